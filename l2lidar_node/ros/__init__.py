@@ -1,0 +1,1 @@
+"""ROS 2 rim of the driver: the only modules that import rclpy and messages."""

@@ -1,0 +1,247 @@
+"""Declares a setting once: default, unit, range and description; everything else is derived from that.
+
+A group of settings is a frozen dataclass whose fields are made by :func:`setting`. The ROS declaration,
+the check of a YAML file, the README table and the error messages all follow from the same metadata.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar, get_type_hints
+
+_KEY = "l2lidar.setting"
+
+Scalar = bool | int | float | str
+Value = Scalar | tuple[str, ...] | tuple[float, ...]
+G = TypeVar("G")
+
+
+class SettingError(ValueError):
+    """A value that a setting cannot take; the message names setting, value and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Everything there is to know about one setting.
+
+    Attributes
+    ----------
+    name : str
+        Name a user types (ROS parameter, YAML key).
+    field : str
+        Name of the dataclass field.
+    type : type
+        One of bool, int, float, str or tuple (then ``item`` says of what).
+    default : Value
+    doc : str
+        What it does, one sentence.
+    unit : str
+        Empty for a number without one.
+    lo, hi : float or None
+        Inclusive bounds.
+    choices : tuple of str
+        Allowed strings; empty for any.
+    live : bool
+        Whether a running node takes a new value.
+    item : type or None
+        Type of the elements of a tuple.
+    """
+
+    name: str
+    field: str
+    type: type
+    default: Value
+    doc: str
+    unit: str = ""
+    lo: float | None = None
+    hi: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
+    item: type | None = None
+
+    @property
+    def range_text(self) -> str:
+        """The permitted values in words, empty when anything of the type will do."""
+        if self.choices:
+            return ", ".join(f"'{choice}'" for choice in self.choices)
+        if self.lo is None and self.hi is None:
+            return ""
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{_number(self.lo)} to {_number(self.hi)}{unit}"
+
+    def check(self, value: object) -> Value:
+        """Return the value in this setting's own type.
+
+        Raises
+        ------
+        SettingError
+            If the type is wrong, a number is not finite or out of range, or a string is not a choice.
+        """
+        if self.item is not None:
+            return self._check_list(value)
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, self.type) or (isinstance(value, bool) and self.type is not bool):
+            raise SettingError(
+                f"parameter '{self.name}': {value!r} is a {type(value).__name__}, "
+                f"expected a {self.type.__name__}"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise SettingError(f"parameter '{self.name}': {value!r} is not a finite number")
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            below = self.lo is not None and value < self.lo
+            above = self.hi is not None and value > self.hi
+            if below or above:
+                raise SettingError(
+                    f"parameter '{self.name}': {value!r} is out of range, expected {self.range_text}"
+                )
+        if self.choices and value not in self.choices:
+            raise SettingError(
+                f"parameter '{self.name}': {value!r} is not known, expected one of {self.range_text}"
+            )
+        return value  # type: ignore[return-value]  # the isinstance test above has the type in a variable
+
+    def _check_list(self, value: object) -> Value:
+        if isinstance(value, str | bytes) or not hasattr(value, "__iter__"):
+            raise SettingError(
+                f"parameter '{self.name}': {value!r} is a {type(value).__name__}, expected a list"
+            )
+        assert self.item is not None
+        element = dataclasses.replace(self, type=self.item, item=None)
+        return tuple(element.check(item) for item in value)  # type: ignore[return-value]  # of one type
+
+
+def _number(value: float | None) -> str:
+    return "unbounded" if value is None else f"{value:g}" if value < 1e6 else str(int(value))
+
+
+def setting(
+    default: Value,
+    doc: str,
+    *,
+    name: str = "",
+    unit: str = "",
+    lo: float | None = None,
+    hi: float | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    """Return a dataclass field that carries everything about one setting.
+
+    ``name`` is only needed where users know the setting under a name that is not the field's.
+    See :class:`Setting` for the other arguments.
+    """
+    metadata = {"doc": doc, "name": name, "unit": unit, "lo": lo, "hi": hi, "choices": choices, "live": live}
+    return field(default=default, metadata={_KEY: metadata})
+
+
+def settings_of(group: type) -> Iterator[Setting]:
+    """Yield every setting of a group in the order of declaration.
+
+    A field that is itself a group (a dataclass of settings) contributes its own settings in place.
+    """
+    hints = get_type_hints(group)
+    for item in dataclasses.fields(group):
+        if _KEY not in item.metadata:
+            yield from settings_of(hints[item.name])
+            continue
+        facts = dict(item.metadata[_KEY])
+        facts["name"] = facts["name"] or item.name
+        declared = hints[item.name]
+        arguments = getattr(declared, "__args__", None)
+        yield Setting(
+            field=item.name,
+            type=tuple if arguments else declared,
+            item=arguments[0] if arguments else None,
+            default=item.default,  # type: ignore[arg-type]  # setting() only takes a Value
+            **facts,
+        )
+
+
+def build(group: type[G], values: Mapping[str, object]) -> G:
+    """Return a group made from user-facing names, every value checked.
+
+    Parameters
+    ----------
+    group : type
+        A frozen dataclass of settings, possibly nested.
+    values : mapping
+        Value by user-facing name; names left out keep their default.
+
+    Raises
+    ------
+    SettingError
+        For a name that no setting has, or a value that its setting cannot take.
+    """
+    known = {item.name for item in settings_of(group)}
+    for name in values:
+        if name not in known:
+            raise SettingError(f"parameter '{name}' is not known{_suggestion(name, known)}")
+    return _build(group, values)
+
+
+def _build(group: type[G], values: Mapping[str, object]) -> G:
+    hints = get_type_hints(group)
+    own = {item.name: item for item in settings_of(group)}
+    arguments: dict[str, object] = {}
+    for item in dataclasses.fields(group):  # type: ignore[arg-type]  # a group is a dataclass
+        if _KEY not in item.metadata:
+            arguments[item.name] = _build(hints[item.name], values)
+            continue
+        name = item.metadata[_KEY]["name"] or item.name
+        if name in values:
+            arguments[item.name] = own[name].check(values[name])
+    return group(**arguments)
+
+
+def values_of(group: object) -> dict[str, Value]:
+    """Return the current value of every setting of a group by user-facing name."""
+    values: dict[str, Value] = {}
+    for item in dataclasses.fields(group):  # type: ignore[arg-type]  # a group is a dataclass
+        value = getattr(group, item.name)
+        if _KEY in item.metadata:
+            values[item.metadata[_KEY]["name"] or item.name] = value
+        else:
+            values.update(values_of(value))
+    return values
+
+
+def change(group: G, values: Mapping[str, object]) -> G:
+    """Return a group with some values replaced; nothing changes unless all of them are right.
+
+    Raises
+    ------
+    SettingError
+        As :func:`build`.
+    """
+    return build(type(group), {**values_of(group), **values})
+
+
+def markdown_table(group: type) -> str:
+    """Return the README's table of a group's settings: name, type, default, range, meaning."""
+    rows = ["| Parameter | Type | Default | Range | Live | Description |", "|---|---|---|---|---|---|"]
+    for item in settings_of(group):
+        kind = f"list of {item.item.__name__}" if item.item else item.type.__name__
+        rows.append(
+            f"| `{item.name}` | {kind} | `{_literal(item.default)}` | {item.range_text} "
+            f"| {'yes' if item.live else ''} | {item.doc} |"
+        )
+    return "\n".join(rows)
+
+
+def _literal(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_literal(item) for item in value) + "]"
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def _suggestion(name: str, known: set[str]) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean '{close[0]}'?" if close else ""

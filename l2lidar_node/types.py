@@ -1,0 +1,82 @@
+"""Names every value that travels between modules; depends on nothing of ours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple, NewType
+
+import numpy as np
+from numpy.typing import NDArray
+
+HostNs = NewType("HostNs", int)
+"""Nanoseconds since the Unix epoch on the host's clock."""
+
+DeviceNs = NewType("DeviceNs", int)
+"""Nanoseconds on the sensor's own clock, which runs at about half speed and steps."""
+
+POINT: Final = np.dtype(
+    [
+        ("x", "<f4"),  # [m] cloud frame
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<f4"),  # [1] 0..255
+        ("range", "<f4"),  # [m] calibrated
+        ("time", "<f4"),  # [s] after Sweep.start
+    ]
+)
+"""One measured point, 24 bytes. An array of points is in ascending order of ``time``."""
+
+IMU_SAMPLE: Final = np.dtype(
+    [
+        ("stamp", "<i8"),  # [ns] host clock
+        ("orientation_wxyz", "<f8", (4,)),  # unit quaternion, IMU to a z-up world, yaw arbitrary
+        ("angular_velocity", "<f8", (3,)),  # [rad/s] IMU frame
+        ("linear_acceleration", "<f8", (3,)),  # [m/s^2] IMU frame, specific force (+g upwards at rest)
+    ]
+)
+"""One IMU sample; an array of samples is in strictly ascending order of ``stamp``."""
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Stream(Enum):
+    """The two streams of measurements that carry sequence numbers and device stamps."""
+
+    POINTS = "points"
+    IMU = "imu"
+
+
+class ImuSample(NamedTuple):
+    """One IMU sample on the host's time line; fields as in :data:`IMU_SAMPLE`."""
+
+    stamp: HostNs
+    orientation_wxyz: Quaternion
+    angular_velocity: Vector3
+    linear_acceleration: Vector3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """The points of consecutive packets, on the host's time line.
+
+    Attributes
+    ----------
+    start : HostNs
+        Instant of the first kept point, whose ``time`` is 0.
+    end : HostNs
+        Instant at which the last packet's last slot was measured; no point is later.
+    points : ndarray, shape (N,), dtype POINT
+        Cloud frame, ``time`` ascending, finite, read-only.
+    packets : int
+        Packets that were aggregated.
+    missing : int
+        Packets that the sequence numbers say are missing within the sweep.
+    """
+
+    start: HostNs
+    end: HostNs
+    points: NDArray[np.void]
+    packets: int
+    missing: int

@@ -1,0 +1,1 @@
+"""Companion of l2lidar_node: deskew, filters and odometry on sweeps; imports no ROS outside ``ros/``."""

@@ -1,0 +1,1 @@
+"""ROS 2 rim of the companion: thin nodes that convert, call and publish."""
