@@ -1,0 +1,143 @@
+"""Groups point packets into sweeps: by count, by head angle or by duration, never without bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from l2lidar_node import wire
+from l2lidar_node.config import SweepConfig
+from l2lidar_node.geometry import PointBatch, Projector, RangeCalibration, RangeLimits
+from l2lidar_node.packets import NS, PointPacket
+from l2lidar_node.types import HostNs, Sweep
+
+MAX_GAP_NS: Final = 200_000_000  # a stream that stalled this long starts a new sweep
+MAX_PACKETS: Final = 4000
+
+Level = Callable[[PointBatch, list[HostNs]], PointBatch]
+
+
+class _Placed(NamedTuple):
+    packet: PointPacket
+    start: HostNs
+
+
+class SweepAssembler:
+    """Collects packets with host stamps and makes a sweep of them when it is complete.
+
+    Parameters
+    ----------
+    config : SweepConfig
+        How sweeps are cut; may be replaced while running through :meth:`configure`.
+    level : callable, optional
+        Applied to each batch of points with the start of every packet, for example to turn points into
+        a levelled frame.
+    """
+
+    def __init__(self, config: SweepConfig, level: Level | None = None) -> None:
+        self._config = config
+        self._level = level
+        self._packets: list[_Placed] = []
+        self._missing = 0
+        self._projectors = {
+            int(kind): Projector(kind)
+            for kind in (wire.PacketType.POINTS_3D, wire.PacketType.POINTS_2D)
+        }
+
+    @property
+    def last_start(self) -> HostNs | None:
+        """Start of the newest packet of the sweep in the making; None when there is none."""
+        return self._packets[-1].start if self._packets else None
+
+    def configure(self, config: SweepConfig, level: Level | None) -> None:
+        """Use other settings from the next packet on."""
+        self._config = config
+        self._level = level
+
+    def push(self, packet: PointPacket, start: HostNs, missing: int = 0) -> list[Sweep]:
+        """Add a packet and return the sweeps this completes: none, one or two.
+
+        Parameters
+        ----------
+        packet : PointPacket
+        start : HostNs
+            Instant of its first slot.
+        missing : int
+            Packets the sequence numbers say are missing just before it.
+        """
+        sweeps: list[Sweep] = []
+        if self._packets and self._starts_anew(packet, start):
+            sweeps.append(self._finish())
+        elif self._packets:
+            # A correction of the clock must not let a packet begin before the previous one ended.
+            last = self._packets[-1]
+            start = HostNs(max(start, last.start + last.packet.duration_ns))
+            self._missing += missing
+        self._packets.append(_Placed(packet, start))
+        if self._is_full():
+            sweeps.append(self._finish())
+        return sweeps
+
+    def flush(self) -> Sweep | None:
+        """Return what has been collected so far as a sweep; None if that is nothing."""
+        return self._finish() if self._packets else None
+
+    def discard(self) -> int:
+        """Forget what has been collected so far; return how many packets that was."""
+        count = len(self._packets)
+        self._packets = []
+        self._missing = 0
+        return count
+
+    def _starts_anew(self, packet: PointPacket, start: HostNs) -> bool:
+        first, last = self._packets[0], self._packets[-1]
+        if packet.packet_type != last.packet.packet_type:
+            return True
+        if start - last.start > MAX_GAP_NS or start < last.start:
+            return True
+        if self._config.cut == "duration":
+            return start - first.start >= self._config.duration_ms * 1_000_000
+        if self._config.cut == "packets" or packet.packet_type == wire.PacketType.POINTS_2D:
+            return False
+        if abs(packet.head_angle - last.packet.head_angle) > math.pi:
+            return True
+        return self._config.cut == "half_turn" and _half(packet) != _half(last.packet)
+
+    def _is_full(self) -> bool:
+        count = len(self._packets)
+        if self._config.cut == "packets":
+            return count >= max(self._config.packets, 1)
+        return count >= MAX_PACKETS
+
+    def _finish(self) -> Sweep:
+        packets, self._packets = self._packets, []
+        missing, self._missing = self._missing, 0
+        starts = [placed.start for placed in packets]
+        epoch = starts[0]
+        config = self._config
+        batch = self._projectors[packets[0].packet.packet_type].points(
+            [placed.packet.payload for placed in packets],
+            np.array([start - epoch for start in starts]) / NS,
+            RangeLimits(config.range_min, config.range_max),
+            RangeCalibration(config.range_scale, config.range_bias)
+            if config.override_range_calibration
+            else None,
+        )
+        if self._level is not None:
+            batch = self._level(batch, starts)
+        batch.points.flags.writeable = False
+        last = packets[-1]
+        return Sweep(
+            start=HostNs(epoch + round(batch.first_s * NS)),
+            end=HostNs(last.start + last.packet.duration_ns),
+            points=batch.points,
+            packets=len(packets),
+            missing=missing,
+        )
+
+
+def _half(packet: PointPacket) -> int:
+    return int(packet.head_angle % (2 * math.pi) >= math.pi)

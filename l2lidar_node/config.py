@@ -1,0 +1,201 @@
+"""Declares every setting of the driver, once: name, default, unit, range and meaning.
+
+Names and defaults that upstream has are upstream's, so its YAML file works unchanged.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass, field
+
+from l2lidar_node import wire
+from l2lidar_node.settings import SettingError, setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkConfig:
+    """Addresses of the device and of this host."""
+
+    l2_ip: str = setting(wire.LIDAR_IP, "IPv4 address of the L2; datagrams from others are refused")
+    l2_port: int = setting(wire.LIDAR_PORT, "UDP port of the L2", lo=1, hi=65535)
+    host_ip: str = setting(wire.HOST_IP, "IPv4 address of this host to listen on; 0.0.0.0 for all")
+    host_port: int = setting(wire.HOST_PORT, "UDP port to listen on", lo=1, hi=65535)
+    receive_buffer_bytes: int = setting(
+        4_194_304, "socket receive buffer to ask the kernel for", unit="B", lo=4096, hi=1 << 30
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("l2_ip", "host_ip"):
+            value = getattr(self, name)
+            try:
+                ipaddress.IPv4Address(value)
+            except ipaddress.AddressValueError as error:
+                raise SettingError(
+                    f"parameter '{name}': {value!r} is not an IPv4 address ({error}), "
+                    "expected four numbers such as 192.168.1.62"
+                ) from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockConfig:
+    """How device stamps become host stamps."""
+
+    enable_l2_time_correction: bool = setting(True, "scale device stamps to true time")
+    enable_l2_host_sync: bool = setting(True, "set the device's clock from the host's")
+    l2_sync_rate_ms: int = setting(50, "interval of host syncs", unit="ms", lo=10, hi=600_000)
+    time_scale_num: int = setting(
+        2, "numerator of the first guess of the clock ratio", name="timeScaleNum", lo=1, hi=10**9
+    )
+    time_scale_denom: int = setting(
+        1, "denominator of the first guess of the clock ratio", name="timeScaleDenom", lo=1, hi=10**9
+    )
+    use_system_time: bool = setting(
+        False, "stamp with the time of arrival instead", name="UseSystemTimeTS", live=True
+    )
+    enable_latency_measure: bool = setting(False, "measure the round trip once a second")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepConfig:
+    """How packets become clouds."""
+
+    frame3d: bool = setting(True, "publish 3D packets; false publishes 2D packets")
+    packets: int = setting(
+        38, "packets in a cloud when cut by packets; 0 publishes every packet",
+        name="aggregateNframes", lo=0, hi=4000, live=True,
+    )  # fmt: skip
+    cut: str = setting(
+        "packets",
+        "where a cloud ends: after a number of packets, a head turn, half a head turn or a duration",
+        name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"), live=True,
+    )  # fmt: skip
+    duration_ms: int = setting(
+        230, "length of a cloud when cut by duration",
+        name="sweep_duration_ms", unit="ms", lo=5, hi=20_000, live=True,
+    )  # fmt: skip
+    override_range_calibration: bool = setting(
+        False, "use calRangeScale and calRangeBias instead of the unit's own",
+        name="EnableCalRangeOVR", live=True,
+    )  # fmt: skip
+    range_scale: float = setting(
+        0.000978, "range scale override", name="calRangeScale", unit="m/count", lo=0.00025, hi=0.002,
+        live=True,
+    )  # fmt: skip
+    range_bias: float = setting(
+        -365.625, "range bias override", name="calRangeBias", unit="counts", lo=-1000.0, hi=0.0,
+        live=True,
+    )  # fmt: skip
+    range_min: float = setting(
+        0.0, "nearest range to publish", unit="m", lo=0.0, hi=100.0, live=True
+    )
+    range_max: float = setting(
+        100.0, "farthest range to publish", unit="m", lo=0.0, hi=100.0, live=True
+    )
+    reorder_window: int = setting(
+        8, "packets that may wait for a missing earlier one", unit="packets", lo=0, hi=256
+    )
+
+    def __post_init__(self) -> None:
+        if self.range_min >= self.range_max:
+            raise SettingError(
+                f"parameter 'range_min': {self.range_min} is not below range_max ({self.range_max})"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuConfig:
+    """The IMU topic and what the onboard orientation is used for."""
+
+    enable_publishing: bool = setting(False, "publish IMU data", name="enable_IMU_publishing")
+    adjust: bool = setting(
+        True, "turn points into a levelled frame with the onboard orientation", name="imu_adjust",
+        live=True,
+    )  # fmt: skip
+    roll_pitch_only: bool = setting(
+        True, "leave the yaw out of imu_adjust", name="imuRollPitchOnly", live=True
+    )
+    accel_x_covar: float = setting(0.01, "variance of acceleration x", unit="(m/s^2)^2", lo=0.0, hi=1e6)
+    accel_y_covar: float = setting(0.01, "variance of acceleration y", unit="(m/s^2)^2", lo=0.0, hi=1e6)
+    accel_z_covar: float = setting(0.01, "variance of acceleration z", unit="(m/s^2)^2", lo=0.0, hi=1e6)
+    gyro_x_covar: float = setting(2.5e-5, "variance of rate x", unit="(rad/s)^2", lo=0.0, hi=1e6)
+    gyro_y_covar: float = setting(2.5e-5, "variance of rate y", unit="(rad/s)^2", lo=0.0, hi=1e6)
+    gyro_z_covar: float = setting(2e-7, "variance of rate z", unit="(rad/s)^2", lo=0.0, hi=1e6)
+    roll_covar: float = setting(4.9e-9, "variance of roll", unit="rad^2", lo=0.0, hi=1e6)
+    pitch_covar: float = setting(4.9e-9, "variance of pitch", unit="rad^2", lo=0.0, hi=1e6)
+    yaw_covar: float = setting(10.0, "variance of yaw", unit="rad^2", lo=0.0, hi=1e6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameConfig:
+    """Frame names and the one transform the driver owns."""
+
+    l2_name: str = setting("l2lidar", "prefix of the default frame names")
+    cloud_frame: str = setting("", "frame of the clouds; empty means <l2_name>_link")
+    publish_tf: bool = setting(True, "publish the static transform from cloud to IMU frame")
+
+    def __post_init__(self) -> None:
+        for name in ("l2_name", "cloud_frame"):
+            value = getattr(self, name)
+            if value.startswith("/") or not re.fullmatch(r"[\w/.~-]*", value):
+                raise SettingError(
+                    f"parameter '{name}': {value!r} is not a frame name, expected letters, digits, "
+                    "'_', '-', '.' and '/', not starting with '/'"
+                )
+
+    @property
+    def cloud(self) -> str:
+        """Name of the cloud frame."""
+        return self.cloud_frame or f"{self.l2_name}_link"
+
+    @property
+    def imu(self) -> str:
+        """Name of the IMU frame: the cloud frame's, ``_link`` replaced by ``_imu``."""
+        return f"{self.cloud.removesuffix('_link')}_imu"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicConfig:
+    """What the topics are called and how they are sent."""
+
+    point_cloud_topic_id: str = setting("/points", "topic of the clouds")
+    imu_topic_id: str = setting("/imu/data", "topic of the IMU samples")
+    qos_reliability: str = setting(
+        "best_effort",
+        "reliability of both topics; reliable reaches every subscriber, best_effort is upstream's",
+        choices=("best_effort", "reliable"),
+    )
+    point_layout: str = setting(
+        "native",
+        "fields of the clouds",
+        choices=("native", "native_ring"),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WatchdogConfig:
+    """What happens when the device falls silent."""
+
+    timeout_ms: int = setting(
+        35_000, "longest silence", name="watchdog_timeout_ms", unit="ms", lo=100, hi=3_600_000
+    )
+    action: str = setting(
+        "shutdown", "end the node, or report and wait for the device", name="watchdog_action",
+        choices=("shutdown", "wait"),
+    )  # fmt: skip
+    standby_on_powerup_enabled: bool = setting(
+        False, "do not watch until the device has spoken, since it starts in standby"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriverConfig:
+    """Everything the driver can be told."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
+    frames: FrameConfig = field(default_factory=FrameConfig)
+    topics: TopicConfig = field(default_factory=TopicConfig)
+    watchdog: WatchdogConfig = field(default_factory=WatchdogConfig)
