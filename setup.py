@@ -1,0 +1,80 @@
+"""Installs both Python packages and the files a ROS 2 package shares; package.xml holds name and version."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import find_packages, setup
+
+HERE = Path(__file__).parent
+MANIFEST = ElementTree.parse(HERE / "package.xml").getroot()
+NAME = MANIFEST.findtext("name", "")
+SHARED_FOLDERS = ("config", "launch", "rviz", "urdf", "meshes")
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """Return ``data_files``: every file of the shared folders, at the same relative path below share."""
+    found: list[tuple[str, list[str]]] = [
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+    ]
+    for top in SHARED_FOLDERS:
+        for folder in sorted({path.parent for path in (HERE / top).rglob("*") if path.is_file()}):
+            relative = folder.relative_to(HERE)
+            if "__pycache__" in relative.parts:
+                continue
+            files = [str(relative / path.name) for path in sorted(folder.iterdir()) if path.is_file()]
+            found.append((f"share/{NAME}/{relative}", files))
+    return found
+
+
+setup(
+    name=NAME,
+    version=MANIFEST.findtext("version"),
+    description=MANIFEST.findtext("description"),
+    license=MANIFEST.findtext("license"),
+    author=MANIFEST.findtext("maintainer"),
+    maintainer=MANIFEST.findtext("maintainer"),
+    packages=find_packages(include=["l2lidar_node*", "l2lidar_proc*"]),
+    package_data={"": ["py.typed"]},
+    data_files=shared_files(),
+    zip_safe=False,
+    python_requires=">=3.11,<3.13",
+    # The lower bounds that matter are those of Ubuntu 24.04, whose packages a sourced ROS 2 brings along.
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "filterpy>=1.4.5",
+        "kiss-icp>=1.3,<2",
+        # The same library twice: the -cpu build is a quarter of the size and exists for one platform only.
+        "open3d-cpu>=0.19; sys_platform == 'linux' and platform_machine == 'x86_64'",
+        "open3d>=0.19; sys_platform != 'linux' or platform_machine != 'x86_64'",
+        "dpkt>=1.9.8",
+        "rosbags>=0.10.6",
+        "PyYAML>=6.0",
+        "typer>=0.12",
+        "rich>=13.7",
+        "matplotlib>=3.8",
+    ],
+    extras_require={
+        "bench": ["evo>=1.31"],
+        "view": ["rerun-sdk>=0.20"],
+        "dev": [
+            "hypothesis>=6.100",
+            "import-linter>=2.1",
+            "mypy>=1.11",
+            "pytest>=8",
+            "ruff>=0.9",
+            "types-PyYAML",
+            "yourdfpy>=0.0.56",
+        ],
+    },
+    entry_points={
+        "console_scripts": [
+            "l2lidar_node = l2lidar_node.ros.driver_node:main",
+            "l2lidar_emulator = l2lidar_node.emulator.cli:main",
+            "deskew_node = l2lidar_proc.ros.deskew_node:main",
+            "odometry_node = l2lidar_proc.ros.odometry_node:main",
+            "l2lidar = l2lidar_node.cli.main:main",
+        ],
+    },
+)
