@@ -1,0 +1,98 @@
+"""Remembers commands until the device has answered them, repeats them, and gives up in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from l2lidar_node import wire
+from l2lidar_node.commands import Command
+from l2lidar_node.packets import Ack
+from l2lidar_node.types import HostNs
+
+REPEAT_NS: Final = 400_000_000
+TRIES: Final = 3
+MAX_PENDING: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """How a command ended.
+
+    Attributes
+    ----------
+    ticket : int
+        What :meth:`Requests.add` returned.
+    command : Command
+    ok : bool
+        Whether the device acknowledged it without objection.
+    text : str
+        One sentence for a person.
+    round_trip_ns : int or None
+        From the last sending to the ACK; None without one.
+    """
+
+    ticket: int
+    command: Command
+    ok: bool
+    text: str
+    round_trip_ns: int | None
+
+
+@dataclass(slots=True)
+class _Pending:
+    ticket: int
+    command: Command
+    sent: HostNs
+    tries_left: int
+
+
+class Requests:
+    """The commands that wait for their ACK; at most :data:`MAX_PENDING`, the oldest give way."""
+
+    def __init__(self) -> None:
+        self._pending: list[_Pending] = []
+        self._tickets = 0
+
+    def add(self, command: Command, now: HostNs, tries: int = TRIES) -> int:
+        """Remember a command that is being sent; return the ticket its answer will carry."""
+        self._tickets += 1
+        del self._pending[: len(self._pending) - MAX_PENDING + 1]
+        self._pending.append(_Pending(self._tickets, command, now, tries - 1))
+        return self._tickets
+
+    def answer(self, ack: Ack, now: HostNs) -> Answer | None:
+        """Return how the command that this ACK belongs to ended; None if it belongs to none."""
+        for index, entry in enumerate(self._pending):
+            if entry.command.is_answered_by(ack):
+                del self._pending[index]
+                ok = ack.status == wire.AckStatus.OK
+                text = "acknowledged" if ok else f"refused: {_status(ack.status)}"
+                return Answer(
+                    entry.ticket, entry.command, ok, f"{entry.command.name}: {text}", now - entry.sent
+                )
+        return None
+
+    def expire(self, now: HostNs) -> tuple[list[Command], list[Answer]]:
+        """Return the commands to send again and the ends of those that were given up."""
+        repeats: list[Command] = []
+        given_up: list[Answer] = []
+        for entry in list(self._pending):
+            if 0 <= now - entry.sent < REPEAT_NS:
+                continue
+            if entry.tries_left > 0:
+                entry.tries_left -= 1
+                entry.sent = now
+                repeats.append(entry.command)
+            else:
+                self._pending.remove(entry)
+                text = f"{entry.command.name}: the device did not acknowledge it"
+                given_up.append(Answer(entry.ticket, entry.command, False, text, None))
+        return repeats, given_up
+
+
+def _status(status: int) -> str:
+    try:
+        return wire.AckStatus(status).name.lower().replace("_", " ")
+    except ValueError:
+        return f"unknown status {status}"

@@ -1,0 +1,53 @@
+"""Reads the command line of a node before rclpy does, so that mistakes get a sentence instead of a trace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+
+class UsageError(ValueError):
+    """The command line is wrong; the message says what and what would be right."""
+
+
+def ros_arguments(argv: list[str]) -> list[str]:
+    """Return the arguments for rclpy.
+
+    ``--params-file FILE`` is also taken without ``--ros-args`` before it.
+
+    Raises
+    ------
+    UsageError
+        If a parameter file is missing or is not the YAML that ROS expects.
+    """
+    arguments = list(argv)
+    if "--ros-args" not in arguments and "--params-file" in arguments:
+        arguments.insert(arguments.index("--params-file"), "--ros-args")
+    for at, argument in enumerate(arguments):
+        if argument == "--params-file":
+            if at + 1 == len(arguments):
+                raise UsageError("--params-file: expected the name of a YAML file after it")
+            _check_parameter_file(Path(arguments[at + 1]))
+    return arguments
+
+
+def _check_parameter_file(path: Path) -> None:
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise UsageError(f"parameter file '{path}': {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise UsageError(f"parameter file '{path}': is not YAML: {reason}") from None
+    if not isinstance(content, dict) or not all(_is_node(entry) for entry in content.values()):
+        raise UsageError(
+            f"parameter file '{path}': expected 'l2lidar_node:' (or '/**:'), below it "
+            "'ros__parameters:', below it the parameters"
+        )
+
+
+def _is_node(entry: object) -> bool:
+    if not isinstance(entry, dict):
+        return False
+    return "ros__parameters" in entry or all(_is_node(below) for below in entry.values())

@@ -1,0 +1,204 @@
+"""The driver as a ROS 2 node: reads parameters, runs the session, publishes what it hands out."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswerError
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import Imu, PointCloud2
+from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
+
+from l2lidar_node import layouts
+from l2lidar_node.clock import ClockEvent
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver import Driver, Event, Silence
+from l2lidar_node.packets import Parameters, Version
+from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
+from l2lidar_node.ros.arguments import UsageError, ros_arguments
+from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
+from l2lidar_node.ros.parameters import ParameterSet
+from l2lidar_node.session import Session
+from l2lidar_node.settings import SettingError
+from l2lidar_node.transport import TransportError, UdpTransport
+from l2lidar_node.types import HostNs, ImuSample, Sweep
+
+_ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 0.5
+_CLOUD_DEPTH = 10
+_IMU_DEPTH = 200
+
+
+class DriverNode(Node):
+    """Publishes clouds, IMU samples and the static transform of one L2.
+
+    Raises
+    ------
+    SettingError
+        If a parameter is wrong.
+    TransportError
+        If the socket cannot be opened.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("l2lidar_node")
+        self.exit_code = 0
+        self._answers: dict[int, Future[Answer]] = {}
+        self._answers_lock = threading.Lock()
+        self._parameters = ParameterSet(self, DriverConfig, self._configure)
+        config = self._parameters.value
+        self._open_publishers(config)
+        self._session = Session(
+            Driver(config), UdpTransport(config.network), self._handle
+        )
+        self.create_service(SetBool, "~/enable", self._enable)
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.get_logger().info(
+            f"listening on {config.network.host_ip}:{config.network.host_port} "
+            f"for the L2 at {config.network.l2_ip}:{config.network.l2_port}"
+        )
+        self._session.start()
+
+    def destroy_node(self) -> None:
+        """End the session, hand out what it still holds, and destroy the node."""
+        if hasattr(self, "_session"):
+            self._session.stop()
+        super().destroy_node()
+
+    def _open_publishers(self, config: DriverConfig) -> None:
+        topics = config.topics
+        reliability = (
+            ReliabilityPolicy.RELIABLE
+            if topics.qos_reliability == "reliable"
+            else ReliabilityPolicy.BEST_EFFORT
+        )
+        self._layout = layouts.LAYOUTS[topics.point_layout]
+        self._cloud_template = CloudTemplate(self._layout.dtype, config.frames.cloud)
+        self._cloud_publisher = self.create_publisher(
+            PointCloud2,
+            topics.point_cloud_topic_id,
+            QoSProfile(depth=_CLOUD_DEPTH, reliability=reliability),
+        )
+        self._imu_publisher = None
+        if config.imu.enable_publishing:
+            self._imu_template = ImuTemplate(config.frames.imu, config.imu)
+            self._imu_publisher = self.create_publisher(
+                Imu, topics.imu_topic_id, QoSProfile(depth=_IMU_DEPTH, reliability=reliability)
+            )
+        if config.frames.publish_tf:
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._tf_publisher = self.create_publisher(TFMessage, "/tf_static", latched)
+            now = HostNs(self.get_clock().now().nanoseconds)
+            self._tf_publisher.publish(TFMessage(transforms=[imu_transform(config.frames, now)]))
+
+    def _configure(self, config: DriverConfig) -> None:
+        self._session.call(lambda driver, now: driver.configure(config))
+
+    def _handle(self, event: Event) -> None:
+        if isinstance(event, ImuSample):
+            if self._imu_publisher is not None:
+                self._imu_publisher.publish(self._imu_template.serialize(event))
+        elif isinstance(event, Sweep):
+            points = self._layout.convert(event)
+            self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
+        elif isinstance(event, Answer):
+            self._answered(event)
+        elif isinstance(event, Silence):
+            self._silent(event)
+        else:
+            self._report(event)
+
+    def _report(self, event: ClockEvent | Version | Parameters) -> None:
+        if isinstance(event, Version):
+            self.get_logger().info(
+                f"the device is {event.name}, firmware {event.firmware} ({event.date}), "
+                f"hardware {event.hardware}"
+            )
+        elif isinstance(event, ClockEvent):
+            self.get_logger().info(f"clock: {event.text}")
+
+    def _silent(self, silence: Silence) -> None:
+        config = self._parameters.value
+        text = (
+            f"no data from the L2 at {config.network.l2_ip} for {silence.duration_ns / 1e9:.1f} s "
+            f"(watchdog_timeout_ms {config.watchdog.timeout_ms})"
+        )
+        if config.watchdog.action == "wait":
+            self.get_logger().error(f"{text}; waiting for it to come back")
+            return
+        self.get_logger().fatal(f"{text}; shutting down")
+        self.exit_code = 1
+        rclpy.try_shutdown()
+
+    def _answered(self, answer: Answer) -> None:
+        with self._answers_lock:
+            future = self._answers.pop(answer.ticket, None)
+        if future is not None:
+            future.set_result(answer)
+
+    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        future: Future[Answer] = Future()
+
+        def command(driver: Driver, now: HostNs) -> list[Event]:
+            if request.data:
+                ticket, events = driver.start_rotation(now), []
+            else:
+                ticket, events = driver.stop_rotation(now)
+            with self._answers_lock:
+                self._answers[ticket] = future
+            return events
+
+        try:
+            for event in self._session.call(command).result(_ANSWER_TIMEOUT_S):
+                self._handle(event)
+            answer = future.result(_ANSWER_TIMEOUT_S)
+            response.success, response.message = answer.ok, answer.text
+        except NoAnswerError:
+            response.success, response.message = False, "the driver did not get to it in time"
+        return response
+
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        del request
+        for event in self._session.call(lambda driver, now: driver.reset_device(now)).result():
+            self._handle(event)
+        response.success = True
+        response.message = "reset sent; the device does not acknowledge it and is back in about 25 s"
+        return response
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the driver node until it is told to end; return the exit code.
+
+    Returns
+    -------
+    int
+        0 after a signal, 1 if the network or the device made it end, 2 for wrong arguments.
+    """
+    node = None
+    try:
+        arguments = ros_arguments(sys.argv if args is None else args)
+        unknown = remove_ros_args(arguments)[1:]
+        if unknown:
+            raise UsageError(f"argument '{unknown[0]}' is not known; parameters follow --ros-args")
+        rclpy.init(args=arguments)
+        node = DriverNode()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (SettingError, UsageError) as error:
+        print(f"l2lidar_node: {error}", file=sys.stderr)
+        return 2
+    except TransportError as error:
+        print(f"l2lidar_node: {error.strerror}", file=sys.stderr)
+        return 1
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return node.exit_code if node is not None else 0

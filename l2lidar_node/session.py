@@ -1,0 +1,103 @@
+"""Runs a driver on a transport in one thread, which alone touches both."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Final, TypeVar
+
+from l2lidar_node.driver import Driver, Event
+from l2lidar_node.transport import Transport
+from l2lidar_node.types import HostNs
+
+T = TypeVar("T")
+
+TICK_S: Final = 0.01
+
+
+class Session:
+    """The receive loop of one device.
+
+    Parameters
+    ----------
+    driver : Driver
+    transport : Transport
+        Closed when the session ends.
+    on_event : callable
+        Called in the loop's thread with everything that happens, in order.
+    """
+
+    def __init__(
+        self, driver: Driver, transport: Transport, on_event: Callable[[Event], None]
+    ) -> None:
+        self.driver = driver
+        self.transport = transport
+        self._on_event = on_event
+        self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="l2lidar-receive", daemon=True)
+
+    @property
+    def failure(self) -> BaseException | None:
+        """What ended the loop before it was stopped; None if nothing did."""
+        return self._failure
+
+    def start(self) -> None:
+        """Start the loop."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the loop after everything collected has been handed out; returns when it has ended."""
+        self._stopping.set()
+        if self._thread.is_alive() and threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def call(self, function: Callable[[Driver, HostNs], T]) -> Future[T]:
+        """Have the loop's thread call ``function(driver, now)``; return its result to come."""
+        future: Future[T] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(function(self.driver, HostNs(time.time_ns())))
+            except Exception as error:  # noqa: BLE001  the caller gets whatever it was
+                future.set_exception(error)
+
+        self._calls.put(run)
+        return future
+
+    def _run(self) -> None:
+        try:
+            next_tick = 0.0
+            while not self._stopping.is_set():
+                for data, arrival in self.transport.receive(TICK_S):
+                    self._hand_out(self.driver.receive(data, arrival))
+                self._run_calls()
+                now = time.monotonic()
+                if now >= next_tick:
+                    next_tick = now + TICK_S
+                    self._hand_out(self.driver.tick(HostNs(time.time_ns())))
+                self._send()
+            self._run_calls()
+            self._send()
+            self._hand_out(self.driver.flush())
+        except BaseException as error:
+            self._failure = error
+            raise
+        finally:
+            self.transport.close()
+
+    def _run_calls(self) -> None:
+        while not self._calls.empty():
+            self._calls.get()()
+
+    def _send(self) -> None:
+        for frame in self.driver.outbox():
+            self.transport.send(frame)
+
+    def _hand_out(self, events: list[Event]) -> None:
+        for event in events:
+            self._on_event(event)

@@ -1,0 +1,158 @@
+"""The socket: datagrams of one sender with the kernel's own arrival times, and frames back to it."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import struct
+import time
+from typing import Final, NamedTuple, Protocol
+
+from l2lidar_node.config import NetworkConfig
+from l2lidar_node.types import HostNs
+
+# Not in Python's socket module; from Linux's asm-generic/socket.h.
+_SO_TIMESTAMPNS: Final = 35
+_SO_RXQ_OVFL: Final = 40
+_TIMESPEC = struct.Struct("@ll")
+_COUNTER = struct.Struct("@I")
+_ANCILLARY_SIZE: Final = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_COUNTER.size)
+_MAX_DATAGRAM: Final = 65_536
+_BATCH: Final = 256  # datagrams read before the caller gets a turn
+
+
+class TransportError(OSError):
+    """The network cannot be used as asked; the message says what to do."""
+
+
+class Datagram(NamedTuple):
+    """Bytes with the host time at which they arrived."""
+
+    data: bytes
+    arrival: HostNs
+
+
+class Transport(Protocol):
+    """Where bytes come from and go to."""
+
+    foreign: int
+    kernel_drops: int
+
+    def receive(self, timeout_s: float) -> list[Datagram]:
+        """Return what has arrived, waiting at most ``timeout_s`` for the first of it."""
+
+    def send(self, frame: bytes) -> None:
+        """Send one frame to the device."""
+
+    def close(self) -> None:
+        """Release what is held; may be called more than once."""
+
+
+class UdpTransport:
+    """A UDP socket that hears one device.
+
+    Parameters
+    ----------
+    config : NetworkConfig
+
+    Attributes
+    ----------
+    foreign : int
+        Datagrams of other senders, dropped.
+    kernel_drops : int
+        Datagrams the kernel dropped because the receive buffer was full.
+    send_errors : int
+        Frames that could not be sent, for example while a cable is out.
+
+    Raises
+    ------
+    TransportError
+        If the address cannot be listened on.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        self.foreign = 0
+        self.kernel_drops = 0
+        self.send_errors = 0
+        self._device = config.l2_ip
+        self._peer = (config.l2_ip, config.l2_port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, config.receive_buffer_bytes)
+        for option in (_SO_TIMESTAMPNS, _SO_RXQ_OVFL):
+            self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
+        try:
+            self._socket.bind((config.host_ip, config.host_port))
+        except OSError as error:
+            self._socket.close()
+            raise TransportError(error.errno, _bind_advice(config, error)) from None
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
+
+    @property
+    def port(self) -> int:
+        """The port that is listened on."""
+        return int(self._socket.getsockname()[1])
+
+    @property
+    def receive_buffer_bytes(self) -> int:
+        """The receive buffer the kernel granted [B]; it doubles what it grants for its own use."""
+        return self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+    def receive(self, timeout_s: float) -> list[Datagram]:
+        """Return what has arrived from the device, in order; empty when nothing did in time."""
+        self._poll.poll(timeout_s * 1e3)
+        batch: list[Datagram] = []
+        receive = self._socket.recvmsg
+        for _ in range(_BATCH):
+            try:
+                data, ancillary, _, sender = receive(_MAX_DATAGRAM, _ANCILLARY_SIZE)
+            except BlockingIOError:
+                break
+            except OSError:  # an ICMP error of an earlier send, reported here
+                continue
+            arrival = self._arrival(ancillary)
+            if sender[0] == self._device:
+                batch.append(Datagram(data, arrival))
+            else:
+                self.foreign += 1
+        return batch
+
+    def send(self, frame: bytes) -> None:
+        """Send one frame to the device; a failure is counted, since commands are repeated."""
+        try:
+            self._socket.sendto(frame, self._peer)
+        except OSError:
+            self.send_errors += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> HostNs:
+        arrival = 0
+        for _, kind, value in ancillary:
+            if kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                arrival = seconds * 1_000_000_000 + nanoseconds
+            elif kind == _SO_RXQ_OVFL:
+                self.kernel_drops = _COUNTER.unpack(value)[0]
+        return HostNs(arrival or time.time_ns())
+
+
+def _bind_advice(config: NetworkConfig, error: OSError) -> str:
+    address = f"{config.host_ip}:{config.host_port}"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return (
+            f"cannot listen on {address}: host_ip '{config.host_ip}' is no address of this machine; "
+            "give a network interface this address, or set host_ip to one it has (0.0.0.0 for all)"
+        )
+    if error.errno == errno.EADDRINUSE:
+        return (
+            f"cannot listen on {address}: host_port {config.host_port} is in use; end the other "
+            "program (another driver?) or set host_port to a free port that the L2 sends to"
+        )
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return f"cannot listen on {address}: no permission; set host_port to 1024 or above"
+    return f"cannot listen on {address}: {error.strerror}"

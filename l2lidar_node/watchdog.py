@@ -1,0 +1,101 @@
+"""Tells what the device is doing from what was heard of it, and when it has been silent for too long."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+from l2lidar_node.config import WatchdogConfig
+from l2lidar_node.types import HostNs, Stream
+
+SILENCE_NS: Final = 1_000_000_000  # a stream that paused this long has stopped
+SPIN_UP_NS: Final = 21_000_000_000  # from the first IMU packet to the first points, at power-on
+
+
+class DeviceState(Enum):
+    """What the device is doing, as far as the host can tell."""
+
+    WAITING = "waiting"  # nothing has been heard yet
+    SPINNING_UP = "spinning_up"  # IMU but no points yet
+    STREAMING = "streaming"
+    STANDBY = "standby"  # stopped on request
+    STALLED = "stalled"  # it was heard before and fell silent, or its points stopped
+
+
+class Watchdog:
+    """Follows the two streams of a device.
+
+    Parameters
+    ----------
+    config : WatchdogConfig
+    """
+
+    def __init__(self, config: WatchdogConfig) -> None:
+        self._timeout_ns = config.timeout_ms * 1_000_000
+        self._patient = config.standby_on_powerup_enabled
+        self._last: dict[Stream, HostNs] = {}
+        self._watching_since: HostNs | None = None
+        self._imu_since: HostNs | None = None
+        self._points_seen = False
+        self._standby = False
+        self._reported = False
+
+    def heard(self, stream: Stream, now: HostNs) -> None:
+        """Note a measurement of a stream."""
+        last = self._last.get(stream)
+        if stream is Stream.POINTS:
+            self._points_seen = True
+        elif last is None or now - last > SILENCE_NS:
+            self._imu_since = now
+        self._last[stream] = now
+
+    def stopped(self) -> None:
+        """Note that the device was told to stop: silence is what is wanted."""
+        self._standby = True
+
+    def started(self, now: HostNs) -> None:
+        """Note that the device was told to start, or rebooted: the time allowed begins now."""
+        self._standby = False
+        self._watching_since = now
+        self._points_seen = False
+        self._imu_since = None
+        self._last.clear()
+        self._reported = False
+
+    def state(self, now: HostNs) -> DeviceState:
+        """Return what the device is doing."""
+        points, imu = (self._fresh(stream, now) for stream in (Stream.POINTS, Stream.IMU))
+        if points:
+            return DeviceState.STREAMING
+        if self._standby:
+            return DeviceState.STANDBY
+        if imu and not self._points_seen:
+            return DeviceState.SPINNING_UP
+        return DeviceState.STALLED if self._last else DeviceState.WAITING
+
+    def spin_up_left_s(self, now: HostNs) -> float:
+        """Return the seconds until points can be expected after power-on; 0 when they are overdue."""
+        if self._imu_since is None:
+            return SPIN_UP_NS / 1e9
+        return max(0.0, (self._imu_since + SPIN_UP_NS - now) / 1e9)
+
+    def silence_ns(self, now: HostNs) -> int:
+        """Return how long nothing has been measured, 0 while that is as it should be."""
+        if self._standby or (self._patient and not self._last):
+            return 0
+        if self._watching_since is None:
+            self._watching_since = now
+        return now - max([*self._last.values(), self._watching_since])
+
+    def expired(self, now: HostNs) -> bool:
+        """Tell, once per silence, that it has lasted too long."""
+        over = self.silence_ns(now) > self._timeout_ns
+        if over and not self._reported:
+            self._reported = True
+            return True
+        self._reported = over
+        return False
+
+    def _fresh(self, stream: Stream, now: HostNs) -> bool:
+        last = self._last.get(stream)
+        return last is not None and now - last <= SILENCE_NS
