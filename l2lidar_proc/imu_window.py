@@ -1,0 +1,162 @@
+"""Keeps the recent IMU samples in order of time, whatever order and state they come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import IMU_SAMPLE, HostNs
+
+Samples = NDArray[np.void]
+"""Array of dtype IMU_SAMPLE, shape (N,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowCounts:
+    """What has come into a window since it was made.
+
+    Attributes
+    ----------
+    accepted : int
+        Samples kept, those that were put in order included.
+    reordered : int
+        Samples that came late and were put where they belong.
+    duplicate : int
+        Samples with a stamp that was already there; refused.
+    invalid : int
+        Samples with a number that is not finite; refused.
+    stale : int
+        Samples older than everything that is kept; refused.
+    jumps : int
+        Times the clock went back, or far ahead, and the window was emptied.
+    """
+
+    accepted: int = 0
+    reordered: int = 0
+    duplicate: int = 0
+    invalid: int = 0
+    stale: int = 0
+    jumps: int = 0
+
+
+class ImuWindow:
+    """Samples of the last seconds in strictly ascending order of time.
+
+    Parameters
+    ----------
+    length_s : float
+        How much is kept behind the newest sample [s].
+    jump_s : float
+        A sample this much behind the newest one, or ahead of it, means a changed clock: the window
+        starts afresh with it [s].
+    """
+
+    def __init__(self, length_s: float = 4.0, jump_s: float = 1.0) -> None:
+        self._length_ns = round(length_s * 1e9)
+        self._jump_ns = round(jump_s * 1e9)
+        self._buffer = np.empty(2048, dtype=IMU_SAMPLE)
+        self._head = 0
+        self._tail = 0
+        self._tally = dict.fromkeys(WindowCounts.__dataclass_fields__, 0)
+
+    @property
+    def counts(self) -> WindowCounts:
+        """What came in so far."""
+        return WindowCounts(**self._tally)
+
+    @property
+    def samples(self) -> Samples:
+        """Everything that is kept, shape (N,); a view that the next :meth:`push` may change."""
+        return self._buffer[self._head : self._tail]
+
+    @property
+    def newest(self) -> HostNs | None:
+        """Stamp of the newest sample, None when empty."""
+        return HostNs(int(self._buffer["stamp"][self._tail - 1])) if len(self) else None
+
+    def __len__(self) -> int:
+        """Return how many samples are kept."""
+        return self._tail - self._head
+
+    def clear(self) -> None:
+        """Forget all samples; the counts stay."""
+        self._head = self._tail = 0
+
+    def between(self, start: HostNs, end: HostNs) -> Samples:
+        """Return a copy of the samples of a span with a neighbour on either side, shape (M,)."""
+        stamps = self.samples["stamp"]
+        first = max(int(np.searchsorted(stamps, start, side="right")) - 1, 0)
+        last = int(np.searchsorted(stamps, end, side="left")) + 1
+        return self.samples[first:last].copy()
+
+    def push(self, samples: Samples) -> Samples:
+        """Take samples in any order.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (N,), dtype IMU_SAMPLE
+
+        Returns
+        -------
+        ndarray, shape (M,), dtype IMU_SAMPLE
+            Those that continue the window in order: what a filter that runs along may use.
+        """
+        finite = np.isfinite(samples["angular_velocity"]).all(axis=1) & np.isfinite(
+            samples["linear_acceleration"]
+        ).all(axis=1)
+        if not finite.all():
+            self._tally["invalid"] += int((~finite).sum())
+            samples = samples[finite]
+        if not len(samples):
+            return samples
+        stamps = samples["stamp"]
+        newest = self.newest
+        steps = np.diff(stamps, prepend=stamps[0] - 1 if newest is None else newest)
+        if (steps > 0).all() and (steps <= self._jump_ns).all():
+            self._append(samples)
+            return samples
+        in_order = [self._push_one(samples[i : i + 1]) for i in range(len(samples))]
+        return samples[in_order]
+
+    def _push_one(self, sample: Samples) -> bool:
+        """Take one sample wherever it belongs; return whether it continues the window."""
+        stamp = int(sample["stamp"][0])
+        newest = self.newest
+        if newest is None or 0 < stamp - newest <= self._jump_ns:
+            self._append(sample)
+            return True
+        if abs(stamp - newest) > self._jump_ns:
+            self._tally["jumps"] += 1
+            self.clear()
+            self._append(sample)
+            return True
+        place = int(np.searchsorted(self.samples["stamp"], stamp))
+        if self.samples["stamp"][place] == stamp:
+            self._tally["duplicate"] += 1
+        elif place == 0:
+            self._tally["stale"] += 1
+        else:
+            self._append(sample)
+            self.samples[place + 1 :] = self.samples[place:-1].copy()
+            self.samples[place] = sample[0]
+            self._tally["reordered"] += 1
+        return False
+
+    def _append(self, samples: Samples) -> None:
+        self._tally["accepted"] += len(samples)
+        kept = self.samples
+        if self._tail + len(samples) > len(self._buffer):
+            oldest = int(samples["stamp"][-1]) - self._length_ns
+            kept = kept[np.searchsorted(kept["stamp"], oldest) :]
+            size = len(self._buffer)
+            while len(kept) + len(samples) > size // 2:
+                size *= 2
+            fresh = np.empty(size, dtype=IMU_SAMPLE)
+            fresh[: len(kept)] = kept
+            self._buffer, self._head, self._tail = fresh, 0, len(kept)
+        self._buffer[self._tail : self._tail + len(samples)] = samples
+        self._tail += len(samples)
+        oldest = int(self._buffer["stamp"][self._tail - 1]) - self._length_ns
+        self._head += int(np.searchsorted(self.samples["stamp"], oldest))
