@@ -1,0 +1,126 @@
+"""Runs a virtual L2 on a port: in real time, faster, or as fast as the receiver takes it."""
+
+from __future__ import annotations
+
+import math
+import select
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from l2lidar_node.emulator.device import VirtualL2
+from l2lidar_node.emulator.flash import Flash
+from l2lidar_node.emulator.lateness import Lateness
+from l2lidar_node.emulator.port import Port
+
+_LONGEST_WAIT_S: Final = 0.05  # to notice a stop or a held-back packet
+_CHUNK_NS: Final = 20_000_000  # of the unit's time between two looks at the receiver
+MAX_SPEED: Final = math.inf
+
+
+class Server:
+    """Joins a virtual unit and a port.
+
+    Parameters
+    ----------
+    device : VirtualL2
+        Its power-on instant is when :meth:`run` starts to send.
+    port : Port
+    speed : float
+        Seconds of the unit's life per second; with :data:`MAX_SPEED` the receiver sets the pace.
+    on_flash : callable, optional
+        Called with the stored settings whenever they have changed.
+
+    Attributes
+    ----------
+    lateness : Lateness
+        How long after its instant each datagram was sent, at the unit's time scale.
+    unsent : int
+        Datagrams that the port could not take.
+    """
+
+    def __init__(
+        self,
+        device: VirtualL2,
+        port: Port,
+        speed: float = 1.0,
+        on_flash: Callable[[Flash], None] | None = None,
+    ) -> None:
+        self.lateness = Lateness()
+        self.unsent = 0
+        self._device = device
+        self._port = port
+        self._speed = speed
+        self._on_flash = on_flash
+        self._flash = device.flash
+        self._network = device.network
+        self._is_stopped = False
+
+    def stop(self) -> None:
+        """Let :meth:`run` return soon; may be called from a signal handler or another thread."""
+        self._is_stopped = True
+
+    def run(self, power_on_ns: int, duration_s: float = math.inf) -> None:
+        """Serve until :meth:`stop` or the end of a duration.
+
+        Parameters
+        ----------
+        power_on_ns : int
+            Wall clock instant of power-on, as the unit was told; later ones follow the
+            monotonic clock.
+        duration_s : float
+            Seconds of the unit's life after power-on.
+
+        Raises
+        ------
+        PortError
+            If the unit moves to an address that cannot be bound.
+        """
+        end_ns = math.inf if math.isinf(duration_s) else power_on_ns + round(duration_s * 1e9)
+        if math.isinf(self._speed):
+            self._race(power_on_ns, end_ns)
+        else:
+            self._keep_pace(power_on_ns, end_ns)
+
+    def _keep_pace(self, power_on_ns: int, end_ns: float) -> None:
+        speed = self._speed
+        base_ns = time.monotonic_ns() + power_on_ns - time.time_ns()
+
+        def now() -> int:
+            return power_on_ns + round((time.monotonic_ns() - base_ns) * speed)
+
+        while not self._is_stopped and now() < end_ns:
+            due_ns = self._device.next_ns
+            wait_s = _LONGEST_WAIT_S
+            if due_ns is not None:
+                wait_s = min(max((due_ns - now()) / speed * 1e-9, 0.0), wait_s)
+            if select.select([self._port], [], [], wait_s)[0]:
+                self._listen(now)
+            for time_ns, data in self._device.advance(now()):
+                self.unsent += not self._port.send(data)
+                self.lateness.add(now() - time_ns)
+
+    def _race(self, power_on_ns: int, end_ns: float) -> None:
+        now_ns = power_on_ns
+        while not self._is_stopped and now_ns < end_ns:
+            if select.select([self._port], [], [], 0.0)[0]:
+                self._listen(partial(int, now_ns))
+            next_ns = self._device.next_ns
+            now_ns = (now_ns if next_ns is None else max(next_ns, now_ns)) + _CHUNK_NS
+            if next_ns is None:
+                select.select([self._port], [], [], _CHUNK_NS * 1e-9)
+            for _, data in self._device.advance(now_ns):
+                self._port.drain(_LONGEST_WAIT_S)
+                self.unsent += not self._port.send(data)
+
+    def _listen(self, now: Callable[[], int]) -> None:
+        for data in self._port.receive():
+            self._device.command(data, now())
+        if self._device.flash != self._flash:
+            self._flash = self._device.flash
+            if self._on_flash:
+                self._on_flash(self._flash)
+        if self._device.network != self._network:
+            self._network = self._device.network
+            self._port.follow(self._network)
