@@ -17,6 +17,7 @@ from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
 from l2lidar_node.commands import Command
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.framing import FrameError, Framer
+from l2lidar_node.gravity import GravityMonitor
 from l2lidar_node.levelling import Levelling
 from l2lidar_node.packets import (
     Ack,
@@ -78,6 +79,8 @@ class Counters:
         Slots measured in all sweeps, with a return or without.
     unanswered : int
         ACKs that belong to no command.
+    unlevelled : int
+        Points left out because ``imu_adjust`` had no orientation for them.
     """
 
     datagrams: int = 0
@@ -95,6 +98,18 @@ class Counters:
     points: int = 0
     slots: int = 0
     unanswered: int = 0
+    unlevelled: int = 0
+
+    def snapshot(self) -> Counters:
+        """Return a copy that does not change any more."""
+        return dataclasses.replace(
+            self,
+            frames=Counter(self.frames),
+            faults=Counter(self.faults),
+            rejected=Counter(self.rejected),
+            unlocked=Counter(self.unlocked),
+            sequence={key: dataclasses.replace(value) for key, value in self.sequence.items()},
+        )
 
 
 @dataclass(slots=True)
@@ -119,6 +134,7 @@ class Driver:
         self.parameters: Parameters | None = None
         self.last_points: bytes | None = None
         self.last_imu: ImuSample | None = None
+        self.gravity = GravityMonitor()
         self._config = config
         self._framer = Framer()
         self._orders = {
@@ -294,6 +310,7 @@ class Driver:
         self.counters.samples += 1
         self.last_imu = sample
         self._levelling.add(sample)
+        self.gravity.add(sample)
         return [sample]
 
     def _points(self, packet: PointPacket, arrival: HostNs, missing: int) -> list[Event]:
@@ -313,6 +330,7 @@ class Driver:
         if sweep is None:
             return []
         self.counters.sweeps += 1
+        self.counters.unlevelled = self._levelling.dropped
         self.counters.points += len(sweep.points)
         self.counters.slots += sweep.packets * self._slots
         if not len(sweep.points):
@@ -358,18 +376,4 @@ class Driver:
         self._levelling.clear()
         self.version = None
         self.parameters = None
-
-
-def copy_counters(counters: Counters) -> Counters:
-    """Return a snapshot that does not change any more."""
-    snapshot = dataclasses.replace(
-        counters,
-        frames=Counter(counters.frames),
-        faults=Counter(counters.faults),
-        rejected=Counter(counters.rejected),
-        unlocked=Counter(counters.unlocked),
-        sequence={key: dataclasses.replace(value) for key, value in counters.sequence.items()},
-    )
-    return snapshot
-
 

@@ -28,10 +28,16 @@ class Levelling:
     ----------
     roll_pitch_only : bool
         Leave out the yaw, which is arbitrary and drifts.
+
+    Attributes
+    ----------
+    dropped : int
+        Points left out for want of an orientation.
     """
 
     def __init__(self, roll_pitch_only: bool) -> None:
         self.roll_pitch_only = roll_pitch_only
+        self.dropped = 0
         self._samples: deque[ImuSample] = deque(maxlen=_HISTORY)
 
     def add(self, sample: ImuSample) -> None:
@@ -66,6 +72,7 @@ class Levelling:
             points[name] = turned[:, axis]
         if known.all():
             return PointBatch(points, batch.first_s, batch.counts)
+        self.dropped += int(batch.counts[~known].sum())
         return _keep(points, known[packet], batch.first_s, batch.counts * known)
 
     def _rotation(self, wxyz: Quaternion) -> NDArray[np.float64]:

@@ -24,6 +24,7 @@ from l2lidar_node.packets import Parameters, Version
 from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
 from l2lidar_node.ros.arguments import UsageError, ros_arguments
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
+from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.session import Session
 from l2lidar_node.settings import SettingError
@@ -59,6 +60,7 @@ class DriverNode(Node):
         )
         self.create_service(SetBool, "~/enable", self._enable)
         self.create_service(Trigger, "~/reset", self._reset)
+        self._health = HealthPublisher(self, self._session)
         self.get_logger().info(
             f"listening on {config.network.host_ip}:{config.network.host_port} "
             f"for the L2 at {config.network.l2_ip}:{config.network.l2_port}"

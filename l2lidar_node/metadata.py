@@ -1,0 +1,80 @@
+"""Gathers what is known about a device: who it is, how it is calibrated and how it scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2lidar_node import wire
+from l2lidar_node.driver import Driver
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """Facts about one device; None or empty where it has not said so yet.
+
+    Attributes
+    ----------
+    hardware, firmware, name, date : str
+    work_mode : int or None
+        Bits of :class:`wire.WorkMode`.
+    work_mode_names : list of str
+    calibration : dict
+        Names and units as in :data:`wire.CALIBRATION`.
+    slots : int
+        Slots in a packet.
+    angle_min_rad, angle_increment_rad : float
+        Of the slots along the arc.
+    time_increment_s : float
+        Between slots.
+    range_min_m, range_max_m : float
+    imu_position_m : tuple
+        In the cloud frame.
+    cloud_frame, imu_frame : str
+    """
+
+    hardware: str
+    firmware: str
+    name: str
+    date: str
+    work_mode: int | None
+    work_mode_names: list[str]
+    calibration: dict[str, float]
+    slots: int
+    angle_min_rad: float
+    angle_increment_rad: float
+    time_increment_s: float
+    range_min_m: float
+    range_max_m: float
+    imu_position_m: tuple[float, float, float]
+    cloud_frame: str
+    imu_frame: str
+
+
+def metadata(driver: Driver) -> Metadata:
+    """Return what a driver knows about its device."""
+    version, parameters = driver.version, driver.parameters
+    mode = None if parameters is None else parameters.work_mode
+    layout = wire.POINTS_3D_PAYLOAD if driver.config.sweep.frame3d else wire.POINTS_2D_PAYLOAD
+    payload = driver.last_points
+    packet = np.zeros(1, layout)[0] if payload is None else np.frombuffer(payload, layout)[0]
+    calibration = packet["calibration"]
+    return Metadata(
+        hardware=version.hardware if version else "",
+        firmware=version.firmware if version else "",
+        name=version.name if version else "",
+        date=version.date if version else "",
+        work_mode=mode,
+        work_mode_names=[] if mode is None else [bit.name or "" for bit in wire.WorkMode if bit & mode],
+        calibration={name: float(calibration[name]) for name in wire.CALIBRATION.names or ()},
+        slots=int(packet["point_num"]),
+        angle_min_rad=float(packet["angle_min"]),
+        angle_increment_rad=float(packet["angle_increment"]),
+        time_increment_s=float(packet["time_increment"]),
+        range_min_m=float(packet["range_min"]),
+        range_max_m=float(packet["range_max"]),
+        imu_position_m=wire.IMU_POSITION_M,
+        cloud_frame=driver.config.frames.cloud,
+        imu_frame=driver.config.frames.imu,
+    )
