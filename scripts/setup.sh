@@ -18,14 +18,14 @@ die() {
 
 # --- steps and their stamps -----------------------------------------------------------------------------
 
-# Prints one number for the contents of files and for words.
-digest() { { cat -- "${files[@]}" && printf '%s\n' "$@"; } | sha256sum | cut -d ' ' -f 1; }
+# Prints one number for the words given and the contents of the files in the array of that name.
+digest() { { cat /dev/null "${files[@]}" && printf '%s\n' "$@"; } | sha256sum | cut -d ' ' -f 1; }
 is_done() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ]; }
 mark() { mkdir -p "$stamps" && echo "$2" >"$stamps/$1"; }
 
 # --- system packages ------------------------------------------------------------------------------------
 
-has_library() { PATH=$PATH:/sbin:/usr/sbin ldconfig -p | grep -q "^[[:space:]]*$1 "; }
+has_library() { PATH=$PATH:/sbin:/usr/sbin ldconfig -p | grep -F "$1 " >/dev/null; }
 
 # Prints the Debian names of what this machine lacks, given the interpreter that was found (or nothing).
 missing_packages() {
@@ -34,7 +34,7 @@ missing_packages() {
         echo python3 python3-venv python3-dev
     else
         name=$("$found" -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
-        "$found" -c 'import ensurepip, venv' 2>/dev/null || echo "$name-venv"
+        has_venv "$found" || echo "$name-venv"
         has_headers "$found" || [ -n "$ros" ] || echo "$name-dev"
     fi
     if [ -z "$ros" ]; then
@@ -71,21 +71,26 @@ install_packages() {
 
 # --- Python ---------------------------------------------------------------------------------------------
 
-has_headers() { "$1" -c 'import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null; }
-
 is_suitable() {
     "$1" -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null
 }
+has_venv() { "$1" -c 'import ensurepip, venv' 2>/dev/null; }
+has_headers() { "$1" -c 'import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null; }
+has_ros() { "$1" -c 'import rclpy' 2>/dev/null; }
+is_complete() {
+    is_suitable "$1" && has_venv "$1" && if [ -n "$ros" ]; then has_ros "$1"; else has_headers "$1"; fi
+}
 
-# Prints the first interpreter of version 3.11 or 3.12; a sourced ROS 2 works with the system's only.
+# Prints the first interpreter that has all it takes, else the first of a right version, else nothing.
 find_python() {
-    local candidate
-    for candidate in ${PYTHON:-} /usr/bin/python3 python3 python3.12 python3.11; do
-        candidate=$(command -v "$candidate") || continue
-        if is_suitable "$candidate"; then
-            echo "$candidate"
-            return
-        fi
+    local candidate will_do
+    for will_do in is_complete is_suitable; do
+        for candidate in ${PYTHON:-} /usr/bin/python3 python3 python3.12 python3.11; do
+            if candidate=$(command -v "$candidate") && "$will_do" "$candidate"; then
+                echo "$candidate"
+                return
+            fi
+        done
     done
 }
 
@@ -125,7 +130,7 @@ make_venv() {
     [ -n "$found" ] || die "Python 3.11 or 3.12 is needed and none was found on this machine." \
         "Set PYTHON to the path of one, then run the command again."
     if [ -n "$ros" ]; then
-        "$found" -c 'import rclpy' 2>/dev/null || die "ROS_DISTRO is '$ros', but $found cannot import rclpy." \
+        has_ros "$found" || die "ROS_DISTRO is '$ros', but $found cannot import rclpy." \
             "Source that ROS 2 ('source /opt/ros/$ros/setup.bash') or unset ROS_DISTRO to do without it."
         options=(--system-site-packages)
     fi
@@ -153,24 +158,19 @@ PYTHON
 }
 
 main() {
-    local files made ros_made depends installed
-
-    files=(scripts/setup.sh)
+    local files made ros_made installed
+    files=()
     made=$(digest "$root" "$ros" "${PYTHON:-}")
     files=(requirements/*.txt scripts/tf2_msgs.sh scripts/tf2_msgs/*.* scripts/tf2_msgs/msg/*)
     ros_made=$(digest "$made")
-    files=(setup.py)
-    depends=$(digest "$ros_made")
-    mapfile -t files < <(find setup.cfg package.xml resource config launch rviz urdf meshes \
-        -type f -not -name '*.pyc' | sort)
-    installed=$(digest "$depends" "${files[@]}")
+    files=(setup.py setup.cfg package.xml)
+    installed=$(digest "$ros_made")
 
     if is_done installed "$installed"; then
         is_healthy && return
         say ".venv is damaged; making it anew"
         rm -rf "$venv"
     fi
-
     if ! is_done made "$made" || ! "$python" -m pip --version >/dev/null 2>&1; then
         check_ros
         install_system
@@ -182,13 +182,8 @@ main() {
         [ -n "$ros" ] || install_ros
         mark ros "$ros_made"
     fi
-    if ! is_done depends "$depends"; then
-        say "installing the Python packages this project needs"
-        pip_install --no-build-isolation --editable '.[bench,dev]'
-        mark depends "$depends"
-    else
-        pip_install --no-build-isolation --no-deps --editable .
-    fi
+    say "installing the Python packages this project needs"
+    pip_install --no-build-isolation --editable '.[bench,dev]'
     is_healthy || die "something is still missing from .venv; run 'make clean', then the command again."
     mark installed "$installed"
     say "done"
