@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.draws import Stream, generator
 from l2lidar_node.emulator.motion import Motion, mount_quaternion, rpy_quaternions
-from l2lidar_node.emulator.scenes import Scene
+from l2lidar_node.emulator.scene import Scene
 from l2lidar_node.emulator.spline import PoseSpline
 
 MOTIONS: Final = ("still", "spin", "walk", "trot", "drone")

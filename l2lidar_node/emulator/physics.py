@@ -60,13 +60,13 @@ def assemble(config: PhysicsConfig) -> Physics:
         For a scene, motion or file that cannot be used; the message names it.
     """
     if config.world in scenes.SCENES:
-        scene = scenes.scene(config.world)
+        scene = scenes.make(config.world)
         world = World(scene.triangles, scene.reflectivity)
     elif _is_path(config.world):
         world = World.load(config.world)
         scene = scenes.of_world(world)
     else:
-        scene = scenes.scene(config.world)
+        scene = scenes.make(config.world)
     if config.mount_rpy_deg and len(config.mount_rpy_deg) != 3:
         raise ValueError(f"mount_rpy_deg: expected 3 angles, got {len(config.mount_rpy_deg)}")
     mount: str | tuple[float, float, float] = config.mount

@@ -98,7 +98,7 @@ def fill(
     raw = np.where(back, raw, 0).astype(np.uint16)
     packets["ranges"] = raw
     rays["measured"] = np.where(raw > 0, scale * (raw + bias), 0.0)
-    bright = 255.0 * np.sqrt(hits["reflectivity"] * hits["incidence"]) / (1.0 + (distance / 25.0) ** 2)
+    bright = 210.0 * np.sqrt(hits["reflectivity"] * hits["incidence"]) / (1.0 + (distance / 25.0) ** 2)
     bright = np.clip(np.rint(bright * (1.0 + 0.04 * draws.normal[1])), 1, 255)
     packets["intensities"] = np.where(raw > 0, bright, 0)
 
@@ -130,10 +130,10 @@ def _mix(
     other /= np.linalg.norm(other, axis=-1, keepdims=True)
     beside = world.cast(rays["origin"].reshape(-1, 3), other.reshape(-1, 3))["distance"].reshape(seen.shape)
     share = draws.uniform[2] * 0.5  # of the beam that meets the other surface
-    with np.errstate(invalid="ignore"):
-        step = np.abs(beside - seen)
-    blends = step < PULSE_M
-    seen[blends] += (share * (beside - seen))[blends]
+    with np.errstate(invalid="ignore"):  # inf - inf: nothing is there
+        step = beside - seen
+    blends = np.abs(step) < PULSE_M
+    seen[blends] += share[blends] * step[blends]
     swaps = ~blends & (share > 0.35) & np.isfinite(beside)
     seen[swaps] = beside[swaps]
 

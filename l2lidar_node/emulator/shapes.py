@@ -72,3 +72,10 @@ def ellipsoid(
     ripple = 1.0 + roughness * np.sin(3.0 * lon + centre[0]) * np.cos(lat) * np.sin(4.0 * lat + centre[1])
     unit = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
     return grid(unit * ripple[..., None] * np.asarray(radii) + np.asarray(centre))
+
+
+def placed(triangles: Triangles, position: tuple[float, float, float], yaw: float) -> Triangles:
+    """Return triangles turned by ``yaw`` [rad] about the vertical axis and then moved to a position."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    moved: Triangles = triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + np.asarray(position)
+    return moved
