@@ -1,18 +1,19 @@
 """Models the sensor's outline as a triangle mesh and writes it as a binary STL file.
 
-The shape follows the published outline of the Unitree L2: a base of 75 mm x 75 mm, 65 mm of height,
-four mounting holes on a circle of 51 mm, 22.5 degrees off the cable's axis, a dome that
-turns, a cable that leaves at -X. Everything else (radii, groove, hole depth, and to which side the holes
-are turned, which the outline does not say) is chosen to look right.
+The shape follows the published outline of the Unitree L2: a base of 75 mm x 75 mm, a height of
+65 mm, four mounting holes on a circle of 51 mm, 22.5 degrees off the cable's axis, a dome that
+turns, a cable that leaves at -X. Everything else (radii, groove, hole depth, and to which side the
+holes are turned, which the outline does not say) is chosen to look right.
 
-Run as ``python tools/make_mesh.py [FILE]``. The same bytes come out every time and everywhere: only
-NumPy is used, and every coordinate is rounded to a micrometre.
+Run as ``python tools/make_mesh.py [FILE]``. The same bytes come out every time and everywhere:
+only NumPy is used, and every coordinate is rounded to a micrometre.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -53,7 +54,7 @@ def l2_mesh() -> Triangles:
         [m] sensor frame; every edge belongs to exactly two triangles.
     """
     rings = _housing_rings()
-    parts = [_bottom(rings[0]), *(_band(low, high) for low, high in zip(rings, rings[1:], strict=False))]
+    parts = [_bottom(rings[0]), *(_band(low, high) for low, high in pairwise(rings))]
     parts.append(_fan(rings[-1], np.array([0.0, 0.0, HEIGHT_M])))
     parts.append(_cable())
     return np.round(np.concatenate(parts), 6)
@@ -78,7 +79,7 @@ def stl_bytes(triangles: Triangles) -> bytes:
 
 
 def _housing_rings() -> list[Vertices]:
-    """Return the housing's horizontal cross-sections from the mounting face up to below the apex."""
+    """Return the housing's horizontal cross-sections from the mounting face to below the apex."""
     half = BASE_M / 2
     rings = [
         _rounded_square(half - 0.001, _CORNER_M, 0.0),
@@ -128,8 +129,8 @@ def _fan(ring: Vertices, apex: NDArray[np.float64]) -> Triangles:
 def _bottom(outline: Vertices) -> Triangles:
     """Return the mounting face with its four blind holes, seen from below.
 
-    Each quarter of the face is a convex sector around one hole. A hole has one vertex in the direction
-    of each vertex of its sector, which makes the face between them one band.
+    Each quarter of the face is a convex sector around one hole. A hole has one vertex in the
+    direction of each vertex of its sector, which makes the face between them one band.
     """
     parts: list[Triangles] = []
     quarter = _SIDES // 4
