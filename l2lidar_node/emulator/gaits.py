@@ -59,10 +59,12 @@ def make(
         raise ValueError(f"speed {speed!r} is out of range, expected 0 to 100")
     speed = speed or DEFAULT_SPEEDS[name]
     route = _Route(scene.route)
-    lap_s = {"still": 2.0, "spin": 2.0 * np.pi / (speed or 1.0)}.get(name, route.length / (speed or 1.0))
+    lap_s = {"still": 2.0, "spin": 2.0 * np.pi / (speed or 1.0)}.get(
+        name, route.length / (speed or 1.0)
+    )
     lap = _Lap(lap_s, _KNOTS_PER_S[name], speed, scene, route, generator(seed, Stream.MOTION, 0))
     position, rpy = _GAITS[name](lap)
-    curve = PoseSpline(lap.t, position, rpy_quaternions(rpy), periodic=True)
+    curve = PoseSpline(lap.t, position, rpy_quaternions(rpy), periodic=True, degree=5)
     return Motion(curve, rest_s=rest_s, mount_wxyz=mount_quaternion(mount))
 
 
@@ -83,7 +85,7 @@ class _Route:
     def at(
         self, s: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return x y (N, 2) [m], heading (N,) [rad] without jumps and curvature (N,) [1/m] at distances (N,)."""
+        """Return x y (N, 2) [m], unwrapped heading [rad] and curvature [1/m] at distances."""
         lap = np.mod(s, self.length)
         u = np.interp(lap, self._distance(self._u), self._u)
         for _ in range(3):  # Newton: without kinks, which would be jerks
@@ -95,7 +97,7 @@ class _Route:
 
 
 class _Lap:
-    """What a gait is made from: the knots of one lap, the route at the knots, and whole numbers of waves."""
+    """What a gait is made of: the knots of one lap, the route there, whole numbers of waves."""
 
     def __init__(
         self,
@@ -116,9 +118,11 @@ class _Lap:
         self.left = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=1)
 
     def wave(self, frequency: float) -> NDArray[np.float64]:
-        """Return a sine of about this frequency [Hz] and any phase, fitted to the lap, shape (N,)."""
+        """Return a sine of about this frequency [Hz], fitted to the lap, shape (N,)."""
         turns = max(round(frequency * self._period), 1)
-        return np.sin(2.0 * np.pi * turns / self._period * self.t + self._source.uniform(0.0, 2.0 * np.pi))
+        return np.sin(
+            2.0 * np.pi * turns / self._period * self.t + self._source.uniform(0.0, 2.0 * np.pi)
+        )
 
     def pose(
         self,
@@ -136,7 +140,9 @@ class _Lap:
         return np.column_stack([xy, z]), rpy
 
 
-_Poses = tuple[NDArray[np.float64], NDArray[np.float64]]  # positions (N, 3) [m], roll pitch yaw (N, 3) [rad]
+_Poses = tuple[
+    NDArray[np.float64], NDArray[np.float64]
+]  # positions (N, 3) [m], roll pitch yaw (N, 3) [rad]
 
 
 def _spot(lap: _Lap, height: float) -> NDArray[np.float64]:
@@ -161,7 +167,7 @@ def _walk(lap: _Lap) -> _Poses:
     """Walk with the sensor in the hand: a bob per step, a sway per stride, a wandering look."""
     step, vigour = 1.8 * np.sqrt(lap.speed / 1.2), min(lap.speed / 1.2, 1.5)
     return lap.pose(
-        1.35 + 0.025 * vigour * lap.wave(step) + 0.03 * lap.wave(0.11),
+        1.1 + 0.025 * vigour * lap.wave(step) + 0.03 * lap.wave(0.11),
         0.025 * vigour * lap.wave(step / 2) + 0.04 * lap.wave(0.17),
         2.0 * vigour * lap.wave(step / 2) + 3.0 * lap.wave(0.31),
         1.5 * vigour * lap.wave(step) + 4.0 * lap.wave(0.23),
@@ -173,7 +179,11 @@ def _trot(lap: _Lap) -> _Poses:
     """Trot on four legs: body motion at 2-3 Hz, its harmonic at footfall, and vibration."""
     stride = 1.9 + 0.7 * lap.speed
     return lap.pose(
-        0.42 + 0.012 * lap.wave(stride) + 0.003 * lap.wave(2 * stride) + 1.5e-4 * lap.wave(17.0) + 4e-5 * lap.wave(31.0),
+        0.42
+        + 0.012 * lap.wave(stride)
+        + 0.003 * lap.wave(2 * stride)
+        + 1.5e-4 * lap.wave(17.0)
+        + 4e-5 * lap.wave(31.0),
         0.010 * lap.wave(stride / 2) + 5e-5 * lap.wave(23.0),
         1.8 * lap.wave(stride / 2) + 0.4 * lap.wave(stride) + 0.03 * lap.wave(19.0),
         1.2 * lap.wave(stride) + 0.3 * lap.wave(2 * stride) + 0.02 * lap.wave(29.0),

@@ -1,4 +1,4 @@
-"""Turns the head: angle of each packet with the measured wobble, and the state block that goes with it."""
+"""Turns the head: angle of each packet with the measured wobble, and the state block."""
 
 from __future__ import annotations
 
@@ -19,17 +19,23 @@ _TURN = 2.0 * np.pi
 
 
 def mean_angle(t_s: NDArray[np.float64], unit: Unit, seed: int) -> NDArray[np.float64]:
-    """Return the head's angle without wobble [rad], not wrapped; it starts anywhere, as the seed says."""
+    """Return the head's angle without wobble [rad], not wrapped; the seed says where it starts."""
     start = generator(seed, Stream.HEAD, 0).uniform(0.0, _TURN)
     return np.asarray(start + _TURN / unit.head_period_s * t_s)
 
 
 def set_angles(
-    packets: NDArray[np.void], times: NDArray[np.float64], unit: Unit, wobble: float, seed: int, first: int
+    packets: NDArray[np.void],
+    times: NDArray[np.float64],
+    unit: Unit,
+    wobble: float,
+    seed: int,
+    first: int,
 ) -> None:
     """Fill in the head's angle at slot 0 and its step per slot.
 
-    The step is that of the reported head period, as on real units, where it does not follow the wobble.
+    The step is that of the reported head period, as on real units, where it does not follow the
+    wobble.
 
     Parameters
     ----------
@@ -48,7 +54,9 @@ def set_angles(
     # rounding to float32 may reach a full turn
     packets["com_horizontal_angle_start"] = np.where(angle < np.float32(_TURN), angle, 0.0)
     turn_s = packets["state"]["com_rotation_period"] * 1e-6
-    packets["com_horizontal_angle_step"] = _TURN * packets["time_increment"].astype(np.float64) / turn_s
+    packets["com_horizontal_angle_step"] = (
+        _TURN * packets["time_increment"].astype(np.float64) / turn_s
+    )
 
 
 def set_state(
@@ -74,4 +82,6 @@ def set_state(
 def _per_packet(seed: int, stream: Stream, first: int, count: int) -> NDArray[np.float64]:
     """Return one standard normal number per packet, shape (count,)."""
     # number 0 of the head's stream is the starting angle
-    return np.array([generator(seed, stream, k + 1).standard_normal() for k in range(first, first + count)])
+    return np.array(
+        [generator(seed, stream, k + 1).standard_normal() for k in range(first, first + count)]
+    )

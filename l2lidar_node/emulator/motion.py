@@ -66,22 +66,25 @@ class Kinematics:
         arm = np.asarray(lever_arm)
         felt = _into_body(self.quaternion_wxyz, self.acceleration + np.array([0.0, 0.0, gravity]))
         spin = self.angular_velocity
-        return felt + np.cross(self.angular_acceleration, arm) + np.cross(spin, np.cross(spin, arm))
+        return (
+            felt + np.cross(self.angular_acceleration, arm) + np.cross(spin, np.cross(spin, arm))
+        )
 
 
 class Motion:
     """The sensor's way through the world.
 
     The time line begins with a rest, then speeds up smoothly (three continuous derivatives) within
-    ``ramp_s`` to the pace of the underlying curve. A periodic curve goes on for ever; any other slows
-    down within ``ramp_s`` before its end and holds there. Before time 0 the sensor rests.
+    ``ramp_s`` to the pace of the underlying curve. A periodic curve goes on for ever; any other
+    slows down within ``ramp_s`` before its end and holds there. Before time 0 the sensor rests.
 
     Parameters
     ----------
     curve : PoseSpline
         Poses of the carrier (x ahead, z up at rest), world frame (z up), over seconds.
     rest_s : float
-        Rest at the beginning [s]. With 0 there is neither rest nor ramp: the curve begins at full pace.
+        Rest at the beginning [s]. With 0 there is neither rest nor ramp: the curve begins at full
+        pace.
     ramp_s : float
         How long speeding up and slowing down take [s].
     mount_wxyz : tuple of float
@@ -126,7 +129,7 @@ class Motion:
         return self._curve.poses(self._warp(np.asarray(t_s, np.float64))[0])
 
     def kinematics(self, t_s: NDArray[np.float64]) -> Kinematics:
-        """Return pose, velocity and acceleration at instants (N,) [s]; exact derivatives of the curve."""
+        """Return pose, velocity and acceleration at instants (N,) [s]: exact derivatives."""
         u, rate, change = self._warp(np.asarray(t_s, np.float64))
         d = self._curve.derivatives(u)
         rate, change = rate[:, None], change[:, None]
@@ -140,7 +143,7 @@ class Motion:
         )
 
     def trajectory(self, t_s: NDArray[np.float64], origin_ns: int = 0) -> NDArray[np.void]:
-        """Return the poses at instants (N,) as a POSE array; time 0 gets the stamp ``origin_ns``."""
+        """Return the poses at instants (N,) as a POSE array; time 0 gets stamp ``origin_ns``."""
         stamps = origin_ns + np.round(np.asarray(t_s) * 1e9).astype(np.int64)
         return tum.pose_array(stamps, *self.poses(t_s))
 
@@ -183,7 +186,7 @@ def mount_quaternion(mount: str | tuple[float, float, float]) -> tuple[float, fl
 
 
 def rpy_quaternions(rpy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quaternions w, x, y, z (N, 4) of roll, pitch, yaw (N, 3) [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return quaternions (N, 4) of roll, pitch, yaw (N, 3) [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
     zero = np.zeros(len(rpy))
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy.T / 2), np.sin(rpy.T / 2)
     roll = np.stack([cr, sr, zero, zero], axis=1)
@@ -200,7 +203,8 @@ def from_tum(
 ) -> Motion:
     """Return the motion along a TUM file's poses, which are taken as the carrier's.
 
-    The first pose is reached at time ``rest_s`` (with a rest the pace first rises, see :class:`Motion`).
+    The first pose is reached at time ``rest_s`` (with a rest the pace first rises, see
+    :class:`Motion`).
 
     Raises
     ------
@@ -229,6 +233,8 @@ def _ramp(
     return integral + np.maximum(t - length, 0.0), value, change
 
 
-def _into_body(quaternions_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _into_body(
+    quaternions_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]
+) -> NDArray[np.float64]:
     matrices = rotation_matrices(quaternions_wxyz)
-    return np.einsum("nij,ni->nj", matrices, vectors)
+    return np.asarray(np.einsum("nij,ni->nj", matrices, vectors))

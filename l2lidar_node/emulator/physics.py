@@ -21,14 +21,23 @@ from l2lidar_node.settings import setting
 class PhysicsConfig:
     """Where the virtual L2 is, how it moves and what is imperfect about it."""
 
-    world: str = setting("room", "built-in scene (box, room, corridor, yard) or path of a mesh file (PLY, STL, OBJ)")
+    world: str = setting(
+        "room", "built-in scene (box, room, corridor, yard) or path of a mesh file (PLY, STL, OBJ)"
+    )
     motion: str = setting(
-        "walk", "built-in motion (still, spin, walk, trot, drone) or path of a TUM file; a path needs a dot or a slash"
+        "walk",
+        "built-in motion (still, spin, walk, trot, drone) or path of a TUM file",
     )
     speed: float = setting(
-        0.0, "speed of a built-in motion in m/s, of spin in rad/s, 0 = its own", lo=0.0, hi=50.0
+        0.0,
+        "speed of a built-in motion in m/s, of spin in rad/s, 0 = its own",
+        name="motion_speed",
+        lo=0.0,
+        hi=50.0,
     )
-    rest_s: float = setting(2.0, "rest at the beginning of the motion", unit="s", lo=0.0, hi=3600.0)
+    rest_s: float = setting(
+        2.0, "rest at the beginning of the motion", unit="s", lo=0.0, hi=3600.0
+    )
     mount: str = setting("upright", "how the sensor sits on its carrier", choices=tuple(MOUNTS))
     mount_rpy_deg: tuple[float, ...] = setting(
         (), "roll, pitch, yaw of the sensor on its carrier, in place of `mount`", unit="deg"
@@ -77,7 +86,12 @@ def assemble(config: PhysicsConfig) -> Physics:
         motion = from_tum(config.motion, rest_s=config.rest_s, mount=mount)
     else:
         motion = gaits.make(
-            config.motion, scene, speed=config.speed, rest_s=config.rest_s, mount=mount, seed=config.seed
+            config.motion,
+            scene,
+            speed=config.speed,
+            rest_s=config.rest_s,
+            mount=mount,
+            seed=config.seed,
         )
     unit = UNITS[config.unit]
     scanner = Scanner(world, motion, unit, config.ranges, config.seed)

@@ -15,7 +15,7 @@ from l2lidar_node.emulator.draws import Stream, generator
 from l2lidar_node.emulator.world import World
 from l2lidar_node.settings import setting
 
-# 1-sigma range noise sqrt(NEAR^2 + (FAR * D^1.25)^2): 10-13 mm below 10 m, 17 mm at 12.5 m, 26 mm at 20 m
+# 1-sigma range noise sqrt(NEAR^2 + (FAR * D^1.25)^2): 11-14 mm to 10 m, 17 mm at 12.5, 26 mm at 20
 NOISE_NEAR_M: Final = 0.0105
 NOISE_FAR: Final = 0.00056
 
@@ -26,7 +26,9 @@ RUN_LONGEST: Final = 9  # run lengths 1..9, even spread: median 5
 
 # reflectivity * incidence / D^2 that is found half of the time: 0.9 at 42 m, 0.1 at 14 m
 WEAKEST_SIGNAL: Final = 0.0005
-PULSE_M: Final = 0.4  # depth steps below this blend, larger ones give the nearer surface or the farther
+PULSE_M: Final = (
+    0.4  # depth steps below this blend, larger ones give the nearer surface or the farther
+)
 
 _SLOT_DRAWS = 5
 
@@ -46,7 +48,9 @@ class RangeNoise:
     @classmethod
     def clean(cls) -> RangeNoise:
         """Return settings with every effect off: ranges are exact up to the raw count's step."""
-        return cls(range_noise=0.0, dropout=0.0, weak_signal=False, divergence_mrad=0.0, head_wobble=0.0)
+        return cls(
+            range_noise=0.0, dropout=0.0, weak_signal=False, divergence_mrad=0.0, head_wobble=0.0
+        )
 
 
 def noise_sigma(distance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,7 +82,9 @@ def fill(
     """
     count, slots = rays.shape
     draws = _Draws(seed, first, count, slots)
-    hits = world.cast(rays["origin"].reshape(-1, 3), rays["direction"].reshape(-1, 3)).reshape(count, slots)
+    hits = world.cast(rays["origin"].reshape(-1, 3), rays["direction"].reshape(-1, 3)).reshape(
+        count, slots
+    )
     rays["distance"] = hits["distance"]
     seen = hits["distance"].copy()
     if noise.divergence_mrad > 0:
@@ -91,14 +97,18 @@ def fill(
     if noise.dropout > 0:
         back &= ~_dropped(draws, noise.dropout)
     distance = distance + noise.range_noise * noise_sigma(distance) * draws.normal[0]
-    back &= (distance >= packets["range_min"][:, None]) & (distance <= packets["range_max"][:, None])
+    back &= (distance >= packets["range_min"][:, None]) & (
+        distance <= packets["range_max"][:, None]
+    )
     scale = packets["calibration"]["range_scale"].astype(np.float64)[:, None]
     bias = packets["calibration"]["range_bias"].astype(np.float64)[:, None]
     raw = np.clip(np.rint(distance / scale - bias), 0, 0xFFFF)
     raw = np.where(back, raw, 0).astype(np.uint16)
     packets["ranges"] = raw
     rays["measured"] = np.where(raw > 0, scale * (raw + bias), 0.0)
-    bright = 210.0 * np.sqrt(hits["reflectivity"] * hits["incidence"]) / (1.0 + (distance / 25.0) ** 2)
+    bright = (
+        210.0 * np.sqrt(hits["reflectivity"] * hits["incidence"]) / (1.0 + (distance / 25.0) ** 2)
+    )
     bright = np.clip(np.rint(bright * (1.0 + 0.04 * draws.normal[1])), 1, 255)
     packets["intensities"] = np.where(raw > 0, bright, 0)
 
@@ -128,7 +138,9 @@ def _mix(
     angle = (2.0 * np.pi * draws.uniform[1])[..., None]
     other = direction + radius * (np.cos(angle) * side + np.sin(angle) * up)
     other /= np.linalg.norm(other, axis=-1, keepdims=True)
-    beside = world.cast(rays["origin"].reshape(-1, 3), other.reshape(-1, 3))["distance"].reshape(seen.shape)
+    beside = world.cast(rays["origin"].reshape(-1, 3), other.reshape(-1, 3))["distance"].reshape(
+        seen.shape
+    )
     share = draws.uniform[2] * 0.5  # of the beam that meets the other surface
     with np.errstate(invalid="ignore"):  # inf - inf: nothing is there
         step = beside - seen

@@ -74,7 +74,7 @@ class Builder:
         reflectivity: float,
         openings: tuple[Opening, ...] = (),
     ) -> None:
-        """Add an upright wall from start to end, standing at z = 0, with niches that recede to its right.
+        """Add an upright wall from start to end, on z = 0, with niches that recede to its right.
 
         Openings are given in ascending order of their place along the wall and do not overlap.
         """
@@ -87,8 +87,12 @@ class Builder:
         def at(u: float, z: float, depth: float = 0.0) -> NDArray[np.float64]:
             return np.asarray(origin + u * along + depth * right + np.array([0.0, 0.0, z]))
 
-        def panel(u0: float, u1: float, z0: float, z1: float, depth: float = 0.0) -> NDArray[np.float64]:
-            return shapes.quad(at(u0, z0, depth), at(u1, z0, depth), at(u1, z1, depth), at(u0, z1, depth))
+        def panel(
+            u0: float, u1: float, z0: float, z1: float, depth: float = 0.0
+        ) -> NDArray[np.float64]:
+            return shapes.quad(
+                at(u0, z0, depth), at(u1, z0, depth), at(u1, z1, depth), at(u0, z1, depth)
+            )
 
         edges = [0.0, *(edge for hole in openings for edge in (hole.start, hole.end)), length]
         for u0, u1 in zip(edges[::2], edges[1::2], strict=True):
@@ -96,10 +100,17 @@ class Builder:
         for hole in openings:
             u0, u1, z0, z1 = hole.start, hole.end, hole.bottom, hole.top
             self.add(reflectivity, panel(u0, u1, 0.0, z0), panel(u0, u1, z1, height))
-            for corner, other in (((u0, z0), (u1, z0)), ((u1, z0), (u1, z1)), ((u1, z1), (u0, z1)), ((u0, z1), (u0, z0))):
+            for corner, other in (
+                ((u0, z0), (u1, z0)),
+                ((u1, z0), (u1, z1)),
+                ((u1, z1), (u0, z1)),
+                ((u0, z1), (u0, z0)),
+            ):
                 self.add(
                     reflectivity,
-                    shapes.quad(at(*corner), at(*other), at(*other, hole.depth), at(*corner, hole.depth)),
+                    shapes.quad(
+                        at(*corner), at(*other), at(*other, hole.depth), at(*corner, hole.depth)
+                    ),
                 )
             self.add(hole.reflectivity, panel(u0, u1, z0, z1, hole.depth))
 

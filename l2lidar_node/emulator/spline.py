@@ -1,7 +1,7 @@
 """Interpolates poses by one smooth spline whose derivatives are exact.
 
-Position and quaternion form one vector of seven numbers, interpolated by a quintic spline over time
-(four continuous derivatives), the quaternion then divided by its norm. With Q the spline's unnormalised
+Position and quaternion form one vector of seven numbers, interpolated by a spline over time, the
+quaternion then divided by its norm. With Q the spline's unnormalised
 quaternion the body's angular velocity is ``w = 2 vec(Q* Q') / |Q|^2`` and its derivative
 ``2 vec(Q* Q'') / |Q|^2 - w (|Q|^2)' / |Q|^2``: no numeric differentiation anywhere.
 """
@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-_DEGREE = 5
-
 
 class Derivatives(NamedTuple):
     """Pose and its first two derivatives with respect to the spline's parameter, each of N rows.
 
-    ``position``, ``velocity``, ``acceleration`` (N, 3) are in the world frame, ``angular_velocity`` and
-    ``angular_acceleration`` (N, 3) in the body frame; ``quaternion_wxyz`` (N, 4) is body to world.
+    ``position``, ``velocity``, ``acceleration`` (N, 3) are in the world frame,
+    ``angular_velocity`` and ``angular_acceleration`` (N, 3) in the body frame; ``quaternion_wxyz``
+    (N, 4) is body to world.
     """
 
     position: NDArray[np.float64]
@@ -45,14 +44,18 @@ class PoseSpline:
     positions : ndarray, shape (N, 3)
         [m], world frame.
     quaternions_wxyz : ndarray, shape (N, 4)
-        Unit, body to world, neighbours less than half a turn apart; the sign of each does not matter.
+        Unit, body to world, neighbours less than half a turn apart; the sign of each does not
+        matter.
     periodic : bool
         The last pose equals the first and the curve goes on smoothly from there.
+    degree : int
+        3 (two continuous derivatives; overshoots least between uneven knots) or 5 (four).
 
     Attributes
     ----------
     start, end : float
         Span of the parameter; outside it a periodic curve repeats, any other must not be asked.
+    periodic : bool
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class PoseSpline:
         quaternions_wxyz: NDArray[np.float64],
         *,
         periodic: bool = False,
+        degree: int = 3,
     ) -> None:
         values = np.hstack([positions, _continuous(quaternions_wxyz)])
         if periodic:
@@ -70,18 +74,20 @@ class PoseSpline:
                 knots = np.r_[knots, knots[1:] + (knots[-1] - knots[0])]
                 values = np.vstack([values, second])
             values[-1] = values[0]
-        self._pieces = _pieces(knots, values, periodic)
+        self._pieces = _pieces(knots, values, periodic, degree)
         self.start = float(knots[0])
         self.end = float(knots[-1])
         self.periodic = periodic
 
     def turned(self, mount_wxyz: NDArray[np.float64]) -> PoseSpline:
-        """Return the curve of a frame fixed to the body: T_world_frame = T_world_body R_body_frame."""
+        """Return the curve of a frame fixed to the body at R_body_frame = ``mount_wxyz``."""
         copy = object.__new__(PoseSpline)
         copy.start, copy.end, copy.periodic = self.start, self.end, self.periodic
         coefficients = self._pieces.c.copy()
         coefficients[..., 3:] = quaternion_product(coefficients[..., 3:], mount_wxyz)
-        copy._pieces = type(self._pieces)(coefficients, self._pieces.x, extrapolate=self._pieces.extrapolate)
+        copy._pieces = type(self._pieces)(
+            coefficients, self._pieces.x, extrapolate=self._pieces.extrapolate
+        )
         return copy
 
     def poses(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -105,7 +111,7 @@ class PoseSpline:
 
 
 def quaternion_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Hamilton product of quaternions w, x, y, z on the last axis, with broadcasting."""
+    """Return the Hamilton product of quaternions on the last axis, with broadcasting."""
     pw, px, py, pz = np.moveaxis(p, -1, 0)
     qw, qx, qy, qz = np.moveaxis(q, -1, 0)
     return np.stack(
@@ -142,11 +148,12 @@ def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternions * signs[:, None]
 
 
-def _pieces(knots: NDArray[np.float64], values: NDArray[np.float64], periodic: bool) -> PPoly:
+def _pieces(
+    knots: NDArray[np.float64], values: NDArray[np.float64], periodic: bool, degree: int
+) -> PPoly:
     """Return the interpolating spline as polynomial pieces, which evaluate fastest."""
     from scipy.interpolate import PPoly, make_interp_spline
 
-    degree = _DEGREE if len(knots) > _DEGREE else 3
     spline = make_interp_spline(knots, values, k=degree, bc_type="periodic" if periodic else None)
     breaks = spline.t[degree:-degree]
     powers = range(degree, -1, -1)

@@ -9,14 +9,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-POSE: Final = np.dtype([("stamp", "<i8"), ("position", "<f8", (3,)), ("quaternion_wxyz", "<f8", (4,))])
+POSE: Final = np.dtype(
+    [("stamp", "<i8"), ("position", "<f8", (3,)), ("quaternion_wxyz", "<f8", (4,))]
+)
 """One pose: stamp [ns], position [m], unit quaternion body to world."""
 
 _NANOSECONDS = 1_000_000_000
 
 
 class TrajectoryError(ValueError):
-    """A trajectory file that cannot be used; the message names the file, the line and the reason."""
+    """A trajectory that cannot be used; the message names file, line and reason."""
 
 
 def parse(text: str, name: str = "trajectory") -> NDArray[np.void]:
@@ -32,12 +34,14 @@ def parse(text: str, name: str = "trajectory") -> NDArray[np.void]:
     Returns
     -------
     ndarray, shape (N,), dtype POSE
-        Strictly ascending stamps (digits of the stamp are kept exactly to the nanosecond), unit quaternions.
+        Strictly ascending stamps (digits of the stamp are kept exactly to the nanosecond), unit
+        quaternions.
 
     Raises
     ------
     TrajectoryError
-        For a line that is not eight finite numbers, a zero quaternion, or a stamp that does not rise.
+        For a line that is not eight finite numbers, a zero quaternion, or a stamp that does not
+        rise.
     """
     rows: list[tuple[int, list[float], list[float]]] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -58,7 +62,9 @@ def parse(text: str, name: str = "trajectory") -> NDArray[np.void]:
         if not 0.5 < norm < 2.0:
             raise TrajectoryError(f"{where}: the quaternion's norm is {norm:g}, expected 1")
         if rows and stamp <= rows[-1][0]:
-            raise TrajectoryError(f"{where}: stamp {fields[0]} is not later than the one before it")
+            raise TrajectoryError(
+                f"{where}: stamp {fields[0]} is not later than the one before it"
+            )
         rows.append((stamp, [x, y, z], [qw / norm, qx / norm, qy / norm, qz / norm]))
     poses = np.zeros(len(rows), POSE)
     if rows:

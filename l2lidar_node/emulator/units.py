@@ -1,4 +1,4 @@
-"""Describes individual L2 units: calibration, mirror and head speed, what their state block says."""
+"""Describes individual L2 units: calibration, speeds of mirror and head, limits."""
 
 from __future__ import annotations
 
@@ -52,10 +52,15 @@ UNITS: Final[dict[str, Unit]] = {
     unit.name: unit
     for unit in (
         Unit("a", (*_SHARED_AXES, 0.032398, 0.003818, 0.002945, -365.625, 0.000978)),
-        Unit("fast", (*_SHARED_AXES, 0.0395972, 0.015708, 0.00545415, -365.625, 0.000978), head_period_s=1 / 5.55),
+        Unit(
+            "fast",
+            (*_SHARED_AXES, 0.0395972, 0.015708, 0.00545415, -365.625, 0.000978),
+            head_period_s=1 / 5.55,
+        ),
     )
 }
-"""Known units: ``a`` turns its head at 4.35 Hz (49.5 packets per turn), ``fast`` at 5.55 Hz (38.9).
+"""Known units: ``a`` turns its head at 4.35 Hz (49.5 packets a turn), ``fast`` at 5.55 Hz (38.8).
 
-Calibrations as published for two units; the range constants of the second were not and are the first one's.
+Calibrations as published for two units; the range constants of the second were not and are the
+first one's.
 """

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 HIT: Final = np.dtype([("distance", "<f8"), ("incidence", "<f8"), ("reflectivity", "<f4")])
-"""What one ray met: distance [m] (inf = nothing), cosine of the angle to the surface normal, reflectivity 0..1."""
+"""What one ray met: distance [m], inf = nothing; cosine of incidence; reflectivity 0..1."""
 
 DEFAULT_REFLECTIVITY: Final = 0.5
 
@@ -59,7 +59,9 @@ class World:
         if not solid.any():
             raise ValueError("triangles: there is none with an area")
         self.triangles = triangles[solid]
-        self.reflectivity = np.broadcast_to(np.asarray(reflectivity, np.float32), len(triangles))[solid]
+        self.reflectivity = np.broadcast_to(np.asarray(reflectivity, np.float32), len(triangles))[
+            solid
+        ]
         self._normals = normals[solid] / length[solid, None]
         self._offsets = np.einsum("ti,ti->t", self._normals, self.triangles[:, 0])
         self._threads = threads
@@ -80,11 +82,13 @@ class World:
         """
         return cls(*_read_mesh(Path(path)), threads=threads)
 
-    def cast(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.void]:
+    def cast(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> NDArray[np.void]:
         """Return what rays meet first.
 
-        open3d finds the triangle in float32; the distance is then computed from that triangle's plane in
-        float64, so hits lie on their plane to 1e-12 m.
+        open3d finds the triangle in float32; the distance is then computed from that triangle's
+        plane in float64, so hits lie on their plane to 1e-12 m.
 
         Parameters
         ----------
@@ -112,7 +116,9 @@ class World:
         with np.errstate(divide="ignore", invalid="ignore"):
             exact = height / towards
         # a ray within a triangle's plane has no exact crossing
-        hits["distance"][met] = np.where(np.abs(exact - rough) < 1e-3 * (1.0 + rough), exact, rough)
+        hits["distance"][met] = np.where(
+            np.abs(exact - rough) < 1e-3 * (1.0 + rough), exact, rough
+        )
         hits["incidence"][met] = np.abs(towards)
         hits["reflectivity"][met] = self.reflectivity[triangle]
         return hits
@@ -132,7 +138,9 @@ class World:
         scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         vertices = np.ascontiguousarray(self.triangles.reshape(-1, 3), np.float32)
         indices = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
-        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(indices))
+        scene.add_triangles(
+            o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(indices)
+        )
         return scene
 
 
@@ -144,12 +152,14 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | f
         raise ValueError(f"{path}: there is no such file")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
-            mesh = o3d.io.read_triangle_mesh(str(path))
+            mesh = o3d.io.read_triangle_mesh(path)
         except RuntimeError as error:
             raise ValueError(f"{path}: cannot be read as a mesh: {error}") from None
     vertices, indices = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
     if len(indices) == 0:
-        raise ValueError(f"{path}: holds no triangles (not a mesh open3d can read, or only points)")
+        raise ValueError(
+            f"{path}: holds no triangles (not a mesh open3d can read, or only points)"
+        )
     if not np.isfinite(vertices).all():
         raise ValueError(f"{path}: a vertex is not finite")
     colours = np.asarray(mesh.vertex_colors)
