@@ -17,7 +17,9 @@ from l2lidar_node.settings import SettingError, setting
 class NetworkConfig:
     """Addresses of the device and of this host."""
 
-    l2_ip: str = setting(wire.LIDAR_IP, "IPv4 address of the L2; datagrams from others are refused")
+    l2_ip: str = setting(
+        wire.LIDAR_IP, "IPv4 address of the L2; datagrams from others are refused"
+    )
     l2_port: int = setting(wire.LIDAR_PORT, "UDP port of the L2", lo=1, hi=65535)
     host_ip: str = setting(wire.HOST_IP, "IPv4 address of this host to listen on; 0.0.0.0 for all")
     host_port: int = setting(wire.HOST_PORT, "UDP port to listen on", lo=1, hi=65535)
@@ -48,7 +50,11 @@ class ClockConfig:
         2, "numerator of the first guess of the clock ratio", name="timeScaleNum", lo=1, hi=10**9
     )
     time_scale_denom: int = setting(
-        1, "denominator of the first guess of the clock ratio", name="timeScaleDenom", lo=1, hi=10**9
+        1,
+        "denominator of the first guess of the clock ratio",
+        name="timeScaleDenom",
+        lo=1,
+        hi=10**9,
     )
     use_system_time: bool = setting(
         False, "stamp with the time of arrival instead", name="UseSystemTimeTS", live=True
@@ -66,9 +72,9 @@ class SweepConfig:
         name="aggregateNframes", lo=0, hi=4000, live=True,
     )  # fmt: skip
     cut: str = setting(
-        "packets",
-        "where a cloud ends: after a number of packets, a head turn, half a head turn or a duration",
-        name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"), live=True,
+        "packets", "where a cloud ends: after a number of packets, a head turn, half a head turn or
+        a duration", name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"),
+        live=True,
     )  # fmt: skip
     duration_ms: int = setting(
         230, "length of a cloud when cut by duration",
@@ -79,8 +85,8 @@ class SweepConfig:
         name="EnableCalRangeOVR", live=True,
     )  # fmt: skip
     range_scale: float = setting(
-        0.000978, "range scale override", name="calRangeScale", unit="m/count", lo=0.00025, hi=0.002,
-        live=True,
+        0.000978, "range scale override", name="calRangeScale", unit="m/count", lo=0.00025,
+        hi=0.002, live=True,
     )  # fmt: skip
     range_bias: float = setting(
         -365.625, "range bias override", name="calRangeBias", unit="counts", lo=-1000.0, hi=0.0,
@@ -115,9 +121,15 @@ class ImuConfig:
     roll_pitch_only: bool = setting(
         True, "leave the yaw out of imu_adjust", name="imuRollPitchOnly", live=True
     )
-    accel_x_covar: float = setting(0.01, "variance of acceleration x", unit="(m/s^2)^2", lo=0.0, hi=1e6)
-    accel_y_covar: float = setting(0.01, "variance of acceleration y", unit="(m/s^2)^2", lo=0.0, hi=1e6)
-    accel_z_covar: float = setting(0.01, "variance of acceleration z", unit="(m/s^2)^2", lo=0.0, hi=1e6)
+    accel_x_covar: float = setting(
+        0.01, "variance of acceleration x", unit="(m/s^2)^2", lo=0.0, hi=1e6
+    )
+    accel_y_covar: float = setting(
+        0.01, "variance of acceleration y", unit="(m/s^2)^2", lo=0.0, hi=1e6
+    )
+    accel_z_covar: float = setting(
+        0.01, "variance of acceleration z", unit="(m/s^2)^2", lo=0.0, hi=1e6
+    )
     gyro_x_covar: float = setting(2.5e-5, "variance of rate x", unit="(rad/s)^2", lo=0.0, hi=1e6)
     gyro_y_covar: float = setting(2.5e-5, "variance of rate y", unit="(rad/s)^2", lo=0.0, hi=1e6)
     gyro_z_covar: float = setting(2e-7, "variance of rate z", unit="(rad/s)^2", lo=0.0, hi=1e6)

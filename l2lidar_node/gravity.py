@@ -21,7 +21,7 @@ class GravityReport:
     norm : float
         Length of the mean specific force [m/s^2]; about 9.8 unless the sensor is thrown about.
     tilt_deg : float
-        Angle between the mean specific force and the up direction of the onboard orientation [deg].
+        Angle between the mean specific force and up by the onboard orientation [deg].
     """
 
     samples: int

@@ -1,4 +1,4 @@
-"""Judges a device from what was counted in a period: one check per aspect, with a level that means something.
+"""Judges a device from what was counted in a period: one check per aspect.
 
 OK needs nobody's attention, WARN should be looked at, ERROR means that data are missing or wrong.
 """
@@ -97,13 +97,14 @@ def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
 def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Check:
     state = driver.state(after.now)
     packets = _measured(before, after)
+    old, new = before.counters, after.counters
     rates = {stream: count / seconds for stream, count in packets.items()}
     values = {
         "state": state.value,
         "point packets [1/s]": f"{rates[Stream.POINTS]:.1f}",
         "IMU packets [1/s]": f"{rates[Stream.IMU]:.1f}",
-        "datagrams [1/s]": f"{(after.counters.datagrams - before.counters.datagrams) / seconds:.1f}",
-        "traffic [kB/s]": f"{(after.counters.octets - before.counters.octets) / seconds / 1e3:.1f}",
+        "datagrams [1/s]": f"{(new.datagrams - old.datagrams) / seconds:.1f}",
+        "traffic [kB/s]": f"{(new.octets - old.octets) / seconds / 1e3:.1f}",
     }
     address = driver.config.network.l2_ip
     if state is DeviceState.WAITING:
@@ -126,7 +127,10 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
         return Check("device", Level.WARN, "streaming points but no IMU", values)
     if driver.counters.ignored_points and not driver.counters.sweeps:
         return Check(
-            "device", Level.ERROR, "it measures 2D where frame3d asks for 3D, or vice versa", values
+            "device",
+            Level.ERROR,
+            "it measures 2D where frame3d asks for 3D, or vice versa",
+            values,
         )
     return Check("device", Level.OK, "streaming", values)
 
@@ -223,7 +227,10 @@ def _hardware(payload: bytes) -> Check:
             (state["dirty_index"] > _MAX_DIRT_PERCENT, "the cover is dirty"),
             (state["apd_temperature"] > _MAX_APD_CELSIUS, "the detector is hot"),
             (state["imu_temperature"] > _MAX_IMU_CELSIUS, "the IMU is hot"),
-            (state["packet_lost_up"] + state["packet_lost_down"] > 0.01, "inner links lose packets"),
+            (
+                state["packet_lost_up"] + state["packet_lost_down"] > 0.01,
+                "inner links lose packets",
+            ),
         )
         if wrong
     ]
@@ -239,8 +246,8 @@ def _imu(report: GravityReport) -> Check:
     }
     if report.norm > _WRONG_GRAVITY:
         message = (
-            f"|a| is {report.norm:.1f} m/s^2: the accelerometer fault of a unit that was not level "
-            "at power-on; power it up level and still"
+            f"|a| is {report.norm:.1f} m/s^2: the accelerometer fault of a unit that was not "
+            "level at power-on; power it up level and still"
         )
         return Check("imu", Level.ERROR, message, values)
     if abs(report.norm - GRAVITY) > _GRAVITY_TOLERANCE:

@@ -66,7 +66,9 @@ def metadata(driver: Driver) -> Metadata:
         name=version.name if version else "",
         date=version.date if version else "",
         work_mode=mode,
-        work_mode_names=[] if mode is None else [bit.name or "" for bit in wire.WorkMode if bit & mode],
+        work_mode_names=[]
+        if mode is None
+        else [bit.name or "" for bit in wire.WorkMode if bit & mode],
         calibration={name: float(calibration[name]) for name in wire.CALIBRATION.names or ()},
         slots=int(packet["point_num"]),
         angle_min_rad=float(packet["angle_min"]),

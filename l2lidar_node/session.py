@@ -51,7 +51,7 @@ class Session:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the loop after everything collected has been handed out; returns when it has ended."""
+        """End the loop, everything collected handed out; returns when it has ended."""
         self._stopping.set()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join()
@@ -63,7 +63,7 @@ class Session:
         def run() -> None:
             try:
                 future.set_result(function(self.driver, HostNs(time.time_ns())))
-            except Exception as error:  # noqa: BLE001  the caller gets whatever it was
+            except Exception as error:  # the caller gets whatever it was
                 future.set_exception(error)
 
         self._calls.put(run)

@@ -1,6 +1,6 @@
-"""Writes what follows from the settings: config/l2lidar_node.yaml and the parameter tables in README.md.
+"""Writes what follows from the settings: config/l2lidar_node.yaml and the README's tables.
 
-Run ``python -m tools.make_reference`` after a setting changed; ``--check`` only tells whether it is due.
+Run ``python -m tools.make_reference`` after a setting changed; ``--check`` tells if it is due.
 """
 
 from __future__ import annotations

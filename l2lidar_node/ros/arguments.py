@@ -1,14 +1,38 @@
-"""Reads the command line of a node before rclpy does, so that mistakes get a sentence instead of a trace."""
+"""Reads a node's command line before rclpy does: mistakes get a sentence instead of a trace."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import rclpy
 import yaml
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.utilities import remove_ros_args
 
 
 class UsageError(ValueError):
     """The command line is wrong; the message says what and what would be right."""
+
+
+def start_rclpy(argv: list[str]) -> None:
+    """Initialise rclpy with a node's command line, the program's name first.
+
+    Raises
+    ------
+    UsageError
+        If anything on the command line is wrong.
+    """
+    arguments = ros_arguments(argv)
+    try:
+        unknown = remove_ros_args(arguments)[1:]
+        if not unknown:
+            rclpy.init(args=arguments)
+    except UnknownROSArgsError as error:
+        raise UsageError(f"ROS arguments not known: {error}") from None
+    except RCLError as error:  # its own words are all there is to say
+        raise UsageError(str(error).partition(", at ")[0]) from None
+    if unknown:
+        raise UsageError(f"argument '{unknown[0]}' is not known; parameters follow --ros-args")
 
 
 def ros_arguments(argv: list[str]) -> list[str]:

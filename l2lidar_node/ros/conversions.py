@@ -1,7 +1,7 @@
-"""Turns plain values into ROS messages and back; changes units and order, nothing else, and has no state.
+"""Turns plain values into ROS messages and back; changes units and order, nothing else.
 
-Clouds and IMU samples are published hundreds of times a second, so both are made as serialised (CDR)
-messages: :class:`MessageTemplate` lets rclpy serialise one message and then only replaces what changes.
+Clouds and IMU samples are published hundreds of times a second, so both are made as serialised
+(CDR) messages: a template lets rclpy serialise one message and then only replaces what changes.
 """
 
 from __future__ import annotations
@@ -56,8 +56,7 @@ def point_fields(layout: np.dtype[Any]) -> list[PointField]:
         If a field's type has no counterpart in PointField, naming it.
     """
     fields = []
-    for name in layout.names or ():
-        item, offset = (layout.fields or {})[name][:2]
+    for name, (item, offset, *_) in (layout.fields or {}).items():
         base, shape = item.subdtype or (item, (1,))
         code = f"{base.kind}{base.itemsize}"
         if code not in _FIELD_TYPES:
@@ -189,7 +188,9 @@ class ImuTemplate:
     def __init__(self, frame: str, config: ImuConfig) -> None:
         message = Imu()
         message.header.frame_id = frame
-        message.orientation.x, message.angular_velocity.x, message.linear_acceleration.x = self._SLOTS
+        message.orientation.x, message.angular_velocity.x, message.linear_acceleration.x = (
+            self._SLOTS
+        )
         for name, variances in (
             ("orientation", (config.roll_covar, config.pitch_covar, config.yaw_covar)),
             ("angular_velocity", (config.gyro_x_covar, config.gyro_y_covar, config.gyro_z_covar)),

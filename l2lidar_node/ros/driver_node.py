@@ -8,10 +8,10 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswerError
 
 import rclpy
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -22,7 +22,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event, Silence
 from l2lidar_node.packets import Parameters, Version
 from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
-from l2lidar_node.ros.arguments import UsageError, ros_arguments
+from l2lidar_node.ros.arguments import UsageError, start_rclpy
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
 from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.parameters import ParameterSet
@@ -52,12 +52,10 @@ class DriverNode(Node):
         self.exit_code = 0
         self._answers: dict[int, Future[Answer]] = {}
         self._answers_lock = threading.Lock()
-        self._parameters = ParameterSet(self, DriverConfig, self._configure)
-        config = self._parameters.value
+        self._settings = ParameterSet(self, DriverConfig, self._configure)
+        config = self._settings.value
         self._open_publishers(config)
-        self._session = Session(
-            Driver(config), UdpTransport(config.network), self._handle
-        )
+        self._session = Session(Driver(config), UdpTransport(config.network), self._handle)
         self.create_service(SetBool, "~/enable", self._enable)
         self.create_service(Trigger, "~/reset", self._reset)
         self._health = HealthPublisher(self, self._session)
@@ -126,7 +124,7 @@ class DriverNode(Node):
             self.get_logger().info(f"clock: {event.text}")
 
     def _silent(self, silence: Silence) -> None:
-        config = self._parameters.value
+        config = self._settings.value
         text = (
             f"no data from the L2 at {config.network.l2_ip} for {silence.duration_ns / 1e9:.1f} s "
             f"(watchdog_timeout_ms {config.watchdog.timeout_ms})"
@@ -149,7 +147,7 @@ class DriverNode(Node):
 
         def command(driver: Driver, now: HostNs) -> list[Event]:
             if request.data:
-                ticket, events = driver.start_rotation(now), []
+                ticket, events = driver.start_rotation(now), list[Event]()
             else:
                 ticket, events = driver.stop_rotation(now)
             with self._answers_lock:
@@ -170,7 +168,9 @@ class DriverNode(Node):
         for event in self._session.call(lambda driver, now: driver.reset_device(now)).result():
             self._handle(event)
         response.success = True
-        response.message = "reset sent; the device does not acknowledge it and is back in about 25 s"
+        response.message = (
+            "reset sent; the device does not acknowledge it and is back in about 25 s"
+        )
         return response
 
 
@@ -184,16 +184,12 @@ def main(args: list[str] | None = None) -> int:
     """
     node = None
     try:
-        arguments = ros_arguments(sys.argv if args is None else args)
-        unknown = remove_ros_args(arguments)[1:]
-        if unknown:
-            raise UsageError(f"argument '{unknown[0]}' is not known; parameters follow --ros-args")
-        rclpy.init(args=arguments)
+        start_rclpy(sys.argv if args is None else args)
         node = DriverNode()
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (SettingError, UsageError) as error:
+    except (SettingError, UsageError, NameValidationException) as error:
         print(f"l2lidar_node: {error}", file=sys.stderr)
         return 2
     except TransportError as error:
@@ -204,3 +200,7 @@ def main(args: list[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return node.exit_code if node is not None else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

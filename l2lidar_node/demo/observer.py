@@ -1,0 +1,113 @@
+"""Listens to the driver's topics as any other ROS node would and keeps what the report needs."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import Imu, PointCloud2
+from tf2_msgs.msg import TFMessage
+
+from l2lidar_node.ros.conversions import from_cloud, from_time
+
+
+@dataclass(slots=True)
+class TopicRecord:
+    """What was seen on one topic.
+
+    Attributes
+    ----------
+    stamps : list of int
+        Header stamps [ns] in the order of arrival.
+    ages_s : list of float
+        From stamp to arrival [s].
+    arrivals : list of float
+        Monotonic times of arrival [s].
+    frame : str
+    """
+
+    stamps: list[int] = field(default_factory=list)
+    ages_s: list[float] = field(default_factory=list)
+    arrivals: list[float] = field(default_factory=list)
+    frame: str = ""
+
+    def add(self, stamp: int, frame: str) -> None:
+        """Note one message."""
+        self.stamps.append(stamp)
+        self.ages_s.append((time.time_ns() - stamp) / 1e9)
+        self.arrivals.append(time.monotonic())
+        self.frame = frame
+
+    @property
+    def rate_hz(self) -> float:
+        """Messages per second by arrival; 0 with fewer than two."""
+        if len(self.arrivals) < 2:
+            return 0.0
+        return (len(self.arrivals) - 1) / (self.arrivals[-1] - self.arrivals[0])
+
+    @property
+    def backward_steps(self) -> int:
+        """Stamps that are not later than the one before."""
+        return int((self.intervals_ms <= 0).sum())
+
+    @property
+    def intervals_ms(self) -> NDArray[np.float64]:
+        """Differences of consecutive stamps [ms]."""
+        stamps = np.array(self.stamps, np.int64)
+        return (stamps[1:] - stamps[:-1]) / 1e6
+
+
+class Observer(Node):
+    """A node that subscribes to everything the driver publishes."""
+
+    def __init__(self) -> None:
+        super().__init__("l2lidar_demo_observer")
+        self.clouds = TopicRecord()
+        self.imu = TopicRecord()
+        self.points: list[int] = []
+        self.cloud: NDArray[np.void] | None = None
+        self.fields: list[str] = []
+        self.diagnostics: list[dict[str, dict[str, str]]] = []
+        self.transforms: list[tuple[str, str]] = []
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(PointCloud2, "/points", self._cloud, qos_profile_sensor_data)
+        self.create_subscription(Imu, "/imu/data", self._imu, qos_profile_sensor_data)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
+        self.create_subscription(TFMessage, "/tf_static", self._transform, latched)
+
+    def watch(self, until: float) -> None:
+        """Handle what arrives until a monotonic time [s]."""
+        while (left := until - time.monotonic()) > 0:
+            rclpy.spin_once(self, timeout_sec=min(left, 0.1))
+
+    def _cloud(self, message: PointCloud2) -> None:
+        self.clouds.add(from_time(message.header.stamp), message.header.frame_id)
+        self.cloud = from_cloud(message)
+        self.fields = [item.name for item in message.fields]
+        self.points.append(message.width * message.height)
+
+    def _imu(self, message: Imu) -> None:
+        self.imu.add(from_time(message.header.stamp), message.header.frame_id)
+
+    def _diagnose(self, message: DiagnosticArray) -> None:
+        self.diagnostics.append(
+            {
+                status.name.rpartition(": ")[2]: {
+                    "level": str(status.level[0]),
+                    "message": status.message,
+                    **{item.key: item.value for item in status.values},
+                }
+                for status in message.status
+            }
+        )
+
+    def _transform(self, message: TFMessage) -> None:
+        self.transforms += [
+            (item.header.frame_id, item.child_frame_id) for item in message.transforms
+        ]

@@ -1,0 +1,110 @@
+"""Starts programs of this package and ends them again, whatever happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Final
+
+GRACE_S: Final = 10.0
+
+
+class ProgramError(RuntimeError):
+    """A program ended by itself; the message holds what it said."""
+
+
+class Program:
+    """One running program, started as ``python -m module``.
+
+    Parameters
+    ----------
+    module : str
+    arguments : list of str
+    """
+
+    def __init__(self, module: str, arguments: list[str]) -> None:
+        self.module = module
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process number."""
+        return self._process.pid
+
+    def check(self) -> None:
+        """Raise :class:`ProgramError` if it has ended."""
+        code = self._process.poll()
+        if code is not None:
+            said = self._process.stdout.read().strip() if self._process.stdout else ""
+            raise ProgramError(f"{self.module} ended with exit code {code}:\n{said}")
+
+    def stop(self) -> tuple[int, str]:
+        """Interrupt it as Ctrl-C does; return its exit code and everything it said."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            said, _ = self._process.communicate(timeout=GRACE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            said, _ = self._process.communicate()
+        return self._process.returncode, said
+
+
+class Programs:
+    """Programs that end together, the last one started first."""
+
+    def __init__(self) -> None:
+        self._stack = ExitStack()
+        self._running: list[Program] = []
+
+    def __enter__(self) -> Programs:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop all programs."""
+        self._stack.close()
+
+    def start(self, module: str, arguments: list[str]) -> Program:
+        """Start a program that is stopped with the others."""
+        program = Program(module, arguments)
+        self._running.append(program)
+        self._stack.callback(program.stop)
+        return program
+
+    def check(self) -> None:
+        """Raise :class:`ProgramError` if any of them has ended."""
+        for program in self._running:
+            program.check()
+
+
+def isolate_ros() -> None:
+    """Keep the topics on this machine and apart from other nodes, unless told otherwise."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+
+
+def free_udp_ports(count: int) -> list[int]:
+    """Return UDP ports of the loopback interface that nobody uses right now."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    for sock in sockets:
+        sock.bind(("127.0.0.1", 0))
+    ports = [int(sock.getsockname()[1]) for sock in sockets]
+    for sock in sockets:
+        sock.close()
+    return ports

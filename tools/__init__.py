@@ -1,0 +1,1 @@
+"""Commands for developers: benchmarks, generators, long runs."""

@@ -1,0 +1,101 @@
+"""The common form of what the measuring commands find: a table to read and a file to compare."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+FOLDER = Path("out") / "bench"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A figure with a bound.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+    bound : float
+    met : bool
+    """
+
+    name: str
+    value: float
+    bound: float
+    met: bool
+
+
+def at_least(name: str, value: float, bound: float) -> Target:
+    """Return a target that is met from ``bound`` upwards."""
+    return Target(name, value, bound, value >= bound)
+
+
+def at_most(name: str, value: float, bound: float) -> Target:
+    """Return a target that is met up to ``bound``."""
+    return Target(name, value, bound, value <= bound)
+
+
+def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable[Target]) -> Path:
+    """Print rows and targets and write ``out/bench/NAME.json``; return its path.
+
+    Parameters
+    ----------
+    name : str
+        Of the measurement.
+    title : str
+        One line above the table.
+    rows : list of dict
+        All with the same keys.
+    targets : iterable of Target
+    """
+    targets = list(targets)
+    console = Console()
+    table = Table(*rows[0], title=title) if rows else Table(title=title)
+    for row in rows:
+        table.add_row(*(_text(value) for value in row.values()))
+    console.print(table)
+    for target in targets:
+        mark = "[green]met" if target.met else "[red]not met"
+        console.print(
+            f"{mark}[/] {target.name}: {_text(target.value)} (bound {_text(target.bound)})"
+        )
+    path = FOLDER / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {"machine": machine(), "rows": rows, "targets": [asdict(item) for item in targets]}
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(content, indent=1, default=float) + "\n")
+    part.replace(path)
+    console.print(f"written to {path}")
+    return path
+
+
+def machine() -> Mapping[str, object]:
+    """Return what kind of machine this is."""
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()}",
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
