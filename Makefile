@@ -11,8 +11,8 @@ BENCHES := load clock deskew odometry
 .PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak clean
 
 help: ## show this list
-	@sed -nE 's/^([a-z][a-z -]*):.*## (.*)/  make \1|\2/p' Makefile | column -t -s '|'
-	@printf '  %s\n' '$(BENCHES:%=make bench-%)'
+	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
+	@printf '  make %s\n' $(BENCHES:%=bench-%)
 
 setup: ## install what is needed into .venv; every other target does this first
 	@scripts/setup.sh
