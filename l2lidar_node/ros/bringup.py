@@ -1,0 +1,178 @@
+"""The parts of every launch: driver, virtual L2, companions, robot, RViz."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from launch.actions import ExecuteProcess, OpaqueFunction, Shutdown
+from launch.conditions import IfCondition
+from launch.launch_context import LaunchContext
+from launch.logging import launch_config
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import ExecutableInPackage
+
+from l2lidar_node import wire
+from l2lidar_node.ros.launch_arguments import ARGUMENTS, PACKAGE, share
+from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
+
+Given = Mapping[str, str]
+"""Value of every launch argument, as text."""
+Parameters = Mapping[str, bool | int | float | str]
+"""Value by parameter name."""
+
+LOOPBACK: Final = "127.0.0.1"
+RESPAWN_DELAY_S: Final = 2.0
+ABSOLUTE_TOPICS: Final = ("/points", "/imu/data")
+"""Topics that upstream names from the root; in a namespace they follow it."""
+RVIZ_TOPICS: Final = (
+    *ABSOLUTE_TOPICS,
+    "/points_deskewed",
+    "/registered_points",
+    "/local_map",
+    "/path",
+    "/odometry",
+    "/robot_description",
+)
+"""Topics that the RViz layouts name from the root; in a namespace they follow it."""
+
+
+def driver(
+    needs: Callable[[Given], Parameters] = lambda given: {},
+    files: Callable[[Given], Sequence[str]] = lambda given: (),
+) -> OpaqueFunction:
+    """Return the driver, with a virtual L2 beside it where one is asked for.
+
+    Parameters
+    ----------
+    needs : callable
+        From the arguments to the values this launch file needs, whatever the parameter file says.
+    files : callable
+        From the arguments to the parameter files that go over ``params_file``.
+    """
+
+    def actions(context: LaunchContext) -> list[Any]:
+        given = _given(context)
+        values = {**needs(given), **_addresses(given)}
+        if given["l2_name"]:
+            values["l2_name"] = given["l2_name"]
+        node = _node(
+            "l2lidar_node", given["name"], given, [given["params_file"], *files(given)], values
+        )
+        return [*_emulator(given, values), node]
+
+    return OpaqueFunction(function=actions)
+
+
+def companion(executable: str, condition: IfCondition | None = None) -> OpaqueFunction:
+    """Return a node of ``l2lidar_proc``, named like its executable."""
+
+    def actions(context: LaunchContext) -> list[Any]:
+        given = _given(context)
+        return [_node(executable, executable, given, [given["proc_params_file"]], {})]
+
+    return OpaqueFunction(function=actions, condition=condition)
+
+
+def robot(urdf: str) -> Node:
+    """Return a robot_state_publisher for a plain URDF file of ``urdf/examples``."""
+    text = Path(share(f"urdf/examples/{urdf}")).read_text(encoding="utf-8")
+    return Node(
+        package="robot_state_publisher",
+        executable="robot_state_publisher",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[{"robot_description": ParameterValue(text, value_type=str)}],
+        output="screen",
+    )
+
+
+def rviz() -> OpaqueFunction:
+    """Return RViz, started only where the argument ``rviz`` says so."""
+
+    def actions(context: LaunchContext) -> list[Any]:
+        given = _given(context)
+        layout = given["rviz_config"]
+        # The layout for the sensor alone is fixed to its frame, whose name follows l2_name.
+        renamed = given["l2_name"] and Path(layout).name == "rvizl2lidar.rviz"
+        frame = ["-f", f"{given['l2_name']}_link"] if renamed else []
+        return [
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                name="rviz2",
+                namespace=given["namespace"],
+                arguments=["-d", layout, *frame],
+                remappings=_relative(RVIZ_TOPICS),
+                output="screen",
+            )
+        ]
+
+    return OpaqueFunction(function=actions, condition=IfCondition(LaunchConfiguration("rviz")))
+
+
+def _node(
+    executable: str, name: str, given: Given, files: Sequence[str], values: Parameters
+) -> Node:
+    """Return a node of ours; the parameters it starts with are kept beside the launch's log."""
+    full_name = "/".join(["", *filter(None, given["namespace"].split("/")), name])
+    merged: dict[str, Any] = {}
+    for path in files:
+        merged.update(parameters_for(Path(path), executable, full_name))
+    merged.update(values)
+    kept = Path(launch_config.get_log_file_path(f"{full_name[1:].replace('/', '.')}.yaml"))
+    kept.write_text(parameter_file(merged), encoding="utf-8")
+    return Node(
+        package=PACKAGE,
+        executable=executable,
+        name=name,
+        namespace=given["namespace"],
+        parameters=[str(kept)],
+        remappings=_relative(ABSOLUTE_TOPICS),
+        ros_arguments=["--log-level", given["log_level"]],
+        output="screen",
+        respawn=LaunchConfiguration("respawn"),
+        respawn_delay=RESPAWN_DELAY_S,
+    )
+
+
+def _given(context: LaunchContext) -> Given:
+    """Return every argument as text; one that a launch file does not have is at its default."""
+    stock = {name: item.default or "" for name, item in ARGUMENTS.items()}
+    return {**stock, **context.launch_configurations}
+
+
+def _addresses(given: Given) -> dict[str, str | int]:
+    """Return the network parameters that were given; with a virtual L2 all four, on this host."""
+    values: dict[str, str | int] = {
+        name: given[name] for name in ("l2_ip", "host_ip") if given[name]
+    }
+    for name in ("l2_port", "host_port"):
+        if given[name]:
+            if not given[name].isdecimal():
+                raise ValueError(f"{name}:={given[name]} is not a port number")
+            values[name] = int(given[name])
+    if given["emulator"] == "true":
+        stock = {"l2_port": wire.LIDAR_PORT, "host_port": wire.HOST_PORT}
+        return {**stock, **values, "l2_ip": LOOPBACK, "host_ip": LOOPBACK}
+    return values
+
+
+def _emulator(given: Given, values: Parameters) -> list[ExecuteProcess]:
+    if given["emulator"] != "true":
+        return []
+    command: list[Any] = [
+        ExecutableInPackage("l2lidar_emulator", PACKAGE),
+        *("--lidar-port", str(values["l2_port"])),
+        *("--host-port", str(values["host_port"])),
+        *shlex.split(given["emulator_options"]),
+    ]
+    ended = Shutdown(reason="the virtual L2 has ended")
+    return [ExecuteProcess(cmd=command, name="l2lidar_emulator", output="screen", on_exit=ended)]
+
+
+def _relative(topics: Iterable[str]) -> list[tuple[str, str]]:
+    return [(topic, topic.removeprefix("/")) for topic in topics]

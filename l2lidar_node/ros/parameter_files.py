@@ -1,0 +1,87 @@
+"""Reads what a ROS parameter file says to one node, under whatever name that node runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any]:
+    """Return the parameters that a file gives to a node, by name with dots.
+
+    ROS applies a section only to the full name it is headed with, so a node with another name or in
+    a namespace would lose the section of its stock name without a word. Here that applies as well.
+
+    Parameters
+    ----------
+    path : Path
+        YAML file.
+    stock_name : str
+        Name that the node has when nobody renames it.
+    full_name : str
+        Namespace and name it has now, for example ``/front/l2lidar_node``.
+
+    Returns
+    -------
+    dict
+        Of two sections that apply, the later one in the file wins.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, or is not a mapping of node names to ``ros__parameters``.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"parameter file '{path}': {error.strerror}") from None
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"parameter file '{path}': is not YAML: {reason}") from None
+    values: dict[str, Any] = {}
+    for heading, section in _sections(content, "", path):
+        if heading == f"/{stock_name}" or _pattern(heading).fullmatch(full_name):
+            values.update(_flat(section))
+    return values
+
+
+def parameter_file(values: Mapping[str, Any]) -> str:
+    """Return the text of a parameter file that gives values to any node that reads it."""
+    return yaml.safe_dump({"/**": {"ros__parameters": dict(values)}}, sort_keys=False)
+
+
+def _sections(content: object, above: str, path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    if content is None:
+        return
+    if not isinstance(content, dict):
+        raise ValueError(
+            f"parameter file '{path}': expected a node's name, below it 'ros__parameters:', "
+            "below it the parameters"
+        )
+    for name, below in content.items():
+        if name == "ros__parameters":
+            yield above, below or {}
+        else:
+            yield from _sections(below, f"{above}/{str(name).strip('/')}", path)
+
+
+def _pattern(heading: str) -> re.Pattern[str]:
+    """Return a heading as an expression: ``*`` is one name, ``**`` any number of them."""
+    parts = {"**": "(/[^/]+)*", "*": "/[^/]+"}
+    return re.compile(
+        "".join(parts.get(name, f"/{re.escape(name)}") for name in heading.split("/")[1:])
+    )
+
+
+def _flat(section: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, value in section.items():
+        if isinstance(value, dict):
+            values.update(_flat(value, f"{above}{name}."))
+        else:
+            values[f"{above}{name}"] = value
+    return values

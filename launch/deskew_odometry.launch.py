@@ -1,0 +1,38 @@
+"""Starts the driver, deskew and odometry, and RViz where asked for."""
+
+from launch import LaunchDescription
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+
+from l2lidar_node.ros.bringup import companion, driver, rviz
+from l2lidar_node.ros.launch_arguments import (
+    BOOL,
+    CUTS,
+    DRIVER_ARGUMENTS,
+    RVIZ_ARGUMENTS,
+    Argument,
+    arguments,
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return driver, deskew, odometry and RViz."""
+    return LaunchDescription(
+        [
+            *arguments(*DRIVER_ARGUMENTS, "proc_params_file"),
+            *arguments(*RVIZ_ARGUMENTS, rviz_config="rviz/slam.rviz"),
+            Argument("turn", "where a cloud ends", CUTS).declare("sweep_cut"),
+            Argument("true", "whether to start the odometry node", BOOL).declare("odometry"),
+            # Deskew needs the IMU, and points in the sensor's own frame, not levelled ones.
+            driver(
+                lambda given: {
+                    "enable_IMU_publishing": True,
+                    "imu_adjust": False,
+                    "sweep_cut": given["sweep_cut"],
+                }
+            ),
+            companion("deskew_node"),
+            companion("odometry_node", condition=IfCondition(LaunchConfiguration("odometry"))),
+            rviz(),
+        ]
+    )

@@ -1,0 +1,19 @@
+"""Starts an example robot with the L2 on its front face, looking ahead."""
+
+from launch import LaunchDescription
+
+from l2lidar_node.ros.bringup import driver, robot, rviz
+from l2lidar_node.ros.launch_arguments import EXAMPLE_ARGUMENTS, RVIZ_ARGUMENTS, arguments
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return robot_state_publisher, driver and RViz."""
+    return LaunchDescription(
+        [
+            *arguments(*EXAMPLE_ARGUMENTS),
+            *arguments(*RVIZ_ARGUMENTS, rviz="true", rviz_config="rviz/rvizl2lidar_example.rviz"),
+            robot("l2_forward_mount_example.urdf"),
+            driver(),
+            rviz(),
+        ]
+    )
