@@ -28,6 +28,7 @@ class NetworkConfig:
     )
 
     def __post_init__(self) -> None:
+        """Check the addresses."""
         for name in ("l2_ip", "host_ip"):
             value = getattr(self, name)
             try:
@@ -59,7 +60,17 @@ class ClockConfig:
     use_system_time: bool = setting(
         False, "stamp with the time of arrival instead", name="UseSystemTimeTS", live=True
     )
-    enable_latency_measure: bool = setting(False, "measure the round trip once a second")
+    enable_latency_measure: bool = setting(
+        False, "measure the round trip once a second and take half of it off every stamp"
+    )
+    l2_sync_mode: str = setting(
+        "once",
+        "with enable_l2_host_sync: set the device's clock once per start, or every l2_sync_rate_ms",
+        choices=("once", "periodic"),
+    )
+    publish_unlocked: bool = setting(
+        False, "publish with the time of arrival until the clock is locked, instead of nothing"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,9 +83,10 @@ class SweepConfig:
         name="aggregateNframes", lo=0, hi=4000, live=True,
     )  # fmt: skip
     cut: str = setting(
-        "packets", "where a cloud ends: after a number of packets, a head turn, half a head turn or
-        a duration", name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"),
-        live=True,
+        "packets",
+        "where a cloud ends: after a number of packets, a turn or half a turn of the head, "
+        "or a duration",
+        name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"), live=True,
     )  # fmt: skip
     duration_ms: int = setting(
         230, "length of a cloud when cut by duration",
@@ -85,8 +97,8 @@ class SweepConfig:
         name="EnableCalRangeOVR", live=True,
     )  # fmt: skip
     range_scale: float = setting(
-        0.000978, "range scale override", name="calRangeScale", unit="m/count", lo=0.00025,
-        hi=0.002, live=True,
+        0.000978, "range scale override", name="calRangeScale", unit="m/count",
+        lo=0.00025, hi=0.002, live=True,
     )  # fmt: skip
     range_bias: float = setting(
         -365.625, "range bias override", name="calRangeBias", unit="counts", lo=-1000.0, hi=0.0,
@@ -103,9 +115,11 @@ class SweepConfig:
     )
 
     def __post_init__(self) -> None:
+        """Check the two limits against each other."""
         if self.range_min >= self.range_max:
             raise SettingError(
-                f"parameter 'range_min': {self.range_min} is not below range_max ({self.range_max})"
+                f"parameter 'range_min': {self.range_min} is out of range, "
+                f"expected less than range_max ({self.range_max})"
             )
 
 
@@ -147,12 +161,13 @@ class FrameConfig:
     publish_tf: bool = setting(True, "publish the static transform from cloud to IMU frame")
 
     def __post_init__(self) -> None:
+        """Check the names."""
         for name in ("l2_name", "cloud_frame"):
             value = getattr(self, name)
             if value.startswith("/") or not re.fullmatch(r"[\w/.~-]*", value):
                 raise SettingError(
-                    f"parameter '{name}': {value!r} is not a frame name, expected letters, digits, "
-                    "'_', '-', '.' and '/', not starting with '/'"
+                    f"parameter '{name}': {value!r} is not a frame name, expected letters, "
+                    "digits, '_', '-', '.' and '/', not starting with '/'"
                 )
 
     @property

@@ -1,0 +1,139 @@
+"""Knows how regular a stream's stamps are and predicts the next one from its sequence number."""
+
+from __future__ import annotations
+
+import statistics
+from typing import Final
+
+FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
+
+_LEARN: Final = 9  # packets from which the period is learned
+_FLOOR_NS: Final = 5_000.0  # deviations this small are never a step
+_CEILING_NS: Final = 50_000.0
+_SIGMAS: Final = 8.0  # in mean absolute deviations
+_SLIP: Final = 0.05  # of the advance: more irregular than that a stream is not
+
+
+class Cadence:
+    """Phase and period of one stream, in device nanoseconds.
+
+    Parameters
+    ----------
+    gain : float
+        Share of a deviation that moves the phase, 0 to 1.
+
+    Notes
+    -----
+    A phase-locked loop of second order, critically damped. A stream whose period itself varies (a motor's)
+    is best predicted from its last packet: high gain. One with a steady period and noise on single stamps
+    (a sampler's) needs a long memory, or every bridged step would add the noise of one stamp to the line.
+    """
+
+    __slots__ = (
+        "_bend",
+        "_gain",
+        "_history",
+        "_lag",
+        "_modulus",
+        "_noise",
+        "_period",
+        "_seq",
+        "_tolerance",
+    )
+
+    def __init__(self, gain: float) -> None:
+        self._gain = gain
+        self._bend = 0.25 * gain * gain
+        self._modulus = FIRST_MODULUS  # 0 while unknown
+        self._history: list[tuple[int, int]] = []
+        self._seq = 0
+        self._period = 0.0
+        self._lag = 0.0  # predicted phase minus the last stamp
+        self._noise = 0.0
+        self._tolerance = _FLOOR_NS
+
+    def forget(self) -> None:
+        """Forget phase and period, not the modulus."""
+        self._history.clear()
+
+    def learn(self, seq: int, stamp: int) -> bool:
+        """Take a packet to learn from; return whether the period is known now, this packet being the last."""
+        history = self._history
+        history.append((seq, stamp))
+        if len(history) < _LEARN:
+            return False
+        del history[:-_LEARN]
+        steps = [
+            (b - a) / self._distance(m, n)
+            for (m, a), (n, b) in zip(history, history[1:], strict=False)
+            if self._distance(m, n) > 0
+        ]
+        period = statistics.median(steps) if steps else 0.0
+        if period <= 0.0:
+            return False
+        self._period = period
+        self._noise = statistics.median(abs(step - period) for step in steps)
+        self._seq = seq
+        self._lag = 0.0
+        self._tolerance = min(_FLOOR_NS + _SIGMAS * self._noise, _CEILING_NS)
+        history.clear()
+        return True
+
+    def follows(self, seq: int, advance: int) -> bool:
+        """Take the next packet if it is where it is expected; ``advance`` counts from the last one."""
+        gap = seq - self._seq
+        if gap <= 0:
+            gap += self._modulus
+        period = self._period
+        off = advance - gap * period - self._lag
+        if gap <= 0 or not -self._tolerance * gap <= off <= self._tolerance * gap:
+            return False
+        self._lag = (self._gain - 1.0) * off
+        self._period = period + self._bend * off / gap
+        self._seq = seq
+        if gap == 1:
+            noise = self._noise
+            self._noise = noise = noise + 0.01 * ((off if off > 0.0 else -off) - noise)
+            tolerance = _FLOOR_NS + _SIGMAS * noise
+            self._tolerance = tolerance if tolerance < _CEILING_NS else _CEILING_NS
+        return True
+
+    def resume(self, seq: int, advance: int) -> None:
+        """Go on from a packet that is not where it was expected, or where a step was bridged."""
+        gap = seq - self._seq
+        if gap < 0 and self._modulus:
+            gap += self._modulus
+        off = advance - gap * self._period - self._lag
+        self._lag = (self._gain - 1.0) * off if abs(off) < self._tolerance else 0.0
+        self._seq = seq
+        if seq >= self._modulus > 0:
+            self._modulus = 0
+
+    def gap(self, seq: int, advance: int) -> int:
+        """Return how many numbers a packet is after the last one; learn from it where numbers wrap."""
+        gap = seq - self._seq
+        if gap > 0:
+            return gap
+        if self._modulus and abs(advance - (gap + self._modulus) * self._period) < self._period:
+            return gap + self._modulus
+        counted = round(advance / self._period)
+        if 0 < counted <= 64 and abs(advance - counted * self._period) <= self.slip(counted):
+            self._modulus = max(self._seq + counted - seq, 0)
+            return counted
+        return gap + self._modulus
+
+    def advance(self, gap: int) -> int:
+        """Return the device time from the last packet to one some numbers later [ns]."""
+        return round(gap * self._period + self._lag)
+
+    def slip(self, gap: int) -> int:
+        """Return by how much a packet may be off without a step being the reason [ns]."""
+        return round(self._tolerance + _SLIP * gap * self._period)
+
+    def regular(self, gap: int, advance: int) -> bool:
+        """Whether two packets so many numbers apart are as far apart as they should be."""
+        return gap > 0 and abs(advance - gap * self._period) <= self.slip(gap)
+
+    def _distance(self, first: int, second: int) -> int:
+        gap = second - first
+        return gap + self._modulus if gap <= 0 else gap

@@ -1,0 +1,294 @@
+"""Maps device stamps to host stamps; says when it is locked and what happened to either clock.
+
+Two lines, one after the other: :class:`DeviceLine` takes the steps out of the stamps, so that both streams
+lie on one even device line whatever syncs and reboots do; :class:`HostLine` lays that line below the
+arrivals (see :mod:`l2lidar_node.envelope` for the estimator and why it is not a Kalman filter).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from l2lidar_node.config import ClockConfig
+from l2lidar_node.device_line import DeviceLine, Step
+from l2lidar_node.host_line import HostLine
+from l2lidar_node.sync import SyncSchedule
+from l2lidar_node.types import DeviceNs, HostNs, Stream
+
+_SILENCE_NS: Final = 1_000_000_000
+_ROUND_TRIPS: Final = 16
+_EVENTS: Final = 64
+
+
+class ClockEventKind(Enum):
+    """What can happen to a clock."""
+
+    LOCKED = "locked"
+    REBOOT = "reboot"
+    FOREIGN_SYNC = "foreign sync"
+    HOST_STEP = "host step"
+    SILENCE = "silence"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEvent:
+    """Something that happened to one of the clocks, with a sentence for the log."""
+
+    kind: ClockEventKind
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStatus:
+    """What is known about the device's clock.
+
+    Attributes
+    ----------
+    locked : bool
+        Whether stamps can be trusted.
+    mode : str
+        What stamps are made of: ``estimated``, ``device`` or ``system``.
+    ratio : float
+        Host nanoseconds per device nanosecond; the first guess until locked.
+    offset_ns : int
+        Host time minus device stamp of the latest packet.
+    residual_ns : int
+        Median height of the fitted packets above the line: how much arrivals vary.
+    path_delay_ns : int
+        Half the shortest measured round trip, which is taken off every stamp; 0 if not measured.
+    synced : bool
+        Whether a sync of this host is in force in the device.
+    epochs : int
+        Steps of the device's clock that were bridged.
+    held : int
+        Packets without a stamp because it would have been before an earlier one of the stream.
+    unlocked : int
+        Packets without a stamp because it would have been doubtful.
+    events : dict
+        How often each kind of event happened.
+    """
+
+    locked: bool
+    mode: str
+    ratio: float
+    offset_ns: int
+    residual_ns: int
+    path_delay_ns: int
+    synced: bool
+    epochs: int
+    held: int
+    unlocked: int
+    events: dict[ClockEventKind, int]
+
+
+class _Mode(Enum):
+    ESTIMATED = "estimated"
+    DEVICE = "device"
+    SYSTEM = "system"
+
+
+class DeviceClock:
+    """The device's clock as seen from the host.
+
+    Pure: time only passes through the arguments, so a recording gives the same stamps as the live device.
+
+    Parameters
+    ----------
+    config : ClockConfig
+
+    Notes
+    -----
+    Stamps of a stream never go backwards and are never after the packet's arrival. Where both cannot be
+    had, after the host's clock was set back, packets get no stamp until it has passed the latest one.
+    """
+
+    def __init__(self, config: ClockConfig) -> None:
+        self._guess = config.time_scale_num / config.time_scale_denom
+        self._schedule = SyncSchedule(config)
+        self._events: deque[ClockEvent] = deque(maxlen=_EVENTS)
+        self._counts: Counter[ClockEventKind] = Counter()
+        self._held = 0
+        self._unlocked = 0
+        self._last = {Stream.IMU: 0, Stream.POINTS: 0}
+        self.configure(config)
+        self.reset()
+
+    def configure(self, config: ClockConfig) -> None:
+        """Use another value of the live settings from the next packet on."""
+        self._config = config
+        if config.use_system_time:
+            self._mode = _Mode.SYSTEM
+        elif config.enable_l2_time_correction:
+            self._mode = _Mode.ESTIMATED
+        else:
+            self._mode = _Mode.DEVICE
+
+    def reset(self) -> None:
+        """Forget the device; stamps still never go backwards."""
+        self._host = HostLine(self._guess)
+        self._device = DeviceLine(self._guess, self._host.lateness)
+        self._restarts = 0
+        self._schedule.reset()
+        self._last_u: int | None = None
+        self._offset = 0
+        self._round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
+
+    def observe(
+        self,
+        stream: Stream,
+        seq: int,
+        stamp: DeviceNs,
+        arrival: HostNs,
+        duration_ns: int = 0,
+    ) -> HostNs | None:
+        """Return the host instant of a packet's stamp.
+
+        Parameters
+        ----------
+        stream : Stream
+            Whose packet it is; each stream's come in the order of their numbers.
+        seq : int
+            Its sequence number.
+        stamp : DeviceNs
+            What the device's clock showed at the first measurement.
+        arrival : HostNs
+            When it reached this host.
+        duration_ns : int
+            True time from the first to the last measurement in it; it cannot have left before.
+
+        Returns
+        -------
+        HostNs or None
+            After every earlier one of the stream and at least ``duration_ns`` before ``arrival``. None while
+            no trustworthy stamp can be told, see :class:`ClockStatus`.
+        """
+        host = self._host
+        left = arrival - duration_ns
+        u = self._device.place(stream, seq, stamp, arrival)
+        if u is None:
+            self._notice()
+        else:
+            host.add(u, left)
+            if u >= host.due:
+                self._update(u, stamp, arrival)
+        mode = self._mode
+        if mode is _Mode.ESTIMATED:
+            if u is not None and host.ready:
+                result = host.at(u)
+                if result > left:
+                    result = left
+            elif self._config.publish_unlocked:
+                result = left
+            else:
+                self._unlocked += 1
+                return None
+        elif mode is _Mode.SYSTEM:
+            result = max(arrival, self._last[stream] + 1)
+        else:
+            if not (self._schedule.in_force or self._config.publish_unlocked):
+                self._unlocked += 1
+                return None
+            result = min(stamp, left)
+        if result <= self._last[stream]:
+            self._held += 1
+            return None
+        self._last[stream] = result
+        return HostNs(result)
+
+    def synced(self, value: HostNs, sent: HostNs) -> None:
+        """Take note that a time-sync command with this value left the host at ``sent``."""
+        self._schedule.sent(value, sent)
+        self._device.synced(value, sent)
+
+    def sync_due(self, now: HostNs) -> bool:
+        """Return whether a time-sync command should be sent now."""
+        return self._schedule.due(now)
+
+    def round_trip(self, rtt_ns: int) -> None:
+        """Take a measured time from a latency request to its echo [ns]."""
+        if rtt_ns < 0 or not self._config.enable_latency_measure:
+            return
+        self._round_trips.append(rtt_ns)
+        self._host.advance_ns = min(self._round_trips) // 2
+
+    def status(self) -> ClockStatus:
+        """Return what is known now."""
+        line = self._host.line
+        return ClockStatus(
+            locked=self._locked,
+            mode=self._mode.value,
+            ratio=line.ratio,
+            offset_ns=self._offset,
+            residual_ns=round(line.excess),
+            path_delay_ns=self._host.advance_ns,
+            synced=self._schedule.in_force,
+            epochs=self._device.epochs,
+            held=self._held,
+            unlocked=self._unlocked,
+            events=dict(self._counts),
+        )
+
+    def events(self) -> list[ClockEvent]:
+        """Return what happened since the last call, oldest first."""
+        happened = list(self._events)
+        self._events.clear()
+        return happened
+
+    @property
+    def _locked(self) -> bool:
+        if self._mode is _Mode.ESTIMATED:
+            return self._host.ready
+        return self._mode is _Mode.SYSTEM or self._schedule.in_force
+
+    def _update(self, u: int, stamp: int, arrival: int) -> None:
+        """Do what need not be done for every packet."""
+        host = self._host
+        was_ready = host.ready
+        host.update(u)
+        self._schedule.seen(stamp, arrival)
+        self._device.ratio = host.line.ratio
+        if not host.ready:
+            return
+        self._offset = host.at(u) - stamp
+        if not was_ready:
+            self._report(ClockEventKind.LOCKED, f"locked, clock ratio {host.line.ratio:.6f}")
+        if self._last_u is not None and (u - self._last_u) * host.line.ratio > _SILENCE_NS:
+            seconds = (u - self._last_u) * host.line.ratio * 1e-9
+            self._report(ClockEventKind.SILENCE, f"device was silent for {seconds:.1f} s")
+        self._last_u = u
+        while host.steps:
+            step = host.steps.popleft()
+            hold = f", stamps are held for {-step * 1e-9:.3f} s" if step < 0 else ""
+            self._report(
+                ClockEventKind.HOST_STEP, f"host clock stepped by {step * 1e-9:+.3f} s{hold}"
+            )
+        self._notice()
+
+    def _notice(self) -> None:
+        """Report what the device line noticed, and begin anew where it does."""
+        device = self._device
+        while device.steps:
+            step, change = device.steps.popleft()
+            if step is not Step.FOREIGN_SYNC:
+                self._schedule.reset()
+            if step is Step.REBOOT:
+                self._report(ClockEventKind.REBOOT, "device restarted, clock begins anew")
+            elif step is Step.FOREIGN_SYNC:
+                self._report(
+                    ClockEventKind.FOREIGN_SYNC,
+                    f"somebody else stepped the device's clock by {change * 1e-9:+.3f} s",
+                )
+            else:
+                self._report(ClockEventKind.LOST, "lost track of the device's clock, begins anew")
+        if device.restarts != self._restarts:
+            self._restarts = device.restarts
+            self._host.reset()
+            self._last_u = None
+
+    def _report(self, kind: ClockEventKind, text: str) -> None:
+        self._counts[kind] += 1
+        self._events.append(ClockEvent(kind, text))

@@ -1,0 +1,260 @@
+"""Lays the stamps of both streams, over steps and restarts of the device's clock, onto one even line.
+
+Between two syncs the device's clock runs evenly; a sync, of this host or another, steps it. Each stretch in
+between is an *epoch*: a constant that, taken from a stamp, gives the *device line*, which has no steps. Which
+epoch a packet was stamped in, and how large the step was, is told by the packets themselves: both streams
+are so regular that the stamp of the next packet is known to microseconds from its sequence number, whatever
+the network does to arrivals. The values this host sent tell which sync it was. Arrivals are asked only when
+regularity cannot answer: after long gaps and for stamps that nothing explains.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from enum import Enum
+from typing import Final
+
+from l2lidar_node.cadence import Cadence
+from l2lidar_node.types import DeviceNs, HostNs, Stream
+
+_MS: Final = 1_000_000
+_SLACK_NS: Final = 50_000  # a sync may take effect that much beside its value
+_EARLY_NS: Final = -1 * _MS  # arrivals may seem that early without making a stamp impossible
+_LATE_NS: Final = 500 * _MS  # no path delays packets more than that
+_REACH_NS: Final = 150 * _MS  # sequence numbers are believed while arrivals agree with them so far
+_IMU_GAIN: Final = 0.02
+_POINTS_GAIN: Final = 0.5
+_SILENT_NS: Final = 1_000 * _MS
+_BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
+_KEEP: Final = 16  # epochs that packets on their way may still belong to
+_SYNCS: Final = 128
+
+
+class Step(Enum):
+    """What this host did not cause: the clock was stepped, or the line had to begin anew."""
+
+    REBOOT = "reboot"
+    FOREIGN_SYNC = "foreign sync"
+    LOST = "lost"
+
+
+class _Epoch:
+    """A stretch without a step: ``base`` is what a stamp is ahead of the device line."""
+
+    __slots__ = ("base", "value")
+
+    def __init__(self, base: int, value: int | None) -> None:
+        self.base = base
+        self.value = value  # of this host's sync that began it
+
+
+class _Track:
+    """Where one stream is."""
+
+    __slots__ = ("arrival", "cadence", "epoch", "stamp", "suspect", "u")
+
+    def __init__(self, gain: float) -> None:
+        self.cadence = Cadence(gain)
+        self.epoch: _Epoch | None = None  # None until it has joined the line
+        self.u = 0
+        self.stamp = 0
+        self.arrival = 0
+        self.suspect: tuple[int, int] | None = (
+            None  # sequence number and stamp that nothing explains
+        )
+
+
+class DeviceLine:
+    """Places stamps on the device line.
+
+    Parameters
+    ----------
+    ratio : float
+        First guess of host nanoseconds per device nanosecond; to be kept up to date in ``ratio``.
+    lateness : callable
+        Returns arrival minus the instant of a place on the line [ns host], None while that is unknown.
+
+    Attributes
+    ----------
+    ratio : float
+    steps : deque of (Step, int)
+        What happened and by how much [ns device]; whoever reads it takes it out. A line that began anew
+        says so in ``restarts``.
+    restarts : int
+        How often the line began anew, places before and after having nothing in common.
+    epochs : int
+        Steps of the clock that were bridged.
+    """
+
+    def __init__(
+        self, ratio: float, lateness: Callable[[int, int], int | None] = lambda u, arrival: None
+    ) -> None:
+        self.ratio = ratio
+        self.steps: deque[tuple[Step, int]] = deque(maxlen=64)
+        self.restarts = 0
+        self.epochs = 0
+        self._lateness = lateness
+        self._syncs: deque[tuple[int, int]] = deque(maxlen=_SYNCS)
+        self._epochs: deque[_Epoch] = deque(maxlen=_KEEP)
+        self._imu = _Track(_IMU_GAIN)
+        self._points = _Track(_POINTS_GAIN)
+
+    def synced(self, value: HostNs, sent: HostNs) -> None:
+        """Take note of a sync that left this host; whether it arrives is not known."""
+        self._syncs.append((value, sent))
+
+    def restart(self) -> None:
+        """Forget everything but how regular the streams are."""
+        self._epochs.clear()
+        for track in (self._imu, self._points):
+            track.epoch = None
+            track.suspect = None
+            track.cadence.forget()
+        self.restarts += 1
+
+    def place(self, stream: Stream, seq: int, stamp: DeviceNs, arrival: HostNs) -> int | None:
+        """Return the place of a stamp on the device line [ns device], None while it is not known.
+
+        Never raises, whatever the arguments; see :meth:`DeviceClock.observe`.
+        """
+        track = self._imu if stream is Stream.IMU else self._points
+        epoch = track.epoch
+        if epoch is None:
+            return self._join(track, seq, stamp, arrival)
+        u = stamp - epoch.base
+        if track.cadence.follows(seq, u - track.u):
+            track.u = u
+            track.stamp = stamp
+            track.arrival = arrival
+            return u
+        return self._step(track, epoch, seq, stamp, arrival)
+
+    def _step(
+        self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int
+    ) -> int | None:
+        """Place a stamp that is not where the cadence wants it."""
+        cadence = track.cadence
+        u = stamp - epoch.base
+        gap = cadence.gap(seq, u - track.u)
+        advance = cadence.advance(gap)
+        expected = track.u + advance
+        waited = arrival - track.arrival
+        reach = _SILENT_NS if waited < _SILENT_NS else _REACH_NS
+        counted = gap > 0 and abs(advance * self.ratio - waited) < reach
+        if counted:
+            value = self._own_sync(stamp, advance, epoch)
+            if value is not None:
+                begun = self._begun(track, value, stamp - expected)
+                return self._accept(track, begun, seq, stamp, arrival)
+            slip = cadence.slip(gap)
+            for other in (epoch, *reversed(self._epochs)):
+                if abs(stamp - other.base - expected) <= slip:
+                    return self._accept(track, other, seq, stamp, arrival)
+        late = u > expected if counted else u > track.u and not self._synced_since(track)
+        if late and self._possible(track, u, arrival):
+            return self._accept(track, epoch, seq, stamp, arrival)
+        return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)
+
+    def _own_sync(self, stamp: int, advance: int, epoch: _Epoch) -> int | None:
+        """Return the value of the sync that a stamp is just after."""
+        for value, _ in reversed(self._syncs):
+            if value == epoch.value:
+                return None
+            if -_SLACK_NS <= stamp - value <= advance + _MS:
+                return value
+        return None
+
+    def _synced_since(self, track: _Track) -> bool:
+        """Whether a sync may have stepped the clock since the last packet."""
+        return any(sent > track.arrival - _LATE_NS for _, sent in self._syncs)
+
+    def _begun(self, track: _Track, value: int, base: int) -> _Epoch:
+        """Return the epoch that a sync began; the IMU stream, more regular, has the last word on it."""
+        for epoch in reversed(self._epochs):
+            if epoch.value == value:
+                if track is self._imu:
+                    if self._points.epoch is epoch:
+                        self._points.u += epoch.base - base
+                    epoch.base = base
+                return epoch
+        self.epochs += 1
+        self._epochs.append(_Epoch(base, value))
+        return self._epochs[-1]
+
+    def _accept(self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int) -> int:
+        u = stamp - epoch.base
+        track.cadence.resume(seq, u - track.u)
+        track.epoch = epoch
+        track.u = u
+        track.stamp = stamp
+        track.arrival = arrival
+        track.suspect = None
+        return u
+
+    def _unexplained(
+        self,
+        track: _Track,
+        epoch: _Epoch,
+        seq: int,
+        stamp: int,
+        arrival: int,
+        expected: int | None,
+    ) -> int | None:
+        """Wait for a second packet that confirms the first; then say what happened and go on."""
+        suspect, track.suspect = track.suspect, (seq, stamp)
+        if suspect is None or not track.cadence.regular(seq - suspect[0], stamp - suspect[1]):
+            return None
+        if stamp < track.stamp and stamp < _BOOT_NS:
+            self.steps.append((Step.REBOOT, stamp - track.stamp))
+        elif expected is not None:
+            self.steps.append((Step.FOREIGN_SYNC, stamp - epoch.base - expected))
+            self.epochs += 1
+            self._epochs.append(_Epoch(stamp - expected, None))
+            return self._accept(track, self._epochs[-1], seq, stamp, arrival)
+        else:
+            self.steps.append((Step.LOST, stamp - track.stamp))
+        self.restart()
+        return None
+
+    def _join(self, track: _Track, seq: int, stamp: int, arrival: int) -> int | None:
+        """Let a stream that is new onto the line once its cadence is known."""
+        if not track.cadence.learn(seq, stamp):
+            return None
+        other = self._points if track is self._imu else self._imu
+        if other.epoch is None:
+            self._epochs.append(_Epoch(0, None))
+            return self._accept(track, self._epochs[-1], seq, stamp, arrival)
+        epoch = self._fitting(other, stamp, arrival)
+        if epoch is not None:
+            return self._accept(track, epoch, seq, stamp, arrival)
+        if arrival - other.arrival > _SILENT_NS:
+            self.steps.append((Step.LOST, stamp - other.stamp))
+            self.restart()
+        return None
+
+    def _fitting(self, other: _Track, stamp: int, arrival: int) -> _Epoch | None:
+        """Return the epoch in which a stamp is least late, given where the other stream is."""
+        best: _Epoch | None = None
+        least = _LATE_NS
+        end: int | None = None  # of an epoch on the line
+        for epoch in reversed(self._epochs):
+            u = stamp - epoch.base
+            begin = None if epoch.value is None else epoch.value - epoch.base
+            inside = (begin is None or u >= begin - _SLACK_NS) and (end is None or u <= end)
+            end = begin
+            if not inside:
+                continue
+            late = self._lateness(u, arrival)
+            if late is None:
+                late = abs(round(arrival - other.arrival - (u - other.u) * self.ratio))
+            if _EARLY_NS <= late < least:
+                best, least = epoch, late
+        return best
+
+    def _possible(self, track: _Track, u: int, arrival: int) -> bool:
+        """Whether a packet measured at this place could have arrived when it did."""
+        late = self._lateness(u, arrival)
+        if late is None:
+            return abs((u - track.u) * self.ratio - (arrival - track.arrival)) < _REACH_NS
+        return _EARLY_NS <= late <= _LATE_NS

@@ -1,0 +1,187 @@
+"""Turns places on the device line into host stamps: acquires the line, follows it smoothly, notices steps."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from l2lidar_node.envelope import BLOCK_NS, Envelope, Line, supporting_line
+
+_MS: Final = 1_000_000
+_TRY_NS: Final = 100 * _MS  # between attempts to lock
+_QUIET_LOCK_NS: Final = 400 * _MS  # data that suffice while arrivals hardly vary
+_LOCK_NS: Final = 1_600 * _MS  # data that must suffice
+_QUIET_NS: Final = 50_000.0  # median delay above the line below which arrivals hardly vary
+_FEWEST: Final = 40
+_MOST: Final = 4096  # packets kept while not locked
+_RATIOS: Final = (0.45, 3.3)
+
+_SETTLE_NS: Final = 1_000.0 * _MS  # time constant with which what is published follows the fit
+_SLEW: Final = 0.002  # at most by that much faster or slower
+_SEGMENTS: Final = 8
+
+_FORWARD_NS: Final = 25 * _MS  # arrivals later than that for a second: the host's clock was set forward
+_BACKWARD_NS: Final = 5 * _MS  # arrivals earlier than that for two blocks: it was set back
+_SPREADS: Final = 10.0
+_FORWARD_BLOCKS: Final = 10
+_BACKWARD_BLOCKS: Final = 2
+_FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
+
+
+class HostLine:
+    """Maps the device line to the host's clock.
+
+    Attributes
+    ----------
+    ready : bool
+        Whether :meth:`at` can be used.
+    due : int
+        Place on the device line at which :meth:`update` wants to be called.
+    steps : deque of int
+        Steps of the host's clock [ns]; whoever reads it takes it out.
+
+    Notes
+    -----
+    What is published is not the fit itself, which moves a little with every new block, but a continuous,
+    strictly rising line that runs at the fitted ratio and closes in on the fit with a time constant of
+    1 s, never more than 0.2 % faster or slower: samples 4 ms apart stay 4 ms apart.
+    """
+
+    __slots__ = (
+        "_envelope",
+        "_host",
+        "_low",
+        "_low_at",
+        "_packets",
+        "_segments",
+        "_slope",
+        "_suspects",
+        "_u",
+        "advance_ns",
+        "due",
+        "line",
+        "ready",
+        "steps",
+    )
+
+    def __init__(self, ratio: float) -> None:
+        self.line = Line(0, 0, ratio, 0.0)
+        self.advance_ns = 0  # how much earlier than the envelope stamps shall be: the constant path delay
+        self.steps: deque[int] = deque(maxlen=64)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the ratio, as a guess."""
+        self.ready = False
+        self._envelope: Envelope | None = None
+        self._packets: list[tuple[int, int]] = []
+        self._suspects: list[tuple[int, int]] = []
+        self._segments: deque[tuple[int, int, float]] = deque(maxlen=_SEGMENTS)
+        self._u = self._host = 0
+        self._slope = self.line.ratio
+        self._low: float | None = None
+        self._low_at = (0, 0)
+        self.due = 0
+
+    def add(self, u: int, arrival: int) -> None:
+        """Take one packet: its place on the device line and its arrival, less what measuring it took."""
+        if not self.ready:
+            self._packets.append((u, arrival))
+            if len(self._packets) > _MOST:
+                del self._packets[: _MOST // 2]
+            return
+        height = (arrival - self._host) - (u - self._u) * self._slope
+        low = self._low
+        if low is None or height < low:
+            self._low = height
+            self._low_at = (u, arrival)
+
+    def at(self, u: int) -> int:
+        """Return the host time [ns] of a place on the device line; needs ``ready``."""
+        since = u - self._u
+        if since >= 0:
+            return self._host + int(since * self._slope)
+        for start, host, slope in reversed(self._segments):
+            if u >= start:
+                return host + int((u - start) * slope)
+        return self._host + int(since * self._slope)
+
+    def lateness(self, u: int, arrival: int) -> int | None:
+        """Return how late a packet is [ns], None while that is unknown."""
+        return arrival - self.at(u) if self.ready else None
+
+    def update(self, u: int) -> None:
+        """Fit again; to be called when a packet at or after ``due`` was added."""
+        if self._envelope is None:
+            self._acquire(u)
+        else:
+            self._follow(self._envelope, u)
+        self.due = u + int(BLOCK_NS / self._slope)
+
+    def _acquire(self, u: int) -> None:
+        packets = self._packets
+        packets.sort()
+        span = packets[-1][1] - packets[0][1]
+        if len(packets) < _FEWEST or span < _QUIET_LOCK_NS:
+            return
+        line = supporting_line(packets, self.line.ratio)
+        if line is None or not _RATIOS[0] < line.ratio < _RATIOS[1]:
+            self._drop_first_half(span)
+            return
+        if span < _LOCK_NS and line.excess > _QUIET_NS:
+            return
+        self._envelope = Envelope(line, packets)
+        self._packets = []
+        self._go(u, line.at(u) - self.advance_ns, line.ratio)
+        self.line = line
+        self.ready = True
+
+    def _drop_first_half(self, span: int) -> None:
+        """Begin again with the newer packets when all of them are on no line."""
+        if span >= _LOCK_NS:
+            del self._packets[: len(self._packets) // 2]
+
+    def _follow(self, envelope: Envelope, u: int) -> None:
+        low, self._low = self._low, None
+        if low is not None and not self._stepped(envelope, u):
+            envelope.close(self._low_at, u)
+        self.line = line = envelope.line
+        host = self.at(u)
+        ratio = line.ratio
+        pull = (line.at(u) - self.advance_ns - host) / _SETTLE_NS
+        self._go(u, host, ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
+
+    def _stepped(self, envelope: Envelope, u: int) -> bool:
+        """Look for a step of the host's clock; return whether the block was dealt with."""
+        line = envelope.line
+        off = self._low_at[1] - line.at(self._low_at[0])
+        spread = _SPREADS * line.excess
+        suspects = self._suspects
+        if off < -_BACKWARD_NS - spread:
+            enough = _BACKWARD_BLOCKS
+        elif off > _FORWARD_NS + spread:
+            enough = _FORWARD_BLOCKS
+        else:
+            suspects.clear()
+            return False
+        if suspects and (suspects[-1][1] - line.at(suspects[-1][0]) < 0) != (off < 0):
+            suspects.clear()
+        suspects.append(self._low_at)
+        if len(suspects) < enough:
+            return True
+        first, last = suspects[0], suspects[-1]
+        if last[1] - first[1] < _FLOWING * (last[0] - first[0]) * line.ratio:
+            del suspects[0]
+            return True
+        before = line.at(u)
+        envelope.move(suspects)
+        suspects.clear()
+        self.steps.append(envelope.line.at(u) - before)
+        self._go(u, envelope.line.at(u) - self.advance_ns, envelope.line.ratio)
+        return True
+
+    def _go(self, u: int, host: int, slope: float) -> None:
+        """Begin a new segment of what is published."""
+        if self.ready:
+            self._segments.append((self._u, self._host, self._slope))
+        self._u, self._host, self._slope = u, host, slope
