@@ -84,6 +84,23 @@ class Motion:
         return samples
 
 
+def noisy(
+    samples: NDArray[np.void],
+    gyro: float = 0.03,
+    line: float = 0.03,
+    force: float = 0.06,
+    seed: int = 3,
+) -> NDArray[np.void]:
+    """Return samples with white noise and the gyro's line at the turning head's 4.36 Hz."""
+    rng = np.random.default_rng(seed)
+    made = samples.copy()
+    t = (made["stamp"] - EPOCH) * 1e-9
+    made["angular_velocity"] += rng.normal(0.0, gyro, (len(made), 3))
+    made["angular_velocity"] += line * np.sin(2 * np.pi * 4.36 * t[:, None] + np.arange(3))
+    made["linear_acceleration"] += rng.normal(0.0, force, (len(made), 3))
+    return made
+
+
 def seen(
     motion: Motion, start: float, end: float, reference: float, count: int = 6000, seed: int = 1
 ):

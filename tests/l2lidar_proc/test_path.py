@@ -52,9 +52,11 @@ def test_bias_is_taken_off_in_imu_axes_and_the_mount_is_honoured():
     R_cloud_imu = rotations.matrices(rotations.exp([0.4, -1.2, 2.0]))
     for name in ("angular_velocity", "linear_acceleration"):
         samples[name] = samples[name] @ R_cloud_imu
-    T = T_CLOUD_IMU.copy()
-    T[:3, :3] = R_cloud_imu
-    path = integrate(samples, at(0.3), at(0.5), T_cloud_imu=T, bias=np.array(bias) @ R_cloud_imu)
+    T_turned = T_CLOUD_IMU.copy()
+    T_turned[:3, :3] = R_cloud_imu
+    path = integrate(
+        samples, at(0.3), at(0.5), T_cloud_imu=T_turned, bias=np.array(bias) @ R_cloud_imu
+    )
     angle, _ = error(path, spin, 0.3, np.linspace(0.3, 0.5, 100))
     assert angle < 1e-4
 

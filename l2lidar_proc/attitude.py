@@ -1,0 +1,306 @@
+"""Tracks the gyro's bias and the direction of gravity through rest and motion.
+
+An error-state Kalman filter (filterpy) over the tilt of the estimated vertical and the gyro's
+bias. The vertical is carried along by the gyro. At rest the mean rate is the bias and the mean
+force is gravity. In motion the force, turned into one frame and averaged over a second, is gravity
+plus the change of velocity in that second: known when a velocity source says so, otherwise a
+larger uncertainty. That ties roll and pitch, and with them the bias across the vertical, to
+gravity; about the vertical the bias rests on what was learned at rest. Yaw is of no interest here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from l2lidar_node.types import HostNs
+from l2lidar_proc import rotations
+from l2lidar_proc.imu_window import Samples
+from l2lidar_proc.path import Gravity
+from l2lidar_proc.rest import Rest, at_rest, blended, still_like
+from l2lidar_proc.rotations import F64
+from l2lidar_proc.velocity import VelocityHistory
+
+STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
+
+_STEP_S: Final = 0.1  # the filter's step
+_WINDOW: Final = 10  # steps that one measurement of gravity or rest spans
+_HISTORY: Final = 80  # states remembered, so that a late sweep finds its own
+_BREAK_NS: Final = 500_000_000  # a gap in the samples after which the vertical is unknown again
+_PLAUSIBLE: Final = (8.8, 10.8)  # [m/s^2] what |a| at rest may be
+_PLAUSIBLE_MOVING: Final = (7.5, 12.5)  # its mean over a second of motion
+
+_GYRO_NOISE: Final = 0.005  # [rad/sqrt(s)]
+_BIAS_WALK: Final = 3e-4  # [rad/s/sqrt(s)]
+_FIRST_TILT: Final = 0.3  # [rad]
+_FIRST_BIAS: Final = 0.05  # [rad/s]
+_TRUSTED_TILT: Final = 0.06  # [rad] largest deviation with which gravity is of use
+_FORCE_AT_REST: Final = 0.05  # [m/s^2]
+_FORCE_MOVING: Final = (0.25, 1.5)  # [m/s^2] with and without known velocities
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attitude:
+    """What is known about vertical and bias at one instant.
+
+    Attributes
+    ----------
+    stamp : HostNs
+    up : ndarray, shape (3,)
+        Vertical, unit, IMU axes.
+    gravity : float
+        What the accelerometer says of gravity's size [m/s^2].
+    bias : ndarray, shape (3,)
+        Of the gyro [rad/s], IMU axes.
+    bias_sigma : float
+        Its standard deviation about the worst axis [rad/s].
+    is_still : bool
+        Whether the sensor stands still.
+    is_trusted : bool
+        Whether vertical and accelerometer can be relied on.
+    is_faulty : bool
+        Whether the size of the measured gravity is impossible, as after a start on its side.
+    """
+
+    stamp: HostNs
+    up: F64
+    gravity: float
+    bias: F64
+    bias_sigma: float
+    is_still: bool
+    is_trusted: bool
+    is_faulty: bool
+
+
+class AttitudeFilter:
+    """Follows the IMU samples in order of time.
+
+    Parameters
+    ----------
+    T_cloud_imu : ndarray, shape (4, 4)
+        IMU coordinates to cloud coordinates.
+    max_bias : float
+        Largest bias [rad/s] to believe in at the first rest.
+    """
+
+    def __init__(self, T_cloud_imu: F64, max_bias: float = 0.1) -> None:
+        self._R_cloud_imu = np.asarray(T_cloud_imu, dtype=np.float64)[:3, :3]
+        self._max_bias = max_bias
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as after a jump of the clock."""
+        self._kalman = KalmanFilter(dim_x=6, dim_z=3)
+        self._kalman.P = np.diag([_FIRST_TILT**2] * 3 + [_FIRST_BIAS**2] * 3)
+        self._bias = np.zeros(3)
+        self._bias_known = False
+        self._up: F64 | None = None
+        self._gravity = STANDARD_GRAVITY
+        self._rest: Rest | None = None
+        self._faulty = False
+        self._pending: list[Samples] = []
+        self._recent: deque[Samples] = deque(maxlen=_WINDOW)
+        self._steps = 0
+        self._states: deque[Attitude] = deque(maxlen=_HISTORY)
+
+    @property
+    def latest(self) -> Attitude | None:
+        """The newest state, None before the first tenth of a second."""
+        return self._states[-1] if self._states else None
+
+    @property
+    def bias(self) -> F64:
+        """The newest bias [rad/s], IMU axes, shape (3,); zero while nothing is known."""
+        return self._bias.copy()
+
+    def at(self, stamp: HostNs) -> Attitude | None:
+        """Return the last state not later than an instant, else the first one, if any."""
+        for state in reversed(self._states):
+            if state.stamp <= stamp:
+                return state
+        return self._states[0] if self._states else None
+
+    def gravity_before(self, stamp: HostNs) -> Gravity | None:
+        """Return gravity in cloud axes as last known at an instant, None if not trusted."""
+        state = self.at(stamp)
+        if state is None or not state.is_trusted:
+            return None
+        return Gravity(state.stamp, self._R_cloud_imu @ state.up * state.gravity)
+
+    def is_still(self, samples: Samples) -> bool:
+        """Return whether the sensor stood still during these samples.
+
+        Judged by the rest it is in; in its first second, before any rest is known, by the samples
+        alone.
+        """
+        if self._rest is not None:
+            return still_like(samples, self._rest)
+        if self._steps >= _WINDOW:
+            return False
+        return at_rest(samples, None, self._max_bias, least=50) is not None
+
+    def push(self, samples: Samples, velocities: VelocityHistory | None = None) -> None:
+        """Follow samples.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (N,), dtype IMU_SAMPLE
+            Later than those before, ascending.
+        velocities : VelocityHistory, optional
+            How the sensor moves, as far as known.
+        """
+        self._pending.append(samples)
+        first = int(self._pending[0]["stamp"][0]) if len(self._pending[0]) else 0
+        if not len(samples) or (int(samples["stamp"][-1]) - first) < _STEP_S * 1e9:
+            if not len(samples):
+                self._pending.pop()
+            return
+        joined = np.concatenate(self._pending)
+        step = np.int64(_STEP_S * 1e9)
+        cuts = np.flatnonzero(np.diff((joined["stamp"] - first) // step)) + 1
+        *whole, rest = np.split(joined, cuts)
+        self._pending = [rest]
+        for part in whole:
+            self._follow(part, velocities)
+
+    def _follow(self, step: Samples, velocities: VelocityHistory | None) -> None:
+        """Take one step of about a tenth of a second."""
+        before = self._recent[-1] if self._recent else None
+        if before is not None and int(step["stamp"][0] - before["stamp"][-1]) > _BREAK_NS:
+            self._recent.clear()
+            self._up, self._rest, before = None, None, None
+        if self._up is None:
+            self._up = rotations.normalised(step["linear_acceleration"].mean(axis=0))
+            self._kalman.P[:3, :3] = np.eye(3) * _FIRST_TILT**2
+        elif before is not None:
+            self._predict(np.concatenate((before[-1:], step)))
+        self._recent.append(step)
+        self._steps += 1
+        if len(self._recent) == _WINDOW:
+            self._look_back(velocities)
+        self._states.append(self._state(HostNs(int(step["stamp"][-1]))))
+
+    def _state(self, stamp: HostNs) -> Attitude:
+        assert self._up is not None
+        covariance = self._kalman.P
+        tilt = np.trace(covariance[:3, :3]) - self._up @ covariance[:3, :3] @ self._up
+        return Attitude(
+            stamp=stamp,
+            up=self._up,
+            gravity=self._gravity,
+            bias=self._bias.copy(),
+            bias_sigma=float(np.sqrt(np.diag(covariance)[3:].max())),
+            is_still=self._rest is not None,
+            is_trusted=not self._faulty and float(tilt) < _TRUSTED_TILT**2,
+            is_faulty=self._faulty,
+        )
+
+    def _look_back(self, velocities: VelocityHistory | None) -> None:
+        """Judge the last second: rest or motion, and what follows from it."""
+        second = np.concatenate(list(self._recent))
+        moving = (
+            velocities.at(HostNs(int(second["stamp"][-1]))) if velocities is not None else None
+        )
+        slow = moving is None or float(np.linalg.norm(moving)) < 0.1
+        known = self._bias if self._bias_known else None
+        found = at_rest(second, known, self._max_bias) if slow else None
+        if self._rest is not None and not still_like(self._recent[-1], self._rest):
+            found = None
+        if found is None:
+            self._rest = None
+        elif self._rest is None:
+            self._rest = found
+        else:
+            self._rest = blended(self._rest, found, 0.1)
+        if self._steps % _WINDOW and not (found is not None and not self._bias_known):
+            return
+        if found is not None:
+            self._measure_rest(found, len(second))
+        else:
+            self._measure_motion(second, velocities)
+
+    def _predict(self, samples: Samples) -> None:
+        """Carry vertical and uncertainty over samples; the first one was there before."""
+        dt = np.diff(samples["stamp"])[:, None] * 1e-9
+        rates = samples["angular_velocity"] - self._bias
+        turns = rotations.exp(0.5 * dt * (rates[:-1] + rates[1:]))
+        back = rotations.conjugate(rotations.cumulative(turns)[-1])
+        span = float(dt.sum())
+        transition = np.eye(6)
+        transition[:3, :3] = rotations.matrices(back)
+        transition[:3, 3:] = span * np.eye(3)
+        growth = np.diag([_GYRO_NOISE**2 * span] * 3 + [_BIAS_WALK**2 * span] * 3)
+        self._kalman.predict(F=transition, Q=growth)
+        assert self._up is not None
+        self._up = rotations.normalised(rotations.rotate(back, self._up))
+
+    def _measure_rest(self, rest: Rest, count: int) -> None:
+        size = float(np.linalg.norm(rest.force))
+        self._faulty = not _PLAUSIBLE[0] <= size <= _PLAUSIBLE[1]
+        observed = np.hstack((np.zeros((3, 3)), np.eye(3)))
+        noise = np.diag(1.5 * rest.rate_spread**2 / count + 1e-8)
+        self._correct(rest.rate - self._bias, observed, noise)
+        self._bias_known = True
+        if not self._faulty:
+            share = 1.0 if self._gravity == STANDARD_GRAVITY else 0.2
+            self._gravity += share * (size - self._gravity)
+            self._measure_force(rest.force, _FORCE_AT_REST)
+
+    def _measure_motion(self, second: Samples, velocities: VelocityHistory | None) -> None:
+        forces = second["linear_acceleration"]
+        size = float(np.linalg.norm(forces, axis=1).mean())
+        self._faulty = not _PLAUSIBLE_MOVING[0] <= size <= _PLAUSIBLE_MOVING[1]
+        if self._faulty:
+            return
+        dt = np.diff(second["stamp"])[:, None] * 1e-9
+        rates = second["angular_velocity"] - self._bias
+        turns = rotations.exp(0.5 * dt * (rates[:-1] + rates[1:]))
+        q = np.concatenate((np.array([[1.0, 0.0, 0.0, 0.0]]), rotations.cumulative(turns)))
+        to_end = rotations.multiply(rotations.conjugate(q[-1]), q)
+        mean = rotations.rotate(to_end, forces).mean(axis=0)
+        known, unknown = _FORCE_MOVING
+        gained = self._gained(second, to_end[0], velocities)
+        if gained is None:
+            self._measure_force(mean, unknown)
+        else:
+            self._measure_force(mean - gained, known)
+
+    def _gained(
+        self, second: Samples, q_end_start: F64, velocities: VelocityHistory | None
+    ) -> F64 | None:
+        """Return the mean acceleration [m/s^2] in IMU axes at the end, None if not known."""
+        if velocities is None:
+            return None
+        start, end = HostNs(int(second["stamp"][0])), HostNs(int(second["stamp"][-1]))
+        before, after = velocities.at(start), velocities.at(end)
+        if before is None or after is None:
+            return None
+        before, after = before @ self._R_cloud_imu, after @ self._R_cloud_imu
+        change = after - rotations.rotate(q_end_start, before)
+        return np.asarray(change / ((end - start) * 1e-9))
+
+    def _measure_force(self, force: F64, sigma: float) -> None:
+        """Correct with a force [m/s^2] that should be gravity alone."""
+        assert self._up is not None
+        x, y, z = self._gravity * self._up
+        observed = np.zeros((3, 6))
+        observed[:, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        self._correct(force - self._gravity * self._up, observed, sigma**2 * np.eye(3))
+
+    def _correct(self, innovation: F64, observed: F64, noise: F64) -> None:
+        """Apply one measurement and fold the error state into vertical and bias."""
+        self._kalman.x = np.zeros((6, 1))
+        self._kalman.update(innovation[:, None], R=noise, H=observed)
+        error = self._kalman.x[:, 0]
+        assert self._up is not None
+        gained = error[3:]
+        if not observed[:, 3:].any():
+            # a force says nothing about turning around the vertical: what is left there is error
+            gained = gained - (gained @ self._up) * self._up
+        self._bias = self._bias + gained
+        self._up = rotations.normalised(rotations.rotate(rotations.exp(error[:3]), self._up))
+        self._kalman.x = np.zeros((6, 1))
