@@ -1,4 +1,4 @@
-"""Groups point packets into sweeps: by count, by head angle or by duration, never without bound."""
+"""Groups point packets into sweeps: by count, head angle or duration, never without bound."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class SweepAssembler:
     config : SweepConfig
         How sweeps are cut; may be replaced while running through :meth:`configure`.
     level : callable, optional
-        Applied to each batch of points with the start of every packet, for example to turn points into
-        a levelled frame.
+        Applied to each batch of points with the start of every packet, for example to turn points
+        into a levelled frame.
     """
 
     def __init__(self, config: SweepConfig, level: Level | None = None) -> None:

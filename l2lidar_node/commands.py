@@ -36,9 +36,9 @@ class Command(NamedTuple):
     def is_answered_by(self, ack: Ack) -> bool:
         """Tell whether an ACK belongs to this command.
 
-        The device echoes the packet type. For the two command families it also echoes the number of the
-        command; the value is compared only for latency requests, whose echo is all they are for, since
-        other echoes are known to be unreliable.
+        The device echoes the packet type. For the two command families it also echoes the number
+        of the command; the value is compared only for latency requests, whose echo is all they are
+        for, since other echoes are known to be unreliable.
         """
         if not self.acknowledged or ack.packet_type != self.packet_type:
             return False
@@ -51,7 +51,7 @@ class Command(NamedTuple):
 
 
 def start() -> Command:
-    """Return the command to leave standby; the IMU returns within a second, points after up to 45 s."""
+    """Return the command to leave standby; IMU returns within a second, points within 45 s."""
     return _user("start rotation", wire.UserCommand.STANDBY, 0)
 
 

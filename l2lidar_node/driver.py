@@ -1,4 +1,4 @@
-"""Composes the driver's parts: bytes with their arrival in, sweeps and samples out; owns no socket, no clock.
+"""Composes the driver's parts: bytes with their arrival in, sweeps and samples out; no socket.
 
 Every method takes the time as an argument and returns what happened, so a recording gives the same
 output as the live sensor did.
@@ -376,4 +376,3 @@ class Driver:
         self._levelling.clear()
         self.version = None
         self.parameters = None
-

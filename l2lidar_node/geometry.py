@@ -11,7 +11,8 @@ The model is the one of Unitree's BSD-3 header for a 3D packet's slot j::
     y     = sin(theta) A + cos(theta) B
     z     = (sin(beta) sin(xi) + cos(beta) cos(xi) sin(alpha)) D + a_axis_dist
 
-The vendor's client accumulates the angles in float32 and is off by up to 0.4 mm at 5 m; this is not.
+The vendor's client accumulates the angles in float32 and is off by up to 0.4 mm at 5 m; this is
+not.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -87,8 +89,8 @@ class _Table(NamedTuple):
 class Projector:
     """Turns batches of packets of one type into points.
 
-    Its work arrays are kept from batch to batch, since fresh memory for them would cost more than the
-    arithmetic; the points it returns are always new memory.
+    Its work arrays are kept from batch to batch, since fresh memory for them would cost more than
+    the arithmetic; the points it returns are always new memory.
 
     Parameters
     ----------
@@ -169,12 +171,12 @@ def _runs(octets: NDArray[np.uint8], limits: slice) -> list[slice]:
     changed = (octets[1:, _CALIBRATION] != octets[:-1, _CALIBRATION]).any(axis=1)
     changed |= (octets[1:, limits] != octets[:-1, limits]).any(axis=1)
     edges = [0, *(np.flatnonzero(changed) + 1).tolist(), len(octets)]
-    return [slice(lo, hi) for lo, hi in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(lo, hi) for lo, hi in pairwise(edges)]
 
 
 @lru_cache(maxsize=16)
 def _table(constants: bytes, count: int) -> _Table:
-    """Return the table of a calibration, from its 32 bytes and the 16 bytes of limits and angles."""
+    """Return the table of a calibration: 32 bytes of it and 16 of limits and angles."""
     calibration = np.frombuffer(constants, wire.CALIBRATION, 1)[0].astype(
         [(name, "f8") for name in wire.CALIBRATION.names or ()]
     )
@@ -230,14 +232,15 @@ def _place_2d(table: _Table, work: _Work) -> None:
 def _place_3d(raw: NDArray[np.void], table: _Table, work: _Work) -> None:
     """Fill x, y, z of 3D packets.
 
-    The head angle of slot j is split into the packet's mid angle, j times the mean step of all packets
-    (a table) and j times what the packet's own step differs from it, whose sine and cosine are a short
-    Taylor series. All of that is one small matrix product per batch instead of a sine per point.
+    The head angle of slot j is split into the packet's mid angle, j times the mean step of all
+    packets (a table) and j times what the packet's own step differs from it, whose sine and cosine
+    are a short Taylor series. All of that is one small matrix product per batch instead of a sine
+    per point.
     """
     step = raw["com_horizontal_angle_step"].astype(np.float64)
     start = raw["com_horizontal_angle_start"].astype(np.float64) + table.theta_bias
     middle = (len(table.u) - 1) / 2
-    j = np.arange(len(table.u)) - middle
+    j: F8 = np.arange(len(table.u), dtype=np.float64) - middle
     mid = start + step * middle
     mean = float(step.mean())
     delta = step - mean

@@ -1,8 +1,8 @@
-"""Turns points into a levelled frame with the sensor's own orientation, one orientation per packet.
+"""Turns points into a levelled frame with the sensor's own orientation, one per packet.
 
-This is what upstream's ``imu_adjust`` does. It is no motion compensation: it turns each packet as a whole,
-knows no translation, and its result is level with gravity instead of fixed to the sensor. The companion
-package deskews properly and needs this off.
+This is what upstream's ``imu_adjust`` does. It is no motion compensation: it turns each packet as
+a whole, knows no translation, and its result is level with gravity instead of fixed to the sensor.
+The companion package deskews properly and needs this off.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Levelling:
         return _keep(points, known[packet], batch.first_s, batch.counts * known)
 
     def _rotation(self, wxyz: Quaternion) -> NDArray[np.float64]:
-        """Return the rotation from the sensor to the levelled frame, without the yaw if so asked."""
+        """Return the rotation from the sensor to the levelled frame."""
         w, x, y, z = wxyz
         matrix = np.array(
             [

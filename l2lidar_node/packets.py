@@ -1,4 +1,4 @@
-"""Turns a frame into a typed packet or a decode error; the only reader of payload bytes besides geometry."""
+"""Turns a frame into a typed packet or a decode error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from l2lidar_node.types import DeviceNs, Quaternion, Vector3
 
 NS: Final = 1_000_000_000
 
-# Measurements are decoded hundreds of times a second: one precompiled struct each instead of a dtype view.
+# Measurements are decoded hundreds of times a second: one precompiled struct each instead of a
+# dtype view.
 _POINTS_3D = struct.Struct("<4I 36x 8f 8f I")
 _POINTS_2D = struct.Struct("<4I 36x 8f 6f I")
 _IMU = struct.Struct("<4I 4f 3f 3f")
@@ -77,7 +78,7 @@ class Version:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The device's answer to a command; ``status`` may be a number :class:`wire.AckStatus` lacks."""
+    """The device's answer to a command; ``status`` need not be a :class:`wire.AckStatus`."""
 
     packet_type: int
     command: int
@@ -226,14 +227,16 @@ def _parameters(payload: bytes) -> Parameters | DecodeError:
     if len(payload) < fields["work_mode"][1] + 4:
         return DecodeError(wire.PacketType.PARAMETERS, "length")
 
-    def value(name: str, layout: str) -> float | None:
+    def metres(name: str) -> float | None:
         offset = fields[name][1]
-        return None if len(payload) < offset + 4 else struct.unpack_from(layout, payload, offset)[0]
+        if len(payload) < offset + 4:
+            return None
+        return float(struct.unpack_from("<f", payload, offset)[0])
 
     return Parameters(
         work_mode=struct.unpack_from("<I", payload, fields["work_mode"][1])[0],
-        range_min=value("range_min", "<f"),
-        range_max=value("range_max", "<f"),
+        range_min=metres("range_min"),
+        range_max=metres("range_max"),
         payload=payload,
     )
 

@@ -69,7 +69,11 @@ class Requests:
                 ok = ack.status == wire.AckStatus.OK
                 text = "acknowledged" if ok else f"refused: {_status(ack.status)}"
                 return Answer(
-                    entry.ticket, entry.command, ok, f"{entry.command.name}: {text}", now - entry.sent
+                    entry.ticket,
+                    entry.command,
+                    ok,
+                    f"{entry.command.name}: {text}",
+                    now - entry.sent,
                 )
         return None
 

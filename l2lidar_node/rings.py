@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 RINGS: Final = 32
 """Rings over the 90 degrees from horizon to zenith, 2.8 degrees each.
 
-A packet is an arc from horizon to horizon over the zenith, so the scanner has no lines of its own that go
-round. Elevation bands do go round, and that is what projection-based pipelines use a ring for.
+A packet is an arc from horizon to horizon over the zenith, so the scanner has no lines of its own
+that go round. Elevation bands do, and that is what projection-based pipelines use a ring for.
 """
 
 
@@ -31,4 +31,4 @@ def rings(points: NDArray[np.void]) -> NDArray[np.uint16]:
     horizontal = np.hypot(points["x"], points["y"])
     elevation = np.arctan2(points["z"], horizontal)
     ring = np.floor(elevation * (RINGS / (np.pi / 2)))
-    return np.clip(ring, 0, RINGS - 1).astype(np.uint16)
+    return np.asarray(np.clip(ring, 0, RINGS - 1), np.uint16)

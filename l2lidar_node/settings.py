@@ -1,26 +1,28 @@
-"""Declares a setting once: default, unit, range and description; everything else is derived from that.
+"""Declares a setting once: default, unit, range, meaning; all else is derived from that.
 
-A group of settings is a frozen dataclass whose fields are made by :func:`setting`. The ROS declaration,
-the check of a YAML file, the README table and the error messages all follow from the same metadata.
+A group of settings is a frozen dataclass whose fields are made by :func:`setting`. The ROS
+declaration, the check of a YAML file, the README table and the error messages all follow from the
+same metadata.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, get_type_hints
 
 _KEY = "l2lidar.setting"
 
 Scalar = bool | int | float | str
-Value = Scalar | tuple[str, ...] | tuple[float, ...]
+Value = Scalar | tuple[Scalar, ...]
+Kind = type[Any]
 G = TypeVar("G")
 
 
 class SettingError(ValueError):
-    """A value that a setting cannot take; the message names setting, value and what would be right."""
+    """A value that a setting cannot take; the message says which, and what would be right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ class Setting:
 
     name: str
     field: str
-    type: type
+    type: Kind
     default: Value
     doc: str
     unit: str = ""
@@ -60,7 +62,7 @@ class Setting:
     hi: float | None = None
     choices: tuple[str, ...] = ()
     live: bool = False
-    item: type | None = None
+    item: Kind | None = None
 
     @property
     def range_text(self) -> str:
@@ -78,40 +80,39 @@ class Setting:
         Raises
         ------
         SettingError
-            If the type is wrong, a number is not finite or out of range, or a string is not a choice.
+            If the type is wrong, a number is not finite or out of range, or a string is not a
+            choice.
         """
-        if self.item is not None:
-            return self._check_list(value)
-        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, self.type) or (isinstance(value, bool) and self.type is not bool):
-            raise SettingError(
-                f"parameter '{self.name}': {value!r} is a {type(value).__name__}, "
-                f"expected a {self.type.__name__}"
-            )
-        if isinstance(value, float) and not math.isfinite(value):
-            raise SettingError(f"parameter '{self.name}': {value!r} is not a finite number")
-        if isinstance(value, int | float) and not isinstance(value, bool):
+        if self.item is None:
+            return self._check_scalar(value, self.type)
+        if isinstance(value, str | bytes) or not isinstance(value, Iterable):
+            raise self._error(value, f"is of type {_type_name(value)}, expected list")
+        return tuple(self._check_scalar(element, self.item) for element in value)
+
+    def _check_scalar(self, value: object, kind: Kind) -> Scalar:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not isinstance(value, kind) and not (is_number and kind is float):
+            raise self._error(value, f"is of type {_type_name(value)}, expected {kind.__name__}")
+        if isinstance(value, bool) and kind is not bool:
+            raise self._error(value, f"is of type bool, expected {kind.__name__}")
+        if isinstance(value, int | float) and is_number:
+            if not math.isfinite(value):
+                raise self._error(value, "is not a finite number")
             below = self.lo is not None and value < self.lo
             above = self.hi is not None and value > self.hi
             if below or above:
-                raise SettingError(
-                    f"parameter '{self.name}': {value!r} is out of range, expected {self.range_text}"
-                )
+                raise self._error(value, f"is out of range, expected {self.range_text}")
         if self.choices and value not in self.choices:
-            raise SettingError(
-                f"parameter '{self.name}': {value!r} is not known, expected one of {self.range_text}"
-            )
-        return value  # type: ignore[return-value]  # the isinstance test above has the type in a variable
+            raise self._error(value, f"is not known, expected one of {self.range_text}")
+        checked: Scalar = kind(value)
+        return checked
 
-    def _check_list(self, value: object) -> Value:
-        if isinstance(value, str | bytes) or not hasattr(value, "__iter__"):
-            raise SettingError(
-                f"parameter '{self.name}': {value!r} is a {type(value).__name__}, expected a list"
-            )
-        assert self.item is not None
-        element = dataclasses.replace(self, type=self.item, item=None)
-        return tuple(element.check(item) for item in value)  # type: ignore[return-value]  # of one type
+    def _error(self, value: object, text: str) -> SettingError:
+        return SettingError(f"parameter '{self.name}': {value!r} {text}")
+
+
+def _type_name(value: object) -> str:
+    return type(value).__name__
 
 
 def _number(value: float | None) -> str:
@@ -134,7 +135,15 @@ def setting(
     ``name`` is only needed where users know the setting under a name that is not the field's.
     See :class:`Setting` for the other arguments.
     """
-    metadata = {"doc": doc, "name": name, "unit": unit, "lo": lo, "hi": hi, "choices": choices, "live": live}
+    metadata = {
+        "doc": doc,
+        "name": name,
+        "unit": unit,
+        "lo": lo,
+        "hi": hi,
+        "choices": choices,
+        "live": live,
+    }
     return field(default=default, metadata={_KEY: metadata})
 
 
@@ -222,7 +231,10 @@ def change(group: G, values: Mapping[str, object]) -> G:
 
 def markdown_table(group: type) -> str:
     """Return the README's table of a group's settings: name, type, default, range, meaning."""
-    rows = ["| Parameter | Type | Default | Range | Live | Description |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| Parameter | Type | Default | Range | Live | Description |",
+        "|---|---|---|---|---|---|",
+    ]
     for item in settings_of(group):
         kind = f"list of {item.item.__name__}" if item.item else item.type.__name__
         rows.append(

@@ -1,4 +1,4 @@
-"""The socket: datagrams of one sender with the kernel's own arrival times, and frames back to it."""
+"""The socket: datagrams of one sender with the kernel's arrival times, and frames to it."""
 
 from __future__ import annotations
 
@@ -145,8 +145,9 @@ def _bind_advice(config: NetworkConfig, error: OSError) -> str:
     address = f"{config.host_ip}:{config.host_port}"
     if error.errno == errno.EADDRNOTAVAIL:
         return (
-            f"cannot listen on {address}: host_ip '{config.host_ip}' is no address of this machine; "
-            "give a network interface this address, or set host_ip to one it has (0.0.0.0 for all)"
+            f"cannot listen on {address}: host_ip '{config.host_ip}' is no address of this "
+            "machine; give a network interface this address, or set host_ip to one it has "
+            "(0.0.0.0 for all)"
         )
     if error.errno == errno.EADDRINUSE:
         return (

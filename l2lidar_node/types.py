@@ -32,7 +32,7 @@ IMU_SAMPLE: Final = np.dtype(
         ("stamp", "<i8"),  # [ns] host clock
         ("orientation_wxyz", "<f8", (4,)),  # unit quaternion, IMU to a z-up world, yaw arbitrary
         ("angular_velocity", "<f8", (3,)),  # [rad/s] IMU frame
-        ("linear_acceleration", "<f8", (3,)),  # [m/s^2] IMU frame, specific force (+g upwards at rest)
+        ("linear_acceleration", "<f8", (3,)),  # [m/s^2] IMU frame, specific force, +g up at rest
     ]
 )
 """One IMU sample; an array of samples is in strictly ascending order of ``stamp``."""

@@ -1,4 +1,4 @@
-"""Tells what the device is doing from what was heard of it, and when it has been silent for too long."""
+"""Tells what the device is doing from what is heard of it, and when silence lasts too long."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Watchdog:
         return DeviceState.STALLED if self._last else DeviceState.WAITING
 
     def spin_up_left_s(self, now: HostNs) -> float:
-        """Return the seconds until points can be expected after power-on; 0 when they are overdue."""
+        """Return the seconds until points can be expected; 0 when they are overdue."""
         if self._imu_since is None:
             return SPIN_UP_NS / 1e9
         return max(0.0, (self._imu_since + SPIN_UP_NS - now) / 1e9)

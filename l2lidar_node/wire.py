@@ -1,8 +1,8 @@
-"""States the wire format of the Unitree L2 once: numbers, layouts, sizes and the frame around them.
+"""States the wire format of the Unitree L2 once: numbers, layouts, sizes, and the frame.
 
-Facts come from Unitree's BSD-3 headers (unilidar_sdk2) and from the behaviour of its client. All numbers
-are little-endian and packed. Sizes called ``size`` include the 12-byte header and the 12-byte tail; a
-``payload`` is what stands between them. The CRC-32 covers the payload only.
+Facts come from Unitree's BSD-3 headers (unilidar_sdk2) and from the behaviour of its client. All
+numbers are little-endian and packed. Sizes called ``size`` include the 12-byte header and the
+12-byte tail; a ``payload`` is what stands between them. The CRC-32 covers the payload only.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 MAGIC: Final = b"\x55\xaa\x05\x0a"
 TAIL_END: Final = b"\x00\xff"
 HEADER: Final = struct.Struct("<4sII")  # magic, packet type, size of the whole frame
-TAIL: Final = struct.Struct("<II2s2s")  # crc of the payload, type check (ignored), reserve (ignored), end mark
+TAIL: Final = struct.Struct("<II2s2s")  # crc of the payload, two ignored fields, end mark
 OVERHEAD: Final = HEADER.size + TAIL.size
 
 POINTS_PER_3D_PACKET: Final = 300
@@ -32,7 +32,7 @@ SERIAL_BAUD: Final = 4_000_000
 
 IMU_RATE_HZ: Final = 250.0
 MIRROR_PERIOD_S: Final = 0.004639  # one fast-mirror turn, so one 3D packet
-IMU_POSITION_M: Final = (-0.007698, -0.014655, 0.00667)  # IMU origin in the cloud frame; axes are parallel
+IMU_POSITION_M: Final = (-0.007698, -0.014655, 0.00667)  # in the cloud frame; axes are parallel
 QUATERNION_NORM: Final = 0.9983  # what units really send
 
 
