@@ -223,4 +223,4 @@ class DeviceConfig:
     crystal: CrystalConfig = field(default_factory=CrystalConfig)
     delays: DelayConfig = field(default_factory=DelayConfig)
     faults: FaultConfig = field(default_factory=FaultConfig)
-    seed: int = setting(1, "seed of everything that is random", lo=0, hi=2**31 - 1)
+    seed: int = setting(0, "everything random follows from this number", lo=0, hi=2**63 - 1)

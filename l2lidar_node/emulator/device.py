@@ -151,6 +151,16 @@ class VirtualL2:
         return self._firmware.boots
 
     @property
+    def power_on_ns(self) -> int:
+        """True instant of the first power-on."""
+        return self._origin_ns
+
+    @property
+    def now_ns(self) -> int:
+        """True instant up to which everything has happened."""
+        return self._now_ns
+
+    @property
     def sent(self) -> Counter[PacketType]:
         """Packets that left the unit so far by type, over restarts."""
         return self._ordinal.copy()

@@ -9,10 +9,11 @@ import numpy as np
 
 from l2lidar_node import wire
 from l2lidar_node.emulator.clock import UnitClock
-from l2lidar_node.emulator.config import DeviceConfig
+from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig
 from l2lidar_node.emulator.flash import Flash, Network, mac_text, parameters_payload
 from l2lidar_node.emulator.inbox import Received
 from l2lidar_node.emulator.power import Power, Readiness
+from l2lidar_node.settings import SettingError
 from l2lidar_node.wire import AckStatus, Command, PacketType, UserCommand, WorkMode
 
 _LIVE: Final = WorkMode.WIDE_FOV | WorkMode.IMU_OFF
@@ -52,6 +53,7 @@ class Firmware:
 
     def __init__(self, config: DeviceConfig, flash: Flash, now_ns: int) -> None:
         self._config = config
+        self._identity = self._version(config.identity)
         self._factory = Flash.factory(config.addresses, config.identity)
         self.flash = flash
         self.clock = UnitClock(config.crystal, now_ns)
@@ -110,7 +112,7 @@ class Firmware:
             if readiness is Readiness.SPINNING_UP:
                 status = AckStatus.NOT_READY
             else:
-                data.append((PacketType.VERSION, self._version()))
+                data.append((PacketType.VERSION, self._identity))
         elif key in _PARAMETERS:
             data.append((PacketType.PARAMETERS, parameters_payload(self.flash)))
         elif key in _STANDBY:
@@ -155,11 +157,11 @@ class Firmware:
             return AckStatus.HEADER_ERROR
         return AckStatus.OK
 
-    def _version(self) -> bytes:
-        identity = self._config.identity
+    @staticmethod
+    def _version(identity: IdentityConfig) -> bytes:
         row = np.zeros(1, wire.VERSION_PAYLOAD)
-        row["hardware"] = [int(part) for part in identity.hardware.split(".")]
-        row["software"] = [int(part) for part in identity.firmware.split(".")]
+        row["hardware"] = tuple(_version_bytes("hardware", identity.hardware))
+        row["software"] = tuple(_version_bytes("firmware", identity.firmware))
         row["name"] = identity.product.encode()
         row["date"] = identity.firmware_date.encode()
         return row.tobytes()
@@ -168,6 +170,18 @@ class Firmware:
 def _ack(packet_type: int, status: AckStatus, command: int = 0, value: int = 0) -> Reply:
     row = np.array([(packet_type, command, value, status)], wire.ACK_PAYLOAD)
     return PacketType.ACK, row.tobytes()
+
+
+def _version_bytes(name: str, text: str) -> bytes:
+    try:
+        numbers = bytes(int(part) for part in text.split("."))
+    except ValueError:
+        numbers = b""
+    if len(numbers) != 4:
+        raise SettingError(
+            f"parameter '{name}': {text!r} is no version, expected four numbers as 2.8.11.1"
+        )
+    return numbers
 
 
 def _is_known(family: PacketType, command: int) -> bool:

@@ -13,14 +13,14 @@ class Lateness:
 
     def __init__(self) -> None:
         self._counts = [0] * (_BINS + 1)
-        self._total = 0
+        self.count = 0
         self.max_ns = 0
 
     def add(self, late_ns: int) -> None:
         """Count one delay; a negative one counts as none."""
         late_ns = max(late_ns, 0)
         self._counts[min(late_ns // _BIN_NS, _BINS)] += 1
-        self._total += 1
+        self.count += 1
         self.max_ns = max(self.max_ns, late_ns)
 
     def quantile_ns(self, share: float) -> int:
@@ -28,6 +28,6 @@ class Lateness:
         seen = 0
         for number, count in enumerate(self._counts):
             seen += count
-            if count and seen >= share * self._total:
+            if count and seen >= share * self.count:
                 return min((number + 1) * _BIN_NS, self.max_ns)
         return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import IntFlag, auto
 from typing import Final, NamedTuple
@@ -73,7 +74,12 @@ class Ledger:
     Parameters
     ----------
     keep : int or None
-        How many of the latest packets and events to remember; None for all (112 MB an hour).
+        How many of the latest packets and events to remember; None for all (105 MB an hour).
+
+    Attributes
+    ----------
+    counts : Counter
+        How often each fault happened.
     """
 
     def __init__(self, keep: int | None = None) -> None:
@@ -83,6 +89,7 @@ class Ledger:
         self._dropped = 0
         self._events: list[FaultEvent] = []
         self._cursor = (JUNK, 0)
+        self.counts: Counter[Fault] = Counter()
 
     @property
     def packets(self) -> NDArray[np.void]:
@@ -116,6 +123,7 @@ class Ledger:
 
     def note(self, time_ns: int, fault: Fault, datagram: Datagram | None = None) -> None:
         """Log a fault and mark the packets that it touched."""
+        self.counts[fault] += 1
         rows = {piece.row for piece in datagram.pieces if piece.row != JUNK} if datagram else set()
         for row in sorted(rows):
             at = row - self._dropped

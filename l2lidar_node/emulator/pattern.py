@@ -48,9 +48,11 @@ class PatternScanner:
         Field of view of 192 instead of 180 degrees.
     flat : bool
         2D packets instead of 3D ones: one plane, no head angle.
+    empty : bool
+        No slot returns anything.
     """
 
-    def __init__(self, wide: bool = False, flat: bool = False) -> None:
+    def __init__(self, wide: bool = False, flat: bool = False, empty: bool = False) -> None:
         self._flat = flat
         dtype = wire.POINTS_2D_PAYLOAD if flat else wire.POINTS_3D_PAYLOAD
         slots = wire.POINTS_PER_2D_PACKET if flat else wire.POINTS_PER_3D_PACKET
@@ -67,7 +69,7 @@ class PatternScanner:
         row["point_num"] = slots
         slot = np.arange(slots)
         raw = 365.625 + (3.0 + 0.05 * ((slot * 12 // slots) % 2)) / 0.000978
-        row["ranges"] = np.where(slot % 25 == 24, 0, np.rint(raw))
+        row["ranges"] = 0 if empty else np.where(slot % 25 == 24, 0, np.rint(raw))
         row["intensities"] = 60 + 120 * slot // slots
         if not flat:
             row["com_horizontal_angle_step"] = (

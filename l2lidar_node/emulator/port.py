@@ -7,13 +7,18 @@ import os
 import select
 import socket
 import termios
+import time
 import tty
 from typing import Final, Protocol
 
+from l2lidar_node.emulator import backlog
 from l2lidar_node.emulator.flash import Network
 
 _READ: Final = 65536
 _SEND_BUFFER: Final = 1 << 20
+_CHECK_EVERY: Final = 8  # datagrams between two looks at the receiver
+_FULL: Final = 48 * 1024  # the usual receive buffer is 208 kB; eight datagrams more weigh 20 kB
+_LOOK_AGAIN_S: Final = 1e-4
 _GONE: Final = {
     errno.ENETUNREACH,
     errno.EHOSTUNREACH,
@@ -47,8 +52,14 @@ class Port(Protocol):
         """Send without waiting; False when it had to be dropped."""
         ...
 
-    def drain(self, timeout_s: float) -> None:
-        """Wait until the host has taken most of what was sent, as far as that can be known."""
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until the host has taken most of what was sent, as far as that can be known.
+
+        Returns
+        -------
+        bool
+            False when it had not after the time.
+        """
         ...
 
     def follow(self, network: Network) -> None:
@@ -81,6 +92,7 @@ class UdpPort:
         self._socket = _bound(network)
         self._network = network
         self._host = (network.user_ip, network.user_port)
+        self._unchecked = 0
 
     @property
     def address(self) -> tuple[str, int]:
@@ -128,8 +140,18 @@ class UdpPort:
             raise
         return True
 
-    def drain(self, timeout_s: float) -> None:
-        """Return at once: nobody tells how much of what was sent has been read."""
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until a receiver on this machine has little left to read; else return at once."""
+        self._unchecked += 1
+        if self._unchecked < _CHECK_EVERY:
+            return True
+        deadline = time.monotonic() + timeout_s
+        while (backlog.unread(*self._host) or 0) > _FULL:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(_LOOK_AGAIN_S)
+        self._unchecked = 0
+        return True
 
     def follow(self, network: Network) -> None:
         """Move to other addresses.
@@ -199,9 +221,9 @@ class SerialPort:
         except (BlockingIOError, OSError):
             return False
 
-    def drain(self, timeout_s: float) -> None:
+    def drain(self, timeout_s: float) -> bool:
         """Wait until the line takes bytes again."""
-        select.select([], [self._descriptor], [], timeout_s)
+        return bool(select.select([], [self._descriptor], [], timeout_s)[1])
 
     def follow(self, network: Network) -> None:
         """Do nothing: a serial line has no address."""

@@ -25,7 +25,6 @@ class Server:
     Parameters
     ----------
     device : VirtualL2
-        Its power-on instant is when :meth:`run` starts to send.
     port : Port
     speed : float
         Seconds of the unit's life per second; with :data:`MAX_SPEED` the receiver sets the pace.
@@ -61,14 +60,14 @@ class Server:
         """Let :meth:`run` return soon; may be called from a signal handler or another thread."""
         self._is_stopped = True
 
-    def run(self, power_on_ns: int, duration_s: float = math.inf) -> None:
+    def run(self, duration_s: float = math.inf) -> None:
         """Serve until :meth:`stop` or the end of a duration.
+
+        The unit's instant of power-on is taken for one on the wall clock; from then on the
+        monotonic clock counts.
 
         Parameters
         ----------
-        power_on_ns : int
-            Wall clock instant of power-on, as the unit was told; later ones follow the
-            monotonic clock.
         duration_s : float
             Seconds of the unit's life after power-on.
 
@@ -77,6 +76,7 @@ class Server:
         PortError
             If the unit moves to an address that cannot be bound.
         """
+        power_on_ns = self._device.power_on_ns
         end_ns = math.inf if math.isinf(duration_s) else power_on_ns + round(duration_s * 1e9)
         if math.isinf(self._speed):
             self._race(power_on_ns, end_ns)
@@ -111,7 +111,8 @@ class Server:
             if next_ns is None:
                 select.select([self._port], [], [], _CHUNK_NS * 1e-9)
             for _, data in self._device.advance(now_ns):
-                self._port.drain(_LONGEST_WAIT_S)
+                while not self._port.drain(_LONGEST_WAIT_S) and not self._is_stopped:
+                    pass
                 self.unsent += not self._port.send(data)
 
     def _listen(self, now: Callable[[], int]) -> None:
