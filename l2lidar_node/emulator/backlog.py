@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import socket
+import ipaddress
 from pathlib import Path
 from typing import Final
 
@@ -24,7 +24,7 @@ def unread(ip: str, port: int) -> int | None:
         None when no socket of this machine listens there, or the system does not tell.
     """
     wanted = f":{port:04X}"
-    address = f"{int.from_bytes(socket.inet_aton(ip), 'little'):08X}"
+    address = f"{int.from_bytes(ipaddress.IPv4Address(ip).packed, 'little'):08X}"
     found: int | None = None
     for table in _TABLES:
         try:
