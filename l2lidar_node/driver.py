@@ -7,7 +7,7 @@ output as the live sensor did.
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -36,6 +36,7 @@ from l2lidar_node.watchdog import DeviceState, Watchdog
 
 QUERY_NS: Final = 1_000_000_000  # interval of version, parameter and latency requests
 REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlier one
+_ROUND_TRIPS: Final = 60  # the last minute's
 RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this began anew
 
 
@@ -135,6 +136,7 @@ class Driver:
         self.last_points: bytes | None = None
         self.last_imu: ImuSample | None = None
         self.gravity = GravityMonitor()
+        self.round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
         self._config = config
         self._framer = Framer()
         self._orders = {
@@ -350,6 +352,7 @@ class Driver:
             return []
         if answer.command.name == "latency":
             if answer.round_trip_ns is not None:
+                self.round_trips.append(answer.round_trip_ns)
                 self._clock.round_trip(answer.round_trip_ns)
             return []
         return [answer]

@@ -5,6 +5,7 @@ OK needs nobody's attention, WARN should be looked at, ERROR means that data are
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -83,7 +84,7 @@ def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
     checks = [
         _device(driver, before, after, seconds),
         _link(before, after),
-        _clock(driver.clock_status(), before.counters, after.counters),
+        _clock(driver.clock_status(), driver.round_trips, before.counters, after.counters),
         _points(before.counters, after.counters, seconds),
     ]
     if driver.last_points is not None:
@@ -180,10 +181,26 @@ def _link(before: Period, after: Period) -> Check:
     return Check("link", Level.OK, "no loss", values)
 
 
-def _clock(status: ClockStatus, old: Counters, new: Counters) -> Check:
-    values = {name.replace("_", " "): text for name, text in status.figures().items()}
+def _clock(
+    status: ClockStatus, round_trips: Collection[int], old: Counters, new: Counters
+) -> Check:
     unlocked = sum(new.unlocked.values()) - sum(old.unlocked.values())
-    values["packets before lock"] = str(sum(new.unlocked.values()))
+    values = {
+        "mode": status.mode,
+        "ratio": f"{status.ratio:.7f}",
+        "offset [s]": f"{status.offset_ns / 1e9:.6f}",
+        "residual [ms]": f"{status.residual_ns / 1e6:.3f}",
+        "path delay [ms]": f"{status.path_delay_ns / 1e6:.3f}",
+        "epochs": str(status.epochs),
+        "packets without stamp": str(sum(new.unlocked.values())),
+        **{f"{kind.value} events": str(count) for kind, count in status.events.items()},
+    }
+    if round_trips:
+        values |= {
+            "round trip min [ms]": f"{min(round_trips) / 1e6:.3f}",
+            "round trip mean [ms]": f"{sum(round_trips) / len(round_trips) / 1e6:.3f}",
+            "round trip max [ms]": f"{max(round_trips) / 1e6:.3f}",
+        }
     if not status.locked:
         level = Level.WARN if unlocked else Level.OK
         return Check("clock", level, "not locked yet" if unlocked else "no data yet", values)
