@@ -8,9 +8,10 @@ from typing import Final
 FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
 
 _LEARN: Final = 9  # packets from which the period is learned
-_FLOOR_NS: Final = 5_000.0  # deviations this small are never a step
+_FLOOR_NS: Final = 2_000.0  # deviations this small are never a step
 _CEILING_NS: Final = 50_000.0
 _SIGMAS: Final = 8.0  # in mean absolute deviations
+_NEAR: Final = 64  # packets; numbers that far ahead after a wrap are believed
 _SLIP: Final = 0.05  # of the advance: more irregular than that a stream is not
 
 
@@ -100,27 +101,24 @@ class Cadence:
 
     def resume(self, seq: int, advance: int) -> None:
         """Go on from a packet that is not where it was expected, or where a step was bridged."""
-        gap = seq - self._seq
-        if gap < 0 and self._modulus:
-            gap += self._modulus
-        off = advance - gap * self._period - self._lag
+        off = advance - self.gap(seq, advance) * self._period - self._lag
         self._lag = (self._gain - 1.0) * off if abs(off) < self._tolerance else 0.0
         self._seq = seq
-        if seq >= self._modulus > 0:
-            self._modulus = 0
 
     def gap(self, seq: int, advance: int) -> int:
         """Return how many numbers a packet is after the last one; learn from it where numbers wrap."""
         gap = seq - self._seq
         if gap > 0:
             return gap
-        if self._modulus and abs(advance - (gap + self._modulus) * self._period) < self._period:
+        if self._seq >= self._modulus:
+            self._modulus = 0
+        elif 0 < gap + self._modulus <= _NEAR:
             return gap + self._modulus
         counted = round(advance / self._period)
-        if 0 < counted <= 64 and abs(advance - counted * self._period) <= self.slip(counted):
-            self._modulus = max(self._seq + counted - seq, 0)
+        if 0 < counted <= _NEAR and abs(advance - counted * self._period) <= self._tolerance:
+            self._modulus = self._seq + counted - seq
             return counted
-        return gap + self._modulus
+        return gap + self._modulus if self._modulus else 1
 
     def advance(self, gap: int) -> int:
         """Return the device time from the last packet to one some numbers later [ns]."""

@@ -29,6 +29,7 @@ _SILENT_NS: Final = 1_000 * _MS
 _BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
 _KEEP: Final = 16  # epochs that packets on their way may still belong to
 _SYNCS: Final = 128
+_NEVER: Final = 1 << 80  # after every stamp
 
 
 class Step(Enum):
@@ -97,6 +98,7 @@ class DeviceLine:
         self._lateness = lateness
         self._syncs: deque[tuple[int, int]] = deque(maxlen=_SYNCS)
         self._epochs: deque[_Epoch] = deque(maxlen=_KEEP)
+        self._newest = _NEVER  # value of the latest sync that is known to have taken effect
         self._imu = _Track(_IMU_GAIN)
         self._points = _Track(_POINTS_GAIN)
 
@@ -105,8 +107,9 @@ class DeviceLine:
         self._syncs.append((value, sent))
 
     def restart(self) -> None:
-        """Forget everything but how regular the streams are."""
+        """Forget everything but how sequence numbers wrap."""
         self._epochs.clear()
+        self._newest = _NEVER
         for track in (self._imu, self._points):
             track.epoch = None
             track.suspect = None
@@ -123,7 +126,8 @@ class DeviceLine:
         if epoch is None:
             return self._join(track, seq, stamp, arrival)
         u = stamp - epoch.base
-        if track.cadence.follows(seq, u - track.u):
+        behind = stamp >= self._newest and epoch.value != self._newest
+        if not behind and track.cadence.follows(seq, u - track.u):
             track.u = u
             track.stamp = stamp
             track.arrival = arrival
@@ -143,11 +147,10 @@ class DeviceLine:
         reach = _SILENT_NS if waited < _SILENT_NS else _REACH_NS
         counted = gap > 0 and abs(advance * self.ratio - waited) < reach
         if counted:
-            value = self._own_sync(stamp, advance, epoch)
-            if value is not None:
-                begun = self._begun(track, value, stamp - expected)
-                return self._accept(track, begun, seq, stamp, arrival)
             slip = cadence.slip(gap)
+            begun = self._begun(track, epoch, stamp, expected)
+            if begun is not None:
+                return self._accept(track, begun, seq, stamp, arrival)
             for other in (epoch, *reversed(self._epochs)):
                 if abs(stamp - other.base - expected) <= slip:
                     return self._accept(track, other, seq, stamp, arrival)
@@ -155,6 +158,32 @@ class DeviceLine:
         if late and self._possible(track, u, arrival):
             return self._accept(track, epoch, seq, stamp, arrival)
         return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)
+
+    def _begun(
+        self, track: _Track, epoch: _Epoch, stamp: int, expected: int
+    ) -> _Epoch | None:
+        """Return the epoch of the sync of this host that a stamp is just after.
+
+        The stream that comes first tells where the epoch lies on the line; the IMU stream, which is more
+        regular, has the last word.
+        """
+        value = self._own_sync(stamp, expected - track.u, epoch)
+        if value is None:
+            return None
+        base = stamp - expected
+        for begun in reversed(self._epochs):
+            if begun.value == value:
+                if abs(begun.base - base) > abs(epoch.base - base):
+                    return None  # not stepped yet
+                if track is self._imu:
+                    if self._points.epoch is begun:
+                        self._points.u += begun.base - base
+                    begun.base = base
+                return begun
+        self.epochs += 1
+        self._newest = value
+        self._epochs.append(_Epoch(base, value))
+        return self._epochs[-1]
 
     def _own_sync(self, stamp: int, advance: int, epoch: _Epoch) -> int | None:
         """Return the value of the sync that a stamp is just after."""
@@ -168,19 +197,6 @@ class DeviceLine:
     def _synced_since(self, track: _Track) -> bool:
         """Whether a sync may have stepped the clock since the last packet."""
         return any(sent > track.arrival - _LATE_NS for _, sent in self._syncs)
-
-    def _begun(self, track: _Track, value: int, base: int) -> _Epoch:
-        """Return the epoch that a sync began; the IMU stream, more regular, has the last word on it."""
-        for epoch in reversed(self._epochs):
-            if epoch.value == value:
-                if track is self._imu:
-                    if self._points.epoch is epoch:
-                        self._points.u += epoch.base - base
-                    epoch.base = base
-                return epoch
-        self.epochs += 1
-        self._epochs.append(_Epoch(base, value))
-        return self._epochs[-1]
 
     def _accept(self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int) -> int:
         u = stamp - epoch.base
