@@ -1,13 +1,15 @@
 """Turns a byte stream cut anywhere into frames and frame errors; bounded and resynchronising.
 
-The stream is what one sender puts into datagrams (or onto a serial line). Frames may be coalesced, split at
-any byte, damaged, or have garbage between them. The rules:
+The stream is what one sender puts into datagrams (or onto a serial line). Frames may be coalesced,
+split at any byte, damaged, or have garbage between them. The rules:
 
-* a bad frame gives up one byte and the search for the next magic starts there, so it costs itself only;
-* a datagram that consists of whole good frames is taken as it is, even while an earlier frame is still
-  incomplete: the stub of a truncated frame delays nothing, and a frame whose fragments have another
-  packet between them still completes;
-* no more than one maximal frame is ever held back.
+* a bad frame gives up one byte and the search for the next magic starts there, so it costs itself
+  only;
+* a datagram that begins with a magic and ends with a frame is taken as it is, even while an
+  earlier frame is incomplete: one whose fragments have another packet between them completes;
+* good frames behind an incomplete one are taken out at once, so the stub of a truncated frame
+  delays nothing, however much it claims;
+* less than one maximal frame is ever held back.
 """
 
 from __future__ import annotations
@@ -62,8 +64,9 @@ FramingEvent = Frame | FrameError
 class Framer:
     """Cuts one sender's byte stream into frames.
 
-    The frames do not depend on how the stream was cut into datagrams. Whatever the bytes are, nothing is
-    raised and at most :data:`wire.MAX_FRAME` bytes are kept for the next call.
+    Whatever the bytes are and however they are cut, nothing is raised, less than
+    :data:`wire.MAX_FRAME` bytes are kept for the next call, and no byte is checked again but for
+    another magic.
     """
 
     def __init__(self) -> None:
@@ -76,16 +79,11 @@ class Framer:
 
     def feed(self, data: bytes) -> list[FramingEvent]:
         """Return the frames and errors that these bytes complete, in order."""
-        if not self._pending:
-            events, consumed = _parse(data)
-            self._pending = data[consumed:]
-            return events
-        events, consumed = _parse(data)
-        if consumed == len(data) and all(type(event) is Frame for event in events):
-            return events
-        data = self._pending + data
-        events, consumed = _parse(data)
-        self._pending = data[consumed:]
+        if self._pending and data.startswith(wire.MAGIC):
+            events, rest = _parse(data, 0)
+            if not rest:
+                return events
+        events, self._pending = _parse(self._pending + data, len(self._pending))
         return events
 
     def reset(self) -> None:
@@ -93,41 +91,68 @@ class Framer:
         self._pending = b""
 
 
-def _parse(data: bytes) -> tuple[list[FramingEvent], int]:
-    """Return the events in ``data`` and how many bytes they account for; the rest is incomplete."""
+def _parse(data: bytes, seen: int) -> tuple[list[FramingEvent], bytes]:
+    """Return the events in ``data``, whose first ``seen`` bytes are not new, and what is left."""
     events: list[FramingEvent] = []
-    end = len(data)
     at = 0
-    while at < end:
+    while at < len(data):
         if not data.startswith(wire.MAGIC, at):
             start = _next_magic(data, at)
-            if start > at:
-                events.append(FrameError(Fault.JUNK, start - at))
-                at = start
-                continue
-            break  # a piece of a magic at the very end
-        if end - at < _HEADER_SIZE:
-            break
-        _, packet_type, size = wire.HEADER.unpack_from(data, at)
-        fault: Fault
-        if not _plausible(packet_type, size):
-            fault = Fault.SIZE
-        elif end - at < size:
-            break
-        elif data[at + size - 2 : at + size] != wire.TAIL_END:
-            fault = Fault.TAIL
+            if start == at:
+                break  # a piece of a magic at the very end
+            events.append(FrameError(Fault.JUNK, start - at))
+            at = start
+            continue
+        found = _frame_at(data, at)
+        if found is None:
+            return events, _take_out(data, at, seen, events)
+        if isinstance(found, Frame):
+            events.append(found)
+            at += len(found.payload) + wire.OVERHEAD
         else:
-            payload = data[at + _HEADER_SIZE : at + size - _TAIL_SIZE]
-            crc = wire.TAIL.unpack_from(data, at + size - _TAIL_SIZE)[0]
-            if zlib.crc32(payload) == crc:
-                events.append(Frame(packet_type, payload))
-                at += size
-                continue
-            fault = Fault.CRC
-        start = _next_magic(data, at + 1)
-        events.append(FrameError(fault, start - at))
-        at = start
-    return events, at
+            start = _next_magic(data, at + 1)
+            events.append(FrameError(found, start - at))
+            at = start
+    return events, data[at:]
+
+
+def _take_out(data: bytes, at: int, seen: int, events: list[FramingEvent]) -> bytes:
+    """Move the good frames behind the incomplete one at ``at`` to the events; return the rest.
+
+    A frame that ends within the bytes seen before was looked at then.
+    """
+    rest = b""
+    begin = at
+    at = data.find(wire.MAGIC, at + 1)
+    while at >= 0:
+        found = _frame_at(data, at, seen)
+        if isinstance(found, Frame):
+            events.append(found)
+            rest += data[begin:at]
+            begin = at + len(found.payload) + wire.OVERHEAD
+        at = data.find(wire.MAGIC, max(at + 1, begin))
+    return rest + data[begin:]
+
+
+def _frame_at(data: bytes, at: int, seen: int = 0) -> Frame | Fault | None:
+    """Return the frame that begins here, or what is wrong with it.
+
+    None if it is not complete, or ended within the first ``seen`` bytes.
+    """
+    if len(data) - at < _HEADER_SIZE:
+        return None
+    _, packet_type, size = wire.HEADER.unpack_from(data, at)
+    if not _plausible(packet_type, size):
+        return Fault.SIZE
+    end = at + size
+    if not seen < end <= len(data):
+        return None
+    if data[end - 2 : end] != wire.TAIL_END:
+        return Fault.TAIL
+    payload = data[at + _HEADER_SIZE : end - _TAIL_SIZE]
+    if zlib.crc32(payload) != wire.TAIL.unpack_from(data, end - _TAIL_SIZE)[0]:
+        return Fault.CRC
+    return Frame(packet_type, payload)
 
 
 def _plausible(packet_type: int, size: int) -> bool:
