@@ -44,10 +44,26 @@ class Command(NamedTuple):
             return False
         if self.packet_type not in (wire.PacketType.USER_COMMAND, wire.PacketType.COMMAND):
             return True
-        command, value = struct.unpack("<2I", self.payload)
-        if ack.command != command:
+        if ack.command != struct.unpack_from("<I", self.payload)[0]:
             return False
-        return self.name != "latency" or ack.value == value
+        return not self.is_latency or self.is_echoed_by(ack)
+
+    def is_echoed_by(self, ack: Ack) -> bool:
+        """Tell whether an ACK repeats this command's number and value."""
+        return self.payload == struct.pack("<2I", ack.command, ack.value)
+
+    def is_same_kind(self, other: Command) -> bool:
+        """Tell whether another command sets what this one sets, so that the later one counts."""
+        if self.packet_type != other.packet_type or self.is_latency:
+            return False
+        is_numbered = self.packet_type in (wire.PacketType.USER_COMMAND, wire.PacketType.COMMAND)
+        return not is_numbered or self.payload[:4] == other.payload[:4]
+
+    @property
+    def is_latency(self) -> bool:
+        """Whether it only asks for an echo."""
+        latency = struct.pack("<I", wire.Command.LATENCY)
+        return self.packet_type == wire.PacketType.COMMAND and self.payload[:4] == latency
 
 
 def start() -> Command:

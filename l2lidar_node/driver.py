@@ -6,9 +6,8 @@ output as the live sensor did.
 
 from __future__ import annotations
 
-import dataclasses
-from collections import Counter, deque
-from dataclasses import dataclass, field
+from collections import deque
+from dataclasses import dataclass
 from typing import Final
 
 from l2lidar_node import commands, wire
@@ -16,6 +15,7 @@ from l2lidar_node.assembler import MAX_GAP_NS, SweepAssembler
 from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
 from l2lidar_node.commands import Command
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.counters import Counters
 from l2lidar_node.framing import FrameError, Framer
 from l2lidar_node.gravity import GravityMonitor
 from l2lidar_node.levelling import Levelling
@@ -30,9 +30,9 @@ from l2lidar_node.packets import (
     decode,
 )
 from l2lidar_node.requests import Answer, Requests
-from l2lidar_node.sequence import SequenceCounts, SequenceOrder
+from l2lidar_node.sequence import SequenceOrder
 from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep
-from l2lidar_node.watchdog import DeviceState, Watchdog
+from l2lidar_node.watchdog import SILENCE_NS, DeviceState, Watchdog
 
 QUERY_NS: Final = 1_000_000_000  # interval of version, parameter and latency requests
 REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlier one
@@ -48,69 +48,6 @@ class Silence:
 
 
 Event = Sweep | ImuSample | Version | Parameters | Answer | ClockEvent | Silence
-
-
-@dataclass(slots=True)
-class Counters:
-    """Everything that was counted since the start.
-
-    Attributes
-    ----------
-    datagrams, octets : int
-        What came from the device.
-    frames : Counter
-        Good frames by packet type.
-    faults : Counter
-        Damaged frames by kind, see :class:`l2lidar_node.framing.Fault`.
-    skipped_octets : int
-        Bytes that belonged to no good frame.
-    rejected : Counter
-        Good frames with impossible content, by ``<packet type>.<reason>``.
-    sequence : dict
-        Counts of :class:`SequenceCounts` by stream.
-    unlocked : Counter
-        Packets not used because the clock could not tell their time yet, by stream.
-    ignored_points : int
-        Packets of the dimension (2D or 3D) that was not asked for.
-    sweeps, empty_sweeps, samples : int
-        What was made; an empty sweep has no valid point and is not published.
-    points : int
-        Points in all sweeps.
-    slots : int
-        Slots measured in all sweeps, with a return or without.
-    unanswered : int
-        ACKs that belong to no command.
-    unlevelled : int
-        Points left out because ``imu_adjust`` had no orientation for them.
-    """
-
-    datagrams: int = 0
-    octets: int = 0
-    frames: Counter[int] = field(default_factory=Counter)
-    faults: Counter[str] = field(default_factory=Counter)
-    skipped_octets: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-    sequence: dict[Stream, SequenceCounts] = field(default_factory=dict)
-    unlocked: Counter[Stream] = field(default_factory=Counter)
-    ignored_points: int = 0
-    sweeps: int = 0
-    empty_sweeps: int = 0
-    samples: int = 0
-    points: int = 0
-    slots: int = 0
-    unanswered: int = 0
-    unlevelled: int = 0
-
-    def snapshot(self) -> Counters:
-        """Return a copy that does not change any more."""
-        return dataclasses.replace(
-            self,
-            frames=Counter(self.frames),
-            faults=Counter(self.faults),
-            rejected=Counter(self.rejected),
-            unlocked=Counter(self.unlocked),
-            sequence={key: dataclasses.replace(value) for key, value in self.sequence.items()},
-        )
 
 
 @dataclass(slots=True)
@@ -176,7 +113,8 @@ class Driver:
                 self.counters.faults[item.fault.value] += 1
                 self.counters.skipped_octets += item.skipped
                 continue
-            self.counters.frames[item.packet_type] += 1
+            is_known = item.packet_type in wire.FRAME_SIZES
+            self.counters.frames[item.packet_type if is_known else 0] += 1
             events += self._handle(decode(item), arrival)
         events += self._clock.events()
         return events
@@ -184,17 +122,16 @@ class Driver:
     def tick(self, now: HostNs) -> list[Event]:
         """Return what is due by now; to be called every few milliseconds."""
         events: list[Event] = []
-        for stream, order in self._orders.items():
-            newest = self._newest.get(stream)
-            if order.waiting and newest and now - newest.arrival > REORDER_NS:
-                events += self._released(order.flush())
+        for order in self._orders.values():
+            while order.oldest and now - order.oldest.arrival > REORDER_NS:
+                events += self._released(order.give_up())
         newest = self._newest.get(Stream.POINTS)
-        if newest and self._assembler.last_start and now - newest.arrival > MAX_GAP_NS:
+        if newest and now - newest.arrival > MAX_GAP_NS:
             events += self._finished(self._assembler.flush())
         self._send_due(now)
         repeats, given_up = self._requests.expire(now)
         self._outbox += [command.encode() for command in repeats]
-        events += [answer for answer in given_up if answer.command.name != "latency"]
+        events += [answer for answer in given_up if not answer.command.is_latency]
         if self._watchdog.expired(now):
             events.append(Silence(self._watchdog.silence_ns(now)))
         return events
@@ -214,6 +151,7 @@ class Driver:
     def start_rotation(self, now: HostNs) -> int:
         """Queue the command to leave standby; return its ticket."""
         self._watchdog.started(now)
+        self._newest.clear()
         return self.send(commands.start(), now)
 
     def stop_rotation(self, now: HostNs) -> tuple[int, list[Event]]:
@@ -225,8 +163,10 @@ class Driver:
         """Queue the command to reboot and return what had been collected so far."""
         self.send(commands.reset(), now)
         self._watchdog.started(now)
+        events = self.flush()
+        self._newest.clear()
         self._forget_device()
-        return self.flush()
+        return events
 
     def flush(self) -> list[Event]:
         """Return everything that is still being collected."""
@@ -284,14 +224,17 @@ class Driver:
         self._watchdog.heard(stream, arrival)
         order = self._orders[stream]
         newest = self._newest.get(stream)
-        events: list[Event] = []
-        if newest and newest.packet.stamp - packet.stamp > RESTART_NS:
-            events += self._released(order.restart())
-            self._forget_device()
         timed = _Timed(packet, arrival)
         self._newest[stream] = timed
-        events += self._released(order.push(packet.seq, timed))
-        return events
+        if newest is None:
+            return self._released(order.restart() + order.push(packet.seq, timed))
+        if newest.packet.stamp - packet.stamp > RESTART_NS:
+            events = self._released(order.restart())
+            self._forget_device()
+            return events + self._released(order.push(packet.seq, timed))
+        if arrival - newest.arrival > SILENCE_NS:
+            return self._released(order.resume(packet.seq, timed))
+        return self._released(order.push(packet.seq, timed))
 
     def _released(self, released: list[tuple[int, _Timed]]) -> list[Event]:
         events: list[Event] = []
@@ -348,9 +291,9 @@ class Driver:
     def _acknowledged(self, ack: Ack, now: HostNs) -> list[Event]:
         answer = self._requests.answer(ack, now)
         if answer is None:
-            self.counters.unanswered += 1
+            self.counters.stray_acks += 1
             return []
-        if answer.command.name == "latency":
+        if answer.command.is_latency:
             if answer.round_trip_ns is not None:
                 self.round_trips.append(answer.round_trip_ns)
                 self._clock.round_trip(answer.round_trip_ns)

@@ -14,7 +14,8 @@ import numpy as np
 
 from l2lidar_node import wire
 from l2lidar_node.clock import ClockStatus
-from l2lidar_node.driver import Counters, Driver
+from l2lidar_node.counters import Counters
+from l2lidar_node.driver import Driver
 from l2lidar_node.gravity import GRAVITY, GravityReport
 from l2lidar_node.transport import Transport
 from l2lidar_node.types import HostNs, Stream

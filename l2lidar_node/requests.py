@@ -57,34 +57,33 @@ class Requests:
     def add(self, command: Command, now: HostNs, tries: int = TRIES) -> int:
         """Remember a command that is being sent; return the ticket its answer will carry."""
         self._tickets += 1
-        del self._pending[: len(self._pending) - MAX_PENDING + 1]
+        for entry in self._pending:
+            if entry.command.is_same_kind(command):
+                entry.tries_left = 0  # repeated now, it would undo this command
         self._pending.append(_Pending(self._tickets, command, now, tries - 1))
         return self._tickets
 
     def answer(self, ack: Ack, now: HostNs) -> Answer | None:
         """Return how the command that this ACK belongs to ended; None if it belongs to none."""
-        for index, entry in enumerate(self._pending):
-            if entry.command.is_answered_by(ack):
-                del self._pending[index]
-                ok = ack.status == wire.AckStatus.OK
-                text = "acknowledged" if ok else f"refused: {_status(ack.status)}"
-                return Answer(
-                    entry.ticket,
-                    entry.command,
-                    ok,
-                    f"{entry.command.name}: {text}",
-                    now - entry.sent,
-                )
-        return None
+        candidates = [entry for entry in self._pending if entry.command.is_answered_by(ack)]
+        if not candidates:
+            return None
+        entry = next((e for e in candidates if e.command.is_echoed_by(ack)), candidates[0])
+        self._pending.remove(entry)
+        ok = ack.status == wire.AckStatus.OK
+        outcome = "acknowledged" if ok else f"refused: {_status(ack.status)}"
+        text = f"{entry.command.name}: {outcome}"
+        return Answer(entry.ticket, entry.command, ok, text, now - entry.sent)
 
     def expire(self, now: HostNs) -> tuple[list[Command], list[Answer]]:
         """Return the commands to send again and the ends of those that were given up."""
         repeats: list[Command] = []
         given_up: list[Answer] = []
-        for entry in list(self._pending):
-            if 0 <= now - entry.sent < REPEAT_NS:
+        too_many = len(self._pending) - MAX_PENDING
+        for index, entry in enumerate(list(self._pending)):
+            if 0 <= now - entry.sent < REPEAT_NS and index >= too_many:
                 continue
-            if entry.tries_left > 0:
+            if entry.tries_left > 0 and index >= too_many:
                 entry.tries_left -= 1
                 entry.sent = now
                 repeats.append(entry.command)

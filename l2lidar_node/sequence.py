@@ -1,4 +1,4 @@
-"""Puts the packets of one stream back into order by their sequence numbers and counts what is missing."""
+"""Puts the packets of one stream back into order by their numbers and counts what is missing."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ T = TypeVar("T")
 
 FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
 _UNKNOWN: Final = 0
+_NUMBERS: Final = 1 << 32
 _LATE_REACH: Final = 64  # numbers this far behind are late ones, not a wrap
 
 
@@ -40,8 +41,8 @@ class SequenceCounts:
 class SequenceOrder(Generic[T]):
     """Releases packets in the order of their numbers.
 
-    A packet that is next in line is released at once. One that is early waits for the missing ones until
-    more than ``window`` packets wait; then the missing ones are counted as lost.
+    A packet that is next in line is released at once. One that is early waits for the missing ones
+    until more than ``window`` packets wait; then the missing ones are given up as lost.
 
     Parameters
     ----------
@@ -50,31 +51,31 @@ class SequenceOrder(Generic[T]):
 
     Notes
     -----
-    Numbers wrap. The modulus is not documented (0..1024 has been seen), so it is learned: a number beyond
-    it makes it unknown, and two wraps in a row from the same number settle it.
+    Numbers wrap. The modulus is not documented (0..1024 has been seen), so it is learned: a number
+    beyond it says that it is larger, and the next wrap says where; two wraps in a row from the
+    same smaller number settle that one.
     """
 
     def __init__(self, window: int) -> None:
         self.counts = SequenceCounts()
         self._window = window
+        self._reach = 2 * window + _LATE_REACH
         self._modulus = FIRST_MODULUS
         self._next: int | None = None
         self._waiting: dict[int, T] = {}
-        self._recent: set[int] = set()  # numbers given up lately: tells late from duplicate
+        self._given_up: set[int] = set()  # of the numbers within reach: tells late from duplicate
         self._last_wrap = _UNKNOWN
 
     @property
-    def waiting(self) -> int:
-        """Packets that came early and wait."""
-        return len(self._waiting)
+    def oldest(self) -> T | None:
+        """What has been waiting the longest; None if nothing waits."""
+        return next(iter(self._waiting.values()), None)
 
     def push(self, seq: int, item: T) -> list[tuple[int, T]]:
-        """Return what can be released now, each with the count of numbers missing just before it."""
-        if seq == self._next and not self._waiting:
+        """Return what can be released now, each with how many are missing just before it."""
+        if self._next is None or (seq == self._next and not self._waiting):
             self._next = self._after(seq)
-            return [(0, item)]
-        if self._next is None:
-            self._next = self._after(seq)
+            self._given_up.discard(seq)
             return [(0, item)]
         if self._modulus != _UNKNOWN and seq >= self._modulus:
             self._next = self._next or self._modulus
@@ -86,76 +87,100 @@ class SequenceOrder(Generic[T]):
         if seq in self._waiting:
             self.counts.duplicates += 1
             return []
-        if ahead == 0:
+        if any(self._ahead(other) > ahead for other in self._waiting):
             self.counts.reordered += 1
         self._waiting[seq] = item
         released = self._run(0)
         while len(self._waiting) > self._window:
-            released += self._skip()
+            released += self.give_up()
         return released
+
+    def resume(self, seq: int, item: T) -> list[tuple[int, T]]:
+        """Release everything that waits and then this packet, the first after a long silence.
+
+        It is late for nothing, so its number only tells how many are missing at the least.
+        """
+        released = self.flush()
+        missing = 0 if self._next is None else seq - self._next
+        missing = missing % self._modulus if self._modulus != _UNKNOWN else max(missing, 0)
+        self.counts.lost += missing
+        self._given_up.clear()
+        self._next = self._after(seq)
+        return [*released, (missing, item)]
+
+    def give_up(self) -> list[tuple[int, T]]:
+        """Release the first packets that wait, counting the numbers before them as lost."""
+        if not self._waiting or self._next is None:
+            return []
+        first = min(self._waiting, key=self._ahead)
+        missing = self._ahead(first)
+        if first < self._next:
+            missing = self._wrapped(first, missing)
+        self.counts.lost += missing
+        lost = range(first - min(missing, self._reach), first)
+        self._given_up.update(number % (self._modulus or _NUMBERS) for number in lost)
+        self._next = first
+        self._given_up = {n for n in self._given_up if -self._reach <= self._ahead(n) < 0}
+        return self._run(missing)
 
     def flush(self) -> list[tuple[int, T]]:
         """Release everything that waits, counting the numbers in between as lost."""
         released: list[tuple[int, T]] = []
         while self._waiting:
-            released += self._skip()
+            released += self.give_up()
         return released
 
     def restart(self) -> list[tuple[int, T]]:
         """Release everything that waits and take the next number, whatever it is, as the first."""
         released = self.flush()
+        if self._next is not None:
+            self.counts.restarts += 1
         self._next = None
-        self._recent.clear()
-        self.counts.restarts += 1
+        self._given_up.clear()
         return released
 
     def _after(self, seq: int) -> int:
         return seq + 1 if seq + 1 != self._modulus else 0
 
     def _ahead(self, seq: int) -> int:
-        """Return how many numbers lie between the next one and this one; negative if it is behind."""
+        """Return how many numbers lie between the next one and this one; negative if behind."""
         assert self._next is not None
-        reach = 2 * self._window + _LATE_REACH
         if self._modulus != _UNKNOWN:
             ahead = (seq - self._next) % self._modulus
-            return ahead - self._modulus if ahead >= self._modulus - reach else ahead
-        if seq >= self._next or self._next - seq <= reach:
+            behind = self._modulus - ahead
+            return -behind if behind <= min(self._reach, self._modulus // 2) else ahead
+        if seq >= self._next - self._reach:
             return seq - self._next
-        return seq  # it wrapped, and where is not known yet: only the numbers after 0 can be missed
+        # It wrapped, nobody knows where: after the largest number seen, as far as can be told.
+        largest = max((n for n in self._waiting if n >= self._next), default=self._next - 1)
+        return largest + 1 - self._next + seq
 
     def _count_behind(self, seq: int) -> None:
-        if seq in self._recent:
-            self._recent.discard(seq)
+        if seq in self._given_up:
+            self._given_up.discard(seq)
             self.counts.lost -= 1
             self.counts.late += 1
         else:
             self.counts.duplicates += 1
-
-    def _skip(self) -> list[tuple[int, T]]:
-        """Give up the numbers before the first waiting packet and release from there."""
-        first = min(self._waiting, key=self._ahead)
-        missing = self._ahead(first)
-        assert self._next is not None
-        if first < self._next and first == 0:
-            missing -= self._learn_wrap(self._next, missing)
-        self._recent = {(first - back) % (self._modulus or 1 << 32) for back in range(1, missing + 1)[:_LATE_REACH]}
-        self.counts.lost += missing
-        self._next = first
-        return self._run(missing)
 
     def _run(self, missing: int) -> list[tuple[int, T]]:
         released: list[tuple[int, T]] = []
         while self._next in self._waiting:
             seq = self._next
             released.append((missing, self._waiting.pop(seq)))
+            self._given_up.discard(seq)
             missing = 0
             self._next = self._after(seq)
         return released
 
-    def _learn_wrap(self, wrapped_from: int, missing: int) -> int:
-        """Learn the modulus from a wrap to 0; return how many of the missing numbers do not exist."""
-        if wrapped_from != self._last_wrap:
-            self._last_wrap = wrapped_from
+    def _wrapped(self, first: int, missing: int) -> int:
+        """Learn from a wrap to ``first``; return how many of the missing numbers do exist."""
+        assert self._next is not None
+        if self._modulus == _UNKNOWN:
+            self._modulus = self._next + missing - first
+        elif first == 0 and missing and self._next != self._last_wrap:
+            self._last_wrap = self._next
+        elif first == 0 and missing:
+            self._modulus = self._next
             return 0
-        self._modulus = wrapped_from
         return missing

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -38,6 +39,7 @@ class Session:
         self._on_event = on_event
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopping = threading.Event()
+        self._ended = threading.Event()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="l2lidar-receive", daemon=True)
 
@@ -55,18 +57,28 @@ class Session:
         self._stopping.set()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join()
+        if self._thread.ident is None:
+            self._end()
 
     def call(self, function: Callable[[Driver, HostNs], T]) -> Future[T]:
-        """Have the loop's thread call ``function(driver, now)``; return its result to come."""
+        """Have the loop's thread call ``function(driver, now)``; return its result to come.
+
+        The future is cancelled when the loop ends before it gets to it.
+        """
         future: Future[T] = Future()
 
         def run() -> None:
+            if self._ended.is_set():
+                future.cancel()
+                return
             try:
                 future.set_result(function(self.driver, HostNs(time.time_ns())))
             except Exception as error:  # the caller gets whatever it was
                 future.set_exception(error)
 
         self._calls.put(run)
+        if self._ended.is_set():
+            self._run_calls()
         return future
 
     def _run(self) -> None:
@@ -88,11 +100,17 @@ class Session:
             self._failure = error
             raise
         finally:
-            self.transport.close()
+            self._end()
+
+    def _end(self) -> None:
+        self.transport.close()
+        self._ended.set()
+        self._run_calls()
 
     def _run_calls(self) -> None:
-        while not self._calls.empty():
-            self._calls.get()()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._calls.get_nowait()()
 
     def _send(self) -> None:
         for frame in self.driver.outbox():

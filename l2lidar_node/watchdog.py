@@ -9,6 +9,7 @@ from l2lidar_node.config import WatchdogConfig
 from l2lidar_node.types import HostNs, Stream
 
 SILENCE_NS: Final = 1_000_000_000  # a stream that paused this long has stopped
+MAX_STEP_NS: Final = 5_000_000_000  # time does not pass in larger steps between two questions
 SPIN_UP_NS: Final = 21_000_000_000  # from the first IMU packet to the first points, at power-on
 
 
@@ -39,6 +40,7 @@ class Watchdog:
         self._points_seen = False
         self._standby = False
         self._reported = False
+        self._checked: HostNs | None = None
 
     def heard(self, stream: Stream, now: HostNs) -> None:
         """Note a measurement of a stream."""
@@ -88,13 +90,30 @@ class Watchdog:
         return now - max([*self._last.values(), self._watching_since])
 
     def expired(self, now: HostNs) -> bool:
-        """Tell, once per silence, that it has lasted too long."""
+        """Tell, once per silence, that it has lasted too long; to be asked regularly."""
+        self._follow_clock(now)
         over = self.silence_ns(now) > self._timeout_ns
         if over and not self._reported:
             self._reported = True
             return True
         self._reported = over
         return False
+
+    def _follow_clock(self, now: HostNs) -> None:
+        """Begin to count anew when the host's clock was set or the host slept.
+
+        A board without a battery starts in the past and jumps when it finds a time server: that
+        is no silence of the device.
+        """
+        step = 0 if self._checked is None else now - self._checked
+        self._checked = now
+        if 0 <= step <= MAX_STEP_NS:
+            return
+        self._last = dict.fromkeys(self._last, now)
+        if self._watching_since is not None:
+            self._watching_since = now
+        if self._imu_since is not None:
+            self._imu_since = now
 
     def _fresh(self, stream: Stream, now: HostNs) -> bool:
         last = self._last.get(stream)
