@@ -22,6 +22,7 @@ _POINTS_3D = struct.Struct("<4I 36x 8f 8f I")
 _POINTS_2D = struct.Struct("<4I 36x 8f 6f I")
 _IMU = struct.Struct("<4I 4f 3f 3f")
 
+_MAX_FIELD: Final = 1e6  # in any unit: all real ones are below 1e4, and points must fit float32
 _MAX_TIME_INCREMENT_S: Final = 1e-3
 _MIN_QUATERNION_NORM: Final = 0.5  # with its IMU switched off a unit may send zeros
 _MAX_RATE: Final = 1e3  # [rad/s]; broken units have been seen to send 1e24
@@ -160,8 +161,11 @@ def _points(
         return DecodeError(packet_type, "point_num")
     if nsec >= NS:
         return DecodeError(packet_type, "stamp")
-    if not math.isfinite(sum(fields[4:-1])):  # one NaN or infinity anywhere makes the sum one
+    size = math.hypot(*fields[4:-1])  # one NaN or infinity anywhere makes it one
+    if not math.isfinite(size):
         return DecodeError(packet_type, "not_finite")
+    if size > _MAX_FIELD:
+        return DecodeError(packet_type, "implausible")
     if not 0.0 < time_increment < _MAX_TIME_INCREMENT_S:
         return DecodeError(packet_type, "time_increment")
     head_angle = fields[12] if packet_type == wire.PacketType.POINTS_3D else 0.0
