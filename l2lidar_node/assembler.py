@@ -16,6 +16,7 @@ from l2lidar_node.types import HostNs, Sweep
 
 MAX_GAP_NS: Final = 200_000_000  # a stream that stalled this long starts a new sweep
 MAX_PACKETS: Final = 4000
+_BACKWARDS_RAD: Final = 1.9 * math.pi  # a head that stands still seems to advance by this or more
 
 Level = Callable[[PointBatch, list[HostNs]], PointBatch]
 
@@ -46,11 +47,6 @@ class SweepAssembler:
             int(kind): Projector(kind)
             for kind in (wire.PacketType.POINTS_3D, wire.PacketType.POINTS_2D)
         }
-
-    @property
-    def last_start(self) -> HostNs | None:
-        """Start of the newest packet of the sweep in the making; None when there is none."""
-        return self._packets[-1].start if self._packets else None
 
     def configure(self, config: SweepConfig, level: Level | None) -> None:
         """Use other settings from the next packet on."""
@@ -85,26 +81,18 @@ class SweepAssembler:
         """Return what has been collected so far as a sweep; None if that is nothing."""
         return self._finish() if self._packets else None
 
-    def discard(self) -> int:
-        """Forget what has been collected so far; return how many packets that was."""
-        count = len(self._packets)
-        self._packets = []
-        self._missing = 0
-        return count
-
     def _starts_anew(self, packet: PointPacket, start: HostNs) -> bool:
         first, last = self._packets[0], self._packets[-1]
         if packet.packet_type != last.packet.packet_type:
             return True
         if start - last.start > MAX_GAP_NS or start < last.start:
             return True
-        if self._config.cut == "duration":
-            return start - first.start >= self._config.duration_ms * 1_000_000
-        if self._config.cut == "packets" or packet.packet_type == wire.PacketType.POINTS_2D:
+        if self._config.cut == "packets":
             return False
-        if abs(packet.head_angle - last.packet.head_angle) > math.pi:
-            return True
-        return self._config.cut == "half_turn" and _half(packet) != _half(last.packet)
+        if self._config.cut == "duration" or packet.packet_type == wire.PacketType.POINTS_2D:
+            return start - first.start >= self._config.duration_ms * 1_000_000
+        period = 2 * math.pi if self._config.cut == "turn" else math.pi
+        return _passes(last.packet.head_angle, packet.head_angle, period)
 
     def _is_full(self) -> bool:
         count = len(self._packets)
@@ -139,5 +127,12 @@ class SweepAssembler:
         )
 
 
-def _half(packet: PointPacket) -> int:
-    return int(packet.head_angle % (2 * math.pi) >= math.pi)
+def _passes(before: float, after: float, period: float) -> bool:
+    """Tell whether the head, which turns forwards, passed a multiple of ``period`` [rad] since.
+
+    However many packets were lost in between, up to most of a turn.
+    """
+    before, after = before % (2 * math.pi), after % (2 * math.pi)
+    if (after - before) % (2 * math.pi) > _BACKWARDS_RAD:
+        return False
+    return after < before or after // period > before // period

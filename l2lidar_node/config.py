@@ -84,8 +84,8 @@ class SweepConfig:
     )  # fmt: skip
     cut: str = setting(
         "packets",
-        "where a cloud ends: after a number of packets, a turn or half a turn of the head, "
-        "or a duration",
+        "where a cloud ends: after a number of packets, a turn or half a turn of the head, or a "
+        "duration (2D packets know no angle: a duration instead)",
         name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"), live=True,
     )  # fmt: skip
     duration_ms: int = setting(
