@@ -41,8 +41,8 @@ class ImuNoise:
     )
     gyro_line: float = setting(
         0.03,
-        "amplitude of the gyro's line at the head's frequency on y; half of it on x, a third on z, "
-        "and 0.4 of each at twice the frequency",
+        "amplitude of the gyro's line at the head's frequency on y; half of it on x, a third "
+        "on z, and 0.4 of each at twice the frequency",
         unit="rad/s",
         lo=0.0,
         hi=10.0,

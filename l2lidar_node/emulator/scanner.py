@@ -89,8 +89,8 @@ class Scanner:
     """The rotating head, the mirror and the range finder.
 
     Packet k (k >= 0) starts at ``k * period_s`` on the motion's time line. A packet depends on the
-    seed and its number alone, not on which packets are asked for together; asking for 20 or more at
-    a time is fastest (0.3 ms each, one by one 1 ms).
+    seed and its number alone, not on which packets are asked for together. Asking for 20 or more
+    at a time is fastest (0.3 ms each, one by one 1 ms).
 
     Parameters
     ----------

@@ -64,6 +64,8 @@ class World:
         ]
         self._normals = normals[solid] / length[solid, None]
         self._offsets = np.einsum("ti,ti->t", self._normals, self.triangles[:, 0])
+        corners = self.triangles.reshape(-1, 3)
+        self._middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0  # float32 is finest there
         self._threads = threads
         self._scene = self._build()
         for array in (self.triangles, self.reflectivity):
@@ -78,9 +80,13 @@ class World:
         Raises
         ------
         ValueError
-            Naming the file, if it cannot be read or has no triangle.
+            Naming the file, if it cannot be read or has no triangle with an area.
         """
-        return cls(*_read_mesh(Path(path)), threads=threads)
+        triangles, reflectivity = _read_mesh(Path(path))
+        try:
+            return cls(triangles, reflectivity, threads=threads)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     def cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64]
@@ -102,7 +108,7 @@ class World:
         import open3d as o3d
 
         rays = np.empty((len(origins), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origins, directions
+        rays[:, :3], rays[:, 3:] = origins - self._middle, directions
         answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=self._threads)
         found = answer["primitive_ids"].numpy()
         hits = np.zeros(len(rays), HIT)
@@ -127,7 +133,7 @@ class World:
         """Return the distance [m] of points (N, 3) to the nearest surface, shape (N,)."""
         import open3d as o3d
 
-        query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32))
+        query = o3d.core.Tensor.from_numpy((points - self._middle).astype(np.float32))
         distance = self._scene.compute_distance(query, nthreads=self._threads).numpy()
         return np.asarray(distance, np.float64)
 
@@ -136,7 +142,7 @@ class World:
         import open3d as o3d
 
         scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
-        vertices = np.ascontiguousarray(self.triangles.reshape(-1, 3), np.float32)
+        vertices = (self.triangles.reshape(-1, 3) - self._middle).astype(np.float32)
         indices = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         scene.add_triangles(
             o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(indices)
@@ -160,8 +166,8 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | f
         raise ValueError(
             f"{path}: holds no triangles (not a mesh open3d can read, or only points)"
         )
-    if not np.isfinite(vertices).all():
-        raise ValueError(f"{path}: a vertex is not finite")
+    if indices.min() < 0 or indices.max() >= len(vertices):
+        raise ValueError(f"{path}: a face names a vertex that is not there")
     colours = np.asarray(mesh.vertex_colors)
     if len(colours) != len(vertices):
         return vertices[indices], DEFAULT_REFLECTIVITY
