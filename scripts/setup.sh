@@ -98,7 +98,7 @@ find_python() {
 
 pip_install() {
     "$python" -m pip install --quiet --disable-pip-version-check "$@" >"$venv/pip.log" 2>&1 && return
-    tail -n 15 "$venv/pip.log" >&2
+    { grep -v '^WARNING' "$venv/pip.log" || true; } | tail -n 15 >&2
     die "pip could not install what is needed; its own words are above." \
         "Is there a network, and free disk space? Where PyPI cannot be reached, set PIP_INDEX_URL to a mirror" \
         "of it. Then run the command again."
