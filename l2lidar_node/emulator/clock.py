@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -45,11 +46,10 @@ class UnitClock:
 
     def set(self, now_ns: int, value_ns: int) -> None:
         """Make the clock show a value from a true instant on; instants must not decrease."""
-        self._epochs = [
-            *(epoch for epoch in self._epochs[:-1] if epoch.start_ns > now_ns - _KEEP_NS),
-            self._epochs[-1],
-            Epoch(now_ns, value_ns),
-        ]
+        epochs = [*self._epochs, Epoch(now_ns, value_ns)]
+        ends_ns = (epoch.start_ns for epoch in epochs[1:])
+        recent = [end_ns > now_ns - _KEEP_NS for end_ns in ends_ns]
+        self._epochs = [*compress(epochs, recent), epochs[-1]]
 
     def step(self, now_ns: int, change_ns: int) -> None:
         """Move the clock by some nanoseconds of its own at a true instant, not below 0."""

@@ -29,5 +29,5 @@ class Lateness:
         for number, count in enumerate(self._counts):
             seen += count
             if count and seen >= share * self.count:
-                return min((number + 1) * _BIN_NS, self.max_ns)
+                return self.max_ns if number == _BINS else min((number + 1) * _BIN_NS, self.max_ns)
         return 0

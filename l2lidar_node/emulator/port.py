@@ -45,7 +45,13 @@ class Port(Protocol):
         ...
 
     def receive(self) -> list[bytes]:
-        """Return what the host has sent and was not returned before; does not wait."""
+        """Return what the host has sent and was not returned before; does not wait.
+
+        Raises
+        ------
+        PortError
+            If the connector is lost for good.
+        """
         ...
 
     def send(self, data: bytes) -> bool:
@@ -201,29 +207,51 @@ class SerialPort:
         except (OSError, termios.error) as error:
             raise PortError(f"cannot open the serial device {path}: {error.args[-1]}") from None
         os.set_blocking(self._descriptor, False)
+        self._rest = b""
 
     def fileno(self) -> int:
         """Return the device's descriptor."""
         return self._descriptor
 
     def receive(self) -> list[bytes]:
-        """Return the waiting bytes."""
+        """Return the waiting bytes.
+
+        Raises
+        ------
+        PortError
+            If the device or its other end is gone.
+        """
         try:
             data = os.read(self._descriptor, _READ)
-        except (BlockingIOError, OSError):  # EIO: the other end is closed for now
+        except BlockingIOError:
             return []
-        return [data] if data else []
+        except OSError:
+            data = b""
+        if not data:
+            raise PortError(f"{self.name}: the other end is gone")
+        return [data]
 
     def send(self, data: bytes) -> bool:
-        """Send bytes; what the line cannot take is lost, as on a UART without flow control."""
-        try:
-            return os.write(self._descriptor, data) == len(data)
-        except (BlockingIOError, OSError):
+        """Send bytes; what comes while the line is full is lost, there is no flow control."""
+        self._flush()
+        if self._rest:
             return False
+        self._rest = data
+        self._flush()
+        return True
+
+    def _flush(self) -> None:
+        try:
+            self._rest = self._rest[os.write(self._descriptor, self._rest) :]
+        except OSError:  # full, or the other end is closed for now
+            return
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until the line takes bytes again."""
-        return bool(select.select([], [self._descriptor], [], timeout_s)[1])
+        """Wait until the line has taken everything."""
+        if self._rest:
+            select.select([], [self._descriptor], [], timeout_s)
+            self._flush()
+        return not self._rest
 
     def follow(self, network: Network) -> None:
         """Do nothing: a serial line has no address."""

@@ -74,7 +74,7 @@ class Server:
         Raises
         ------
         PortError
-            If the unit moves to an address that cannot be bound.
+            If the unit moves to an address that cannot be bound, or loses its connector.
         """
         power_on_ns = self._device.power_on_ns
         end_ns = math.inf if math.isinf(duration_s) else power_on_ns + round(duration_s * 1e9)
