@@ -8,10 +8,11 @@ from typing import Final
 FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
 
 _LEARN: Final = 9  # packets from which the period is learned
+_MEMORY: Final = 512  # packets over which the period is averaged
 _FLOOR_NS: Final = 2_000.0  # deviations this small are never a step
-_CEILING_NS: Final = 50_000.0
+_CEILING_NS: Final = 150_000.0
 _SIGMAS: Final = 8.0  # in mean absolute deviations
-_NEAR: Final = 64  # packets; numbers that far ahead after a wrap are believed
+_NEAR: Final = 64  # packets that may be missing where numbers wrap for the first time
 _SLIP: Final = 0.05  # of the advance: more irregular than that a stream is not
 
 
@@ -25,13 +26,13 @@ class Cadence:
 
     Notes
     -----
-    A phase-locked loop of second order, critically damped. A stream whose period itself varies (a motor's)
+    A phase-locked loop beside a running mean of the period. A stream whose period itself varies (a motor's)
     is best predicted from its last packet: high gain. One with a steady period and noise on single stamps
     (a sampler's) needs a long memory, or every bridged step would add the noise of one stamp to the line.
     """
 
     __slots__ = (
-        "_bend",
+        "_count",
         "_gain",
         "_history",
         "_lag",
@@ -39,16 +40,18 @@ class Cadence:
         "_noise",
         "_period",
         "_seq",
+        "_sure",
         "_tolerance",
     )
 
     def __init__(self, gain: float) -> None:
         self._gain = gain
-        self._bend = 0.25 * gain * gain
         self._modulus = FIRST_MODULUS  # 0 while unknown
+        self._sure = False  # numbers have wrapped there
         self._history: list[tuple[int, int]] = []
         self._seq = 0
         self._period = 0.0
+        self._count = 0  # packets that the period is the mean of
         self._lag = 0.0  # predicted phase minus the last stamp
         self._noise = 0.0
         self._tolerance = _FLOOR_NS
@@ -73,6 +76,7 @@ class Cadence:
         if period <= 0.0:
             return False
         self._period = period
+        self._count = len(history)
         self._noise = statistics.median(abs(step - period) for step in steps)
         self._seq = seq
         self._lag = 0.0
@@ -89,8 +93,13 @@ class Cadence:
         off = advance - gap * period - self._lag
         if gap <= 0 or not -self._tolerance * gap <= off <= self._tolerance * gap:
             return False
+        if seq < self._seq:
+            self._sure = True
         self._lag = (self._gain - 1.0) * off
-        self._period = period + self._bend * off / gap
+        count = self._count
+        if count < _MEMORY:
+            self._count = count = count + 1
+        self._period = period + (advance / gap - period) / count
         self._seq = seq
         if gap == 1:
             noise = self._noise
@@ -112,7 +121,8 @@ class Cadence:
             return gap
         if self._seq >= self._modulus:
             self._modulus = 0
-        elif 0 < gap + self._modulus <= _NEAR:
+            self._sure = False
+        elif self._sure:
             return gap + self._modulus
         counted = round(advance / self._period)
         if 0 < counted <= _NEAR and abs(advance - counted * self._period) <= self._tolerance:
@@ -123,6 +133,14 @@ class Cadence:
     def advance(self, gap: int) -> int:
         """Return the device time from the last packet to one some numbers later [ns]."""
         return round(gap * self._period + self._lag)
+
+    def ascends(self, seq: int) -> bool:
+        """Whether a number is above the last one, so neither wrapped nor restarted since."""
+        return seq > self._seq
+
+    def noise(self, gap: int) -> float:
+        """Return by how much a packet may be off before it is not where it was expected [ns]."""
+        return gap * self._tolerance
 
     def slip(self, gap: int) -> int:
         """Return by how much a packet may be off without a step being the reason [ns]."""

@@ -27,6 +27,7 @@ _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
 _SILENT_NS: Final = 1_000 * _MS
 _BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
+_BOOT_SEQ: Final = 256  # so can sequence numbers
 _KEEP: Final = 16  # epochs that packets on their way may still belong to
 _SYNCS: Final = 128
 _NEVER: Final = 1 << 80  # after every stamp
@@ -144,11 +145,11 @@ class DeviceLine:
         advance = cadence.advance(gap)
         expected = track.u + advance
         waited = arrival - track.arrival
-        reach = _SILENT_NS if waited < _SILENT_NS else _REACH_NS
+        reach = _SILENT_NS if cadence.ascends(seq) else _REACH_NS
         counted = gap > 0 and abs(advance * self.ratio - waited) < reach
         if counted:
             slip = cadence.slip(gap)
-            begun = self._begun(track, epoch, stamp, expected)
+            begun = self._begun(track, epoch, stamp, expected, cadence.noise(gap))
             if begun is not None:
                 return self._accept(track, begun, seq, stamp, arrival)
             for other in (epoch, *reversed(self._epochs)):
@@ -160,38 +161,36 @@ class DeviceLine:
         return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)
 
     def _begun(
-        self, track: _Track, epoch: _Epoch, stamp: int, expected: int
+        self, track: _Track, epoch: _Epoch, stamp: int, expected: int, noise: float
     ) -> _Epoch | None:
         """Return the epoch of the sync of this host that a stamp is just after.
 
-        The stream that comes first tells where the epoch lies on the line; the IMU stream, which is more
-        regular, has the last word.
+        Clocks faster than the host's pass the value of a sync before it steps them back, so the stamp
+        must also be nearer to where it is expected than without the step. The stream that comes first
+        tells where the epoch lies on the line; the IMU stream, more regular, has the last word.
         """
-        value = self._own_sync(stamp, expected - track.u, epoch)
-        if value is None:
-            return None
         base = stamp - expected
-        for begun in reversed(self._epochs):
-            if begun.value == value:
-                if abs(begun.base - base) > abs(epoch.base - base):
-                    return None  # not stepped yet
-                if track is self._imu:
-                    if self._points.epoch is begun:
-                        self._points.u += begun.base - base
-                    begun.base = base
-                return begun
-        self.epochs += 1
-        self._newest = value
-        self._epochs.append(_Epoch(base, value))
-        return self._epochs[-1]
-
-    def _own_sync(self, stamp: int, advance: int, epoch: _Epoch) -> int | None:
-        """Return the value of the sync that a stamp is just after."""
+        off = abs(base - epoch.base)
         for value, _ in reversed(self._syncs):
             if value == epoch.value:
-                return None
-            if -_SLACK_NS <= stamp - value <= advance + _MS:
-                return value
+                break
+            if not -_SLACK_NS <= stamp - value <= expected - track.u + _MS:
+                continue
+            begun = next((item for item in self._epochs if item.value == value), None)
+            if begun is None:
+                if off <= noise:
+                    continue
+                begun = _Epoch(base, value)
+                self.epochs += 1
+                self._newest = value
+                self._epochs.append(begun)
+            elif abs(base - begun.base) > off:
+                continue
+            elif track is self._imu:
+                if self._points.epoch is begun:
+                    self._points.u += begun.base - base
+                begun.base = base
+            return begun
         return None
 
     def _synced_since(self, track: _Track) -> bool:
@@ -221,7 +220,8 @@ class DeviceLine:
         suspect, track.suspect = track.suspect, (seq, stamp)
         if suspect is None or not track.cadence.regular(seq - suspect[0], stamp - suspect[1]):
             return None
-        if stamp < track.stamp and stamp < _BOOT_NS:
+        begins = expected is None and seq < _BOOT_SEQ and not track.cadence.ascends(seq)
+        if begins or (stamp < track.stamp and stamp < _BOOT_NS):
             self.steps.append((Step.REBOOT, stamp - track.stamp))
         elif expected is not None:
             self.steps.append((Step.FOREIGN_SYNC, stamp - epoch.base - expected))
