@@ -137,10 +137,9 @@ def _mix(
     radius = (width / 2.0) * np.sqrt(draws.uniform[0])[..., None]
     angle = (2.0 * np.pi * draws.uniform[1])[..., None]
     other = direction + radius * (np.cos(angle) * side + np.sin(angle) * up)
-    other /= np.linalg.norm(other, axis=-1, keepdims=True)
-    beside = world.cast(rays["origin"].reshape(-1, 3), other.reshape(-1, 3))["distance"].reshape(
-        seen.shape
-    )
+    other /= np.sqrt(1.0 + radius**2)
+    beside = world.distances(rays["origin"].reshape(-1, 3), other.reshape(-1, 3))
+    beside = beside.reshape(seen.shape).astype(np.float64)
     share = draws.uniform[2] * 0.5  # of the beam that meets the other surface
     with np.errstate(invalid="ignore"):  # inf - inf: nothing is there
         step = beside - seen

@@ -105,29 +105,28 @@ class World:
         -------
         ndarray, shape (N,), dtype HIT
         """
-        import open3d as o3d
-
-        rays = np.empty((len(origins), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origins - self._middle, directions
-        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=self._threads)
-        found = answer["primitive_ids"].numpy()
-        hits = np.zeros(len(rays), HIT)
-        hits["distance"] = np.inf
-        met = np.flatnonzero(found != _MISSED)
-        triangle = found[met]
-        normal = self._normals[triangle]
+        triangles, rough = self._trace(origins, directions)
+        hits = np.zeros(len(rough), HIT)
+        hits["distance"] = rough
+        met = np.flatnonzero(triangles != _MISSED)
+        triangles = triangles[met]
+        normal = self._normals[triangles]
         towards = np.einsum("ni,ni->n", normal, directions[met])
-        height = self._offsets[triangle] - np.einsum("ni,ni->n", normal, origins[met])
-        rough = answer["t_hit"].numpy()[met].astype(np.float64)
+        height = self._offsets[triangles] - np.einsum("ni,ni->n", normal, origins[met])
         with np.errstate(divide="ignore", invalid="ignore"):
             exact = height / towards
         # a ray within a triangle's plane has no exact crossing
-        hits["distance"][met] = np.where(
-            np.abs(exact - rough) < 1e-3 * (1.0 + rough), exact, rough
-        )
+        sound = np.abs(exact - rough[met]) < 1e-3 * (1.0 + rough[met])
+        hits["distance"][met[sound]] = exact[sound]
         hits["incidence"][met] = np.abs(towards)
-        hits["reflectivity"][met] = self.reflectivity[triangle]
+        hits["reflectivity"][met] = self.reflectivity[triangles]
         return hits
+
+    def distances(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return only how far rays go, in float32 (some 1e-6 m), shape (N,); see :meth:`cast`."""
+        return self._trace(origins, directions)[1]
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance [m] of points (N, 3) to the nearest surface, shape (N,)."""
@@ -136,6 +135,17 @@ class World:
         query = o3d.core.Tensor.from_numpy((points - self._middle).astype(np.float32))
         distance = self._scene.compute_distance(query, nthreads=self._threads).numpy()
         return np.asarray(distance, np.float64)
+
+    def _trace(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+        """Return number of the triangle met and distance of every ray."""
+        import open3d as o3d
+
+        rays = np.empty((len(origins), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = origins - self._middle, directions
+        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=self._threads)
+        return answer["primitive_ids"].numpy(), answer["t_hit"].numpy()
 
     def _build(self) -> Any:
         """Return open3d's scene; it has no type stubs."""
