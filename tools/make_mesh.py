@@ -57,7 +57,8 @@ def l2_mesh() -> Triangles:
     parts = [_bottom(rings[0]), *(_band(low, high) for low, high in pairwise(rings))]
     parts.append(_fan(rings[-1], np.array([0.0, 0.0, HEIGHT_M])))
     parts.append(_cable())
-    return np.round(np.concatenate(parts), 6)
+    mesh: Triangles = np.concatenate(parts).round(6)
+    return mesh
 
 
 def stl_bytes(triangles: Triangles) -> bytes:

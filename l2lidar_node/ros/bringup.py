@@ -19,6 +19,7 @@ from launch_ros.substitutions import ExecutableInPackage
 from l2lidar_node import wire
 from l2lidar_node.ros.launch_arguments import ARGUMENTS, PACKAGE, share
 from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
+from l2lidar_node.ros.topics import DRIVER_TOPICS, SHOWN_TOPICS
 
 Given = Mapping[str, str]
 """Value of every launch argument, as text."""
@@ -27,18 +28,6 @@ Parameters = Mapping[str, bool | int | float | str]
 
 LOOPBACK: Final = "127.0.0.1"
 RESPAWN_DELAY_S: Final = 2.0
-ABSOLUTE_TOPICS: Final = ("/points", "/imu/data")
-"""Topics that upstream names from the root; in a namespace they follow it."""
-RVIZ_TOPICS: Final = (
-    *ABSOLUTE_TOPICS,
-    "/points_deskewed",
-    "/registered_points",
-    "/local_map",
-    "/path",
-    "/odometry",
-    "/robot_description",
-)
-"""Topics that the RViz layouts name from the root; in a namespace they follow it."""
 
 
 def driver(
@@ -106,7 +95,7 @@ def rviz() -> OpaqueFunction:
                 name="rviz2",
                 namespace=given["namespace"],
                 arguments=["-d", layout, *frame],
-                remappings=_relative(RVIZ_TOPICS),
+                remappings=_relative(SHOWN_TOPICS),
                 output="screen",
             )
         ]
@@ -131,7 +120,7 @@ def _node(
         name=name,
         namespace=given["namespace"],
         parameters=[str(kept)],
-        remappings=_relative(ABSOLUTE_TOPICS),
+        remappings=_relative(DRIVER_TOPICS),
         ros_arguments=["--log-level", given["log_level"]],
         output="screen",
         respawn=LaunchConfiguration("respawn"),
@@ -175,4 +164,5 @@ def _emulator(given: Given, values: Parameters) -> list[ExecuteProcess]:
 
 
 def _relative(topics: Iterable[str]) -> list[tuple[str, str]]:
+    """Return remappings that take topics named from the root into the node's namespace."""
     return [(topic, topic.removeprefix("/")) for topic in topics]

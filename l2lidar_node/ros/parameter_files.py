@@ -10,11 +10,25 @@ from typing import Any
 import yaml
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML as ROS reads it: 2e-07 is a number, which for PyYAML it is only with a point in it."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """YAML as ROS reads it: the text "2e-07" is quoted."""
+
+
+for _side in (_Loader, _Dumper):
+    _side.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+"), list("-+0123456789")
+    )
+
+
 def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any]:
     """Return the parameters that a file gives to a node, by name with dots.
 
-    ROS applies a section only to the full name it is headed with, so a node with another name or in
-    a namespace would lose the section of its stock name without a word. Here that applies as well.
+    ROS applies a section only to the full name it is headed with. A node with another name or in a
+    namespace would lose the section of its stock name without a word; here that applies as well.
 
     Parameters
     ----------
@@ -36,7 +50,7 @@ def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any
         If the file does not exist, or is not a mapping of node names to ``ros__parameters``.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ValueError(f"parameter file '{path}': {error.strerror}") from None
     except yaml.YAMLError as error:
@@ -51,7 +65,8 @@ def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any
 
 def parameter_file(values: Mapping[str, Any]) -> str:
     """Return the text of a parameter file that gives values to any node that reads it."""
-    return yaml.safe_dump({"/**": {"ros__parameters": dict(values)}}, sort_keys=False)
+    content = {"/**": {"ros__parameters": dict(values)}}
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False)
 
 
 def _sections(content: object, above: str, path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -1,0 +1,29 @@
+"""Names the topics of a launch as they are without a namespace; in one, they follow it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from l2lidar_node.config import TopicConfig
+
+POINTS: Final = TopicConfig().point_cloud_topic_id
+IMU: Final = TopicConfig().imu_topic_id
+POINTS_DESKEWED: Final = "/points_deskewed"
+REGISTERED_POINTS: Final = "/registered_points"
+LOCAL_MAP: Final = "/local_map"
+PATH: Final = "/path"
+ODOMETRY: Final = "/odometry"
+ROBOT_DESCRIPTION: Final = "/robot_description"
+
+DRIVER_TOPICS: Final = (POINTS, IMU)
+"""Topics that upstream, and so the driver, names from the root."""
+SHOWN_TOPICS: Final = (
+    *DRIVER_TOPICS,
+    POINTS_DESKEWED,
+    REGISTERED_POINTS,
+    LOCAL_MAP,
+    PATH,
+    ODOMETRY,
+    ROBOT_DESCRIPTION,
+)
+"""Topics that the RViz layouts may name, all from the root."""

@@ -1,0 +1,108 @@
+import pytest
+import yaml
+
+from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
+
+FILE = """
+/**:
+  ros__parameters:
+    l2_port: 1
+    host_port: 1
+    l2_name: "1"
+l2lidar_node:
+  ros__parameters:
+    host_port: 2
+/front/l2lidar_node:
+  ros__parameters:
+    host_port: 3
+rear:
+  lidar:
+    ros__parameters:
+      host_port: 4
+      nested: {deep: {value: 1.5}, list: [1.0, 2.0]}
+/*/other:
+  ros__parameters:
+    host_port: 5
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(FILE)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("full_name", "host_port"),
+    [
+        ("/l2lidar_node", 2),
+        ("/renamed", 2),  # ROS itself would drop the section of the stock name
+        ("/rear/l2lidar_node", 2),
+        ("/front/l2lidar_node", 3),
+        ("/rear/lidar", 4),
+        ("/any/other", 5),
+        ("/any/deeper/other", 2),
+    ],
+)
+def test_later_section_that_applies_wins(path, full_name, host_port):
+    values = parameters_for(path, "l2lidar_node", full_name)
+    assert values["host_port"] == host_port
+    assert values["l2_port"] == 1
+    assert values["l2_name"] == "1"
+
+
+def test_section_of_another_node_does_not_apply(path):
+    assert parameters_for(path, "deskew_node", "/deskew_node")["host_port"] == 1
+
+
+def test_nested_names_are_joined_by_dots(path):
+    values = parameters_for(path, "l2lidar_node", "/rear/lidar")
+    assert values["nested.deep.value"] == 1.5
+    assert values["nested.list"] == [1.0, 2.0]
+
+
+def test_wildcard_of_any_depth(tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/**/lidar: {ros__parameters: {l2_port: 7}}")
+    for full_name in ("/lidar", "/a/lidar", "/a/b/lidar"):
+        assert parameters_for(file, "l2lidar_node", full_name) == {"l2_port": 7}
+    assert parameters_for(file, "l2lidar_node", "/a/lidar/b") == {}
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "l2lidar_node:\n  ros__parameters:\n"])
+def test_nothing_said_is_nothing_set(tmp_path, text):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text)
+    assert parameters_for(file, "l2lidar_node", "/l2lidar_node") == {}
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "l2_port: 6101", "a: {b: [}"])
+def test_other_content_is_refused_with_the_files_name(tmp_path, text):
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=r"mine\.yaml"):
+        parameters_for(file, "l2lidar_node", "/l2lidar_node")
+
+
+def test_missing_file_is_refused_with_its_name(tmp_path):
+    with pytest.raises(ValueError, match=r"absent\.yaml.*No such file"):
+        parameters_for(tmp_path / "absent.yaml", "l2lidar_node", "/l2lidar_node")
+
+
+def test_numbers_are_read_as_ros_reads_them(tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/**: {ros__parameters: {a: 2e-07, b: 4.9e-9, c: -1E3, d: '2e-07', e: 0.5}}")
+    values = parameters_for(file, "any", "/any")
+    assert values == {"a": 2e-7, "b": 4.9e-9, "c": -1000.0, "d": "2e-07", "e": 0.5}
+
+
+def test_written_file_applies_to_every_node_and_keeps_types(tmp_path):
+    values = {"a": True, "b": 1, "c": 1e-7, "d": "1.0", "e": "", "f": [0.5], "g.h": "on"}
+    values["i"] = "2e-07"
+    file = tmp_path / "written.yaml"
+    file.write_text(parameter_file(values))
+    again = parameters_for(file, "any", "/some/where")
+    assert again == values
+    assert [type(value) for value in again.values()] == [type(value) for value in values.values()]
+    assert yaml.safe_load(file.read_text()).keys() == {"/**"}
