@@ -65,6 +65,7 @@ setup(
             "pytest>=8",
             "ruff>=0.9",
             "types-PyYAML",
+            "xacro>=2.0",
             "yourdfpy>=0.0.56",
         ],
     },
