@@ -25,6 +25,7 @@ _HEADER_SIZE: Final = wire.HEADER.size
 _TAIL_SIZE: Final = wire.TAIL.size
 _ELASTIC: Final = frozenset({int(wire.PacketType.PARAMETERS)})
 """Known types whose size differs between firmware versions."""
+_MAX_MISSES: Final = 8
 
 
 class Fault(Enum):
@@ -65,8 +66,8 @@ class Framer:
     """Cuts one sender's byte stream into frames.
 
     Whatever the bytes are and however they are cut, nothing is raised, less than
-    :data:`wire.MAX_FRAME` bytes are kept for the next call, and no byte is checked again but for
-    another magic.
+    :data:`wire.MAX_FRAME` bytes are kept for the next call, and the time taken is bounded by the
+    number of bytes and calls.
     """
 
     def __init__(self) -> None:
@@ -119,17 +120,21 @@ def _parse(data: bytes, seen: int) -> tuple[list[FramingEvent], bytes]:
 def _take_out(data: bytes, at: int, seen: int, events: list[FramingEvent]) -> bytes:
     """Move the good frames behind the incomplete one at ``at`` to the events; return the rest.
 
-    A frame that ends within the bytes seen before was looked at then.
+    A frame that ends within the bytes seen before was looked at then. Real streams have one or
+    two magics there that begin no good frame; more are not worth the time.
     """
     rest = b""
     begin = at
+    misses = 0
     at = data.find(wire.MAGIC, at + 1)
-    while at >= 0:
+    while at >= 0 and misses < _MAX_MISSES:
         found = _frame_at(data, at, seen)
         if isinstance(found, Frame):
             events.append(found)
             rest += data[begin:at]
             begin = at + len(found.payload) + wire.OVERHEAD
+        else:
+            misses += 1
         at = data.find(wire.MAGIC, max(at + 1, begin))
     return rest + data[begin:]
 
