@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2lidar_node.emulator import scenes
+from l2lidar_node.emulator import gaits, scenes
 from l2lidar_node.emulator.shapes import box, cone, ellipsoid, placed
 from l2lidar_node.emulator.world import World
 
@@ -251,10 +251,26 @@ def test_an_unknown_scene_is_refused() -> None:
         scenes.make("kitchen")
 
 
-def test_any_world_has_a_way_about_its_middle() -> None:
-    world = World(box((2.0, 0.0, -1.0), (10.0, 4.0, 2.0)))
+def test_any_world_has_a_way_where_there_is_room() -> None:
+    hall = box((2.0, 0.0, -1.0), (10.0, 6.0, 2.0))
+    block = box((2.0, 0.0, -1.0), (5.0, 6.0, 2.0))
+    world = World(np.concatenate([hall, block]))
+
     scene = scenes.of_world(world)
 
-    np.testing.assert_allclose(scene.route.mean(axis=0), [6.0, 2.0], atol=1e-9)
-    assert scene.ground(np.array(6.0), np.array(2.0)) == pytest.approx(-1.0)
+    motion = gaits.make("walk", scene)
+    positions, _ = motion.poses(np.arange(0.0, 40.0, 0.1))
+    assert world.clearance(positions).min() > 0.5
+    assert (positions[:, 0] > 5.0).all()
+    assert np.ptp(positions[:, 0]) > 1.0
+    assert scene.ground(np.array(7.0), np.array(2.0)) == pytest.approx(-1.0)
     assert scene.headroom == pytest.approx(3.0)
+
+
+def test_a_world_without_room_still_has_a_place() -> None:
+    scene = scenes.of_world(
+        World(np.array([[[3.0, -9.0, -9.0], [3.0, 9.0, -9.0], [3.0, 0.0, 20.0]]]))
+    )
+
+    assert np.isfinite(scene.route).all()
+    assert np.isfinite(scene.headroom)
