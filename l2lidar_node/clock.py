@@ -167,11 +167,12 @@ class DeviceClock:
             no trustworthy stamp can be told, see :class:`ClockStatus`.
         """
         host = self._host
+        device = self._device
         left = arrival - duration_ns
-        u = self._device.place(stream, seq, stamp, arrival)
+        u = device.place(stream, seq, stamp, arrival)
         if u is None:
             self._notice()
-        else:
+        elif device.is_firm:
             host.add(u, left)
             if u >= host.due:
                 self._update(u, stamp, arrival)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
-from typing import Final
+from typing import Final, NamedTuple
 
 from l2lidar_node.cadence import Cadence
 from l2lidar_node.types import DeviceNs, HostNs, Stream
@@ -27,10 +27,9 @@ _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
 _SILENT_NS: Final = 1_000 * _MS
 _BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
-_BOOT_SEQ: Final = 256  # so can sequence numbers
+_BOOT_SEQ: Final = 16  # so can sequence numbers
 _KEEP: Final = 16  # epochs that packets on their way may still belong to
 _SYNCS: Final = 128
-_NEVER: Final = 1 << 80  # after every stamp
 
 
 class Step(Enum):
@@ -41,14 +40,26 @@ class Step(Enum):
     LOST = "lost"
 
 
+class _Sync(NamedTuple):
+    """A sync of this host; ``number`` tells those of the same value apart."""
+
+    number: int
+    value: int
+    sent: int
+
+
+_NO_SYNC: Final = _Sync(0, 1 << 80, 0)  # its value is after every stamp
+
+
 class _Epoch:
     """A stretch without a step: ``base`` is what a stamp is ahead of the device line."""
 
-    __slots__ = ("base", "value")
+    __slots__ = ("base", "is_firm", "sync")
 
-    def __init__(self, base: int, value: int | None) -> None:
+    def __init__(self, base: int, sync: _Sync | None, is_firm: bool = True) -> None:
         self.base = base
-        self.value = value  # of this host's sync that began it
+        self.sync = sync  # of this host, that began it
+        self.is_firm = is_firm  # whether a more regular stream will still have its say
 
 
 class _Track:
@@ -87,6 +98,9 @@ class DeviceLine:
         How often the line began anew, places before and after having nothing in common.
     epochs : int
         Steps of the clock that were bridged.
+    is_firm : bool
+        Whether the latest place was told as well as it can be: false between the first point packet
+        after a step and the first IMU packet after it.
     """
 
     def __init__(
@@ -96,21 +110,24 @@ class DeviceLine:
         self.steps: deque[tuple[Step, int]] = deque(maxlen=64)
         self.restarts = 0
         self.epochs = 0
+        self.is_firm = True
         self._lateness = lateness
-        self._syncs: deque[tuple[int, int]] = deque(maxlen=_SYNCS)
+        self._syncs: deque[_Sync] = deque(maxlen=_SYNCS)
+        self._sync_count = 0
         self._epochs: deque[_Epoch] = deque(maxlen=_KEEP)
-        self._newest = _NEVER  # value of the latest sync that is known to have taken effect
+        self._newest = _NO_SYNC  # the latest that is known to have taken effect
         self._imu = _Track(_IMU_GAIN)
         self._points = _Track(_POINTS_GAIN)
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Take note of a sync that left this host; whether it arrives is not known."""
-        self._syncs.append((value, sent))
+        self._sync_count += 1
+        self._syncs.append(_Sync(self._sync_count, value, sent))
 
     def restart(self) -> None:
         """Forget everything but how sequence numbers wrap."""
         self._epochs.clear()
-        self._newest = _NEVER
+        self._newest = _NO_SYNC
         for track in (self._imu, self._points):
             track.epoch = None
             track.suspect = None
@@ -127,11 +144,13 @@ class DeviceLine:
         if epoch is None:
             return self._join(track, seq, stamp, arrival)
         u = stamp - epoch.base
-        behind = stamp >= self._newest and epoch.value != self._newest
+        newest = self._newest
+        behind = stamp >= newest.value and epoch.sync is not newest
         if not behind and track.cadence.follows(seq, u - track.u):
             track.u = u
             track.stamp = stamp
             track.arrival = arrival
+            self.is_firm = epoch.is_firm
             return u
         return self._step(track, epoch, seq, stamp, arrival)
 
@@ -171,18 +190,18 @@ class DeviceLine:
         """
         base = stamp - expected
         off = abs(base - epoch.base)
-        for value, _ in reversed(self._syncs):
-            if value == epoch.value:
+        for sync in reversed(self._syncs):
+            if sync is epoch.sync:
                 break
-            if not -_SLACK_NS <= stamp - value <= expected - track.u + _MS:
+            if not -_SLACK_NS <= stamp - sync.value <= expected - track.u + _MS:
                 continue
-            begun = next((item for item in self._epochs if item.value == value), None)
+            begun = next((item for item in self._epochs if item.sync is sync), None)
             if begun is None:
                 if off <= noise:
                     continue
-                begun = _Epoch(base, value)
+                begun = _Epoch(base, sync, track is self._imu or not self._imu_flows(track))
                 self.epochs += 1
-                self._newest = value
+                self._newest = sync
                 self._epochs.append(begun)
             elif abs(base - begun.base) > off:
                 continue
@@ -190,17 +209,24 @@ class DeviceLine:
                 if self._points.epoch is begun:
                     self._points.u += begun.base - base
                 begun.base = base
+                begun.is_firm = True
             return begun
         return None
 
+    def _imu_flows(self, track: _Track) -> bool:
+        """Whether the IMU stream is about as far as another one."""
+        imu = self._imu
+        return imu.epoch is not None and (track.u - imu.u) * self.ratio < _LATE_NS
+
     def _synced_since(self, track: _Track) -> bool:
         """Whether a sync may have stepped the clock since the last packet."""
-        return any(sent > track.arrival - _LATE_NS for _, sent in self._syncs)
+        return any(sync.sent > track.arrival - _LATE_NS for sync in self._syncs)
 
     def _accept(self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int) -> int:
         u = stamp - epoch.base
         track.cadence.resume(seq, u - track.u)
         track.epoch = epoch
+        self.is_firm = epoch.is_firm
         track.u = u
         track.stamp = stamp
         track.arrival = arrival
@@ -256,7 +282,7 @@ class DeviceLine:
         end: int | None = None  # of an epoch on the line
         for epoch in reversed(self._epochs):
             u = stamp - epoch.base
-            begin = None if epoch.value is None else epoch.value - epoch.base
+            begin = None if epoch.sync is None else epoch.sync.value - epoch.base
             inside = (begin is None or u >= begin - _SLACK_NS) and (end is None or u <= end)
             end = begin
             if not inside:

@@ -20,11 +20,10 @@ _SETTLE_NS: Final = 1_000.0 * _MS  # time constant with which what is published 
 _SLEW: Final = 0.002  # at most by that much faster or slower
 _SEGMENTS: Final = 8
 
-_FORWARD_NS: Final = 25 * _MS  # arrivals later than that for a second: the host's clock was set forward
-_BACKWARD_NS: Final = 5 * _MS  # arrivals earlier than that for two blocks: it was set back
+_STEP_NS: Final = 5 * _MS  # arrivals off by more, and for long enough: the host's clock was set
 _SPREADS: Final = 10.0
-_FORWARD_BLOCKS: Final = 10
-_BACKWARD_BLOCKS: Final = 2
+_FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
+_BACKWARD_BLOCKS: Final = 2  # early ones cannot
 _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
 
 
@@ -157,9 +156,9 @@ class HostLine:
         off = self._low_at[1] - line.at(self._low_at[0])
         spread = _SPREADS * line.excess
         suspects = self._suspects
-        if off < -_BACKWARD_NS - spread:
+        if off < -_STEP_NS - spread:
             enough = _BACKWARD_BLOCKS
-        elif off > _FORWARD_NS + spread:
+        elif off > _STEP_NS + spread:
             enough = _FORWARD_BLOCKS
         else:
             suspects.clear()
