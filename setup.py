@@ -1,4 +1,4 @@
-"""Installs both Python packages and the files a ROS 2 package shares; package.xml holds name and version."""
+"""Installs both Python packages and the files a ROS 2 package shares."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,7 +12,7 @@ SHARED_FOLDERS = ("config", "launch", "rviz", "urdf", "meshes")
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
-    """Return ``data_files``: every file of the shared folders, at the same relative path below share."""
+    """Return the shared folders' files, each at the same relative path below ``share``."""
     found: list[tuple[str, list[str]]] = [
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -20,10 +20,11 @@ def shared_files() -> list[tuple[str, list[str]]]:
     for top in SHARED_FOLDERS:
         for folder in sorted({path.parent for path in (HERE / top).rglob("*") if path.is_file()}):
             relative = folder.relative_to(HERE)
-            if "__pycache__" in relative.parts:
-                continue
-            files = [str(relative / path.name) for path in sorted(folder.iterdir()) if path.is_file()]
-            found.append((f"share/{NAME}/{relative}", files))
+            if "__pycache__" not in relative.parts:
+                names = sorted(path.name for path in folder.iterdir() if path.is_file())
+                found.append(
+                    (f"share/{NAME}/{relative}", [f"{relative}/{name}" for name in names])
+                )
     return found
 
 
@@ -39,13 +40,13 @@ setup(
     data_files=shared_files(),
     zip_safe=False,
     python_requires=">=3.11,<3.13",
-    # The lower bounds that matter are those of Ubuntu 24.04, whose packages a sourced ROS 2 brings along.
+    # The lower bounds let the packages of Ubuntu 24.04 do, which a sourced ROS 2 brings along.
     install_requires=[
         "numpy>=1.26",
         "scipy>=1.11",
         "filterpy>=1.4.5",
         "kiss-icp>=1.3,<2",
-        # The same library twice: the -cpu build is a quarter of the size and exists for one platform only.
+        # One library: its -cpu build is a quarter of the size and exists for one platform only.
         "open3d-cpu>=0.19; sys_platform == 'linux' and platform_machine == 'x86_64'",
         "open3d>=0.19; sys_platform != 'linux' or platform_machine != 'x86_64'",
         "dpkt>=1.9.8",
@@ -62,7 +63,7 @@ setup(
             "hypothesis>=6.100",
             "import-linter>=2.1",
             "mypy>=1.11",
-            "pytest>=8",
+            "pytest>=8.4",
             "ruff>=0.9",
             "types-PyYAML",
             "xacro>=2.0",

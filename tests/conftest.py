@@ -1,12 +1,12 @@
-"""Keeps the ROS graph of a test run to itself: this machine only, and a domain no other run has."""
+"""Keeps the ROS graph of a test run to itself: this machine only, a domain no other run has."""
 
 import importlib.util
 import os
 
 import pytest
 
-# Before anything imports rclpy. Fast DDS makes its ports of the domain, and those above 101 reach into the
-# range Linux hands out to programs that ask for any port.
+# Before anything imports rclpy. Fast DDS makes its ports from the domain, and those of domains
+# above 101 are in the range that Linux hands out to programs asking for any port.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.pop("ROS_LOCALHOST_ONLY", None)

@@ -1,0 +1,143 @@
+"""Checks that what is built, installed and declared is what the code needs."""
+
+import ast
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+NAME = "l2lidar_node"
+MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
+SHARED_FOLDERS = ("config", "launch", "rviz", "urdf", "meshes")
+EXECUTABLES = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node", "l2lidar"}
+
+# Of ROS 2, by import name, where it is not the package's own.
+ROS_MODULES = re.compile(
+    r"(rclpy|ament_index_python|launch|launch_ros|rcl_interfaces|builtin_interfaces|\w+_msgs|\w+_srvs)$"
+)
+# By import name, where PyPI has another.
+DISTRIBUTIONS = {
+    "yaml": "PyYAML",
+    "kiss_icp": "kiss-icp",
+    "open3d": "open3d-cpu",
+    "rerun": "rerun-sdk",
+}
+
+
+def imported(*folders: str) -> set[str]:
+    """Return the top-level names that the Python files of the folders import."""
+    names: set[str] = set()
+    for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names.update(alias.name.split(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module.split(".")[0])
+    return names - set(sys.stdlib_module_names) - {"__future__", "l2lidar_node", "l2lidar_proc"}
+
+
+def shared_files(folder: Path) -> set[Path]:
+    """Return the files of the shared folders relative to ``folder``."""
+    return {
+        path.relative_to(folder)
+        for name in SHARED_FOLDERS
+        for path in (folder / name).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def test_the_version_stands_once() -> None:
+    assert importlib.metadata.version(NAME) == MANIFEST.findtext("version")
+
+
+def test_the_changelog_knows_the_version() -> None:
+    latest = re.search(r"^(Forthcoming|\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.rst").read_text(), re.M)
+    assert latest is not None
+    assert latest[0] in ("Forthcoming", MANIFEST.findtext("version"))
+
+
+def test_every_ros_package_imported_is_declared() -> None:
+    declared = {item.text for item in MANIFEST.iter("exec_depend")}
+    used = {
+        name
+        for name in imported("l2lidar_node", "l2lidar_proc", "launch")
+        if ROS_MODULES.match(name)
+    }
+    assert "rclpy" in used
+    assert used - declared == set()
+
+
+def test_every_python_package_imported_is_declared() -> None:
+    requirements = importlib.metadata.requires(NAME) or []
+    declared = {re.match(r"[\w.-]+", line)[0] for line in requirements if "extra ==" not in line}
+    optional = {
+        re.match(r"[\w.-]+", line)[0] for line in requirements if 'extra == "view"' in line
+    }
+    used = {
+        name for name in imported("l2lidar_node", "l2lidar_proc") if not ROS_MODULES.match(name)
+    }
+    assert {DISTRIBUTIONS.get(name, name) for name in used} - declared - optional == set()
+
+
+@pytest.mark.parametrize(
+    "entry", importlib.metadata.distribution(NAME).entry_points, ids=lambda entry: entry.name
+)
+def test_an_entry_point_leads_to_a_function(entry: importlib.metadata.EntryPoint) -> None:
+    if ".ros." in entry.module:
+        pytest.importorskip("rclpy", reason="needs rclpy")
+    assert callable(entry.load())
+
+
+def test_colcon_builds_the_package(tmp_path: Path) -> None:
+    """Executables, index entry and shared files are where ``ros2 run`` and launch files look."""
+    colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    if colcon is None:
+        pytest.skip("needs colcon")
+    command = [colcon, "--log-base", str(tmp_path / "log"), "build", "--base-paths", str(ROOT)]
+    command += [
+        "--build-base",
+        str(tmp_path / "build"),
+        "--install-base",
+        str(tmp_path / "install"),
+    ]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+    prefix = tmp_path / "install" / NAME
+    built = {path.name for path in (prefix / "lib" / NAME).iterdir() if os.access(path, os.X_OK)}
+    assert built == EXECUTABLES
+    assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
+    assert shared_files(prefix / "share" / NAME) == shared_files(ROOT)
+    installed = next(prefix.glob("lib/python3*/site-packages"))
+    packages = {
+        path.relative_to(ROOT)
+        for name in (NAME, "l2lidar_proc")
+        for path in (ROOT / name).rglob("*.py")
+    }
+    assert {path.relative_to(installed) for path in installed.rglob("*.py")} >= packages
+
+
+@pytest.mark.ros
+def test_transforms_have_the_type_every_ros_2_has() -> None:
+    """Another machine's ROS 2 takes our transforms only if the message's type hash is its own."""
+    import rclpy
+    from tf2_msgs.msg import TFMessage
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("probe", context=context)
+    publisher = node.create_publisher(TFMessage, "transforms", 1)
+    (endpoint,) = node.get_publishers_info_by_topic("transforms")
+    assert str(endpoint.topic_type_hash) == (
+        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+    )
+    publisher.destroy()
+    node.destroy_node()
+    context.shutdown()
