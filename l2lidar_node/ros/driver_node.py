@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import threading
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswerError
 
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -101,6 +103,14 @@ class DriverNode(Node):
         self._session.call(lambda driver, now: driver.configure(config))
 
     def _handle(self, event: Event) -> None:
+        try:
+            self._hand_on(event)
+        except RCLError:
+            # A signal ends rclpy while the session still hands out what it holds.
+            if self.context.ok():
+                raise
+
+    def _hand_on(self, event: Event) -> None:
         if isinstance(event, ImuSample):
             if self._imu_publisher is not None:
                 self._imu_publisher.publish(self._imu_template.serialize(event))
@@ -196,6 +206,8 @@ def main(args: list[str] | None = None) -> int:
         print(f"l2lidar_node: {error.strerror}", file=sys.stderr)
         return 1
     finally:
+        # Ctrl-C under `ros2 launch` comes twice, from the terminal and from launch.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
