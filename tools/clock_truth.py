@@ -1,4 +1,4 @@
-"""Simulates what a clock is given: stamps and arrivals of both streams, with the truth of every packet.
+"""Simulates what a clock is given: stamps and arrivals of both streams, with their truth.
 
 A second, much faster model beside the emulator, of nothing but time: no bytes, no world. Tests and
 ``bench_clock`` use it; the emulator's own truth judges the same rows more slowly.
@@ -39,7 +39,7 @@ _SWEEP: Final = 299 * 7.7316e3  # [ns] first to last slot
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """What the device, the path and the two hosts do. Times in seconds unless the name says otherwise.
+    """What the device, the path and the hosts do, in seconds unless a name says otherwise.
 
     Attributes
     ----------
@@ -54,8 +54,8 @@ class Scenario:
     path_ms : float
         Constant part of the way of a packet to the host.
     jitter : str
-        ``none``; ``uniform`` up to ``jitter_ms``; ``exponential`` with that mean; ``heavy``: mostly
-        nothing, 99th percentile ``jitter_ms``.
+        ``none``; ``uniform`` up to ``jitter_ms``; ``exponential`` with that mean; ``heavy``:
+        mostly nothing, 99th percentile ``jitter_ms``.
     fifo : bool
         Whether packets keep their order on the way (a datagram behind a late one is late too).
     burst_ms, burst_every : float
@@ -108,7 +108,7 @@ class Scenario:
 
 
 def simulate(scenario: Scenario, seed: int) -> NDArray[np.void]:
-    """Return what happens at the host, shape (N,), dtype EVENT, in order; the same for the same seed."""
+    """Return what happens at the host, shape (N,), dtype EVENT, in order of time."""
     rng = np.random.default_rng(seed)
     parts = [_sent(scenario)]
     clock = _DeviceClock(scenario, parts[0], rng)
@@ -145,7 +145,9 @@ def _sent(scenario: Scenario) -> NDArray[np.void]:
 class _DeviceClock:
     """The device's clock as piecewise integral of its rate."""
 
-    def __init__(self, scenario: Scenario, syncs: NDArray[np.void], rng: np.random.Generator) -> None:
+    def __init__(
+        self, scenario: Scenario, syncs: NDArray[np.void], rng: np.random.Generator
+    ) -> None:
         self._scenario = scenario
         shift = _host_shift(scenario, syncs["arrival"]) + scenario.epoch
         lost = rng.random(len(syncs)) < scenario.sync_loss
@@ -167,9 +169,9 @@ class _DeviceClock:
 
     def _dead(self, instant: float) -> bool:
         scenario = self._scenario
-        return any(at <= instant * 1e-9 <= at + scenario.reboot_s for at in scenario.reboot_at) or any(
-            start <= instant * 1e-9 <= stop for start, stop in scenario.silences
-        )
+        return any(
+            at <= instant * 1e-9 <= at + scenario.reboot_s for at in scenario.reboot_at
+        ) or any(start <= instant * 1e-9 <= stop for start, stop in scenario.silences)
 
     def _elapsed(self, instants: NDArray[np.float64]) -> NDArray[np.float64]:
         scenario = self._scenario
@@ -184,7 +186,11 @@ class _DeviceClock:
 
 
 def _packets(
-    scenario: Scenario, kind: int, instants: NDArray[np.float64], duration: float, clock: _DeviceClock
+    scenario: Scenario,
+    kind: int,
+    instants: NDArray[np.float64],
+    duration: float,
+    clock: _DeviceClock,
 ) -> NDArray[np.void]:
     events = np.zeros(len(instants), EVENT)
     events["kind"] = kind
@@ -204,15 +210,12 @@ def _packets(
     return events
 
 
-def _travel(scenario: Scenario, packets: NDArray[np.void], rng: np.random.Generator) -> NDArray[np.void]:
+def _travel(
+    scenario: Scenario, packets: NDArray[np.void], rng: np.random.Generator
+) -> NDArray[np.void]:
     """Return the packets that arrive, with the time at which they do."""
     count = len(packets)
-    jitter = {
-        "none": lambda: np.zeros(count),
-        "uniform": lambda: rng.uniform(0.0, scenario.jitter_ms, count),
-        "exponential": lambda: rng.exponential(scenario.jitter_ms, count),
-        "heavy": lambda: _heavy(rng, count, scenario.jitter_ms),
-    }[scenario.jitter]()
+    jitter = _jitter(scenario, count, rng)
     arrival = packets["arrival"] + jitter * _MS
     if scenario.burst_ms:
         phase = np.mod(arrival, scenario.burst_every * 1e9)
@@ -229,8 +232,20 @@ def _travel(scenario: Scenario, packets: NDArray[np.void], rng: np.random.Genera
     return packets[keep]
 
 
+def _jitter(scenario: Scenario, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return one random delay per packet [ms]."""
+    width = scenario.jitter_ms
+    if scenario.jitter == "uniform":
+        return rng.uniform(0.0, width, count)
+    if scenario.jitter == "exponential":
+        return rng.exponential(width, count)
+    if scenario.jitter == "heavy":
+        return _heavy(rng, count, width)
+    return np.zeros(count)
+
+
 def _heavy(rng: np.random.Generator, count: int, p99_ms: float) -> NDArray[np.float64]:
-    """Return Pareto delays (tail index 1.5) whose 99th percentile is given, at most 10 times that."""
+    """Return Pareto delays (tail index 1.5) by their 99th percentile, at most 10 times that."""
     delays = (rng.random(count) ** (-1.0 / 1.5) - 1.0) * p99_ms / (0.01 ** (-1.0 / 1.5) - 1.0)
     return np.asarray(np.minimum(delays, 10.0 * p99_ms))
 

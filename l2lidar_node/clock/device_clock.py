@@ -1,8 +1,9 @@
 """Maps device stamps to host stamps; says when it is locked and what happened to either clock.
 
-Two lines, one after the other: :class:`DeviceLine` takes the steps out of the stamps, so that both streams
-lie on one even device line whatever syncs and reboots do; :class:`HostLine` lays that line below the
-arrivals (see :mod:`l2lidar_node.envelope` for the estimator and why it is not a Kalman filter).
+Two lines, one after the other: :class:`DeviceLine` takes the steps out of the stamps, so that both
+streams lie on one even device line whatever syncs and reboots do; :class:`HostLine` lays that line
+below the arrivals (see :mod:`l2lidar_node.clock.envelope` for the estimator and why it is not a
+Kalman filter).
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from l2lidar_node.clock.device_line import DeviceLine, Step
+from l2lidar_node.clock.host_line import HostLine
+from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
-from l2lidar_node.device_line import DeviceLine, Step
-from l2lidar_node.host_line import HostLine
-from l2lidar_node.sync import SyncSchedule
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 
 _SILENCE_NS: Final = 1_000_000_000
@@ -94,7 +95,8 @@ class _Mode(Enum):
 class DeviceClock:
     """The device's clock as seen from the host.
 
-    Pure: time only passes through the arguments, so a recording gives the same stamps as the live device.
+    Pure: time only passes through the arguments, so a recording gives the same stamps as the live
+    device.
 
     Parameters
     ----------
@@ -102,8 +104,9 @@ class DeviceClock:
 
     Notes
     -----
-    Stamps of a stream never go backwards and are never after the packet's arrival. Where both cannot be
-    had, after the host's clock was set back, packets get no stamp until it has passed the latest one.
+    Stamps of a stream never go backwards and are never after the packet's arrival. Where both
+    cannot be had, after the host's clock was set back, packets get no stamp until it has passed
+    the latest one.
     """
 
     def __init__(self, config: ClockConfig) -> None:
@@ -163,8 +166,8 @@ class DeviceClock:
         Returns
         -------
         HostNs or None
-            After every earlier one of the stream and at least ``duration_ns`` before ``arrival``. None while
-            no trustworthy stamp can be told, see :class:`ClockStatus`.
+            After every earlier one of the stream and at least ``duration_ns`` before ``arrival``.
+            None while no trustworthy stamp can be told, see :class:`ClockStatus`.
         """
         host = self._host
         device = self._device

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from itertools import pairwise
 from typing import Final
 
 FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
@@ -26,9 +27,10 @@ class Cadence:
 
     Notes
     -----
-    A phase-locked loop beside a running mean of the period. A stream whose period itself varies (a motor's)
-    is best predicted from its last packet: high gain. One with a steady period and noise on single stamps
-    (a sampler's) needs a long memory, or every bridged step would add the noise of one stamp to the line.
+    A phase-locked loop beside a running mean of the period. A stream whose period itself varies (a
+    motor's) is best predicted from its last packet: high gain. One with a steady period and noise
+    on single stamps (a sampler's) needs a long memory, or every bridged step would add the noise
+    of one stamp to the line.
     """
 
     __slots__ = (
@@ -61,7 +63,7 @@ class Cadence:
         self._history.clear()
 
     def learn(self, seq: int, stamp: int) -> bool:
-        """Take a packet to learn from; return whether the period is known now, this packet being the last."""
+        """Take a packet to learn from; return whether the period is known now."""
         history = self._history
         history.append((seq, stamp))
         if len(history) < _LEARN:
@@ -69,7 +71,7 @@ class Cadence:
         del history[:-_LEARN]
         steps = [
             (b - a) / self._distance(m, n)
-            for (m, a), (n, b) in zip(history, history[1:], strict=False)
+            for (m, a), (n, b) in pairwise(history)
             if self._distance(m, n) > 0
         ]
         period = statistics.median(steps) if steps else 0.0
@@ -85,7 +87,10 @@ class Cadence:
         return True
 
     def follows(self, seq: int, advance: int) -> bool:
-        """Take the next packet if it is where it is expected; ``advance`` counts from the last one."""
+        """Take the next packet if it is where it is expected.
+
+        ``advance`` is how far its place is from the last packet's.
+        """
         gap = seq - self._seq
         if gap <= 0:
             gap += self._modulus
@@ -115,7 +120,7 @@ class Cadence:
         self._seq = seq
 
     def gap(self, seq: int, advance: int) -> int:
-        """Return how many numbers a packet is after the last one; learn from it where numbers wrap."""
+        """Return how many numbers a packet is after the last; learn where numbers wrap."""
         gap = seq - self._seq
         if gap > 0:
             return gap

@@ -7,7 +7,9 @@ from typing import Final
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import HostNs
 
-_AGAIN_NS: Final = 1_000_000_000  # a single sync that did not take effect is repeated after this long
+_AGAIN_NS: Final = (
+    1_000_000_000  # a single sync that did not take effect is repeated after this long
+)
 _SLACK_NS: Final = 50_000_000
 _FASTEST: Final = 2  # device seconds per true second, at most
 

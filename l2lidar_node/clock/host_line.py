@@ -1,11 +1,11 @@
-"""Turns places on the device line into host stamps: acquires the line, follows it smoothly, notices steps."""
+"""Lays the device line onto the host's clock: locks, follows smoothly, notices steps."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import Final
 
-from l2lidar_node.envelope import BLOCK_NS, Envelope, Line, supporting_line
+from l2lidar_node.clock.envelope import BLOCK_NS, Envelope, Line, supporting_line
 
 _MS: Final = 1_000_000
 _TRY_NS: Final = 100 * _MS  # between attempts to lock
@@ -41,9 +41,10 @@ class HostLine:
 
     Notes
     -----
-    What is published is not the fit itself, which moves a little with every new block, but a continuous,
-    strictly rising line that runs at the fitted ratio and closes in on the fit with a time constant of
-    1 s, never more than 0.2 % faster or slower: samples 4 ms apart stay 4 ms apart.
+    What is published is not the fit itself, which moves a little with every new block, but a
+    continuous, strictly rising line that runs at the fitted ratio and closes in on the fit with a
+    time constant of 1 s, never more than 0.2 % faster or slower: samples 4 ms apart stay 4 ms
+    apart.
     """
 
     __slots__ = (
@@ -65,7 +66,9 @@ class HostLine:
 
     def __init__(self, ratio: float) -> None:
         self.line = Line(0, 0, ratio, 0.0)
-        self.advance_ns = 0  # how much earlier than the envelope stamps shall be: the constant path delay
+        self.advance_ns = (
+            0  # how much earlier than the envelope stamps shall be: the constant path delay
+        )
         self.steps: deque[int] = deque(maxlen=64)
         self.reset()
 
@@ -83,7 +86,7 @@ class HostLine:
         self.due = 0
 
     def add(self, u: int, arrival: int) -> None:
-        """Take one packet: its place on the device line and its arrival, less what measuring it took."""
+        """Take one packet: its place on the device line, and when it could leave at the latest."""
         if not self.ready:
             self._packets.append((u, arrival))
             if len(self._packets) > _MOST:

@@ -1,17 +1,18 @@
 """Fits the line from device time to host time that no packet can have arrived before.
 
-A packet arrives when it was measured plus a delay that is never below the constant part of the path. So in
-the plane of device time and arrival all packets lie on or above the wanted line, many close to it, some far
-above: a lower envelope. Of all lines with no packet below, :func:`supporting_line` returns the one with the
-least sum of distances to the packets. It is the edge of the lower convex hull that spans their mean device
-time (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements",
-INFOCOM 1999, who solve the same linear programme).
+A packet arrives when it was measured plus a delay that is never below the constant part of the
+path. So in the plane of device time and arrival all packets lie on or above the wanted line, many
+close to it, some far above: a lower envelope. Of all lines with no packet below,
+:func:`supporting_line` returns the one with the least sum of distances to the packets. It is the
+edge of the lower convex hull that spans their mean device time (Moon, Skelly and Towsley,
+"Estimation and removal of clock skew from network delay measurements", INFOCOM 1999, who solve the
+same linear programme).
 
-Why not a Kalman filter (filterpy): it averages, so for one-sided delays its answer moves with their mean,
-by milliseconds when the network gets busy, and gets better with the square root of the number of packets;
-the envelope moves with their minimum, and gets better with their number. No noise level has to be known, and
-slope and offset come out together. Its one weakness, a curved line (drifting rate), is met by the length of
-the window, see :class:`Envelope`.
+Why not a Kalman filter (filterpy): it averages, so for one-sided delays its answer moves with
+their mean, by milliseconds when the network gets busy, and gets better with the square root of the
+number of packets; the envelope moves with their minimum, and gets better with their number. No
+noise level has to be known, and slope and offset come out together. Its one weakness, a curved
+line (drifting rate), is met by the length of the window, see :class:`Envelope`.
 """
 
 from __future__ import annotations
@@ -109,10 +110,10 @@ class Envelope:
 
     Notes
     -----
-    A long window averages better, a short one follows a drifting rate better: a drift of a per second makes
-    an error of a T^2 / 8 over a window T. The window is 3 s while the network is quiet (the median block
-    minimum lies less than 20 us above the line) and grows with the square root of that excess up to 16 s,
-    one block at a time so the line never jumps because of it.
+    A long window averages better, a short one follows a drifting rate better: a drift of a per
+    second makes an error of a T^2 / 8 over a window T. The window is 3 s while the network is
+    quiet (the median block minimum lies less than 20 us above the line) and grows with the square
+    root of that excess up to 16 s, one block at a time so the line never jumps because of it.
     """
 
     __slots__ = ("_blocks", "_low", "_low_at", "_reach", "_start", "line")
@@ -124,7 +125,7 @@ class Envelope:
         self._restart(packets)
 
     def close(self, low: tuple[int, int], now: int) -> None:
-        """Add the least delayed packet (device time, arrival) of a block that ends at ``now``, and fit."""
+        """Add the least delayed packet of a block that ends at ``now``, and fit."""
         blocks = self._blocks
         blocks.append(low)
         oldest = now - _FORGET * BLOCK_NS / self.line.ratio

@@ -1,11 +1,12 @@
-"""Lays the stamps of both streams, over steps and restarts of the device's clock, onto one even line.
+"""Lays the stamps of both streams, over the steps of the device's clock, onto one even line.
 
-Between two syncs the device's clock runs evenly; a sync, of this host or another, steps it. Each stretch in
-between is an *epoch*: a constant that, taken from a stamp, gives the *device line*, which has no steps. Which
-epoch a packet was stamped in, and how large the step was, is told by the packets themselves: both streams
-are so regular that the stamp of the next packet is known to microseconds from its sequence number, whatever
-the network does to arrivals. The values this host sent tell which sync it was. Arrivals are asked only when
-regularity cannot answer: after long gaps and for stamps that nothing explains.
+Between two syncs the device's clock runs evenly; a sync, of this host or another, steps it. Each
+stretch in between is an *epoch*: a constant that, taken from a stamp, gives the *device line*,
+which has no steps. Which epoch a packet was stamped in, and how large the step was, is told by the
+packets themselves: both streams are so regular that the stamp of the next packet is known to
+microseconds from its sequence number, whatever the network does to arrivals. The values this host
+sent tell which sync it was. Arrivals are asked only when regularity cannot answer: after long gaps
+and for stamps that nothing explains.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Final, NamedTuple
 
-from l2lidar_node.cadence import Cadence
+from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 
 _MS: Final = 1_000_000
@@ -86,21 +87,22 @@ class DeviceLine:
     ratio : float
         First guess of host nanoseconds per device nanosecond; to be kept up to date in ``ratio``.
     lateness : callable
-        Returns arrival minus the instant of a place on the line [ns host], None while that is unknown.
+        Returns arrival minus the instant of a place on the line [ns host], None while that is
+        unknown.
 
     Attributes
     ----------
     ratio : float
     steps : deque of (Step, int)
-        What happened and by how much [ns device]; whoever reads it takes it out. A line that began anew
-        says so in ``restarts``.
+        What happened and by how much [ns device]; whoever reads it takes it out. A line that began
+        anew says so in ``restarts``.
     restarts : int
         How often the line began anew, places before and after having nothing in common.
     epochs : int
         Steps of the clock that were bridged.
     is_firm : bool
-        Whether the latest place was told as well as it can be: false between the first point packet
-        after a step and the first IMU packet after it.
+        Whether the latest place was told as well as it can be: false between the first point
+        packet after a step and the first IMU packet after it.
     """
 
     def __init__(
@@ -184,9 +186,10 @@ class DeviceLine:
     ) -> _Epoch | None:
         """Return the epoch of the sync of this host that a stamp is just after.
 
-        Clocks faster than the host's pass the value of a sync before it steps them back, so the stamp
-        must also be nearer to where it is expected than without the step. The stream that comes first
-        tells where the epoch lies on the line; the IMU stream, more regular, has the last word.
+        Clocks faster than the host's pass the value of a sync before it steps them back, so the
+        stamp must also be nearer to where it is expected than without the step. The stream that
+        comes first tells where the epoch lies on the line; the IMU stream, more regular, has the
+        last word.
         """
         base = stamp - expected
         off = abs(base - epoch.base)
