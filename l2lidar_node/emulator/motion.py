@@ -111,6 +111,11 @@ class Motion:
             return np.inf
         return self.rest_s + self.ramp_s + self._curve.end - self._curve.start
 
+    @property
+    def lap_s(self) -> float:
+        """How long one lap takes once the sensor is at full pace [s]; infinite without repetition."""
+        return self._curve.end - self._curve.start if self._curve.periodic else np.inf
+
     def poses(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return where the cloud frame is.
 

@@ -327,3 +327,25 @@ def test_a_periodic_curve_of_one_turn_stays_smooth() -> None:
     rates = curve.derivatives(np.linspace(-3.0, 9.0, 500)).angular_velocity
 
     np.testing.assert_allclose(rates[:, 2], np.pi, atol=1e-4)
+
+
+@pytest.mark.parametrize("degree", [3, 5])
+def test_rates_are_exact_even_where_knots_are_far_apart(degree: int) -> None:
+    rng = np.random.default_rng(2)
+    knots = np.arange(12.0)
+    turns = [Rotation.identity()]
+    for step in rng.normal(0.0, 0.7, (11, 3)):  # 70 degrees from knot to knot
+        turns.append(turns[-1] * Rotation.from_rotvec(step))
+    quaternions = Rotation.concatenate(turns).as_quat(scalar_first=True)
+    curve = PoseSpline(knots, rng.normal(size=(12, 3)), quaternions, degree=degree)
+    u, h = np.linspace(0.3, 10.7, 200), 1e-5
+
+    here = curve.derivatives(u)
+
+    before, after = curve.derivatives(u - h), curve.derivatives(u + h)
+    turned = rotation(before.quaternion_wxyz).inv() * rotation(after.quaternion_wxyz)
+    np.testing.assert_allclose(here.angular_velocity, turned.as_rotvec() / (2 * h), atol=1e-6)
+    change = (after.angular_velocity - before.angular_velocity) / (2 * h)
+    np.testing.assert_allclose(here.angular_acceleration, change, atol=1e-5)
+    met = curve.poses(knots)[1]
+    np.testing.assert_allclose(np.abs(np.sum(met * quaternions, axis=1)), 1.0, atol=1e-12)
