@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc import rotations
@@ -29,6 +30,7 @@ STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 
 _STEP_S: Final = 0.1  # the filter's step
 _WINDOW: Final = 10  # steps that one measurement of gravity or rest spans
+_LAG: Final = 5  # steps that the newest velocity may be behind
 _HISTORY: Final = 80  # states remembered, so that a late sweep finds its own
 _BREAK_NS: Final = 500_000_000  # a gap in the samples after which the vertical is unknown again
 _PLAUSIBLE: Final = (8.8, 10.8)  # [m/s^2] what |a| at rest may be
@@ -103,7 +105,7 @@ class AttitudeFilter:
         self._rest: Rest | None = None
         self._faulty = False
         self._pending: list[Samples] = []
-        self._recent: deque[Samples] = deque(maxlen=_WINDOW)
+        self._recent: deque[Samples] = deque(maxlen=_WINDOW + _LAG)
         self._steps = 0
         self._states: deque[Attitude] = deque(maxlen=_HISTORY)
 
@@ -167,6 +169,20 @@ class AttitudeFilter:
         for part in whole:
             self._follow(part, velocities)
 
+    def measure_bias(self, bias: F64, sigma: float) -> None:
+        """Take a bias [rad/s] that was found elsewhere, as by matching sweeps.
+
+        Parameters
+        ----------
+        bias : ndarray, shape (3,)
+            IMU axes.
+        sigma : float
+            Its standard deviation [rad/s].
+        """
+        if self._up is not None:
+            observed = np.hstack((np.zeros((3, 3)), np.eye(3)))
+            self._correct(bias - self._bias, observed, sigma**2 * np.eye(3))
+
     def _follow(self, step: Samples, velocities: VelocityHistory | None) -> None:
         """Take one step of about a tenth of a second."""
         before = self._recent[-1] if self._recent else None
@@ -180,7 +196,7 @@ class AttitudeFilter:
             self._predict(np.concatenate((before[-1:], step)))
         self._recent.append(step)
         self._steps += 1
-        if len(self._recent) == _WINDOW:
+        if len(self._recent) >= _WINDOW:
             self._look_back(velocities)
         self._states.append(self._state(HostNs(int(step["stamp"][-1]))))
 
@@ -201,7 +217,7 @@ class AttitudeFilter:
 
     def _look_back(self, velocities: VelocityHistory | None) -> None:
         """Judge the last second: rest or motion, and what follows from it."""
-        second = np.concatenate(list(self._recent))
+        second = np.concatenate(list(self._recent)[-_WINDOW:])
         moving = (
             velocities.at(HostNs(int(second["stamp"][-1]))) if velocities is not None else None
         )
@@ -221,15 +237,12 @@ class AttitudeFilter:
         if found is not None:
             self._measure_rest(found, len(second))
         else:
-            self._measure_motion(second, velocities)
+            self._measure_motion(velocities)
 
     def _predict(self, samples: Samples) -> None:
         """Carry vertical and uncertainty over samples; the first one was there before."""
-        dt = np.diff(samples["stamp"])[:, None] * 1e-9
-        rates = samples["angular_velocity"] - self._bias
-        turns = rotations.exp(0.5 * dt * (rates[:-1] + rates[1:]))
-        back = rotations.conjugate(rotations.cumulative(turns)[-1])
-        span = float(dt.sum())
+        back = self._turned_to_last(samples)[0]
+        span = float(samples["stamp"][-1] - samples["stamp"][0]) * 1e-9
         transition = np.eye(6)
         transition[:3, :3] = rotations.matrices(back)
         transition[:3, 3:] = span * np.eye(3)
@@ -250,38 +263,53 @@ class AttitudeFilter:
             self._gravity += share * (size - self._gravity)
             self._measure_force(rest.force, _FORCE_AT_REST)
 
-    def _measure_motion(self, second: Samples, velocities: VelocityHistory | None) -> None:
-        forces = second["linear_acceleration"]
+    def _measure_motion(self, velocities: VelocityHistory | None) -> None:
+        """Take the mean force of a second for gravity, less what the velocity gained in it.
+
+        Velocities come late, so the second is the one before the newest of them; what the sensor
+        turned since is known from the gyro.
+        """
+        samples = np.concatenate(list(self._recent))
+        stamps, forces = samples["stamp"], samples["linear_acceleration"]
         size = float(np.linalg.norm(forces, axis=1).mean())
         self._faulty = not _PLAUSIBLE_MOVING[0] <= size <= _PLAUSIBLE_MOVING[1]
         if self._faulty:
             return
-        dt = np.diff(second["stamp"])[:, None] * 1e-9
-        rates = second["angular_velocity"] - self._bias
-        turns = rotations.exp(0.5 * dt * (rates[:-1] + rates[1:]))
-        q = np.concatenate((np.array([[1.0, 0.0, 0.0, 0.0]]), rotations.cumulative(turns)))
-        to_end = rotations.multiply(rotations.conjugate(q[-1]), q)
-        mean = rotations.rotate(to_end, forces).mean(axis=0)
+        span = round(_WINDOW * _STEP_S * 1e9)
+        end = int(stamps[-1])
+        newest = velocities.newest if velocities is not None else None
+        if newest is not None and stamps[0] + span <= newest < end:
+            end = newest
+        second = slice(*np.searchsorted(stamps, [end - span, end]))
+        to_now = self._turned_to_last(samples)
+        force = rotations.rotate(to_now, forces)[second].mean(axis=0)
+        ends = [second.start, second.stop - 1]
+        gained = self._gained(stamps[ends], to_now[ends], velocities)
         known, unknown = _FORCE_MOVING
-        gained = self._gained(second, to_end[0], velocities)
         if gained is None:
-            self._measure_force(mean, unknown)
+            self._measure_force(force, unknown)
         else:
-            self._measure_force(mean - gained, known)
+            self._measure_force(force - gained, known)
+
+    def _turned_to_last(self, samples: Samples) -> F64:
+        """Return the rotations from each sample's axes to the last one's, shape (N, 4)."""
+        dt = np.diff(samples["stamp"])[:, None] * 1e-9
+        rates = samples["angular_velocity"] - self._bias
+        turns = rotations.exp(0.5 * dt * (rates[:-1] + rates[1:]))
+        q = rotations.cumulative(np.concatenate((np.array([[1.0, 0.0, 0.0, 0.0]]), turns)))
+        return rotations.multiply(rotations.conjugate(q[-1]), q)
 
     def _gained(
-        self, second: Samples, q_end_start: F64, velocities: VelocityHistory | None
+        self, stamps: NDArray[np.int64], to_now: F64, velocities: VelocityHistory | None
     ) -> F64 | None:
-        """Return the mean acceleration [m/s^2] in IMU axes at the end, None if not known."""
+        """Return the mean acceleration between two instants [m/s^2] if it is known."""
         if velocities is None:
             return None
-        start, end = HostNs(int(second["stamp"][0])), HostNs(int(second["stamp"][-1]))
-        before, after = velocities.at(start), velocities.at(end)
+        before, after = (velocities.at(HostNs(int(stamp))) for stamp in stamps)
         if before is None or after is None:
             return None
-        before, after = before @ self._R_cloud_imu, after @ self._R_cloud_imu
-        change = after - rotations.rotate(q_end_start, before)
-        return np.asarray(change / ((end - start) * 1e-9))
+        v = rotations.rotate(to_now, np.stack((before, after)) @ self._R_cloud_imu)
+        return np.asarray((v[1] - v[0]) / ((stamps[1] - stamps[0]) * 1e-9))
 
     def _measure_force(self, force: F64, sigma: float) -> None:
         """Correct with a force [m/s^2] that should be gravity alone."""

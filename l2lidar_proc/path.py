@@ -62,18 +62,12 @@ class Path:
         Origin at the knot in the frame of the first knot [m].
     rates : ndarray, shape (K, 3)
         Angular velocity without bias [rad/s], cloud axes; linear in time between knots.
-    covered : float
-        Share of the path that lies within the IMU samples, 0 to 1.
-    largest_gap_ns : int
-        Longest stretch of the path without a sample.
     """
 
     stamps: NDArray[np.int64]
     rotations_wxyz: F64
     positions: F64
     rates: F64
-    covered: float
-    largest_gap_ns: int
 
     def pose(self, stamp: HostNs) -> tuple[F64, F64]:
         """Return rotation (w, x, y, z), shape (4,), and position [m], shape (3,), at one instant.
@@ -107,7 +101,7 @@ def still_path(start: HostNs, end: HostNs) -> Path:
     """Return the path of a sensor that does not move."""
     stamps = np.array([start, max(end, start + 1)], dtype=np.int64)
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
-    return Path(stamps, identity, np.zeros((2, 3)), np.zeros((2, 3)), 1.0, 0)
+    return Path(stamps, identity, np.zeros((2, 3)), np.zeros((2, 3)))
 
 
 def integrate(
@@ -156,7 +150,7 @@ def integrate(
     anchors = [gravity.stamp] if gravity is not None else []
     if velocities is not None:
         anchors.extend(velocities["stamp"])
-    knots, gap = _knots(samples["stamp"], start, end, hold_ns, anchors)
+    knots = _knots(samples["stamp"], start, end, hold_ns, anchors)
     times = _seconds(knots, start)
     R_cloud_imu = np.asarray(T_cloud_imu)[:3, :3]
     rates = _held(samples, start, knots, hold_ns, bias) @ R_cloud_imu.T
@@ -175,14 +169,27 @@ def integrate(
             carried = _specific_force(samples, start, times) @ R_cloud_imu.T
         positions = _translate(knots, q, rates, velocities, carried, gravity, lever)
 
-    inside = min(end, int(samples["stamp"][-1])) - max(start, int(samples["stamp"][0]))
-    return Path(knots, q, positions, rates, min(max(inside / (end - start), 0.0), 1.0), gap)
+    return Path(knots, q, positions, rates)
 
 
-def _knots(
-    stamps: NDArray[np.int64], start: HostNs, end: HostNs, hold_ns: int, anchors: list[HostNs]
-) -> tuple[NDArray[np.int64], int]:
-    """Return the knots of a path and the longest stretch without a sample that touches it [ns]."""
+def coverage(stamps: NDArray[np.int64], start: HostNs, end: HostNs) -> tuple[float, int]:
+    """Return how far IMU samples cover a span.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (N,), int64
+        Of the samples [ns], ascending.
+    start, end : HostNs
+
+    Returns
+    -------
+    share : float
+        Part of the span between the first and the last sample, 0 to 1.
+    gap_ns : int
+        Longest stretch without a sample that touches the span.
+    """
+    if not len(stamps):
+        return 0.0, int(end - start)
     first = max(int(np.searchsorted(stamps, start, side="right")) - 1, 0)
     last = min(int(np.searchsorted(stamps, end, side="left")), len(stamps) - 1)
     stretches = np.diff(stamps[first : last + 1], prepend=start, append=end)
@@ -190,15 +197,22 @@ def _knots(
         stretches[0] = 0
     if stamps[last] >= end:
         stretches[-1] = 0
-    gap = int(stretches.max())
-    knots = [[start, end], stamps[first : last + 1], anchors]
-    if gap > 2 * _STEP_NS:
+    inside = min(end, int(stamps[-1])) - max(start, int(stamps[0]))
+    return min(max(inside / max(end - start, 1), 0.0), 1.0), max(int(stretches.max()), 0)
+
+
+def _knots(
+    stamps: NDArray[np.int64], start: HostNs, end: HostNs, hold_ns: int, anchors: list[HostNs]
+) -> NDArray[np.int64]:
+    """Return the knots of a path: its ends, samples and anchors, and more in a gap."""
+    knots = [[start, end], stamps, anchors]
+    if coverage(stamps, start, end)[1] > 2 * _STEP_NS:
         knots.append(np.arange(start, end, _STEP_NS))
         # where the hold begins and ends the rate changes within a nanosecond: knots on either side
         early, late = int(stamps[0]) - hold_ns, int(stamps[-1]) + hold_ns
         knots.append([early - 1, early, late, late + 1])
     joined = np.unique(np.concatenate([np.asarray(some, dtype=np.int64) for some in knots]))
-    return joined[(joined >= start) & (joined <= end)], gap
+    return joined[(joined >= start) & (joined <= end)]
 
 
 def _held(

@@ -124,3 +124,19 @@ def between(a: ArrayLike, b: ArrayLike) -> F64:
         across = cross(u, np.eye(3)[np.argmin(np.abs(u))])
         return np.concatenate(([0.0], across / np.linalg.norm(across)))
     return normalised(np.concatenate(([w], cross(u, v))))
+
+
+def transform(q_wxyz: ArrayLike, translation: ArrayLike) -> F64:
+    """Return the (4, 4) matrix of a rotation followed by a translation [m]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = matrices(q_wxyz)
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def inverse(transform: F64) -> F64:
+    """Return the inverse of a rigid transform, (4, 4)."""
+    back = np.eye(4)
+    back[:3, :3] = transform[:3, :3].T
+    back[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return back

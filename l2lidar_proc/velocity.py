@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc.path import VELOCITY
-from l2lidar_proc.rotations import F64, cross, matrices
+from l2lidar_proc.rotations import F64, cross
 
 _MOST: Final = 400  # two seconds of an odometry at IMU rate
 
@@ -29,6 +29,11 @@ class VelocityHistory:
         self.source = ""
         self._stamps: deque[int] = deque(maxlen=_MOST)
         self._velocities: deque[F64] = deque(maxlen=_MOST)
+
+    @property
+    def newest(self) -> HostNs | None:
+        """Stamp of the newest velocity, None when empty."""
+        return HostNs(self._stamps[-1]) if self._stamps else None
 
     def push(self, stamp: HostNs, velocity: ArrayLike, source: str = "odometry") -> bool:
         """Take a velocity; one that is not finite or not later than the newest is refused.
@@ -105,19 +110,3 @@ def carried_over(linear: ArrayLike, angular: ArrayLike, T_cloud_body: F64) -> F6
     place_of_cloud = -turn.T @ T_cloud_body[:3, 3]
     moved = np.asarray(linear, dtype=np.float64) + cross(angular, place_of_cloud)
     return np.asarray(turn @ moved)
-
-
-def transform(q_wxyz: ArrayLike, translation: ArrayLike) -> F64:
-    """Return the (4, 4) matrix of a rotation followed by a translation [m]."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = matrices(q_wxyz)
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def inverse(transform: F64) -> F64:
-    """Return the inverse of a rigid transform, (4, 4)."""
-    back = np.eye(4)
-    back[:3, :3] = transform[:3, :3].T
-    back[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return back

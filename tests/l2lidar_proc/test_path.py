@@ -7,7 +7,7 @@ import pytest
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc import rotations
-from l2lidar_proc.path import VELOCITY, Gravity, Path, integrate, still_path
+from l2lidar_proc.path import VELOCITY, Gravity, Path, coverage, integrate, still_path
 from tests.l2lidar_proc.analytic import T_CLOUD_IMU, G, Motion, at
 
 WALK = Motion(turn=1.0, nod=0.15, speed=1.0)
@@ -41,8 +41,6 @@ def test_rotation_follows_a_fast_motion_between_samples():
     path = integrate(spin.imu(0, 1), at(0.3013), at(0.5307), T_cloud_imu=T_CLOUD_IMU, bias=NO_BIAS)
     angle, _ = error(path, spin, 0.3013, np.linspace(0.3013, 0.5307, 400))
     assert angle < 1e-4
-    assert path.covered == 1.0
-    assert path.largest_gap_ns == 4_000_000
 
 
 def test_bias_is_taken_off_in_imu_axes_and_the_mount_is_honoured():
@@ -113,8 +111,6 @@ def test_a_gap_is_bridged_and_reported():
     )
     angle, _ = error(path, spin, 0.3, np.linspace(0.3, 0.5, 100))
     assert angle < 1e-6
-    assert path.largest_gap_ns == 56_000_000
-    assert path.covered == 1.0
 
 
 @pytest.mark.parametrize(("last", "turned"), [(0.452, 0.152 + 0.02), (0.2, 0.0)])
@@ -123,8 +119,6 @@ def test_beyond_the_samples_the_rate_is_held_a_little_and_then_stops(last, turne
     path = integrate(spin.imu(0, last), at(0.3), at(0.6), T_cloud_imu=T_CLOUD_IMU, bias=NO_BIAS)
     q, _ = path.pose(at(0.6))
     assert rotations.log(q)[2] == pytest.approx(turned, abs=1e-4)
-    assert path.covered == pytest.approx(max(last - 0.3, 0.0) / 0.3, abs=0.02)
-    assert path.largest_gap_ns >= 148_000_000
 
 
 def test_before_the_samples_likewise():
@@ -132,7 +126,6 @@ def test_before_the_samples_likewise():
     path = integrate(spin.imu(0.4, 1.0), at(0.3), at(0.6), T_cloud_imu=T_CLOUD_IMU, bias=NO_BIAS)
     q, _ = path.pose(at(0.6))
     assert rotations.log(q)[2] == pytest.approx(0.22, abs=1e-4)
-    assert path.covered == pytest.approx(2 / 3, abs=0.01)
 
 
 def test_between_two_instants_of_the_path():
@@ -161,3 +154,22 @@ def test_a_path_of_no_length_and_a_still_one_are_whole():
     q, p = still_path(at(0), HostNs(at(0) + 10)).pose(at(5))
     assert q.tolist() == [1, 0, 0, 0]
     assert not p.any()
+
+
+@pytest.mark.parametrize(
+    ("stamps", "share", "gap"),
+    [
+        ([0, 4, 8, 12], 1.0, 4),
+        ([1, 4, 8, 11], 1.0, 4),
+        ([-9, 4, 8, 60], 1.0, 52),
+        ([2, 4, 8, 12], 0.9, 4),
+        ([-5, 5], 0.4, 10),
+        ([-8, -4], 0.0, 15),
+        ([30, 34], 0.0, 29),
+        ([3], 0.0, 8),
+        ([], 0.0, 10),
+    ],
+)
+def test_coverage_of_a_span(stamps, share, gap):
+    found = coverage(np.array(stamps, dtype=np.int64), HostNs(1), HostNs(11))
+    assert found == (pytest.approx(share), gap)

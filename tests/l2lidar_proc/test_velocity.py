@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2lidar_proc.velocity import VelocityHistory, carried_over, inverse, transform
+from l2lidar_proc.rotations import inverse, transform
+from l2lidar_proc.velocity import VelocityHistory, carried_over
 from tests.l2lidar_proc.analytic import at
 
 

@@ -1,0 +1,145 @@
+"""Turns any structured cloud with one time per point into a Sweep, or says why it cannot."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import POINT, HostNs, Sweep
+
+TIME_FIELDS: Final = ("time", "t", "timestamp")
+
+_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
+_NEAR_NS: Final = 2_000_000_000  # how far times may be from the stamp
+
+
+class CloudError(ValueError):
+    """A cloud whose points' times cannot be told; the message says why."""
+
+
+def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Sweep:
+    """Return a cloud's points with times in seconds after the sweep's start, ascending.
+
+    Parameters
+    ----------
+    cloud : ndarray, shape (N,) or (H, W)
+        Structured, with ``x``, ``y``, ``z`` and exactly one of ``time``, ``t`` and ``timestamp``.
+    stamp : HostNs
+        The cloud's stamp. Times may count from it or be absolute.
+    unit : str
+        Of the times: s, ms, us, ns; or auto, which takes floating-point numbers that span up to 1
+        for seconds, 1e3 to 1e6 for microseconds, more for nanoseconds, and integers that span
+        1e6 or more for nanoseconds. Anything else could be two things and is refused.
+
+    Returns
+    -------
+    Sweep
+        ``start`` is the stamp, or the first point where that is earlier; ``end`` the last point.
+        The points keep their fields; the time field becomes ``time``, float32. Points that are not
+        finite are left out. A cloud in the driver's own layout is passed through.
+
+    Raises
+    ------
+    CloudError
+        If there is no time field, or several; if all times are equal; or if unit or origin are not
+        plain.
+    """
+    cloud = cloud.reshape(-1)
+    name = _time_field(cloud.dtype)
+    finite = np.isfinite(cloud[name])
+    for axis in "xyz":
+        finite &= np.isfinite(cloud[axis])
+    if not finite.all():
+        cloud = cloud[finite]
+    if not len(cloud):
+        raise CloudError("no point is finite")
+    if cloud.dtype == POINT and unit == "auto":
+        unit = "s"
+    times = _relative_ns(cloud[name], stamp, unit)
+    if (np.diff(times) < 0).any():
+        order = np.argsort(times, kind="stable")
+        cloud, times = cloud[order], times[order]
+    before = min(int(times[0]), 0)
+    points = _with_time(cloud, name, np.asarray((times - before) * 1e-9))
+    points.flags.writeable = False
+    return Sweep(HostNs(stamp + before), HostNs(stamp + int(times[-1])), points, 0, 0)
+
+
+def without_time(points: NDArray[np.void]) -> NDArray[np.void]:
+    """Return the points without their field ``time``, packed."""
+    names = [name for name in points.dtype.names or () if name != "time"]
+    slim = np.empty(points.shape, dtype=[(name, points.dtype[name]) for name in names])
+    for name in names:
+        slim[name] = points[name]
+    return slim
+
+
+def _time_field(layout: np.dtype[Any]) -> str:
+    names = layout.names or ()
+    for axis in "xyz":
+        if axis not in names or layout[axis].kind != "f" or layout[axis].shape:
+            raise CloudError(f"field '{axis}' is missing or not a floating-point number")
+    found = [name for name in TIME_FIELDS if name in names]
+    if not found:
+        raise CloudError(f"no time field; one of {', '.join(TIME_FIELDS)} is needed")
+    if len(found) > 1:
+        raise CloudError(f"several time fields: {', '.join(found)}")
+    if layout[found[0]].kind not in "fiu" or layout[found[0]].shape:
+        raise CloudError(f"field '{found[0]}' is not a number")
+    return found[0]
+
+
+def _relative_ns(times: NDArray[Any], stamp: HostNs, unit: str) -> NDArray[np.int64]:
+    """Return times after the stamp [ns], shape (N,), int64."""
+    first, last = times.min(), times.max()
+    spread = float(last) - float(first) if times.dtype.kind == "f" else int(last) - int(first)
+    if spread == 0:
+        raise CloudError(f"all {len(times)} times are equal")
+    factor = _UNITS[_unit(times.dtype, spread) if unit == "auto" else unit]
+    if float(np.abs([float(first), float(last)]).max()) * factor > 9e18:
+        raise CloudError(f"times up to {float(last):g} are no instants")
+    if times.dtype.kind == "f":
+        instants = np.round(times.astype(np.float64) * factor).astype(np.int64)
+    else:
+        instants = times.astype(np.int64) * factor
+    ends = instants.min(), instants.max()
+    from_stamp = max(abs(int(end)) for end in ends) <= _NEAR_NS * max(spread * factor / 1e9, 1.0)
+    # half-width numbers cannot hold an instant, only what counts from the stamp
+    absolute = times.dtype.itemsize == 8 and abs(int(ends[0]) - stamp) <= _NEAR_NS
+    if from_stamp and absolute:
+        raise CloudError(
+            "the times may be absolute or count from the stamp, which is near 0 itself"
+        )
+    if not from_stamp and not absolute:
+        raise CloudError("the times are neither near the stamp nor do they count from it")
+    return instants - stamp if absolute else instants
+
+
+def _unit(layout: np.dtype[Any], spread: float) -> str:
+    if layout.kind == "f":
+        if spread <= 1.0:
+            return "s"
+        if 1e3 <= spread < 1e6:
+            return "us"
+    if 1e6 <= spread <= 1e9:
+        return "ns"
+    raise CloudError(
+        f"times of type {layout} that span {spread:g} have no plain unit; set it with time_unit"
+    )
+
+
+def _with_time(
+    cloud: NDArray[np.void], name: str, seconds: NDArray[np.float64]
+) -> NDArray[np.void]:
+    """Return the points with their time field replaced by ``time``, float32 seconds."""
+    layout = cloud.dtype
+    renamed = {old: "time" if old == name else old for old in layout.names or ()}
+    kinds = [
+        (new, np.dtype("<f4") if old == name else layout[old]) for old, new in renamed.items()
+    ]
+    points = np.empty(len(cloud), dtype=kinds)
+    for old, new in renamed.items():
+        points[new] = seconds if old == name else cloud[old]
+    return points
