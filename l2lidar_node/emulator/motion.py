@@ -113,7 +113,7 @@ class Motion:
 
     @property
     def lap_s(self) -> float:
-        """How long one lap takes once the sensor is at full pace [s]; infinite without repetition."""
+        """How long one lap takes at full pace [s]; infinite for a motion without laps."""
         return self._curve.end - self._curve.start if self._curve.periodic else np.inf
 
     def poses(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
