@@ -7,7 +7,6 @@ The companion package deskews properly and needs this off.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from typing import Final
 
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.geometry import PointBatch
-from l2lidar_node.types import HostNs, ImuSample, Quaternion
+from l2lidar_node.types import HostNs, ImuSample
 
 MAX_AGE_NS: Final = 80_000_000  # upstream's tolerance between a packet and its orientation
 _HISTORY: Final = 8192  # samples, 32 s: more than the longest sweep
@@ -55,50 +54,57 @@ class Levelling:
         """
         while self._samples and self._samples[0].stamp < starts[0] - MAX_AGE_NS:
             self._samples.popleft()
-        samples = list(self._samples)
-        stamps = [sample.stamp for sample in samples]
-        matrices = np.zeros((len(starts), 3, 3))
-        known = np.zeros(len(starts), np.bool_)
-        for index, start in enumerate(starts):
-            nearest = _nearest(stamps, start)
-            if nearest is not None:
-                known[index] = True
-                matrices[index] = self._rotation(samples[nearest].orientation_wxyz)
+        orientations, known = self._orientations(np.array(starts, np.int64))
+        rotations = _rotations(orientations)
+        if self.roll_pitch_only:
+            rotations = _without_yaw(rotations)
         points = batch.points.copy()
-        xyz = np.stack([points["x"], points["y"], points["z"]], axis=1, dtype=np.float64)
-        packet = np.repeat(np.arange(len(starts)), batch.counts)
-        turned = np.einsum("nij,nj->ni", matrices[packet], xyz)
-        for axis, name in enumerate(("x", "y", "z")):
-            points[name] = turned[:, axis]
+        x, y, z = (batch.points[name] for name in ("x", "y", "z"))
+        for row, name in enumerate(("x", "y", "z")):
+            weights = np.repeat(rotations[:, row].T, batch.counts, axis=1)
+            points[name] = weights[0] * x + weights[1] * y + weights[2] * z
         if known.all():
             return PointBatch(points, batch.first_s, batch.counts)
         self.dropped += int(batch.counts[~known].sum())
-        return _keep(points, known[packet], batch.first_s, batch.counts * known)
+        kept = np.repeat(known, batch.counts)
+        return _keep(points, kept, batch.first_s, batch.counts * known)
 
-    def _rotation(self, wxyz: Quaternion) -> NDArray[np.float64]:
-        """Return the rotation from the sensor to the levelled frame."""
-        w, x, y, z = wxyz
-        matrix = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        if not self.roll_pitch_only:
-            return matrix
-        yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        unturn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return np.asarray(unturn @ matrix)
+    def _orientations(
+        self, instants: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the orientations nearest to some instants, (P, 4), and which are near enough."""
+        if not self._samples:
+            return np.tile([1.0, 0.0, 0.0, 0.0], (len(instants), 1)), np.zeros(
+                len(instants), np.bool_
+            )
+        stamps = np.array([sample.stamp for sample in self._samples], np.int64)
+        after = np.clip(np.searchsorted(stamps, instants), 1, max(len(stamps) - 1, 1))
+        before = after - 1
+        after = np.minimum(after, len(stamps) - 1)
+        is_before_nearer = instants - stamps[before] <= stamps[after] - instants
+        nearest = np.where(is_before_nearer, before, after)
+        known = np.abs(stamps[nearest] - instants) <= MAX_AGE_NS
+        wxyz = np.array([sample.orientation_wxyz for sample in self._samples])
+        return wxyz[nearest], known
 
 
-def _nearest(stamps: list[HostNs], instant: HostNs) -> int | None:
-    """Return the index of the stamp nearest to an instant; None if none is near enough."""
-    after = bisect_right(stamps, instant)
-    near = [index for index in (after - 1, after) if 0 <= index < len(stamps)]
-    best = min(near, key=lambda index: abs(stamps[index] - instant), default=None)
-    return None if best is None or abs(stamps[best] - instant) > MAX_AGE_NS else best
+def _rotations(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrices, (P, 3, 3), of unit quaternions, (P, 4)."""
+    w, x, y, z = wxyz.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def _without_yaw(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rotations, (P, 3, 3), turned back about the vertical by their yaw."""
+    yaw = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+    cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    rows = [[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]
+    return np.asarray(np.array(rows).transpose(2, 0, 1) @ rotations)
 
 
 def _keep(

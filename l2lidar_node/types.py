@@ -47,6 +47,8 @@ class Stream(Enum):
     POINTS = "points"
     IMU = "imu"
 
+    __hash__ = object.__hash__  # by identity: members are keys that every packet looks up
+
 
 class ImuSample(NamedTuple):
     """One IMU sample on the host's time line; fields as in :data:`IMU_SAMPLE`."""
