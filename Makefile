@@ -1,11 +1,10 @@
 # The two commands of a newcomer are `make demo` and `make test`; both make .venv first.
 PYTHON := .venv/bin/python
-PACKAGES := l2lidar_node l2lidar_proc
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-BENCHES := load clock deskew odometry
+BENCHES := $(patsubst tools/bench_%.py,%,$(wildcard tools/bench_*.py))
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak clean

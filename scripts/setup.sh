@@ -117,9 +117,15 @@ check_ros() {
     say "using the ROS 2 that is sourced ($ros)"
 }
 
+no_python() {
+    die "Python 3.11 or 3.12 is needed and none was found on this machine." \
+        "Set PYTHON to the path of one, then run the command again."
+}
+
 install_system() {
     local found missing
     found=$(find_python)
+    [ -n "$found" ] || [ ! -x /usr/bin/python3 ] || no_python
     mapfile -t missing < <(missing_packages "$found" | tr ' ' '\n')
     [ ${#missing[@]} = 0 ] || install_packages "${missing[@]}"
 }
@@ -127,8 +133,7 @@ install_system() {
 make_venv() {
     local found options=()
     found=$(find_python)
-    [ -n "$found" ] || die "Python 3.11 or 3.12 is needed and none was found on this machine." \
-        "Set PYTHON to the path of one, then run the command again."
+    [ -n "$found" ] || no_python
     if [ -n "$ros" ]; then
         has_ros "$found" || die "ROS_DISTRO is '$ros', but $found cannot import rclpy." \
             "Source that ROS 2 ('source /opt/ros/$ros/setup.bash') or unset ROS_DISTRO to do without it."
@@ -182,7 +187,7 @@ main() {
         [ -n "$ros" ] || install_ros
         mark ros "$ros_made"
     fi
-    say "installing the Python packages this project needs"
+    say "installing the Python packages this project needs (the first time: some minutes)"
     pip_install --no-build-isolation --editable '.[bench,dev]'
     is_healthy || die "something is still missing from .venv; run 'make clean', then the command again."
     mark installed "$installed"
