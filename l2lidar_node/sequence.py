@@ -73,13 +73,14 @@ class SequenceOrder(Generic[T]):
 
     def push(self, seq: int, item: T) -> list[tuple[int, T]]:
         """Return what can be released now, each with how many are missing just before it."""
-        if self._next is None or (seq == self._next and not self._waiting):
+        if seq == self._next and not self._waiting:
             self._next = self._after(seq)
             self._given_up.discard(seq)
             return [(0, item)]
-        if self._modulus != _UNKNOWN and seq >= self._modulus:
-            self._next = self._next or self._modulus
-            self._modulus = _UNKNOWN
+        self._unlearn(seq)
+        if self._next is None:
+            self._next = self._after(seq)
+            return [(0, item)]
         ahead = self._ahead(seq)
         if ahead < 0:
             self._count_behind(seq)
@@ -101,6 +102,7 @@ class SequenceOrder(Generic[T]):
         It is late for nothing, so its number only tells how many are missing at the least.
         """
         released = self.flush()
+        self._unlearn(seq)
         missing = 0 if self._next is None else seq - self._next
         missing = missing % self._modulus if self._modulus != _UNKNOWN else max(missing, 0)
         self.counts.lost += missing
@@ -172,6 +174,13 @@ class SequenceOrder(Generic[T]):
             missing = 0
             self._next = self._after(seq)
         return released
+
+    def _unlearn(self, seq: int) -> None:
+        """Take note of a number that shows the modulus to be too small."""
+        if self._modulus != _UNKNOWN and seq >= self._modulus:
+            if self._next == 0:
+                self._next = self._modulus
+            self._modulus = _UNKNOWN
 
     def _wrapped(self, first: int, missing: int) -> int:
         """Learn from a wrap to ``first``; return how many of the missing numbers do exist."""
