@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
 from l2lidar_node.settings import Setting, SettingError, Value, build, settings_of
 
 G = TypeVar("G")
+
+_NUMBERS: Final = {int: "whole number", float: "number"}
+_METAVARS: Final = {int: "N", float: "X", str: "TEXT", bool: None}
 
 Panels = Mapping[str, Sequence[Setting]]
 """Settings by the heading under which the help shows them."""
@@ -74,23 +77,29 @@ def flag(item: Setting) -> str:
     return f"--{item.name.replace('_', '-')}"
 
 
-def _value(item: Setting, given: object) -> Value:
+def _value(item: Setting, given: bool | str) -> Value:
     try:
-        if item.item is None:
+        if isinstance(given, bool):
             return item.check(given)
-        parts = [part for part in str(given).split(",") if part.strip()]
+        if item.item is None:
+            return item.check(item.type(given))
+        parts = [part for part in given.split(",") if part.strip()]
         return item.check([item.item(part) for part in parts])
     except SettingError as error:
         text = str(error).removeprefix(f"parameter '{item.name}': ")
     except ValueError:
-        text = f"{given!r} is no list of numbers such as 1.5,4"
+        kind = "list of numbers such as 1.5,4" if item.item else _NUMBERS[item.type]
+        text = f"{given!r} is no {kind}"
+        if item.range_text:
+            text += f", expected {item.range_text}"
     raise typer.BadParameter(text, param_hint=f"'{flag(item)}'")
 
 
 def _option(item: Setting, panel: str) -> Any:
-    kind: Any = str if item.item is not None else item.type
+    # Numbers come as text: what is wrong with one is said in one place, by the setting.
+    kind: Any = bool if item.type is bool else str
     names = [f"{flag(item)}/--no-{flag(item)[2:]}"] if kind is bool else [flag(item)]
-    metavar = "|".join(item.choices) or ("A,B,..." if item.item else None)
+    metavar = "|".join(item.choices) or ("A,B,..." if item.item else _METAVARS[item.type])
     facts = [f"{item.doc[0].upper()}{item.doc[1:]}."]
     if item.unit and not item.range_text.endswith(item.unit):
         facts.append(f"In {item.unit}.")

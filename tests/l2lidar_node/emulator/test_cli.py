@@ -1,0 +1,294 @@
+"""The command line as a user starts it: processes, exit codes, what it says and what it writes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2lidar_node import wire
+from l2lidar_node.emulator import tum
+from l2lidar_node.emulator.cli import main
+from l2lidar_node.emulator.config import DeviceConfig
+from l2lidar_node.emulator.flash import Flash
+from l2lidar_node.emulator.ledger import Fault
+from l2lidar_node.emulator.physics import PhysicsConfig, assemble
+from l2lidar_node.emulator.results import Results
+from l2lidar_node.settings import build, settings_of
+from l2lidar_node.wire import WorkMode
+from tests.l2lidar_node.emulator.rig import command, read
+
+LIMIT_S = 30.0
+ROOT = Path(__file__).parents[3]
+QUICK = ("--world", "pattern", "--ready", "--lidar-port", "0")
+
+
+@pytest.fixture
+def host() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as item:
+        item.bind(("127.0.0.1", 0))
+        item.settimeout(LIMIT_S)
+        yield item
+
+
+_processes: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def _no_process_is_left() -> Iterator[None]:
+    yield
+    for process in _processes:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+    _processes.clear()
+
+
+def started(*options: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "l2lidar_node.emulator", *options],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    _processes.append(process)
+    return process
+
+
+def run(*options: str) -> tuple[int, str, str]:
+    process = started(*options)
+    out, err = process.communicate(timeout=LIMIT_S)
+    return process.returncode, out, err
+
+
+def port_of(item: socket.socket) -> str:
+    return str(item.getsockname()[1])
+
+
+def lidar_of(process: subprocess.Popen[str]) -> tuple[str, int]:
+    """Read the greeting up to the line that says where the unit listens."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("udp "):
+            ip, port = line.split()[1].split(":")
+            return ip, int(port)
+    raise AssertionError("the emulator said nothing")
+
+
+def ask(host: socket.socket, lidar: tuple[str, int], data: bytes) -> None:
+    """Send a command once the unit is on, and wait until it was acknowledged."""
+    host.recv(2000)
+    host.sendto(data, lidar)
+    for _ in range(5000):
+        if any(frame.packet_type == wire.PacketType.ACK for frame in read(host.recv(2000))):
+            return
+    raise AssertionError("no acknowledgement")
+
+
+def test_a_bounded_run_says_what_it_is_and_what_it_did(host):
+    code, out, err = run(
+        *QUICK, "--host-port", port_of(host), "--duration", "4", "--speed", "20", "--loss", "0.1",
+        "--clock-ratio", "2",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0] == "virtual YS-L2, firmware 2.8.11.1, work mode 0, clock 1/2: pattern"
+    assert lines[1].startswith("udp 127.0.0.1:")
+    assert lines[1].endswith(f"127.0.0.1:{port_of(host)}, IMU after 0 s, points after 0 s")
+    assert lines[2] == "faults: loss 0.1"
+    assert "POINTS_3D" in lines[3]
+    assert "heard: nothing" in lines[3]
+    assert lines[4].startswith("lateness: p50 ")
+    assert lines[5].startswith("faults that happened: ")
+    assert read(host.recv(2000))[0].packet_type == wire.PacketType.IMU
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("world", ["pattern", "box"])
+def test_it_ends_cleanly_when_told_to(host, number, world):
+    process = started(*QUICK, "--world", world, "--host-port", port_of(host))
+    ask(host, lidar_of(process), command(2000, 6, 1))
+    process.send_signal(number)
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, err) == (0, "")
+    assert "heard: 1 COMMAND" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--loss", "2"], ["'--loss'", "2.0 is out of range", "0 to 1"]),
+        (["--loss", "often"], ["'--loss'", "'often' is no number", "0 to 1"]),
+        (["--lidar-port", "x"], ["'--lidar-port'", "'x' is no whole number"]),
+        (["--jitter", "some"], ["'--jitter'", "'heavy'"]),
+        (["--reboot-at", "1,x"], ["'--reboot-at'", "1,x", "such as"]),
+        (["--reboot-at", "-1"], ["'--reboot-at'", "out of range"]),
+        (["--speed", "fast"], ["'--speed'", "'fast'", "or max"]),
+        (["--speed", "0"], ["'--speed'", "0.01 to 1000"]),
+        (["--duration", "-1"], ["'--duration'"]),
+        (["--ready", "--boot-scale", "1"], ["'--ready'", "'--boot-scale'"]),
+        (["--truth-points"], ["'--truth-points'", "'--truth'"]),
+        (["--lidar-ip", "l2"], ["lidar_ip", "'l2'", "192.168.1.62"]),
+        (["--firmware", "2"], ["firmware", "four numbers"]),
+        (["--world", "garden"], ["garden", "room"]),
+        (["--world", "no/such/mesh.ply"], ["no/such/mesh.ply"]),
+        (["--motion", "no/such/path.tum"], ["no/such/path.tum"]),
+        (["--mount", "sideways"], ["'--mount'", "upside_down"]),
+        (["--flash", "pyproject.toml"], ["pyproject.toml", "stored settings"]),
+        (["--worlds", "room"], ["--worlds"]),
+    ],
+)
+def test_a_wrong_option_is_named_with_what_would_be_right(options, words, monkeypatch, capfd):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "argv", ["l2lidar_emulator", "--lidar-port", "0", *options])
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with pytest.raises(SystemExit) as leaving:
+        main()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    out, err = capfd.readouterr()
+    assert leaving.value.code == 2, err
+    assert out == ""
+    text = " ".join(err.replace("│", " ").split())
+    for word in words:
+        assert word in text
+    assert "Traceback" not in err
+
+
+def test_a_port_in_use_is_one_message(host):
+    code, out, err = run("--world", "pattern", "--lidar-port", port_of(host))
+    assert (code, out) == (1, "")
+    assert err.splitlines() == [
+        f"l2lidar_emulator: cannot listen on 127.0.0.1:{port_of(host)}: Address already in use"
+    ]
+
+
+def test_a_folder_that_cannot_be_written_is_one_message(tmp_path):
+    (tmp_path / "file").write_text("")
+    code, _, err = run(*QUICK, "--duration", "0.1", "--truth", str(tmp_path / "file" / "truth"))
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert "truth" in err
+
+
+def test_help_shows_every_setting_once():
+    code, out, _ = run("--help")
+    assert code == 0
+    text = out.split()
+    for kind in (DeviceConfig, PhysicsConfig):
+        for item in settings_of(kind):
+            option = f"--{item.name.replace('_', '-')}"
+            assert text.count(option) + text.count(f"{option},") >= 1, option
+    for heading in ("Network", "World and motion", "Clock", "Power", "Faults", "Run"):
+        assert f"─ {heading} ─" in out
+
+
+def test_what_the_unit_stores_outlives_it(host, tmp_path):
+    file = tmp_path / "flash.json"
+    process = started(*QUICK, "--host-port", port_of(host), "--flash", str(file))
+    ask(host, lidar_of(process), command(2002, int(WorkMode.IMU_OFF)))
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=LIMIT_S)
+    assert Flash.from_json(file.read_text()).work_mode == WorkMode.IMU_OFF
+    code, out, _ = run(*QUICK, "--flash", str(file), "--duration", "1", "--speed", "20")
+    assert code == 0
+    assert "work mode 4" in out
+    assert "IMU," not in out.splitlines()[2]
+
+
+def test_a_pseudo_terminal_is_named_and_carries_packets():
+    process = started("--world", "none", "--ready", "--serial", "pty")
+    assert process.stdout is not None
+    process.stdout.readline()
+    kind, path = process.stdout.readline().rstrip().split(",")[0].split()
+    assert kind == "serial"
+    line = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    stream = b""
+    while {frame.packet_type for frame in read(stream)} != {102, 104}:
+        stream += os.read(line, 65536)
+    os.close(line)
+    points = next(frame for frame in read(stream) if frame.packet_type == 102)
+    row = np.frombuffer(points.payload, wire.POINTS_3D_PAYLOAD)
+    assert not row["ranges"].any()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0
+
+
+def test_the_truth_of_a_run(host, tmp_path):
+    """What arrives at the socket, the ledger, the trajectory and the exact points agree."""
+    folder = tmp_path / "truth"
+    process = started(
+        "--world", "box", "--motion", "spin", "--rest-s", "0.2", "--ready", "--lidar-port", "0",
+        "--host-port", port_of(host), "--duration", "2", "--split", "0.2", "--bad-crc", "0.1",
+        "--truth", str(folder), "--truth-points", "--seed", "7", "--clock-ratio", "1.95",
+    )  # fmt: skip
+    host.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, err) == (0, ""), out
+    stream = b""
+    host.setblocking(False)
+    while True:
+        try:
+            stream += host.recv(2000)
+        except BlockingIOError:
+            break
+    got = [
+        np.frombuffer(f.payload, wire.POINTS_3D_PAYLOAD)[0]
+        for f in read(stream)
+        if f.packet_type == 102
+    ]
+
+    results = Results(folder)
+    assert results.run["settings"]["seed"] == 7
+    assert json.loads((folder / "run.json").read_text())["settings"]["world"] == "box"
+    packets = results.packets[results.packets["type"] == 102]
+    whole = packets[packets["copies"] > 0]
+    assert len(whole) < len(packets)
+    assert [int(row["info"]["seq"]) for row in got] == whole["seq"].tolist()
+    bad = {
+        (event.packet_type, event.ordinal)
+        for event in results.faults
+        if event.fault is Fault.BAD_CRC
+    }
+    gone = results.packets[results.packets["copies"] == 0]
+    assert {(int(row["type"]), int(row["ordinal"])) for row in gone} == bad
+
+    since = packets["start_ns"] - results.run["power_on_ns"]
+    assert np.abs(since - packets["index"] * 4_639_000).max() <= 1
+    assert np.abs(packets["stamp_ns"] - since / 1.95).max() <= 1
+
+    physics = assemble(
+        build(PhysicsConfig, {"world": "box", "motion": "spin", "rest_s": 0.2, "seed": 7})
+    )
+    scan = physics.scanner.scan(0, 100)
+    points = results.points(whole["index"][:60], WorkMode(0))
+    hits = scan.hits[whole["index"][:60]]
+    np.testing.assert_allclose(points["hit"], hits, atol=1e-5)
+    sent = np.stack([row["ranges"] for row in got[:60]])
+    assert (sent == scan.packets["ranges"][whole["index"][:60]]).all()
+
+    poses = results.trajectory()
+    at = np.searchsorted(poses["stamp"], results.run["power_on_ns"] + 1_000_000_000)
+    position, _ = physics.motion.poses(np.array([1.0]))
+    np.testing.assert_allclose(poses["position"][at], position[0], atol=1e-6)
+    assert poses["stamp"][-1] >= packets["left_ns"][-1]
+    assert poses.dtype == tum.POSE
+
+
+def test_asking_for_points_that_were_never_measured_says_so(tmp_path):
+    code, _, err = run(*QUICK, "--duration", "0.2", "--truth", str(tmp_path))
+    assert code == 0, err
+    with pytest.raises(KeyError, match="no points of packet 3"):
+        Results(tmp_path).points(np.array([3]), WorkMode(0))
