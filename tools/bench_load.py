@@ -1,0 +1,198 @@
+"""Measures what the driver costs: packets per CPU second, and the node's share of a core.
+
+``make bench-load`` prints the table and writes ``out/bench/load.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import struct
+import sys
+import time
+from typing import Any
+
+import rclpy
+
+from l2lidar_node import wire
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.demo.observer import Observer
+from l2lidar_node.demo.processes import Programs, free_udp_ports, isolate_ros
+from l2lidar_node.driver import Driver
+from l2lidar_node.emulator.pattern import PatternScanner
+from l2lidar_node.framing import Frame, Framer
+from l2lidar_node.geometry import Projector
+from l2lidar_node.packets import PointPacket, decode
+from l2lidar_node.settings import build
+from l2lidar_node.transport import UdpTransport
+from l2lidar_node.types import HostNs, Sweep
+from tools.cpu import process_cpu_s
+from tools.results import Target, at_least, at_most, publish
+
+FULL_TURN = 50
+_SYNTHETIC_PACKETS = 5_000
+_STAMP = struct.Struct("<II")
+_CLOCK_RATIO = 1.99866  # of the virtual L2
+_EPOCH_NS = 1_700_000_000 * 10**9
+
+
+def decode_rate(rounds: int) -> float:
+    """Return packets per CPU second of framing, CRC, decoding and geometry, full turns."""
+    import numpy as np
+
+    payloads, _ = PatternScanner().packets(0, _SYNTHETIC_PACKETS)
+    datagrams = [wire.encode_frame(wire.PacketType.POINTS_3D, item.tobytes()) for item in payloads]
+    starts = np.arange(FULL_TURN) * wire.MIRROR_PERIOD_S
+    rates = []
+    for _ in range(rounds):
+        framer, projector = Framer(), Projector(wire.PacketType.POINTS_3D)
+        begin = time.process_time()
+        batch: list[bytes] = []
+        for datagram in datagrams:
+            for event in framer.feed(datagram):
+                if isinstance(event, Frame):
+                    packet = decode(event)
+                    if isinstance(packet, PointPacket):
+                        batch.append(packet.payload)
+            if len(batch) == FULL_TURN:
+                projector.points(batch, starts)
+                batch.clear()
+        rates.append(len(datagrams) / (time.process_time() - begin))
+    return statistics.median(rates)
+
+
+def socket_rate(seconds: float, with_imu: bool) -> dict[str, float]:
+    """Return what it costs to make full-turn sweeps of packets from a socket.
+
+    A virtual L2 in a process of its own sends as fast as this one reads. Only this process's CPU
+    time counts, and only its point packets.
+    """
+    host_port, lidar_port = free_udp_ports(2)
+    values = {
+        "l2_ip": "127.0.0.1", "l2_port": lidar_port,
+        "host_ip": "127.0.0.1", "host_port": host_port,
+        "imu_adjust": False, "sweep_cut": "turn", "enable_l2_host_sync": False,
+    }  # fmt: skip
+    config = build(DriverConfig, values)
+    driver, transport = Driver(config), UdpTransport(config.network)
+    mode = "0" if with_imu else str(int(wire.WorkMode.IMU_OFF))
+    arguments = [
+        "--ready", "--world", "pattern", "--speed", "max", "--work-mode", mode,
+        "--host-port", str(host_port), "--lidar-port", str(lidar_port),
+    ]  # fmt: skip
+    with Programs() as programs:
+        programs.start("l2lidar_node.emulator", arguments)
+        while not driver.counters.sweeps:
+            _take(driver, transport, programs)
+        before, cpu, wall = driver.counters.snapshot(), time.process_time(), time.monotonic()
+        sweeps = 0
+        while time.monotonic() - wall < seconds:
+            sweeps += _take(driver, transport, programs)
+        spent, elapsed = time.process_time() - cpu, time.monotonic() - wall
+    transport.close()
+    after = driver.counters
+    kind = wire.PacketType.POINTS_3D
+    packets = after.frames[kind] - before.frames[kind]
+    lost = sum(after.sequence[key].lost - before.sequence[key].lost for key in after.sequence)
+    return {
+        "rate": packets / spent,
+        "speed": packets * wire.MIRROR_PERIOD_S / elapsed,
+        "lost": lost,
+    }
+
+
+def _take(driver: Driver, transport: UdpTransport, programs: Programs) -> int:
+    """Handle what has arrived; return how many sweeps it completed."""
+    sweeps = 0
+    batch = transport.receive(0.1)
+    if not batch:
+        programs.check()
+    arrival = HostNs(0)
+    for data, _ in batch:
+        arrival = _arrival_at_real_time(data)
+        sweeps += sum(isinstance(event, Sweep) for event in driver.receive(data, arrival))
+    driver.tick(arrival)
+    return sweeps
+
+
+def _arrival_at_real_time(data: bytes) -> HostNs:
+    """Return when a datagram would have come at the real rate: the clock has its usual work."""
+    seconds, nanoseconds = _STAMP.unpack_from(data, wire.HEADER.size + 8)
+    return HostNs(_EPOCH_NS + round((seconds * 10**9 + nanoseconds) * _CLOCK_RATIO))
+
+
+def node_share(seconds: float) -> dict[str, float]:
+    """Return the driver node's CPU share at the real rate, with one subscriber of both topics."""
+    isolate_ros()
+    host_port, lidar_port = free_udp_ports(2)
+    parameters = {
+        "l2_ip": "127.0.0.1", "l2_port": lidar_port,
+        "host_ip": "127.0.0.1", "host_port": host_port,
+        "enable_IMU_publishing": "true",
+    }  # fmt: skip
+    assignments = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
+    rclpy.init()
+    observer = Observer()
+    try:
+        with Programs() as programs:
+            node = programs.start("l2lidar_node.ros.driver_node", ["--ros-args", *assignments])
+            programs.start(
+                "l2lidar_node.emulator",
+                ["--ready", "--world", "pattern",
+                 "--host-port", str(host_port), "--lidar-port", str(lidar_port)],
+            )  # fmt: skip
+            while not observer.clouds.stamps:
+                observer.watch(time.monotonic() + 0.5)
+                programs.check()
+            observer.watch(time.monotonic() + 2.0)
+            seen = len(observer.clouds.stamps), len(observer.imu.stamps)
+            cpu, wall = process_cpu_s(node.pid), time.monotonic()
+            observer.watch(wall + seconds)
+            share = (process_cpu_s(node.pid) - cpu) / (time.monotonic() - wall)
+            clouds = (len(observer.clouds.stamps) - seen[0]) / seconds
+            imu = (len(observer.imu.stamps) - seen[1]) / seconds
+    finally:
+        observer.destroy_node()
+        rclpy.try_shutdown()
+    return {"share": share, "clouds": clouds, "imu": imu}
+
+
+def main() -> int:
+    """Run the measurements; return 0 whatever they found."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
+    seconds: float = parser.parse_args().seconds
+    rows: list[dict[str, Any]] = []
+
+    def row(what: str, value: float, unit: str, remark: str = "") -> None:
+        rows.append({"what": what, "value": round(value, 4), "unit": unit, "remark": remark})
+
+    pure = decode_rate(5)
+    row("framing + CRC + decode + geometry, full turns", pure, "packets per CPU s")
+    points = socket_rate(seconds, with_imu=False)
+    row(
+        "socket to sweep, points only", points["rate"], "packets per CPU s",
+        f"{points['speed']:.0f} x real time, {points['lost']:.0f} lost",
+    )  # fmt: skip
+    mixed = socket_rate(seconds, with_imu=True)
+    row(
+        "socket to sweep, points with their share of IMU", mixed["rate"],
+        "point packets per CPU s",
+        f"{mixed['speed']:.0f} x real time, {mixed['lost']:.0f} lost",
+    )  # fmt: skip
+    node = node_share(seconds)
+    row(
+        "driver node, one subscriber", 100 * node["share"], "% of a core",
+        f"{node['clouds']:.2f} clouds/s, {node['imu']:.1f} IMU samples/s received",
+    )  # fmt: skip
+    targets: list[Target] = [
+        at_least("framing + CRC + decode + geometry [packets per CPU s]", pure, 60_000),
+        at_least("socket to sweep [packets per CPU s]", points["rate"], 30_000),
+        at_most("driver node [% of a core]", 100 * node["share"], 5.0),
+    ]
+    publish("load", "What the driver costs", rows, targets)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
