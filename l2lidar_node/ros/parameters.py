@@ -101,8 +101,9 @@ def _declaration(item: Setting) -> tuple[str, Any, ParameterDescriptor]:
         description=f"{item.doc}{unit}",
         additional_constraints=f"one of {item.range_text}" if item.choices else "",
         read_only=False,
-        # A YAML file may say 100 for a float: the check below takes it, rclpy alone would not.
-        dynamic_typing=item.type is float,
+        # A YAML file may say 100 for a float, and an empty list has no type of its own: the check
+        # below takes both, rclpy alone would not.
+        dynamic_typing=item.type in (float, tuple),
     )
     if item.lo is not None and item.hi is not None and item.item is None:
         if item.type is float:
