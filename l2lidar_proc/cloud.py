@@ -68,8 +68,8 @@ def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Swee
 
 
 def without_time(points: NDArray[np.void]) -> NDArray[np.void]:
-    """Return the points without their field ``time``, packed."""
-    names = [name for name in points.dtype.names or () if name != "time"]
+    """Return the points without any field of times, packed."""
+    names = [name for name in points.dtype.names or () if name not in TIME_FIELDS]
     slim = np.empty(points.shape, dtype=[(name, points.dtype[name]) for name in names])
     for name in names:
         slim[name] = points[name]

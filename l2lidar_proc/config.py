@@ -186,3 +186,31 @@ class ProcConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     deskew: DeskewConfig = field(default_factory=DeskewConfig)
     filters: FilterConfig = field(default_factory=FilterConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeskewTopics:
+    """Where a deskew node listens and speaks."""
+
+    cloud_topic: str = setting("/points", "clouds with one time per point")
+    imu_topic: str = setting("/imu/data", "IMU samples")
+    velocity_topic: str = setting("odometry", "velocity of the sensor or of what carries it")
+    velocity_type: str = setting(
+        "odometry", "what comes on velocity_topic: nav_msgs/Odometry, geometry_msgs/TwistStamped",
+        choices=("odometry", "twist", "none"),
+    )  # fmt: skip
+    output_topic: str = setting("points_deskewed", "deskewed clouds")
+    qos_reliability: str = setting(
+        "reliable", "reliability of the output", choices=("best_effort", "reliable")
+    )
+    use_tf: bool = setting(
+        True, "take the mounts from /tf_static where it has them; else imu_xyz and imu_rpy hold"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeskewNodeConfig:
+    """Everything the deskew node can be told."""
+
+    topics: DeskewTopics = field(default_factory=DeskewTopics)
+    proc: ProcConfig = field(default_factory=ProcConfig)

@@ -1,0 +1,226 @@
+"""Deskew and filters as a ROS 2 node: converts messages, calls the pipeline, publishes."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TwistStamped, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.exceptions import NameValidationException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, PointCloud2
+
+from l2lidar_node.ros.arguments import UsageError, start_rclpy
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.parameters import ParameterSet
+from l2lidar_node.settings import SettingError
+from l2lidar_node.types import IMU_SAMPLE
+from l2lidar_proc import report
+from l2lidar_proc.cloud import CloudError, to_sweep, without_time
+from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.pipeline import Deskewed, Pipeline
+from l2lidar_proc.ros.levelling_watch import LevellingWatch
+from l2lidar_proc.ros.static_frames import StaticFrames
+from l2lidar_proc.velocity import carried_over
+
+_IMU_DEPTH = 500
+
+
+class DeskewNode(Node):
+    """Publishes every cloud as a sensor at rest would have seen it.
+
+    Raises
+    ------
+    SettingError
+        If a parameter is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("deskew_node")
+        self._settings = ParameterSet(self, DeskewNodeConfig, self._configure)
+        config = self._settings.value
+        self._pipeline = Pipeline(config.proc)
+        self._frames = StaticFrames(self) if config.topics.use_tf else None
+        self._mounted: tuple[str, str, int] | None = None
+        self._cloud_frame = ""
+        self._refused: Counter[str] = Counter()
+        self._last: report.Report | None = None
+        self._before = self._pipeline.counts
+        self._open(config)
+        self._levelling = LevellingWatch(self, config.topics.cloud_topic)
+        self._overdue = self.create_timer(0.01, self._hand_out)
+        self._overdue.cancel()
+        self.create_timer(1.0, self._diagnose)
+
+    def _open(self, config: DeskewNodeConfig) -> None:
+        topics = config.topics
+        reliable = topics.qos_reliability == "reliable"
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self._output = self.create_publisher(
+            PointCloud2, topics.output_topic, QoSProfile(depth=10, reliability=reliability)
+        )
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._statistics = self.create_publisher(DiagnosticStatus, "~/statistics", 10)
+        listening = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        often = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
+        self.create_subscription(Imu, topics.imu_topic, self._imu, often)
+        if topics.velocity_type == "odometry":
+            self.create_subscription(Odometry, topics.velocity_topic, self._odometry, often)
+        elif topics.velocity_type == "twist":
+            self.create_subscription(TwistStamped, topics.velocity_topic, self._twist, often)
+
+    def _configure(self, config: DeskewNodeConfig) -> None:
+        self._pipeline.configure(config.proc)
+
+    def _imu(self, message: Imu) -> None:
+        self._mount(message.header.frame_id)
+        q, rate, force = message.orientation, message.angular_velocity, message.linear_acceleration
+        sample = np.array(
+            [
+                (
+                    from_time(message.header.stamp),
+                    (q.w, q.x, q.y, q.z),
+                    (rate.x, rate.y, rate.z),
+                    (force.x, force.y, force.z),
+                )
+            ],
+            dtype=IMU_SAMPLE,
+        )
+        self._pipeline.imu(sample)
+        self._hand_out()
+
+    def _mount(self, imu_frame: str) -> None:
+        """Take the place of the IMU from TF as soon as both frames are in it."""
+        if self._frames is None or not self._cloud_frame:
+            return
+        asked = (self._cloud_frame, imu_frame, self._frames.version)
+        if asked != self._mounted:
+            self._mounted = asked
+            T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
+            if T_cloud_imu is not None and self._cloud_frame != imu_frame:
+                self._pipeline.tracker.mount(T_cloud_imu)
+
+    def _cloud(self, message: PointCloud2) -> None:
+        self._cloud_frame = message.header.frame_id
+        stamp = from_time(message.header.stamp)
+        try:
+            points = from_cloud(message)
+        except ValueError as error:
+            self._refuse(error, "dropped")
+            return
+        try:
+            sweep = to_sweep(points, stamp, self._settings.value.proc.deskew.time_unit)
+        except CloudError as error:
+            self._refuse(error, "passed on as it came, without times")
+            self._output.publish(to_cloud(without_time(points), stamp, self._cloud_frame))
+            return
+        self._pipeline.sweep(sweep, time.monotonic_ns())
+        self._hand_out()
+
+    def _refuse(self, error: ValueError, fate: str) -> None:
+        self._refused[str(error)] += 1
+        self.get_logger().warning(f"cloud {fate}: {error}", throttle_duration_sec=5.0)
+
+    def _odometry(self, message: Odometry) -> None:
+        twist = message.twist.twist
+        self._velocity(message, message.child_frame_id, twist.linear, twist.angular, "odometry")
+
+    def _twist(self, message: TwistStamped) -> None:
+        twist = message.twist
+        self._velocity(message, message.header.frame_id, twist.linear, twist.angular, "twist")
+
+    def _velocity(
+        self, message: Any, frame: str, linear: Vector3, angular: Vector3, source: str
+    ) -> None:
+        if not self._cloud_frame:
+            return
+        T_cloud_body = np.eye(4)
+        if frame != self._cloud_frame:
+            found = self._frames.find(self._cloud_frame, frame) if self._frames else None
+            if found is None:
+                self.get_logger().warning(
+                    f"velocity of frame '{frame}' not used: how '{self._cloud_frame}' is mounted "
+                    "on it is not on /tf_static",
+                    throttle_duration_sec=5.0,
+                )
+                return
+            T_cloud_body = found
+        velocity = carried_over(
+            (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), T_cloud_body
+        )
+        self._pipeline.velocity(from_time(message.header.stamp), velocity, source)
+
+    def _hand_out(self) -> None:
+        """Publish what is finished, and come back in time for what still waits."""
+        for item in self._pipeline.poll(time.monotonic_ns()):
+            self._publish(item)
+        due = self._pipeline.due_ns
+        self._overdue.cancel()
+        if due is not None:
+            self._overdue.timer_period_ns = max(due - time.monotonic_ns(), 1_000_000)
+            self._overdue.reset()
+
+    def _publish(self, item: Deskewed) -> None:
+        self._output.publish(to_cloud(item.points, item.stamp, self._cloud_frame))
+        self._last = report.of_sweep(item.quality, item.waited_ns)
+        if self._statistics.get_subscription_count():
+            self._statistics.publish(self._status(self._last, "sweep"))
+
+    def _diagnose(self) -> None:
+        tracker = self._pipeline.tracker
+        judged = report.of_period(
+            self._before,
+            self._pipeline.counts,
+            self._last,
+            tracker.window.counts,
+            tracker.attitude.latest,
+            self._refused,
+            is_levelled=self._levelling.is_levelled,
+        )
+        self._before = self._pipeline.counts
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [self._status(judged, "deskew")]
+        self._diagnostics.publish(message)
+
+    def _status(self, judged: report.Report, name: str) -> DiagnosticStatus:
+        return DiagnosticStatus(
+            level=bytes([judged.level]),
+            name=f"{self.get_fully_qualified_name().lstrip('/')}: {name}",
+            message=judged.message,
+            values=[KeyValue(key=key, value=value) for key, value in judged.values.items()],
+        )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the deskew node until it is told to end; return the exit code (2: wrong arguments)."""
+    node = None
+    try:
+        start_rclpy(sys.argv if args is None else args)
+        node = DeskewNode()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (SettingError, UsageError, NameValidationException) as error:
+        print(f"deskew_node: {error}", file=sys.stderr)
+        return 2
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
