@@ -59,6 +59,7 @@ class Bench:
         self.until(lambda: self.cloud_publisher.get_subscription_count())
         self.until(lambda: self.imu_publisher.get_subscription_count())
         self.until(lambda: self.node._output.get_subscription_count())
+        self.until(lambda: self.node._statistics.get_subscription_count())
 
     def close(self) -> None:
         self.executor.shutdown()
@@ -110,8 +111,9 @@ def bench(request):
 def prime(bench: Bench, seconds: float) -> None:
     """Give the node its cloud frame and IMU samples up to an instant."""
     bench.send_cloud(seen(WALK, 0, 0.23, 0)[0], 0.0)
-    bench.until(lambda: bench.clouds)
+    bench.until(lambda: bench.clouds and bench.statistics)
     bench.clouds.clear()
+    bench.statistics.clear()
     bench.send_imu(WALK.imu(0, seconds))
 
 
