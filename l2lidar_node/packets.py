@@ -41,7 +41,7 @@ class PointPacket(NamedTuple):
     stamp : DeviceNs
         Instant of the first slot.
     duration_ns : int
-        From the first slot to the last one, in true time.
+        From the first slot to the last one, in true time, rounded up.
     head_angle : float
         Head angle at the first slot [rad]; 0 for 2D packets.
     payload : bytes
@@ -173,7 +173,7 @@ def _points(
         packet_type,
         seq,
         DeviceNs(sec * NS + nsec),
-        int(max(count - 1, 0) * time_increment * NS),
+        math.ceil(max(count - 1, 0) * time_increment * NS),
         head_angle,
         payload,
     )
