@@ -86,12 +86,17 @@ def test_every_shared_file_named_exists(path):
             assert (ROOT / "urdf" / "examples" / text).is_file(), text
 
 
-@pytest.mark.parametrize(
-    "name", ["l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node"]
-)
-def test_every_executable_named_is_installed(name):
-    assert name in executables()
-    assert any(name in strings(path) for path in LAUNCH_FILES + PARTS)
+def test_every_executable_started_is_installed():
+    started = {
+        node.args[0].value
+        for path in LAUNCH_FILES + PARTS
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") in {"_node", "companion", "ExecutableInPackage"}
+        and isinstance(node.args[0], ast.Constant)
+    }
+    assert started == {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node"}
+    assert started <= executables()
 
 
 @pytest.mark.parametrize(
