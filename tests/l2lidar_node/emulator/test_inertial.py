@@ -24,7 +24,7 @@ def inertial(
 
 
 def orientation(samples: np.ndarray) -> Rotation:
-    return Rotation.from_quat(samples["quaternion_wxyz"].astype(float), scalar_first=True)
+    return Rotation.from_quat(np.roll(samples["quaternion_wxyz"].astype(float), -1, axis=-1))
 
 
 def test_a_level_sensor_at_rest_feels_gravity_on_plus_z() -> None:
@@ -46,7 +46,7 @@ def test_clean_samples_integrate_to_the_true_pose(motion: str, mount: str) -> No
     samples, times = device.samples(first, count)
     arm = np.array(wire.IMU_POSITION_M)
     positions, quaternions = device.motion.poses(times)
-    truth = Rotation.from_quat(quaternions, scalar_first=True)
+    truth = Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
     place = positions + truth.apply(arm)
 
     dt = 1 / RATE
@@ -85,7 +85,7 @@ def test_the_wires_quaternion_turns_the_body_into_the_world_and_is_short() -> No
 
     np.testing.assert_allclose(norm, 0.9983, atol=1e-6)
     _, truth = device.motion.poses(times)
-    up = Rotation.from_quat(truth, scalar_first=True).inv().apply([0, 0, 1])
+    up = Rotation.from_quat(np.roll(truth, -1, axis=-1)).inv().apply([0, 0, 1])
     np.testing.assert_allclose(orientation(samples).inv().apply([0, 0, 1]), up, atol=1e-6)
 
 
