@@ -3,6 +3,7 @@
 import importlib.util
 import os
 
+import hypothesis
 import pytest
 
 # Before anything imports rclpy. Fast DDS makes its ports from the domain, and those of domains
@@ -10,6 +11,15 @@ import pytest
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.pop("ROS_LOCALHOST_ONLY", None)
+
+# The gate gives the same answer twice, and no slow or busy machine fails it.
+hypothesis.settings.register_profile(
+    "gate",
+    deadline=None,
+    derandomize="CI" in os.environ,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("gate")
 
 HAS_ROS = importlib.util.find_spec("rclpy") is not None
 collect_ignore_glob = [] if HAS_ROS else ["l2lidar_node/ros/*", "l2lidar_proc/ros/*"]
