@@ -42,14 +42,22 @@ class UnitClock:
     def __init__(self, config: CrystalConfig, power_on_ns: int) -> None:
         self._config = config
         self._origin_ns = power_on_ns
-        self._epochs = [Epoch(power_on_ns, 0)]
+        self._drifts = bool(config.clock_drift_ppm_per_h or config.clock_wave_ppm)
+        self._arrange([Epoch(power_on_ns, 0)])
 
     def set(self, now_ns: int, value_ns: int) -> None:
         """Make the clock show a value from a true instant on; instants must not decrease."""
         epochs = [*self._epochs, Epoch(now_ns, value_ns)]
         ends_ns = (epoch.start_ns for epoch in epochs[1:])
         recent = [end_ns > now_ns - _KEEP_NS for end_ns in ends_ns]
-        self._epochs = [*compress(epochs, recent), epochs[-1]]
+        self._arrange([*compress(epochs, recent), epochs[-1]])
+
+    def _arrange(self, epochs: list[Epoch]) -> None:
+        """Keep epochs, and what is needed of them again and again as arrays."""
+        self._epochs = epochs
+        self._starts_ns = np.array([epoch.start_ns for epoch in epochs], dtype=np.int64)
+        self._values_ns = np.array([epoch.value_ns for epoch in epochs], dtype=np.int64)
+        self._begun = self._elapsed(self._starts_ns)
 
     def step(self, now_ns: int, change_ns: int) -> None:
         """Move the clock by some nanoseconds of its own at a true instant, not below 0."""
@@ -73,16 +81,17 @@ class UnitClock:
         ndarray, shape (N,), dtype int64
             Nanoseconds of the unit's clock.
         """
-        starts = np.array([epoch.start_ns for epoch in self._epochs], dtype=np.int64)
-        values = np.array([epoch.value_ns for epoch in self._epochs], dtype=np.int64)
-        epoch = np.maximum(np.searchsorted(starts, instants_ns, side="right") - 1, 0)
-        elapsed = self._elapsed(instants_ns) - self._elapsed(starts)[epoch]
-        return np.asarray(values[epoch] + np.floor(elapsed).astype(np.int64), dtype=np.int64)
+        epoch = np.maximum(np.searchsorted(self._starts_ns, instants_ns, side="right") - 1, 0)
+        elapsed = self._elapsed(instants_ns) - self._begun[epoch]
+        shown = self._values_ns[epoch] + np.floor(elapsed).astype(np.int64)
+        return np.asarray(shown, dtype=np.int64)
 
     def _elapsed(self, instants_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the integral of the rate from power-on [ns], exact to 2 ns over a month."""
         config = self._config
         t = (instants_ns - self._origin_ns).astype(np.float64)
+        if not self._drifts:
+            return np.asarray(t / config.clock_ratio)
         seconds = t / _NS
         angular = 2.0 * math.pi / config.clock_wave_s
         ppm_seconds = (

@@ -47,8 +47,8 @@ def flip_bit(frame: bytes, random: np.random.Generator) -> bytes:
 
 
 def truncate(frame: bytes, random: np.random.Generator) -> bytes:
-    """Cut off the end, at least one byte of it."""
-    return frame[: int(random.integers(1, len(frame)))]
+    """Cut off the end, at least CRC and tail: tails alone are alike and might be found elsewhere."""
+    return frame[: int(random.integers(1, len(frame) - wire.TAIL.size + 1))]
 
 
 def hostile_size(frame: bytes, random: np.random.Generator) -> bytes:

@@ -269,14 +269,19 @@ class VirtualL2:
         """Enter packets in the ledger in the order of leaving and return them as datagrams."""
         if not batches:
             return []
-        packets = np.concatenate([batch for batch, _ in batches])
-        frames = [frame for _, batch in batches for frame in batch]
-        order = np.argsort(packets["left_ns"], kind="stable")
-        first = self.ledger.book(packets[order])
-        times = packets["left_ns"][order].tolist()
+        if len(batches) == 1:  # in order already
+            packets, frames = batches[0]
+        else:
+            packets = np.concatenate([batch for batch, _ in batches])
+            frames = [frame for _, batch in batches for frame in batch]
+            order = np.argsort(packets["left_ns"], kind="stable")
+            packets = packets[order]
+            frames = [frames[at] for at in order.tolist()]
+        first = self.ledger.book(packets)
+        times = packets["left_ns"].tolist()
         return [
-            Datagram(time_ns, frames[at], (Piece(row, 0, len(frames[at]), len(frames[at])),))
-            for row, (time_ns, at) in enumerate(zip(times, order.tolist(), strict=True), first)
+            Datagram(time_ns, frame, (Piece(row, 0, len(frame), len(frame)),))
+            for row, (time_ns, frame) in enumerate(zip(times, frames, strict=True), first)
         ]
 
     def _retune(self, now_ns: int) -> None:

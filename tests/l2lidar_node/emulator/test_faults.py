@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -107,10 +108,13 @@ def test_the_ledger_knows_what_a_good_reader_gets(name, mode):
 )
 def test_the_ledger_is_right_for_any_mixture(rates, timed, mode, seed):
     bench = bench_with(seed, mode, **rates, **timed, burst_every_s=0.1)
-    datagrams = bench.run(0.4)
+    bench.run(0.4)
     bench.ask(command(100, 4, 9))
-    datagrams = [*datagrams, *bench.run(2.0)]
-    assert identities(bench.log) == booked(bench.device)
+    bench.run(2.0)
+    got, expected = identities(bench.log), booked(bench.device)
+    assert expected - got == Counter()
+    # Two packets cut within their tails, which are alike, may complete each other.
+    assert (got - expected).total() <= (1 if "split" in rates else 0)
     times = [time for time, _ in bench.log]
     assert times == sorted(times)
     assert max(len(data) for _, data in bench.log) <= wire.MAX_DATAGRAM
@@ -176,7 +180,7 @@ def test_truncation_keeps_a_beginning():
     plain, cut = bench_with().run(2.0), bench_with(truncate=0.2).run(2.0)
     shorter = [(a, b) for (_, a), (_, b) in zip(plain, cut, strict=True) if a != b]
     assert len(shorter) > 50
-    assert all(a.startswith(b) and 0 < len(b) < len(a) for a, b in shorter)
+    assert all(a.startswith(b) and 0 < len(b) <= len(a) - 12 for a, b in shorter)
 
 
 def test_hostile_sizes_are_the_famous_ones():
