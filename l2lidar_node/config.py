@@ -8,9 +8,13 @@ from __future__ import annotations
 import ipaddress
 import re
 from dataclasses import dataclass, field
+from typing import Final
 
 from l2lidar_node import wire
 from l2lidar_node.settings import SettingError, setting
+
+MIN_CLOCK_RATIO: Final = 0.5
+MAX_CLOCK_RATIO: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,12 +69,22 @@ class ClockConfig:
     )
     l2_sync_mode: str = setting(
         "once",
-        "with enable_l2_host_sync: set the device's clock once per start, or every l2_sync_rate_ms",
+        "with enable_l2_host_sync: set the device's clock once, or every l2_sync_rate_ms",
         choices=("once", "periodic"),
     )
     publish_unlocked: bool = setting(
         False, "publish with the time of arrival until the clock is locked, instead of nothing"
     )
+
+    def __post_init__(self) -> None:
+        """Check the first guess."""
+        guess = self.time_scale_num / self.time_scale_denom
+        if not MIN_CLOCK_RATIO <= guess <= MAX_CLOCK_RATIO:
+            raise SettingError(
+                f"parameter 'timeScaleNum': {self.time_scale_num} is out of range, expected "
+                f"{MIN_CLOCK_RATIO:g} to {MAX_CLOCK_RATIO:g} times timeScaleDenom "
+                f"({self.time_scale_denom})"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

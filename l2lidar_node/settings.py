@@ -96,7 +96,7 @@ class Setting:
         if isinstance(value, bool) and kind is not bool:
             raise self._error(value, f"is of type bool, expected {kind.__name__}")
         if isinstance(value, int | float) and is_number:
-            if not math.isfinite(value):
+            if isinstance(value, float) and not math.isfinite(value):
                 raise self._error(value, "is not a finite number")
             below = self.lo is not None and value < self.lo
             above = self.hi is not None and value > self.hi
