@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 from concurrent.futures import Future
@@ -10,8 +9,6 @@ from concurrent.futures import TimeoutError as NoAnswerError
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
-from rclpy.exceptions import NameValidationException
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
@@ -24,12 +21,11 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event, Silence
 from l2lidar_node.packets import Parameters, Version
 from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
-from l2lidar_node.ros.arguments import UsageError, start_rclpy
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
 from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.parameters import ParameterSet
+from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.session import Session
-from l2lidar_node.settings import SettingError
 from l2lidar_node.transport import TransportError, UdpTransport
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 
@@ -45,7 +41,7 @@ class DriverNode(Node):
     ------
     SettingError
         If a parameter is wrong.
-    TransportError
+    StartError
         If the socket cannot be opened.
     """
 
@@ -57,7 +53,11 @@ class DriverNode(Node):
         self._settings = ParameterSet(self, DriverConfig, self._configure)
         config = self._settings.value
         self._open_publishers(config)
-        self._session = Session(Driver(config), UdpTransport(config.network), self._handle)
+        try:
+            transport = UdpTransport(config.network)
+        except TransportError as error:
+            raise StartError(str(error.strerror)) from None
+        self._session = Session(Driver(config), transport, self._handle)
         self.create_service(SetBool, "~/enable", self._enable)
         self.create_service(Trigger, "~/reset", self._reset)
         self._health = HealthPublisher(self, self._session)
@@ -185,33 +185,8 @@ class DriverNode(Node):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the driver node until it is told to end; return the exit code.
-
-    Returns
-    -------
-    int
-        0 after a signal, 1 if the network or the device made it end, 2 for wrong arguments.
-    """
-    node = None
-    try:
-        start_rclpy(sys.argv if args is None else args)
-        node = DriverNode()
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (SettingError, UsageError, NameValidationException) as error:
-        print(f"l2lidar_node: {error}", file=sys.stderr)
-        return 2
-    except TransportError as error:
-        print(f"l2lidar_node: {error.strerror}", file=sys.stderr)
-        return 1
-    finally:
-        # Ctrl-C under `ros2 launch` comes twice, from the terminal and from launch.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return node.exit_code if node is not None else 0
+    """Run the driver node; see :func:`l2lidar_node.ros.program.run`."""
+    return run("l2lidar_node", DriverNode, args)
 
 
 if __name__ == "__main__":

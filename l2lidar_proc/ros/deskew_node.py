@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections import Counter
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.exceptions import NameValidationException
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
-from l2lidar_node.ros.arguments import UsageError, start_rclpy
 from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
-from l2lidar_node.settings import SettingError
+from l2lidar_node.ros.program import run
 from l2lidar_node.types import IMU_SAMPLE
 from l2lidar_proc import report
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
@@ -203,23 +198,8 @@ class DeskewNode(Node):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the deskew node until it is told to end; return the exit code (2: wrong arguments)."""
-    node = None
-    try:
-        start_rclpy(sys.argv if args is None else args)
-        node = DeskewNode()
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (SettingError, UsageError, NameValidationException) as error:
-        print(f"deskew_node: {error}", file=sys.stderr)
-        return 2
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    """Run the deskew node; see :func:`l2lidar_node.ros.program.run`."""
+    return run("deskew_node", DeskewNode, args)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,94 @@
+"""A bench for node tests: programs in processes of their own, and a node that watches and asks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+
+from l2lidar_node.demo.observer import Observer
+from l2lidar_node.demo.processes import Program, Programs, free_udp_ports
+
+TIMEOUT_S = 40.0  # generous: only a failure waits that long
+
+
+@dataclass
+class Rig:
+    """Programs, a watching node and the ports of one driver."""
+
+    programs: Programs
+    observer: Observer
+    host_port: int
+    lidar_port: int
+
+    def emulator(self, *arguments: str) -> Program:
+        """Start a virtual L2 that sends to this rig's driver."""
+        ports = ["--host-port", str(self.host_port), "--lidar-port", str(self.lidar_port)]
+        world = [] if "--world" in arguments else ["--world", "pattern"]
+        return self.programs.start("l2lidar_node.emulator", [*ports, *world, *arguments])
+
+    def driver(self, **parameters: object) -> Program:
+        """Start the driver node for this rig's virtual L2."""
+        return self.programs.start("l2lidar_node.ros.driver_node", self.arguments(**parameters))
+
+    def arguments(self, **parameters: object) -> list[str]:
+        """Return the driver's command line."""
+        values: dict[str, object] = {
+            "l2_ip": "127.0.0.1",
+            "host_ip": "127.0.0.1",
+            "l2_port": self.lidar_port,
+            "host_port": self.host_port,
+            "enable_IMU_publishing": True,
+            "imu_adjust": False,
+            **parameters,
+        }
+        return ["--ros-args", *assignments(values)]
+
+    def wait_for(self, condition: Callable[[], Any], what: str) -> None:
+        """Spin until a condition holds; fail if a program ends or it takes too long."""
+        deadline = time.monotonic() + TIMEOUT_S
+        while not condition():
+            rclpy.spin_once(self.observer, timeout_sec=0.05)
+            self.programs.check()
+            assert time.monotonic() < deadline, f"waited in vain for {what}"
+
+    def call(self, kind: type, name: str, request: Any) -> Any:
+        """Call a service of the driver and return its response."""
+        client = self.observer.create_client(kind, name)
+        self.wait_for(client.service_is_ready, name)
+        future = client.call_async(request)
+        self.wait_for(future.done, f"an answer of {name}")
+        self.observer.destroy_client(client)
+        return future.result()
+
+
+def assignments(values: Mapping[str, object]) -> list[str]:
+    """Return ``-p name:=value`` for each value."""
+    return [
+        part
+        for name, value in values.items()
+        for part in ("-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}")
+    ]
+
+
+@contextmanager
+def open_rig() -> Iterator[Rig]:
+    """Make a rig and end everything it started."""
+    rclpy.init()
+    observer = Observer()
+    try:
+        with Programs() as programs:
+            yield Rig(programs, observer, *free_udp_ports(2))
+    finally:
+        observer.destroy_node()
+        rclpy.try_shutdown()
+
+
+def publishers(node: Node, topic: str) -> list[Any]:
+    """Return what is known about the publishers of a topic."""
+    return list(node.get_publishers_info_by_topic(topic))

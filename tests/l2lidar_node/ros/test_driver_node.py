@@ -1,0 +1,220 @@
+"""The driver node as its users meet it: a process, a virtual L2 on UDP, another node on DDS."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
+
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.demo.observer import TopicRecord
+from l2lidar_node.settings import settings_of
+from tests.l2lidar_node.ros.rig import Rig, open_rig, publishers
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Rig]:
+    """A driver that streams."""
+    with open_rig() as rig:
+        rig.driver(aggregateNframes=38)
+        rig.emulator("--boot-scale", "0.02")
+        rig.wait_for(lambda: len(rig.observer.clouds.stamps) > 3, "clouds")
+        yield rig
+
+
+def test_topics_have_the_rates_fields_frames_and_stamps_that_users_rely_on(rig: Rig) -> None:
+    rig.observer.clouds, rig.observer.imu = TopicRecord(), TopicRecord()
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= 12, "clouds")
+    clouds, imu, cloud = rig.observer.clouds, rig.observer.imu, rig.observer.cloud
+    assert rig.observer.fields == ["x", "y", "z", "intensity", "range", "time"]
+    assert (clouds.frame, imu.frame) == ("l2lidar_link", "l2lidar_imu")
+    assert clouds.backward_steps == 0
+    assert imu.backward_steps == 0
+    # By stamp, so that a slow machine does not matter.
+    assert np.median(clouds.intervals_ms) == pytest.approx(38 * 4.639, rel=0.01)
+    assert np.median(imu.intervals_ms) == pytest.approx(4.0, abs=0.01)
+    assert cloud is not None
+    assert cloud["time"][0] == 0.0
+    assert (np.diff(cloud["time"]) >= 0).all()
+    assert 0.16 < cloud["time"][-1] < 0.18
+    norms = np.sqrt(cloud["x"] ** 2 + cloud["y"] ** 2 + cloud["z"] ** 2)
+    assert np.abs(norms - cloud["range"]).max() < 0.06  # the axis is 45 mm above the origin
+    assert min(clouds.ages_s) > 0.16  # stamped at the first point, received after the last
+
+
+def test_qos_is_upstreams(rig: Rig) -> None:
+    for topic in ("/points", "/imu/data"):
+        (info,) = publishers(rig.observer, topic)
+        assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_the_static_transform_reaches_a_late_subscriber(rig: Rig) -> None:
+    received: list[TFMessage] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = rig.observer.create_subscription(
+        TFMessage, "/tf_static", received.append, latched
+    )
+    rig.wait_for(lambda: received, "/tf_static")
+    rig.observer.destroy_subscription(subscription)
+    (transform,) = received[0].transforms
+    assert transform.header.frame_id == "l2lidar_link"
+    assert transform.child_frame_id == "l2lidar_imu"
+    offset = transform.transform.translation
+    assert (offset.x, offset.y, offset.z) == (-0.007698, -0.014655, 0.00667)
+    assert transform.transform.rotation.w == 1.0
+
+
+def test_diagnostics_and_metadata_tell_what_the_device_is_and_does(rig: Rig) -> None:
+    rig.observer.diagnostics.clear()
+    rig.wait_for(lambda: len(rig.observer.diagnostics) >= 3, "/diagnostics")
+    checks = rig.observer.diagnostics[-1]
+    assert set(checks) == {"device", "link", "clock", "points", "hardware", "imu"}
+    assert {name: check["level"] for name, check in checks.items()} == dict.fromkeys(checks, "0")
+    assert checks["device"]["message"] == "streaming"
+    assert float(checks["device"]["point packets [1/s]"]) == pytest.approx(215.6, rel=0.1)
+    assert float(checks["clock"]["ratio"]) == pytest.approx(1.99866, abs=1e-3)
+    about: list[String] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = rig.observer.create_subscription(
+        String, "/l2lidar_node/metadata", about.append, latched
+    )
+    rig.wait_for(lambda: about, "metadata")
+    rig.observer.destroy_subscription(subscription)
+    facts = json.loads(about[-1].data)
+    assert facts["firmware"] == "2.8.11.1"
+    assert facts["work_mode"] == 0
+    assert facts["calibration"]["range_scale"] == pytest.approx(0.000978)
+
+
+def test_every_parameter_is_described(rig: Rig) -> None:
+    settings = list(settings_of(DriverConfig))
+    request = DescribeParameters.Request(names=[item.name for item in settings])
+    response = rig.call(DescribeParameters, "/l2lidar_node/describe_parameters", request)
+    for item, descriptor in zip(settings, response.descriptors, strict=True):
+        assert item.doc in descriptor.description
+        ranges = list(descriptor.integer_range) + list(descriptor.floating_point_range)
+        if item.lo is not None and item.hi is not None:
+            (bounds,) = ranges
+            assert (bounds.from_value, bounds.to_value) == (item.lo, item.hi)
+        for choice in item.choices:
+            assert choice in descriptor.additional_constraints
+
+
+def _parameter(name: str, value: object) -> Parameter:
+    message = ParameterValue()
+    if isinstance(value, bool):
+        message.type, message.bool_value = ParameterType.PARAMETER_BOOL, value
+    elif isinstance(value, int):
+        message.type, message.integer_value = ParameterType.PARAMETER_INTEGER, value
+    elif isinstance(value, float):
+        message.type, message.double_value = ParameterType.PARAMETER_DOUBLE, value
+    else:
+        message.type, message.string_value = ParameterType.PARAMETER_STRING, str(value)
+    return Parameter(name=name, value=message)
+
+
+def _set(rig: Rig, name: str, value: object) -> tuple[bool, str]:
+    request = SetParameters.Request(parameters=[_parameter(name, value)])
+    (result,) = rig.call(SetParameters, "/l2lidar_node/set_parameters", request).results
+    return result.successful, result.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("aggregateNframes", 4001, ("aggregateNframes",)),
+        ("aggregateNframes", -1, ("aggregateNframes",)),
+        ("calRangeScale", 0.1, ("calRangeScale",)),
+        ("sweep_cut", "circle", ("sweep_cut", "circle", "half_turn")),
+        ("calRangeBias", math.nan, ("calRangeBias",)),
+        ("host_port", 6202, ("host_port", "starts")),
+        ("range_min", 100.0, ("range_min", "range_max")),
+    ],
+)
+def test_a_wrong_live_value_is_refused_with_a_reason(
+    rig: Rig, name: str, value: object, words: tuple[str, ...]
+) -> None:
+    successful, reason = _set(rig, name, value)
+    assert not successful
+    for word in words:
+        assert word in reason
+
+
+def test_live_parameters_act_on_the_stream(rig: Rig) -> None:
+    assert _set(rig, "aggregateNframes", 10) == (True, "")
+    rig.wait_for(
+        lambda: rig.observer.cloud is not None and rig.observer.cloud["time"][-1] < 0.05,
+        "short clouds",
+    )
+    assert _set(rig, "EnableCalRangeOVR", True)[0]
+    assert _set(rig, "calRangeScale", 0.0005)[0]
+    # The pattern is within 3 to 6 m by the unit's own scale of 0.000978 m.
+    before = 0.000978
+    rig.wait_for(
+        lambda: (
+            rig.observer.cloud is not None
+            and rig.observer.cloud["range"].max() < 6.5 * 0.0005 / before
+        ),
+        "ranges by the override",
+    )
+    assert _set(rig, "EnableCalRangeOVR", False)[0]
+    assert _set(rig, "calRangeScale", 0.000978)[0]
+    assert _set(rig, "aggregateNframes", 38)[0]
+
+
+def test_an_atomic_change_with_one_wrong_value_changes_nothing(rig: Rig) -> None:
+    request = SetParametersAtomically.Request(
+        parameters=[_parameter("aggregateNframes", 5), _parameter("sweep_duration_ms", 1)]
+    )
+    name = "/l2lidar_node/set_parameters_atomically"
+    result = rig.call(SetParametersAtomically, name, request).result
+    assert not result.successful
+    assert "sweep_duration_ms" in result.reason
+    seen = len(rig.observer.clouds.stamps)
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= seen + 3, "clouds")
+    assert rig.observer.cloud is not None
+    assert rig.observer.cloud["time"][-1] > 0.16
+
+
+def test_enable_stops_and_starts_the_device(rig: Rig) -> None:
+    response = rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=False))
+    assert response.success, response.message
+    rig.wait_for(
+        lambda: (
+            rig.observer.diagnostics
+            and rig.observer.diagnostics[-1]["device"]["state"] == "standby"
+        ),
+        "standby",
+    )
+    seen = len(rig.observer.clouds.stamps)
+    response = rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
+    assert response.success, response.message
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) > seen + 2, "clouds after the start")
+    assert rig.observer.clouds.backward_steps == 0
+
+
+def test_reset_reboots_the_device_and_stamps_go_on(rig: Rig) -> None:
+    response = rig.call(Trigger, "/l2lidar_node/reset", Trigger.Request())
+    assert response.success
+    rig.wait_for(
+        lambda: (
+            rig.observer.diagnostics
+            and rig.observer.diagnostics[-1]["device"]["state"] != "streaming"
+        ),
+        "the reboot",
+    )
+    seen = len(rig.observer.clouds.stamps)
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) > seen + 2, "clouds after the reboot")
+    assert rig.observer.clouds.backward_steps == 0
+    assert rig.observer.imu.backward_steps == 0

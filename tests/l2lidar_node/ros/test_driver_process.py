@@ -1,0 +1,217 @@
+"""How the driver node starts and ends: exit codes, messages, the watchdog."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool
+
+from l2lidar_node.demo.processes import free_udp_ports
+from l2lidar_node.ros.conversions import from_cloud
+from tests.build import REAL_L2, real_capture
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, assignments, open_rig
+
+pytestmark = pytest.mark.ros
+
+LOOPBACK = {"l2_ip": "127.0.0.1", "host_ip": "127.0.0.1"}
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    """An empty rig."""
+    with open_rig() as rig:
+        yield rig
+
+
+def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "l2lidar_node.ros.driver_node", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("l2_ip:=lidar", ("l2_ip", "lidar", "IPv4")),
+        ("host_port:=70000", ("host_port", "70000", "65535")),
+        ("frame3d:=3", ("frame3d", "3", "bool")),
+        ("sweep_cut:=circle", ("sweep_cut", "circle", "half_turn")),
+        ("calRangeScale:=.nan", ("calRangeScale", "finite")),
+        ("cloud_frame:=/abs", ("cloud_frame", "/abs")),
+        ("point_cloud_topic_id:=/a//b", ("/a//b",)),
+    ],
+)
+def test_a_wrong_parameter_ends_the_start_with_one_message(
+    assignment: str, words: tuple[str, ...]
+) -> None:
+    result = _run("--ros-args", "-p", assignment)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    for word in words:
+        assert word in result.stderr
+
+
+def test_a_missing_or_broken_parameter_file_is_named(tmp_path: Path) -> None:
+    missing = _run("--params-file", str(tmp_path / "nowhere.yaml"))
+    assert missing.returncode == 2
+    assert "nowhere.yaml" in missing.stderr
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("l2lidar_node: [1, 2\n")
+    result = _run("--ros-args", "--params-file", str(broken))
+    assert result.returncode == 2
+    assert "broken.yaml" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_port_in_use_and_a_foreign_address_are_explained() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        busy = _run("--ros-args", *assignments({**LOOPBACK, "host_port": port}))
+    assert busy.returncode == 1
+    assert f"host_port {port} is in use" in busy.stderr
+    foreign = _run("--ros-args", *assignments({**LOOPBACK, "host_ip": "203.0.113.9"}))
+    assert foreign.returncode == 1
+    assert "203.0.113.9" in foreign.stderr
+    assert "no address of this machine" in foreign.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(number: signal.Signals) -> None:
+    (port,) = free_udp_ports(1)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "l2lidar_node.ros.driver_node", "--ros-args",
+         *assignments({**LOOPBACK, "host_port": port})],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert "listening" in process.stdout.readline()
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+
+
+def test_the_watchdog_ends_a_driver_without_device() -> None:
+    (port,) = free_udp_ports(1)
+    values = {**LOOPBACK, "host_port": port, "watchdog_timeout_ms": 300}
+    result = _run("--ros-args", *assignments(values))
+    assert result.returncode == 1
+    assert "no data from the L2 at 127.0.0.1" in result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_patient_driver_waits_and_takes_up_a_device_that_comes_late(rig: Rig) -> None:
+    rig.driver(watchdog_timeout_ms=300, watchdog_action="wait")
+    rig.wait_for(
+        lambda: (
+            rig.observer.diagnostics
+            and rig.observer.diagnostics[-1]["device"]["state"] == "waiting"
+        ),
+        "the driver",
+    )
+    response = rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
+    assert not response.success
+    assert "did not acknowledge" in response.message
+    rig.emulator("--ready")
+    rig.wait_for(lambda: rig.observer.clouds.stamps, "clouds")
+
+
+UPSTREAM = """\
+l2lidar_node:
+  ros__parameters:
+    l2_ip: "127.0.0.1"
+    l2_port: {lidar_port}
+    host_ip: "127.0.0.1"
+    host_port: {host_port}
+    frame3d: true
+    imu_adjust: true
+    imuRollPitchOnly: true
+    enable_l2_time_correction: true
+    enable_l2_host_sync: true
+    l2_sync_rate_ms: 50
+    timeScaleNum: 2
+    timeScaleDenom: 1
+    UseSystemTimeTS: false
+    enable_latency_measure: false
+    l2_name: "front"
+    cloud_frame: ""
+    publish_tf: true
+    enable_IMU_publishing: true
+    accel_x_covar: 0.01
+    accel_y_covar: 0.02
+    accel_z_covar: 0.03
+    gyro_x_covar: 0.000025
+    gyro_y_covar: 0.000025
+    gyro_z_covar: 0.0000002
+    roll_covar: 4.9e-9
+    pitch_covar: 4.9e-9
+    yaw_covar: 10
+    aggregateNframes: 38
+    EnableCalRangeOVR: false
+    calRangeScale: 0.000978
+    calRangeBias: -365.625
+    watchdog_timeout_ms: 35000
+    point_cloud_topic_id: "/points"
+    imu_topic_id: "/imu/data"
+    standby_on_powerup_enabled: false
+"""
+
+
+def test_an_upstream_parameter_file_works_unchanged(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "l2lidar_node.yaml"
+    path.write_text(UPSTREAM.format(host_port=rig.host_port, lidar_port=rig.lidar_port))
+    driver = rig.programs.start("l2lidar_node.ros.driver_node", ["--params-file", str(path)])
+    rig.emulator("--ready")
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) > 2 and rig.observer.imu.stamps, "data")
+    assert rig.observer.clouds.frame == "front_link"
+    assert rig.observer.imu.frame == "front_imu"
+    code, said = driver.stop()
+    assert code == 0
+    assert "not known" not in said
+
+
+@pytest.mark.skipif(not REAL_L2.exists(), reason="the recordings are not here")
+def test_a_real_recording_comes_out_at_its_recorded_points(rig: Rig) -> None:
+    capture = real_capture(1)
+    clouds: list[np.ndarray] = []
+
+    rig.observer.create_subscription(
+        PointCloud2,
+        "/points",
+        lambda m: clouds.append(from_cloud(m).copy()),
+        QoSProfile(depth=500),
+    )
+    rig.driver(
+        UseSystemTimeTS=True, aggregateNframes=0, qos_reliability="reliable",
+        enable_l2_host_sync=False,
+    )  # fmt: skip
+    rig.wait_for(lambda: rig.observer.diagnostics, "the driver")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+        device.bind(("127.0.0.1", rig.lidar_port))
+        datagrams = capture.datagrams()
+        for at in range(0, len(datagrams), 40):
+            for datagram in datagrams[at : at + 40]:
+                device.sendto(datagram.data, ("127.0.0.1", rig.host_port))
+            wanted = min(at + 40, len(datagrams))
+            rig.wait_for(lambda wanted=wanted: len(clouds) >= wanted, f"cloud {wanted}")
+    points = np.concatenate(clouds)
+    xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
+    recorded = capture.points[np.isfinite(capture.points[..., 0])]
+    assert len(xyz) == len(recorded)
+    error = np.linalg.norm(xyz - recorded, axis=1)
+    assert np.median(error) < 1e-4
+    assert error.max() < 2.5e-3
