@@ -7,20 +7,15 @@ from pathlib import Path
 from typing import Final
 
 from l2lidar_node.emulator.config import DeviceConfig
-from l2lidar_node.emulator.device import Link, PointSource, VirtualL2
+from l2lidar_node.emulator.device import Link, VirtualL2
 from l2lidar_node.emulator.flash import Flash
 from l2lidar_node.emulator.ledger import Ledger
 from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
 from l2lidar_node.emulator.physics import PhysicsConfig
 from l2lidar_node.emulator.port import Port, SerialPort, UdpPort
+from l2lidar_node.emulator.sources import VIEW, PointSource
 from l2lidar_node.emulator.studio import Studio
 from l2lidar_node.wire import WorkMode
-
-MODES: Final = tuple(
-    WorkMode(bits)
-    for bits in (0, WorkMode.WIDE_FOV, WorkMode.MODE_2D, WorkMode.WIDE_FOV | WorkMode.MODE_2D)
-)
-"""The work modes that differ in what points there are."""
 
 WORLDLESS: Final = ("pattern", "none")
 """Worlds that are not ray-cast: a shell, and nothing at all."""
@@ -106,11 +101,12 @@ def unit(
         Keep the whole truth in memory instead of the latest of it.
     """
     sources: dict[WorkMode, PointSource] = {
-        mode: studio.points(mode) if studio else _pattern(mode, empty) for mode in MODES
+        mode: studio.points(mode) if studio else _pattern(mode, empty)
+        for mode in map(WorkMode, range(int(VIEW) + 1))
     }
     return VirtualL2(
         config,
-        sources.pop(MODES[0]),
+        sources.pop(WorkMode(0)),
         studio.inertial() if studio else StillInertial(),
         power_on_ns=power_on_ns,
         flash=flash,

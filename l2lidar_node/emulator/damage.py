@@ -47,7 +47,7 @@ def flip_bit(frame: bytes, random: np.random.Generator) -> bytes:
 
 
 def truncate(frame: bytes, random: np.random.Generator) -> bytes:
-    """Cut off the end, at least CRC and tail: tails alone are alike and might be found elsewhere."""
+    """Cut off the end, at least CRC and tail: tails are alike, others might complete it."""
     return frame[: int(random.integers(1, len(frame) - wire.TAIL.size + 1))]
 
 

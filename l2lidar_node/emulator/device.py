@@ -5,28 +5,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from enum import Enum
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from l2lidar_node import wire
 from l2lidar_node.emulator.config import DeviceConfig
-from l2lidar_node.emulator.datagram import Datagram, Piece
+from l2lidar_node.emulator.datagram import Datagram
 from l2lidar_node.emulator.faults import Dice, is_silent, stages
 from l2lidar_node.emulator.firmware import Firmware
 from l2lidar_node.emulator.flash import Flash, Network
 from l2lidar_node.emulator.inbox import Inbox, Received
-from l2lidar_node.emulator.ledger import PACKET, Fault, Ledger
+from l2lidar_node.emulator.ledger import Fault, Ledger
+from l2lidar_node.emulator.outbox import Outbox, Reply
 from l2lidar_node.emulator.path import Path
-from l2lidar_node.emulator.pattern import PatternScanner
-from l2lidar_node.emulator.stream import SEQ_MODULUS, Due, Feed, MeasurementStream, finish
+from l2lidar_node.emulator.sources import (
+    VIEW,
+    Feed,
+    InertialSource,
+    PointSource,
+    imu_feed,
+    point_feeds,
+)
+from l2lidar_node.emulator.stream import MeasurementStream
 from l2lidar_node.wire import AckStatus, PacketType, WorkMode
 
 _S: Final = 1_000_000_000
-_POINTS_BLOCK: Final = 50  # 232 ms
-_FLAT_BLOCK: Final = 10
-_IMU_BLOCK: Final = 50  # 200 ms
 _IMU_STREAM: Final = "imu"
 _POINTS_STREAM: Final = "points"
 
@@ -36,22 +37,6 @@ class Link(Enum):
 
     ETHERNET = "ethernet"
     SERIAL = "serial"
-
-
-class PointSource(Protocol):
-    """Makes point packets by index; ``packets`` is a :class:`Source`."""
-
-    def packets(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-        """Return payloads and their true start times [s]."""
-        ...
-
-
-class InertialSource(Protocol):
-    """Makes IMU packets by index; ``samples`` is a :class:`Source`."""
-
-    def samples(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-        """Return payloads and their true sample times [s]."""
-        ...
 
 
 class _Event(NamedTuple):
@@ -125,12 +110,11 @@ class VirtualL2:
             config.seed,
             self.ledger,
         )
-        self._feeds = _feeds(scanner, modes or {})
-        self._imu = Feed(PacketType.IMU, inertial.samples, _IMU_BLOCK)
+        self._points = point_feeds(scanner, modes or {})
+        self._imu = imu_feed(inertial)
         self._events = self._scheduled()
-        self._replies: list[tuple[int, PacketType, bytes]] = []
-        self._seq: Counter[PacketType] = Counter()
-        self._ordinal: Counter[PacketType] = Counter()
+        self._outbox = Outbox(self._firmware.clock, self.ledger)
+        self._replies: list[Reply] = []
         self._streams: dict[str, MeasurementStream] = {}
         self._tuned: dict[str, tuple[Feed, int] | None] = {}
         self._retune(power_on_ns)
@@ -163,7 +147,7 @@ class VirtualL2:
     @property
     def sent(self) -> Counter[PacketType]:
         """Packets that left the unit so far by type, over restarts."""
-        return self._ordinal.copy()
+        return self._outbox.sent.copy()
 
     @property
     def is_reachable(self) -> bool:
@@ -176,7 +160,7 @@ class VirtualL2:
         """True instant at which something happens next; None when only a command changes that."""
         instants = [stream.next_ns for stream in self._streams.values()]
         instants += [item for item in (self._path.next_ns,) if item is not None]
-        instants += [self._replies[0][0]] if self._replies else []
+        instants += [self._replies[0].leaves_ns] if self._replies else []
         instants += [self._events[0].time_ns] if self._events else []
         return min(instants, default=None)
 
@@ -200,19 +184,20 @@ class VirtualL2:
             return
         if not self.is_reachable or is_silent(self.config.faults, now_ns - self._origin_ns):
             return
+        boots = self.boots
         for received in self._inbox.feed(data):
             if received.status is AckStatus.OK:
                 self.received[received.packet_type] += 1
             self._obey(received, now_ns)
+            if self.boots != boots:  # what came after a reset in the same bytes is forgotten
+                self._restarted()
+                break
+        self._retune(now_ns)
 
     def _obey(self, received: Received, now_ns: int) -> None:
-        boots = self.boots
         leaves_ns = now_ns + round(self.config.delays.reply_delay_us * 1e3)
         for packet_type, payload in self._firmware.answer(received, now_ns):
-            self._replies.append((leaves_ns, packet_type, payload))
-        if self.boots != boots:
-            self._restarted()
-        self._retune(now_ns)
+            self._replies.append(Reply(leaves_ns, packet_type, payload))
 
     def _run(self, now_ns: int) -> None:
         """Bring everything up to a true instant, event by event."""
@@ -228,67 +213,20 @@ class VirtualL2:
 
     def _produce(self, until_ns: int) -> None:
         """Send everything that leaves the unit until a true instant."""
-        batches = [
-            self._measured(stream.packet_type, stream.take(until_ns))
+        measured = [
+            (stream.packet_type, stream.take(until_ns))
             for stream in self._streams.values()
             if stream.next_ns <= until_ns
         ]
-        due = [item for item in self._replies if item[0] <= until_ns]
-        self._replies = self._replies[len(due) :]
-        batches += [self._replied(*item) for item in due]
-        self._path.send(self._book(batches), until_ns)
-
-    def _measured(self, packet_type: PacketType, due: Due) -> tuple[NDArray[np.void], list[bytes]]:
-        packets = self._packets(packet_type, len(due.frames))
-        packets["seq"] = (self._seq[packet_type] + np.arange(len(packets))) % SEQ_MODULUS
-        self._seq[packet_type] += len(packets)
-        packets["index"] = due.numbers
-        packets["stamp_ns"] = self._firmware.clock.stamps(due.start_ns)
-        packets["start_ns"] = due.start_ns
-        packets["left_ns"] = due.left_ns
-        return packets, finish(due, packet_type, packets["seq"], packets["stamp_ns"])
-
-    def _replied(
-        self, leaves_ns: int, packet_type: PacketType, payload: bytes
-    ) -> tuple[NDArray[np.void], list[bytes]]:
-        packets = self._packets(packet_type, 1)
-        packets["start_ns"] = packets["left_ns"] = leaves_ns
-        packets["index"] = -1
-        return packets, [wire.encode_frame(packet_type, payload)]
-
-    def _packets(self, packet_type: PacketType, count: int) -> NDArray[np.void]:
-        packets = np.zeros(count, PACKET)
-        packets["type"] = packet_type
-        packets["boot"] = self.boots
-        packets["ordinal"] = self._ordinal[packet_type] + np.arange(count)
-        packets["arrived_ns"] = -1
-        self._ordinal[packet_type] += count
-        return packets
-
-    def _book(self, batches: list[tuple[NDArray[np.void], list[bytes]]]) -> list[Datagram]:
-        """Enter packets in the ledger in the order of leaving and return them as datagrams."""
-        if not batches:
-            return []
-        if len(batches) == 1:  # in order already
-            packets, frames = batches[0]
-        else:
-            packets = np.concatenate([batch for batch, _ in batches])
-            frames = [frame for _, batch in batches for frame in batch]
-            order = np.argsort(packets["left_ns"], kind="stable")
-            packets = packets[order]
-            frames = [frames[at] for at in order.tolist()]
-        first = self.ledger.book(packets)
-        times = packets["left_ns"].tolist()
-        return [
-            Datagram(time_ns, frame, (Piece(row, 0, len(frame), len(frame)),))
-            for row, (time_ns, frame) in enumerate(zip(times, frames, strict=True), first)
-        ]
+        replies = [reply for reply in self._replies if reply.leaves_ns <= until_ns]
+        self._replies = self._replies[len(replies) :]
+        self._path.send(self._outbox.send(measured, replies), until_ns)
 
     def _retune(self, now_ns: int) -> None:
         """Let each stream begin, change its source or end, as power and work mode want it."""
         power, mode = self._firmware.power, self._firmware.mode
         reachable = self.is_reachable
-        points = self._feeds[mode & (WorkMode.WIDE_FOV | WorkMode.MODE_2D)]
+        points = self._points[mode & VIEW]
         points_from = power.points_from_ns if reachable else None
         imu_from = power.imu_from_ns if reachable and not mode & WorkMode.IMU_OFF else None
         delays = self.config.delays
@@ -317,7 +255,7 @@ class VirtualL2:
         """Drop what a restart takes from the unit's memory."""
         self._inbox = Inbox()
         self._replies.clear()
-        self._seq.clear()
+        self._outbox.restart()
         self._streams.clear()
         self._tuned.clear()
 
@@ -346,21 +284,3 @@ class VirtualL2:
             ),
             key=lambda event: event.time_ns,
         )
-
-
-def _feeds(scanner: PointSource, modes: Mapping[WorkMode, PointSource]) -> dict[WorkMode, Feed]:
-    """Return the feed of points for each combination of field of view and 2D or 3D."""
-    wide, flat = WorkMode.WIDE_FOV, WorkMode.MODE_2D
-    sources: dict[WorkMode, PointSource] = {
-        WorkMode(0): scanner,
-        wide: PatternScanner(wide=True),
-        flat: PatternScanner(flat=True),
-        wide | flat: PatternScanner(wide=True, flat=True),
-        **modes,
-    }
-    return {
-        mode: Feed(PacketType.POINTS_2D, source.packets, _FLAT_BLOCK)
-        if mode & flat
-        else Feed(PacketType.POINTS_3D, source.packets, _POINTS_BLOCK)
-        for mode, source in sources.items()
-    }

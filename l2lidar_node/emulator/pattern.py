@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +16,6 @@ _FLAT_PERIOD_S: Final = 0.02
 _WIDE_START_RAD: Final = -0.105  # of the mirror; 192 degrees instead of 180
 _STATE: Final = (4639, 229769, 0.0, 0.0, 0.0, 43.7, 154.16, 51.38, 60.8)
 """Inside state of a published unit, in the order of :data:`wire.INSIDE_STATE`."""
-
-
-class Source(Protocol):
-    """Measurements by index, on a time line that starts at the first power-on."""
-
-    def __call__(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-        """Return payloads and the true instants of their stamps.
-
-        Parameters
-        ----------
-        first, count : int
-            Which measurements; the same index always means the same measurement.
-
-        Returns
-        -------
-        payloads : ndarray, shape (count,)
-            Dtype of the packet's payload; ``info`` is left for the unit to fill in.
-        t_s : ndarray, shape (count,), float64
-            True seconds since power-on, strictly ascending with the index.
-        """
-        ...
 
 
 class PatternScanner:
@@ -78,7 +57,7 @@ class PatternScanner:
         self._row = row
 
     def packets(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-        """Return packets and their start times; see :class:`Source`."""
+        """Return packets and their start times; see :class:`sources.Source`."""
         t_s = np.arange(first, first + count, dtype=np.float64) * self._period_s
         payloads = np.repeat(self._row, count)
         if not self._flat:
@@ -91,7 +70,7 @@ class StillInertial:
     """Samples of an IMU that lies level and still, without noise."""
 
     def samples(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-        """Return samples and their times; see :class:`Source`."""
+        """Return samples and their times; see :class:`sources.Source`."""
         payloads = np.zeros(count, wire.IMU_PAYLOAD)
         payloads["quaternion_wxyz"] = (wire.QUATERNION_NORM, 0.0, 0.0, 0.0)
         payloads["linear_acceleration"] = (0.0, 0.0, 9.81)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import select
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -77,39 +78,43 @@ class Server:
             If the unit moves to an address that cannot be bound, or loses its connector.
         """
         power_on_ns = self._device.power_on_ns
-        end_ns = math.inf if math.isinf(duration_s) else power_on_ns + round(duration_s * 1e9)
+        end_ns = sys.maxsize
+        if not math.isinf(duration_s):
+            end_ns = power_on_ns + round(duration_s * 1e9)
         if math.isinf(self._speed):
             self._race(power_on_ns, end_ns)
         else:
             self._keep_pace(power_on_ns, end_ns)
 
-    def _keep_pace(self, power_on_ns: int, end_ns: float) -> None:
+    def _keep_pace(self, power_on_ns: int, end_ns: int) -> None:
         speed = self._speed
         base_ns = time.monotonic_ns() + power_on_ns - time.time_ns()
 
         def now() -> int:
             return power_on_ns + round((time.monotonic_ns() - base_ns) * speed)
 
-        while not self._is_stopped and now() < end_ns:
+        until_ns = 0
+        while not self._is_stopped and until_ns < end_ns:
             due_ns = self._device.next_ns
             wait_s = _LONGEST_WAIT_S
             if due_ns is not None:
                 wait_s = min(max((due_ns - now()) / speed * 1e-9, 0.0), wait_s)
             if select.select([self._port], [], [], wait_s)[0]:
                 self._listen(now)
-            for time_ns, data in self._device.advance(now()):
+            until_ns = min(now(), end_ns)
+            for time_ns, data in self._device.advance(until_ns):
                 self.unsent += not self._port.send(data)
                 self.lateness.add(now() - time_ns)
 
-    def _race(self, power_on_ns: int, end_ns: float) -> None:
+    def _race(self, power_on_ns: int, end_ns: int) -> None:
         now_ns = power_on_ns
         while not self._is_stopped and now_ns < end_ns:
             if select.select([self._port], [], [], 0.0)[0]:
                 self._listen(partial(int, now_ns))
             next_ns = self._device.next_ns
-            now_ns = (now_ns if next_ns is None else max(next_ns, now_ns)) + _CHUNK_NS
             if next_ns is None:
                 select.select([self._port], [], [], _CHUNK_NS * 1e-9)
+            now_ns = min(max(next_ns or 0, now_ns) + _CHUNK_NS, end_ns)
             for _, data in self._device.advance(now_ns):
                 while not self._port.drain(_LONGEST_WAIT_S) and not self._is_stopped:
                     pass

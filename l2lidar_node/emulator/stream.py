@@ -9,26 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import wire
-from l2lidar_node.emulator.pattern import Source
+from l2lidar_node.emulator.sources import Feed
 from l2lidar_node.wire import PacketType
 
 SEQ_MODULUS: Final = 1025  # what units show
-
-
-class Feed(NamedTuple):
-    """Where a stream's measurements come from.
-
-    Attributes
-    ----------
-    packet_type : PacketType
-    source : Source
-    block : int
-        Measurements asked for at a time; requests always start at a multiple of it.
-    """
-
-    packet_type: PacketType
-    source: Source
-    block: int
 
 
 class Due(NamedTuple):

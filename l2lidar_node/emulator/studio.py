@@ -99,7 +99,7 @@ class StudioScanner:
         self._mode = mode
 
     def packets(self, first: int, count: int) -> Block:
-        """Return packets and their start times [s]; see :class:`pattern.Source`."""
+        """Return packets and their start times [s]; see :class:`sources.Source`."""
         return self._block(self._mode, first, count)
 
 
@@ -110,7 +110,7 @@ class StudioInertial:
         self._block = block
 
     def samples(self, first: int, count: int) -> Block:
-        """Return samples and their times [s]; see :class:`pattern.Source`."""
+        """Return samples and their times [s]; see :class:`sources.Source`."""
         return self._block(_IMU, first, count)
 
 

@@ -269,6 +269,13 @@ def test_reset_is_a_reboot():
     assert 0 <= new[new["type"] == 102]["start_ns"][0] - (began + 2.5 * S) < 4_639_000
 
 
+def test_what_follows_a_reset_in_the_same_datagram_is_forgotten():
+    bench = Bench()
+    bench.run(1.0)
+    assert bench.ask(client("reset") + client("latency 101")) == []
+    assert bench.device.boots == 1
+
+
 def test_network_settings_come_into_force_after_a_reset():
     bench = Bench()
     before = bench.device.network
