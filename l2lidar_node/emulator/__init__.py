@@ -1,1 +1,1 @@
-"""Virtual L2: the other end of the wire, with a world, a motion, a clock with the real defect, and faults."""
+"""Virtual L2: the other end of the wire, with world, motion, the clock's real defect and faults."""
