@@ -1,1 +1,1 @@
-"""Virtual L2: the other end of the wire, with world, motion, the clock's real defect and faults."""
+"""Virtual L2: the other end of the wire, with world, motion, the real clock's defect and faults."""
