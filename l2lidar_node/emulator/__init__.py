@@ -1,1 +1,1 @@
-"""Virtual L2: the other end of the wire, with world, motion, the real clock's defect and faults."""
+"""Virtual L2, the other end of the wire: a world, a motion, the real clock defect, faults."""
