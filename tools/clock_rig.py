@@ -42,7 +42,7 @@ NOTE: Final = np.dtype(
 """One packet that reached the clock, in the order in which it did."""
 
 EPOCH_NS: Final = 1_760_000_000 * 10**9
-_TICK_NS: Final = 1_000_000  # how often the driver looks what is due
+_TICK_NS: Final = 2_000_000  # how often the driver looks what is due
 _COMMAND_NS: Final = 150_000  # shortest way of a command; the rest is exponential with this mean
 _TYPES: Final = {Stream.IMU: PacketType.IMU, Stream.POINTS: PacketType.POINTS_3D}
 
@@ -73,7 +73,7 @@ class Case:
     faults: dict[str, Value] = field(default_factory=dict)
     imu: bool = True
     latency: bool = False
-    seconds: float = 30.0
+    seconds: float = 60.0
 
 
 class RecordingClock(DeviceClock):
@@ -137,7 +137,7 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
         for arrival, datagram in device.advance(now):
             driver.receive(datagram, HostNs(arrival))
         driver.tick(HostNs(now))
-        for data in driver.outbox():
+        for data, _ in driver.outbox():
             latency = _COMMAND_NS + round(rng.exponential(_COMMAND_NS))
             heapq.heappush(commands, (now + latency, count, data))
             count += 1

@@ -27,6 +27,7 @@ _REACH_NS: Final = 150 * _MS  # sequence numbers are believed while arrivals agr
 _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
 _SILENT_NS: Final = 1_000 * _MS
+_STALE_NS: Final = 500 * _MS  # [device]
 _BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
 _BOOT_SEQ: Final = 16  # so can sequence numbers
 _KEEP: Final = 16  # epochs that packets on their way may still belong to
@@ -55,12 +56,11 @@ _NO_SYNC: Final = _Sync(0, 1 << 80, 0)  # its value is after every stamp
 class _Epoch:
     """A stretch without a step: ``base`` is what a stamp is ahead of the device line."""
 
-    __slots__ = ("base", "is_firm", "sync")
+    __slots__ = ("base", "sync")
 
-    def __init__(self, base: int, sync: _Sync | None, is_firm: bool = True) -> None:
+    def __init__(self, base: int, sync: _Sync | None) -> None:
         self.base = base
         self.sync = sync  # of this host, that began it
-        self.is_firm = is_firm  # whether a more regular stream will still have its say
 
 
 class _Track:
@@ -71,12 +71,10 @@ class _Track:
     def __init__(self, gain: float) -> None:
         self.cadence = Cadence(gain)
         self.epoch: _Epoch | None = None  # None until it has joined the line
-        self.u = 0
+        self.u = -_STALE_NS  # place of the last packet
         self.stamp = 0
         self.arrival = 0
-        self.suspect: tuple[int, int] | None = (
-            None  # sequence number and stamp that nothing explains
-        )
+        self.suspect: tuple[int, int] | None = None  # number and stamp that nothing explains
 
 
 class DeviceLine:
@@ -101,8 +99,8 @@ class DeviceLine:
     epochs : int
         Steps of the clock that were bridged.
     is_firm : bool
-        Whether the latest place was told as well as it can be: false between the first point
-        packet after a step and the first IMU packet after it.
+        Whether the latest place was told as well as it can be: false for point packets while the
+        IMU stream, whose word counts, is in another epoch.
     """
 
     def __init__(
@@ -132,6 +130,7 @@ class DeviceLine:
         self._newest = _NO_SYNC
         for track in (self._imu, self._points):
             track.epoch = None
+            track.u = -_STALE_NS
             track.suspect = None
             track.cadence.forget()
         self.restarts += 1
@@ -152,7 +151,7 @@ class DeviceLine:
             track.u = u
             track.stamp = stamp
             track.arrival = arrival
-            self.is_firm = epoch.is_firm
+            self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _STALE_NS
             return u
         return self._step(track, epoch, seq, stamp, arrival)
 
@@ -202,7 +201,7 @@ class DeviceLine:
             if begun is None:
                 if off <= noise:
                     continue
-                begun = _Epoch(base, sync, track is self._imu or not self._imu_flows(track))
+                begun = _Epoch(base, sync)
                 self.epochs += 1
                 self._newest = sync
                 self._epochs.append(begun)
@@ -212,14 +211,8 @@ class DeviceLine:
                 if self._points.epoch is begun:
                     self._points.u += begun.base - base
                 begun.base = base
-                begun.is_firm = True
             return begun
         return None
-
-    def _imu_flows(self, track: _Track) -> bool:
-        """Whether the IMU stream is about as far as another one."""
-        imu = self._imu
-        return imu.epoch is not None and (track.u - imu.u) * self.ratio < _LATE_NS
 
     def _synced_since(self, track: _Track) -> bool:
         """Whether a sync may have stepped the clock since the last packet."""
@@ -229,8 +222,8 @@ class DeviceLine:
         u = stamp - epoch.base
         track.cadence.resume(seq, u - track.u)
         track.epoch = epoch
-        self.is_firm = epoch.is_firm
         track.u = u
+        self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _STALE_NS
         track.stamp = stamp
         track.arrival = arrival
         track.suspect = None

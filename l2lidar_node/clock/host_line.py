@@ -16,7 +16,7 @@ _FEWEST: Final = 40
 _MOST: Final = 4096  # packets kept while not locked
 _RATIOS: Final = (0.45, 3.3)
 
-_SETTLE_NS: Final = 1_000.0 * _MS  # time constant with which what is published follows the fit
+_SETTLE_NS: Final = 500.0 * _MS  # time constant with which what is published follows the fit
 _SLEW: Final = 0.002  # at most by that much faster or slower
 _SEGMENTS: Final = 8
 
@@ -43,7 +43,7 @@ class HostLine:
     -----
     What is published is not the fit itself, which moves a little with every new block, but a
     continuous, strictly rising line that runs at the fitted ratio and closes in on the fit with a
-    time constant of 1 s, never more than 0.2 % faster or slower: samples 4 ms apart stay 4 ms
+    time constant of 0.5 s, never more than 0.2 % faster or slower: samples 4 ms apart stay 4 ms
     apart.
     """
 
