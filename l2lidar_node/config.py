@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from l2lidar_node import wire
+from l2lidar_node.layouts import LAYOUTS
 from l2lidar_node.settings import SettingError, setting
 
 MIN_CLOCK_RATIO: Final = 0.5
@@ -206,11 +207,7 @@ class TopicConfig:
         "reliability of both topics; reliable reaches every subscriber, best_effort is upstream's",
         choices=("best_effort", "reliable"),
     )
-    point_layout: str = setting(
-        "native",
-        "fields of the clouds",
-        choices=("native", "native_ring"),
-    )
+    point_layout: str = setting("native", "fields of the clouds", choices=tuple(LAYOUTS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

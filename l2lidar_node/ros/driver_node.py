@@ -115,7 +115,7 @@ class DriverNode(Node):
             if self._imu_publisher is not None:
                 self._imu_publisher.publish(self._imu_template.serialize(event))
         elif isinstance(event, Sweep):
-            points = self._layout.convert(event)
+            points = self._layout.convert(event.points, event.start)
             self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
         elif isinstance(event, Answer):
             self._answered(event)
