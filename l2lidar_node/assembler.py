@@ -53,6 +53,11 @@ class SweepAssembler:
         self._config = config
         self._level = level
 
+    @property
+    def is_collecting(self) -> bool:
+        """Whether packets wait for their sweep to be complete."""
+        return bool(self._packets)
+
     def push(self, packet: PointPacket, start: HostNs, missing: int = 0) -> list[Sweep]:
         """Add a packet and return the sweeps this completes: none, one or two.
 

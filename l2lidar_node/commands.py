@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import ipaddress
 import struct
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from l2lidar_node import wire
 from l2lidar_node.packets import NS, Ack
 from l2lidar_node.types import HostNs
+
+_FROM_HOST: Final = frozenset(
+    {
+        wire.PacketType.USER_COMMAND,
+        wire.PacketType.TIME_SYNC,
+        wire.PacketType.NETWORK,
+        wire.PacketType.MAC,
+        wire.PacketType.COMMAND,
+        wire.PacketType.PARAMETERS,
+        wire.PacketType.WORK_MODE,
+    }
+)
 
 
 class Command(NamedTuple):
@@ -64,6 +76,38 @@ class Command(NamedTuple):
         """Whether it only asks for an echo."""
         latency = struct.pack("<I", wire.Command.LATENCY)
         return self.packet_type == wire.PacketType.COMMAND and self.payload[:4] == latency
+
+    @property
+    def is_start(self) -> bool:
+        """Whether it ends standby."""
+        return (self.packet_type, self.payload) == (start().packet_type, start().payload)
+
+    @property
+    def is_standby(self) -> bool:
+        """Whether it stops the motors."""
+        return (self.packet_type, self.payload) == (standby().packet_type, standby().payload)
+
+    @property
+    def is_reset(self) -> bool:
+        """Whether it reboots the device."""
+        number = struct.pack("<I", wire.UserCommand.RESET)
+        return self.packet_type == wire.PacketType.USER_COMMAND and self.payload[:4] == number
+
+    @property
+    def time(self) -> HostNs | None:
+        """What it sets the device's clock to; None if it is no time sync."""
+        if self.packet_type != wire.PacketType.TIME_SYNC:
+            return None
+        seconds, nanoseconds = struct.unpack("<2I", self.payload)
+        return HostNs(seconds * NS + nanoseconds)
+
+
+def recorded(packet_type: int, payload: bytes) -> Command | None:
+    """Return the command of a frame that somebody sent; None if no command looks like that."""
+    layout = wire.PAYLOADS.get(packet_type)
+    if packet_type not in _FROM_HOST or layout is None or len(payload) != layout.itemsize:
+        return None
+    return Command("recorded command", packet_type, payload)
 
 
 def start() -> Command:

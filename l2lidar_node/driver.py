@@ -1,14 +1,15 @@
 """Composes the driver's parts: bytes with their arrival in, sweeps and samples out; no socket.
 
-Every method takes the time as an argument and returns what happened, so a recording gives the same
-output as the live sensor did.
+Every method takes the time as an argument and returns what happened. What comes out depends on
+the calls of :meth:`Driver.receive`, :meth:`Driver.sent` and :meth:`Driver.settle`, their order and
+their arguments alone, so a recording of those gives what the live sensor gave, bit for bit.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from l2lidar_node import commands, wire
 from l2lidar_node.assembler import MAX_GAP_NS, SweepAssembler
@@ -18,6 +19,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.counters import Counters
 from l2lidar_node.framing import FrameError, Framer
 from l2lidar_node.gravity import GravityMonitor
+from l2lidar_node.intake import Intake, Released
 from l2lidar_node.levelling import Levelling
 from l2lidar_node.packets import (
     Ack,
@@ -30,14 +32,11 @@ from l2lidar_node.packets import (
     decode,
 )
 from l2lidar_node.requests import Answer, Requests
-from l2lidar_node.sequence import SequenceOrder
 from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep
-from l2lidar_node.watchdog import SILENCE_NS, DeviceState, Watchdog
+from l2lidar_node.watchdog import DeviceState, Watchdog
 
 QUERY_NS: Final = 1_000_000_000  # interval of version, parameter and latency requests
-REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlier one
 _ROUND_TRIPS: Final = 60  # the last minute's
-RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this began anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +46,14 @@ class Silence:
     duration_ns: int
 
 
+class Outgoing(NamedTuple):
+    """A frame for the device, and the instant at which the driver counts it as sent."""
+
+    frame: bytes
+    at: HostNs
+
+
 Event = Sweep | ImuSample | Version | Parameters | Answer | ClockEvent | Silence
-
-
-@dataclass(slots=True)
-class _Timed:
-    """A packet with its arrival."""
-
-    packet: PointPacket | ImuPacket
-    arrival: HostNs
 
 
 class Driver:
@@ -76,17 +74,14 @@ class Driver:
         self.round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
         self._config = config
         self._framer = Framer()
-        self._orders = {
-            stream: SequenceOrder[_Timed](config.sweep.reorder_window) for stream in Stream
-        }
-        self.counters.sequence = {stream: order.counts for stream, order in self._orders.items()}
-        self._newest: dict[Stream, _Timed] = {}
+        self._intake = Intake(config.sweep.reorder_window)
+        self.counters.sequence = self._intake.counts
         self._clock = DeviceClock(config.clock)
         self._levelling = Levelling(config.imu.roll_pitch_only)
         self._assembler = SweepAssembler(config.sweep, self._level())
         self._requests = Requests()
         self._watchdog = Watchdog(config.watchdog)
-        self._outbox: list[bytes] = []
+        self._outbox: list[Outgoing] = []
         self._next_query = HostNs(0)
         self._latency_id = 100
 
@@ -107,7 +102,7 @@ class Driver:
         """
         self.counters.datagrams += 1
         self.counters.octets += len(data)
-        events: list[Event] = []
+        events = self.settle(arrival)
         for item in self._framer.feed(data):
             if isinstance(item, FrameError):
                 self.counters.faults[item.fault.value] += 1
@@ -119,60 +114,91 @@ class Driver:
         events += self._clock.events()
         return events
 
-    def tick(self, now: HostNs) -> list[Event]:
-        """Return what is due by now; to be called every few milliseconds."""
-        events: list[Event] = []
-        for order in self._orders.values():
-            while order.oldest and now - order.oldest.arrival > REORDER_NS:
-                events += self._released(order.give_up())
-        newest = self._newest.get(Stream.POINTS)
-        if newest and now - newest.arrival > MAX_GAP_NS:
-            events += self._finished(self._assembler.flush())
-        self._send_due(now)
-        repeats, given_up = self._requests.expire(now)
-        self._outbox += [command.encode() for command in repeats]
-        events += [answer for answer in given_up if not answer.command.is_latency]
+    def tick(self, now: HostNs, heard_until: HostNs | None = None) -> list[Event]:
+        """Return what is due by now; to be called every few milliseconds.
+
+        Parameters
+        ----------
+        now : HostNs
+        heard_until : HostNs, optional
+            Instant up to which everything that arrived has been handed to :meth:`receive`: where
+            the host is behind, a packet that still waits in the socket is not late. ``now`` if
+            left out.
+        """
+        events = self.settle(now if heard_until is None else heard_until)
+        events += self._send_due(now)
         if self._watchdog.expired(now):
             events.append(Silence(self._watchdog.silence_ns(now)))
         return events
 
-    def outbox(self) -> list[bytes]:
+    def settle(self, until: HostNs) -> list[Event]:
+        """Return what need not wait any longer, nothing more having arrived until then.
+
+        Packets that waited :data:`~l2lidar_node.intake.REORDER_NS` for an earlier one, and the
+        sweep of a stream of points that paused for :data:`MAX_GAP_NS`.
+        """
+        events = self._released(self._intake.settle(until))
+        if self._has_stalled(until):
+            events += self._finished(self._assembler.flush())
+        return events
+
+    def is_overdue(self, until: HostNs) -> bool:
+        """Tell whether :meth:`settle` would do anything."""
+        return self._has_stalled(until) or self._intake.is_overdue(until)
+
+    def outbox(self) -> list[Outgoing]:
         """Return the frames to send now, in order, once."""
         frames, self._outbox = self._outbox, []
         return frames
 
     def send(self, command: Command, now: HostNs) -> int:
         """Queue a command and return the ticket that its :class:`Answer` will carry."""
-        self._outbox.append(command.encode())
+        self._outbox.append(Outgoing(command.encode(), now))
         if not command.acknowledged:
             return 0
         return self._requests.add(command, now)
 
+    def sent(self, command: Command, at: HostNs) -> list[Event]:
+        """Do what sending a command does to the driver itself; return what it completes.
+
+        The driver calls it for everything it sends. Whoever replays a recording calls it for the
+        commands in there.
+        """
+        if command.time is not None:
+            self._clock.synced(command.time, at)
+        elif command.is_latency:
+            self._requests.add(command, at, tries=1)
+        elif command.is_start:
+            self._watchdog.started(at)
+            self._intake.forget()
+        elif command.is_standby:
+            self._watchdog.stopped()
+            return self.flush()
+        elif command.is_reset:
+            self._watchdog.started(at)
+            events = self.flush()
+            self._intake.forget()
+            self._forget_device()
+            return events
+        return []
+
     def start_rotation(self, now: HostNs) -> int:
         """Queue the command to leave standby; return its ticket."""
-        self._watchdog.started(now)
-        self._newest.clear()
+        self.sent(commands.start(), now)
         return self.send(commands.start(), now)
 
     def stop_rotation(self, now: HostNs) -> tuple[int, list[Event]]:
         """Queue the command for standby; return its ticket and what had been collected so far."""
-        self._watchdog.stopped()
-        return self.send(commands.standby(), now), self.flush()
+        return self.send(commands.standby(), now), self.sent(commands.standby(), now)
 
     def reset_device(self, now: HostNs) -> list[Event]:
         """Queue the command to reboot and return what had been collected so far."""
         self.send(commands.reset(), now)
-        self._watchdog.started(now)
-        events = self.flush()
-        self._newest.clear()
-        self._forget_device()
-        return events
+        return self.sent(commands.reset(), now)
 
     def flush(self) -> list[Event]:
         """Return everything that is still being collected."""
-        events: list[Event] = []
-        for order in self._orders.values():
-            events += self._released(order.flush())
+        events = self._released(self._intake.flush())
         return events + self._finished(self._assembler.flush())
 
     def configure(self, config: DriverConfig) -> None:
@@ -222,21 +248,13 @@ class Driver:
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
     ) -> list[Event]:
         self._watchdog.heard(stream, arrival)
-        order = self._orders[stream]
-        newest = self._newest.get(stream)
-        timed = _Timed(packet, arrival)
-        self._newest[stream] = timed
-        if newest is None:
-            return self._released(order.restart() + order.push(packet.seq, timed))
-        if newest.packet.stamp - packet.stamp > RESTART_NS:
-            events = self._released(order.restart())
+        events: list[Event] = []
+        if self._intake.begins_anew(stream, packet):
+            events = self._released(self._intake.restart(stream))
             self._forget_device()
-            return events + self._released(order.push(packet.seq, timed))
-        if arrival - newest.arrival > SILENCE_NS:
-            return self._released(order.resume(packet.seq, timed))
-        return self._released(order.push(packet.seq, timed))
+        return events + self._released(self._intake.push(stream, packet, arrival))
 
-    def _released(self, released: list[tuple[int, _Timed]]) -> list[Event]:
+    def _released(self, released: Released) -> list[Event]:
         events: list[Event] = []
         for missing, timed in released:
             packet = timed.packet
@@ -300,22 +318,29 @@ class Driver:
             return []
         return [answer]
 
-    def _send_due(self, now: HostNs) -> None:
+    def _has_stalled(self, until: HostNs) -> bool:
+        is_silent = self._intake.silence_ns(Stream.POINTS, until) > MAX_GAP_NS
+        return is_silent and self._assembler.is_collecting
+
+    def _send_due(self, now: HostNs) -> list[Event]:
+        due: list[Command] = []
         if self._clock.sync_due(now):
-            self._outbox.append(commands.sync_time(now).encode())
-            self._clock.synced(now, now)
-        if 0 <= self._next_query - now <= QUERY_NS:
-            return
-        self._next_query = HostNs(now + QUERY_NS)
-        if self.version is None:
-            self._outbox.append(commands.request_version().encode())
-        if self.parameters is None:
-            self._outbox.append(commands.request_parameters().encode())
-        if self._config.clock.enable_latency_measure:
-            self._latency_id += 1
-            command = commands.latency(self._latency_id)
-            self._outbox.append(command.encode())
-            self._requests.add(command, now, tries=1)
+            due.append(commands.sync_time(now))
+        if not 0 <= self._next_query - now <= QUERY_NS:
+            self._next_query = HostNs(now + QUERY_NS)
+            if self.version is None:
+                due.append(commands.request_version())
+            if self.parameters is None:
+                due.append(commands.request_parameters())
+            if self._config.clock.enable_latency_measure:
+                self._latency_id += 1
+                due.append(commands.latency(self._latency_id))
+        repeats, given_up = self._requests.expire(now)
+        events: list[Event] = []
+        for command in due + repeats:
+            self._outbox.append(Outgoing(command.encode(), now))
+            events += self.sent(command, now)
+        return events + [answer for answer in given_up if not answer.command.is_latency]
 
     def _forget_device(self) -> None:
         """Ask again who the device is: it may have another version or work mode after a reboot."""

@@ -60,12 +60,20 @@ class Requests:
         for entry in self._pending:
             if entry.command.is_same_kind(command):
                 entry.tries_left = 0  # repeated now, it would undo this command
+        self._pending = [
+            entry for entry in self._pending if not (entry.command.is_latency and _old(entry, now))
+        ]
         self._pending.append(_Pending(self._tickets, command, now, tries - 1))
         return self._tickets
 
     def answer(self, ack: Ack, now: HostNs) -> Answer | None:
         """Return how the command that this ACK belongs to ended; None if it belongs to none."""
-        candidates = [entry for entry in self._pending if entry.command.is_answered_by(ack)]
+        candidates = [
+            entry
+            for entry in self._pending
+            # Too late is too late, whether or not expire() came by in the meantime.
+            if entry.command.is_answered_by(ack) and (entry.tries_left > 0 or not _old(entry, now))
+        ]
         if not candidates:
             return None
         entry = next((e for e in candidates if e.command.is_echoed_by(ack)), candidates[0])
@@ -81,7 +89,7 @@ class Requests:
         given_up: list[Answer] = []
         too_many = len(self._pending) - MAX_PENDING
         for index, entry in enumerate(list(self._pending)):
-            if 0 <= now - entry.sent < REPEAT_NS and index >= too_many:
+            if not _old(entry, now) and index >= too_many:
                 continue
             if entry.tries_left > 0 and index >= too_many:
                 entry.tries_left -= 1
@@ -92,6 +100,10 @@ class Requests:
                 text = f"{entry.command.name}: the device did not acknowledge it"
                 given_up.append(Answer(entry.ticket, entry.command, False, text, None))
         return repeats, given_up
+
+
+def _old(entry: _Pending, now: HostNs) -> bool:
+    return not 0 <= now - entry.sent < REPEAT_NS
 
 
 def _status(status: int) -> str:

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Final, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from l2lidar_node.driver import Driver, Event
 from l2lidar_node.transport import Transport
@@ -17,6 +17,22 @@ from l2lidar_node.types import HostNs
 T = TypeVar("T")
 
 TICK_S: Final = 0.01
+
+
+class Tap(Protocol):
+    """Somebody who notes everything that a driver's output depends on, in order."""
+
+    def received(self, data: bytes, arrival: HostNs) -> None:
+        """Take note of bytes that are handed to the driver."""
+
+    def sent(self, frame: bytes, at: HostNs) -> None:
+        """Take note of a frame that the driver counts as sent at an instant."""
+
+    def waited(self, until: HostNs) -> None:
+        """Take note that the driver is told to wait no longer for what was due until then."""
+
+    def close(self) -> None:
+        """Take note that this was all."""
 
 
 class Session:
@@ -29,14 +45,21 @@ class Session:
         Closed when the session ends.
     on_event : callable
         Called in the loop's thread with everything that happens, in order.
+    tap : Tap, optional
+        Told everything in the loop's thread; closed when the session ends.
     """
 
     def __init__(
-        self, driver: Driver, transport: Transport, on_event: Callable[[Event], None]
+        self,
+        driver: Driver,
+        transport: Transport,
+        on_event: Callable[[Event], None],
+        tap: Tap | None = None,
     ) -> None:
         self.driver = driver
         self.transport = transport
         self._on_event = on_event
+        self._tap = tap
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._ended = threading.Event()
@@ -70,6 +93,7 @@ class Session:
         def run() -> None:
             if self._ended.is_set():
                 future.cancel()
+            if not future.set_running_or_notify_cancel():
                 return
             try:
                 future.set_result(function(self.driver, HostNs(time.time_ns())))
@@ -85,14 +109,19 @@ class Session:
         try:
             next_tick = 0.0
             while not self._stopping.is_set():
-                for data, arrival in self.transport.receive(TICK_S):
+                heard_until = HostNs(time.time_ns())
+                batch = self.transport.receive(TICK_S)
+                for data, arrival in batch:
+                    if self._tap:
+                        self._tap.received(data, arrival)
                     self._hand_out(self.driver.receive(data, arrival))
                 self._run_calls()
+                self._send()
                 now = time.monotonic()
                 if now >= next_tick:
                     next_tick = now + TICK_S
-                    self._hand_out(self.driver.tick(HostNs(time.time_ns())))
-                self._send()
+                    # More may wait in the socket than one batch holds.
+                    self._tick(batch[-1].arrival if batch else heard_until)
             self._run_calls()
             self._send()
             self._hand_out(self.driver.flush())
@@ -102,8 +131,16 @@ class Session:
         finally:
             self._end()
 
+    def _tick(self, heard_until: HostNs) -> None:
+        if self._tap and self.driver.is_overdue(heard_until):
+            self._tap.waited(heard_until)
+        self._hand_out(self.driver.tick(HostNs(time.time_ns()), heard_until))
+        self._send()
+
     def _end(self) -> None:
         self.transport.close()
+        if self._tap:
+            self._tap.close()
         self._ended.set()
         self._run_calls()
 
@@ -113,7 +150,9 @@ class Session:
                 self._calls.get_nowait()()
 
     def _send(self) -> None:
-        for frame in self.driver.outbox():
+        for frame, at in self.driver.outbox():
+            if self._tap:
+                self._tap.sent(frame, at)
             self.transport.send(frame)
 
     def _hand_out(self, events: list[Event]) -> None:
