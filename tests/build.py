@@ -1,8 +1,12 @@
-"""Assembles packets, datagrams and captures from plain values: no test needs a sensor."""
+"""Assembles packets, datagrams and captures from plain values: no test needs a sensor.
+
+``python -m tests.build`` writes the digests of ``tests/l2lidar_node/data`` anew.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from l2lidar_node import wire
+from l2lidar_node import settings, wire
+from l2lidar_node.assembler import SweepAssembler
+from l2lidar_node.config import SweepConfig
+from l2lidar_node.framing import Frame, Framer
+from l2lidar_node.packets import PointPacket, decode
+from l2lidar_node.types import HostNs, Sweep
 from l2lidar_node.wire import PacketType
 
 NS = 1_000_000_000
@@ -186,7 +195,6 @@ def to_device_ns(true_ns: int) -> int:
 def capture(
     duration_s: float = 1.0,
     *,
-    seed: int = 1,
     uptime_s: float = 100.0,
     latency_ns: int = 200_000,
     calibration: Mapping[str, float] = UNIT_A,
@@ -195,16 +203,16 @@ def capture(
     """Return what a device in a round room sends: 3D and IMU packets, one to a datagram, in order.
 
     The device has been on for ``uptime_s`` at the first datagram, its clock has never been set.
-    Ranges vary smoothly with angle and slot, every eleventh slot has no return.
+    Ranges vary with angle and slot, every eleventh slot has no return. Without random numbers: it
+    is the same on every machine.
     """
-    rng = np.random.default_rng(seed)
     power_on_ns = EPOCH_NS - round(uptime_s * NS)
     slots = np.arange(wire.POINTS_PER_3D_PACKET)
     sent: list[Datagram] = []
     for number in range(round(duration_s * NS / PERIOD_NS)):
         at = EPOCH_NS + number * PERIOD_NS
         theta = (2 * np.pi * number / TURN_PACKETS) % (2 * np.pi)
-        ranges = 3365 + 1500 * np.sin(3 * theta + slots / 40) + rng.normal(0, 12, len(slots))
+        ranges = 3365 + 1500 * np.sin(3 * theta + slots / 40) + (31 * number + 17 * slots) % 49
         ranges[slots % 11 == 5] = 0
         payload = points_3d(
             number % MODULUS,
@@ -212,7 +220,7 @@ def capture(
             theta=theta,
             step=STEP_RAD * (1 + 0.01 * np.sin(theta)),
             ranges=np.round(ranges),
-            intensities=rng.integers(0, 256, len(slots)),
+            intensities=(7 * number + 13 * slots) % 256,
             calibration=calibration,
         )
         left = at + round(300 * SLOT_NS) + latency_ns
@@ -311,6 +319,24 @@ def _matching(
     return matching
 
 
+def sweeps(
+    datagrams: Iterable[Datagram], values: Mapping[str, object] | None = None
+) -> list[Sweep]:
+    """Return the sweeps of 3D packets whose true starts are known: no clock, no levelling."""
+    framer, assembler = Framer(), SweepAssembler(settings.build(SweepConfig, values or {}))
+    made: list[Sweep] = []
+    start = EPOCH_NS
+    for datagram in datagrams:
+        for item in framer.feed(datagram.data):
+            assert isinstance(item, Frame)
+            packet = decode(item)
+            if isinstance(packet, PointPacket):
+                made += assembler.push(packet, HostNs(start))
+                start += PERIOD_NS
+    last = assembler.flush()
+    return made if last is None else [*made, last]
+
+
 def digest(points: NDArray[np.void]) -> dict[str, str | int]:
     """Return a hash of every field, of values rounded to what is the same on every machine.
 
@@ -322,3 +348,32 @@ def digest(points: NDArray[np.void]) -> dict[str, str | int]:
         rounded = np.round(points[name].astype(np.float64) / unit.get(name, 1e-5)).astype("<i8")
         result[name] = hashlib.sha256(rounded.tobytes()).hexdigest()[:16]
     return result
+
+
+DIGESTED: dict[str, tuple[Mapping[str, float], Mapping[str, object]]] = {
+    "unit_a_by_packets": (UNIT_A, {}),
+    "unit_b_by_turn": (UNIT_B, {"sweep_cut": "turn"}),
+    "unit_a_by_half_turn": (UNIT_A, {"sweep_cut": "half_turn"}),
+    "unit_a_with_own_range_calibration": (
+        UNIT_A,
+        {"EnableCalRangeOVR": True, "calRangeScale": 0.000989, "calRangeBias": -525.5},
+    ),
+}
+"""What :data:`DIGESTS` has a file for: the calibration and the settings, by name."""
+
+
+def digests(name: str) -> list[dict[str, str | int]]:
+    """Return the digest of every sweep of a second of :func:`capture`."""
+    calibration, values = DIGESTED[name]
+    return [digest(item.points) for item in sweeps(capture(calibration=calibration), values)]
+
+
+def write_digests() -> None:
+    """Write the digests anew, after a change that is meant to change points."""
+    for name in DIGESTED:
+        text = json.dumps(digests(name), indent=1)
+        (DIGESTS / f"{name}.digest.json").write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_digests()
