@@ -14,8 +14,8 @@ trap 'rm -rf "$build"' EXIT
 
 # The wheels' exported targets name include folders of the machine they were built on; CMake refuses targets
 # whose folders do not exist, and the folders that do are passed in by the Python3 module.
-{ grep -rlE '/opt/python/' "$venv/share" --include='*.cmake' || true; } |
-    xargs -r sed -i -E 's#;?/opt/python/[^;"]*##g'
+{ grep -rlZ '/opt/python/' "$venv/share" --include='*.cmake' || true; } |
+    xargs -r0 sed -i -E 's#;?/opt/python/[^;"]*##g'
 
 # A clean environment: flags and prefixes of the caller's shell would end up in the message's libraries.
 if ! env -i HOME="$HOME" PATH="$venv/bin:/usr/local/bin:/usr/bin:/bin" ${LANG:+LANG="$LANG"} \
