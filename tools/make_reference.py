@@ -7,35 +7,44 @@ from __future__ import annotations
 
 import argparse
 import sys
+import textwrap
 from pathlib import Path
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import Setting, markdown_table, settings_of
+from l2lidar_proc.config import DeskewNodeConfig
 
 ROOT = Path(__file__).resolve().parents[1]
-YAML = ROOT / "config" / "l2lidar_node.yaml"
 README = ROOT / "README.md"
+FILES: dict[str, dict[str, type]] = {
+    "l2lidar_node.yaml": {"/**": DriverConfig},
+    "l2lidar_proc.yaml": {"deskew_node": DeskewNodeConfig},
+}
+"""Parameter files: the settings of each node they are for."""
+TABLES: dict[str, type] = {"driver": DriverConfig, "deskew": DeskewNodeConfig}
+"""Tables of the README."""
 
 SHIPPED = {"enable_IMU_publishing": True}
-"""Where the shipped file differs from the defaults: a newcomer wants to see the IMU."""
+"""Where a shipped file differs from the defaults: a newcomer wants to see the IMU."""
 
 HEAD = """\
-# Every parameter of the driver with its default, unless a comment says otherwise.
-# This file is written by tools/make_reference.py; copy it and give yours as params_file.
-/**:
-  ros__parameters:
+# Every parameter with its default, unless a comment says otherwise.
+# This file is written by tools/make_reference.py; copy it and give yours to the launch file.
 """
 
 
-def parameter_file() -> str:
-    """Return the text of the driver's parameter file."""
+def parameter_file(nodes: dict[str, type]) -> str:
+    """Return the text of a parameter file from the settings of each node it is for."""
     lines = [HEAD]
-    for item in settings_of(DriverConfig):
-        lines.append(f"    # {_meaning(item)}\n")
-        value = SHIPPED.get(item.name, item.default)
-        if item.name in SHIPPED:
-            lines.append(f"    # (the default is {_scalar(item.default)})\n")
-        lines.append(f"    {item.name}: {_scalar(value)}\n")
+    for node, group in nodes.items():
+        lines.append(f"{node}:\n  ros__parameters:\n")
+        for item in settings_of(group):
+            words = textwrap.wrap(_meaning(item), 93)
+            lines += [f"    # {line}\n" for line in words]
+            value = SHIPPED.get(item.name, item.default)
+            if item.name in SHIPPED:
+                lines.append(f"    # (the default is {_scalar(item.default)})\n")
+            lines.append(f"    {item.name}: {_scalar(value)}\n")
     return "".join(lines)
 
 
@@ -48,6 +57,11 @@ def _meaning(item: Setting) -> str:
 def _scalar(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_scalar(item) for item in value) + "]"
+    if isinstance(value, float):
+        mantissa, exponent, power = repr(value).partition("e")
+        return mantissa + ("" if "." in mantissa else ".0") + exponent + power  # as YAML wants it
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
@@ -71,10 +85,8 @@ def readme(text: str, tables: dict[str, type]) -> str:
 
 def outputs() -> dict[Path, str]:
     """Return the text of every file that follows from the settings."""
-    return {
-        YAML: parameter_file(),
-        README: readme(README.read_text(), {"driver": DriverConfig}),
-    }
+    files = {ROOT / "config" / name: parameter_file(nodes) for name, nodes in FILES.items()}
+    return {**files, README: readme(README.read_text(), TABLES)}
 
 
 def main() -> int:
