@@ -108,62 +108,70 @@ class FilterConfig:
     filters_after: tuple[str, ...] = setting(
         (), "filters on the deskewed points, in this order", choices=FILTERS, live=True
     )
-    range_min: float = setting(0.0, "range: nearest", unit="m", lo=0.0, hi=1000.0, live=True)
-    range_max: float = setting(1000.0, "range: farthest", unit="m", lo=0.0, hi=1000.0, live=True)
+    range_min: float = setting(
+        0.0, "filter range: nearest", unit="m", lo=0.0, hi=1000.0, live=True
+    )
+    range_max: float = setting(
+        1000.0, "filter range: farthest", unit="m", lo=0.0, hi=1000.0, live=True
+    )
     vertical_min: float = setting(
-        -90.0, "vertical: lowest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
+        -90.0, "filter vertical: lowest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
     )
     vertical_max: float = setting(
-        90.0, "vertical: highest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
+        90.0, "filter vertical: highest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
     )
     azimuth_min: float = setting(
-        -180.0, "azimuth: where the window begins; x ahead, counter-clockwise", unit="deg",
+        -180.0, "filter azimuth: where the window begins; x ahead, counter-clockwise", unit="deg",
         lo=-360.0, hi=360.0, live=True,
     )  # fmt: skip
     azimuth_max: float = setting(
-        180.0, "azimuth: where the window ends; below the beginning it goes across 180 degrees",
+        180.0, "filter azimuth: where the window ends; below the beginning it goes across 180 degrees",
         unit="deg", lo=-360.0, hi=360.0, live=True,
     )  # fmt: skip
     keep_boxes: tuple[float, ...] = setting(
-        (), "keep_boxes: x y z of one corner and of the opposite one, box after box", unit="m",
+        (), "filter keep_boxes: x y z of one corner and of the opposite one, box after box", unit="m",
         live=True,
     )  # fmt: skip
     remove_boxes: tuple[float, ...] = setting(
-        (), "remove_boxes: likewise, such as the robot's own body", unit="m", live=True
+        (), "filter remove_boxes: likewise, such as the robot's own body", unit="m", live=True
     )
-    intensity_min: float = setting(0.0, "intensity: least", lo=0.0, hi=65535.0, live=True)
-    intensity_max: float = setting(65535.0, "intensity: most", lo=0.0, hi=65535.0, live=True)
+    intensity_min: float = setting(0.0, "filter intensity: least", lo=0.0, hi=65535.0, live=True)
+    intensity_max: float = setting(
+        65535.0, "filter intensity: most", lo=0.0, hi=65535.0, live=True
+    )
     isolated_slots: int = setting(
-        3, "isolated: neighbours are this many slots away at most, in the same packet", lo=1,
+        3, "filter isolated: neighbours are this many slots away at most, in the same packet", lo=1,
         hi=50, live=True,
     )  # fmt: skip
     isolated_neighbours: int = setting(
-        1, "isolated: how many neighbours a point needs", lo=1, hi=20, live=True
+        1, "filter isolated: how many neighbours a point needs", lo=1, hi=20, live=True
     )
     isolated_distance: float = setting(
-        0.08, "isolated: how far a neighbour may be", unit="m", lo=0.0, hi=10.0, live=True
+        0.08, "filter isolated: how far a neighbour may be", unit="m", lo=0.0, hi=10.0, live=True
     )
     isolated_ratio: float = setting(
-        0.05, "isolated: and this times the range in addition", lo=0.0, hi=1.0, live=True
+        0.05, "filter isolated: and this times the range in addition", lo=0.0, hi=1.0, live=True
     )
     isolated_intensity: float = setting(
-        65535.0, "isolated: brighter points stay in any case", lo=0.0, hi=65535.0, live=True
+        65535.0, "filter isolated: brighter points stay in any case", lo=0.0, hi=65535.0, live=True
     )
     voxel_size: float = setting(
-        0.1, "voxel: edge of the cubes of which one point is kept", unit="m", lo=0.001, hi=100.0,
+        0.1, "filter voxel: edge of the cubes of which one point is kept", unit="m", lo=0.001, hi=100.0,
         live=True,
     )  # fmt: skip
     statistical_neighbours: int = setting(
-        16, "statistical: neighbours to average the distance to", lo=1, hi=200, live=True
+        16, "filter statistical: neighbours to average the distance to", lo=1, hi=200, live=True
     )
     statistical_ratio: float = setting(
-        2.0, "statistical: standard deviations above the mean to be left out", lo=0.01, hi=100.0,
+        2.0, "filter statistical: standard deviations above the mean to be left out", lo=0.01, hi=100.0,
         live=True,
     )  # fmt: skip
     radius: float = setting(
-        0.3, "radius: where neighbours are counted", unit="m", lo=0.001, hi=100.0, live=True
+        0.3, "filter radius: where neighbours are counted", unit="m", lo=0.001, hi=100.0, live=True
     )
-    radius_neighbours: int = setting(3, "radius: how many there must be", lo=1, hi=1000, live=True)
+    radius_neighbours: int = setting(
+        3, "filter radius: how many there must be", lo=1, hi=1000, live=True
+    )
 
     def __post_init__(self) -> None:
         """Check what a single setting cannot."""
