@@ -8,6 +8,7 @@ from typing import Final
 
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.device import Link, VirtualL2
+from l2lidar_node.emulator.firmware import version_payload
 from l2lidar_node.emulator.flash import Flash
 from l2lidar_node.emulator.ledger import Ledger
 from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
@@ -43,8 +44,9 @@ def stored_settings(path: Path | None, config: DeviceConfig, serial: bool) -> Fl
     FlashError
         If the file is none that the emulator wrote.
     SettingError
-        If an address is not one.
+        If an address or a version is not one.
     """
+    version_payload(config.identity)  # says what is wrong with it before anything is started
     if path is not None and path.exists():
         try:
             return Flash.from_json(path.read_text(encoding="utf-8"))

@@ -233,6 +233,9 @@ def main() -> None:
     except (PortError, OSError) as error:
         typer.echo(f"l2lidar_emulator: {error}", err=True)
         sys.exit(1)
+    except ImportError as error:
+        typer.echo(f"l2lidar_emulator: {error}; '--world pattern' needs no rays", err=True)
+        sys.exit(1)
     except ValueError as error:
         typer.echo(f"l2lidar_emulator: {error}", err=True)
         sys.exit(2)

@@ -53,7 +53,7 @@ class Firmware:
 
     def __init__(self, config: DeviceConfig, flash: Flash, now_ns: int) -> None:
         self._config = config
-        self._identity = self._version(config.identity)
+        self._identity = version_payload(config.identity)
         self._factory = Flash.factory(config.addresses, config.identity)
         self.flash = flash
         self.clock = UnitClock(config.crystal, now_ns)
@@ -157,14 +157,21 @@ class Firmware:
             return AckStatus.HEADER_ERROR
         return AckStatus.OK
 
-    @staticmethod
-    def _version(identity: IdentityConfig) -> bytes:
-        row = np.zeros(1, wire.VERSION_PAYLOAD)
-        row["hardware"] = tuple(_version_bytes("hardware", identity.hardware))
-        row["software"] = tuple(_version_bytes("firmware", identity.firmware))
-        row["name"] = identity.product.encode()
-        row["date"] = identity.firmware_date.encode()
-        return row.tobytes()
+
+def version_payload(identity: IdentityConfig) -> bytes:
+    """Return the payload of packet 105.
+
+    Raises
+    ------
+    SettingError
+        If a version is not four numbers.
+    """
+    row = np.zeros(1, wire.VERSION_PAYLOAD)
+    row["hardware"] = tuple(_version_bytes("hardware", identity.hardware))
+    row["software"] = tuple(_version_bytes("firmware", identity.firmware))
+    row["name"] = identity.product.encode()
+    row["date"] = identity.firmware_date.encode()
+    return row.tobytes()
 
 
 def _ack(packet_type: int, status: AckStatus, command: int = 0, value: int = 0) -> Reply:

@@ -69,7 +69,8 @@ class Ledger:
     """Books every packet when it leaves the unit and again when it reaches the host.
 
     A packet has arrived when its bytes reached the host undamaged, one after the other and with
-    nothing in between: a reader of a byte stream needs that and no more.
+    nothing in between: a reader of a byte stream needs that and no more. One that also uses the
+    boundaries of datagrams may recover a few others.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ from tests.l2lidar_node.emulator.rig import command, read
 LIMIT_S = 30.0
 ROOT = Path(__file__).parents[3]
 QUICK = ("--world", "pattern", "--ready", "--lidar-port", "0")
+
+needs_rays = pytest.mark.skipif(find_spec("open3d") is None, reason="needs open3d")
 
 
 @pytest.fixture
@@ -115,7 +118,7 @@ def test_a_bounded_run_says_what_it_is_and_what_it_did(host):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("world", ["pattern", "box"])
+@pytest.mark.parametrize("world", ["pattern", pytest.param("box", marks=needs_rays)])
 def test_it_ends_cleanly_when_told_to(host, number, world):
     process = started(*QUICK, "--world", world, "--host-port", port_of(host))
     ask(host, lidar_of(process), command(2000, 6, 1))
@@ -141,9 +144,9 @@ def test_it_ends_cleanly_when_told_to(host, number, world):
         (["--truth-points"], ["'--truth-points'", "'--truth'"]),
         (["--lidar-ip", "l2"], ["lidar_ip", "'l2'", "192.168.1.62"]),
         (["--firmware", "2"], ["firmware", "four numbers"]),
-        (["--world", "garden"], ["garden", "room"]),
-        (["--world", "no/such/mesh.ply"], ["no/such/mesh.ply"]),
-        (["--motion", "no/such/path.tum"], ["no/such/path.tum"]),
+        pytest.param(["--world", "garden"], ["garden", "room"], marks=needs_rays),
+        pytest.param(["--world", "no/mesh.ply"], ["no/mesh.ply"], marks=needs_rays),
+        pytest.param(["--motion", "no/path.tum"], ["no/path.tum"], marks=needs_rays),
         (["--mount", "sideways"], ["'--mount'", "upside_down"]),
         (["--flash", "pyproject.toml"], ["pyproject.toml", "stored settings"]),
         (["--worlds", "room"], ["--worlds"]),
@@ -164,6 +167,15 @@ def test_a_wrong_option_is_named_with_what_would_be_right(options, words, monkey
     for word in words:
         assert word in text
     assert "Traceback" not in err
+
+
+@pytest.mark.skipif(find_spec("open3d") is not None, reason="needs a machine without open3d")
+def test_a_world_without_what_casts_rays_is_one_message():
+    code, _, err = run("--lidar-port", "0")
+    assert code == 1
+    assert err.splitlines() == [
+        "l2lidar_emulator: No module named 'open3d'; '--world pattern' needs no rays"
+    ]
 
 
 def test_a_port_in_use_is_one_message(host):
@@ -226,6 +238,7 @@ def test_a_pseudo_terminal_is_named_and_carries_packets():
     assert process.returncode == 0
 
 
+@needs_rays
 def test_the_truth_of_a_run(host, tmp_path):
     """What arrives at the socket, the ledger, the trajectory and the exact points agree."""
     folder = tmp_path / "truth"
