@@ -22,8 +22,11 @@ Level = Callable[[PointBatch, list[HostNs]], PointBatch]
 
 
 class _Placed(NamedTuple):
+    """A packet and where it stands in its sweep."""
+
     packet: PointPacket
-    start: HostNs
+    given: HostNs  # its start as it was pushed
+    start: HostNs  # not before the end of the packet before
 
 
 class SweepAssembler:
@@ -70,14 +73,16 @@ class SweepAssembler:
             Packets the sequence numbers say are missing just before it.
         """
         sweeps: list[Sweep] = []
+        placed = start
         if self._packets and self._starts_anew(packet, start):
             sweeps.append(self._finish())
         elif self._packets:
-            # A correction of the clock must not let a packet begin before the previous one ended.
+            # A correction of the clock, or stamps of arrival in a burst, must not let a packet
+            # begin before the previous one ended.
             last = self._packets[-1]
-            start = HostNs(max(start, last.start + last.packet.duration_ns))
+            placed = HostNs(max(start, last.start + last.packet.duration_ns))
             self._missing += missing
-        self._packets.append(_Placed(packet, start))
+        self._packets.append(_Placed(packet, start, placed))
         if self._is_full():
             sweeps.append(self._finish())
         return sweeps
@@ -90,12 +95,12 @@ class SweepAssembler:
         first, last = self._packets[0], self._packets[-1]
         if packet.packet_type != last.packet.packet_type:
             return True
-        if start - last.start > MAX_GAP_NS or start < last.start:
+        if start - last.given > MAX_GAP_NS or start < last.given:
             return True
         if self._config.cut == "packets":
             return False
         if self._config.cut == "duration" or packet.packet_type == wire.PacketType.POINTS_2D:
-            return start - first.start >= self._config.duration_ms * 1_000_000
+            return start - first.given >= self._config.duration_ms * 1_000_000
         period = 2 * math.pi if self._config.cut == "turn" else math.pi
         return _passes(last.packet.head_angle, packet.head_angle, period)
 

@@ -270,6 +270,17 @@ def test_a_packet_that_seems_to_begin_before_the_last_one_ended_is_put_behind_it
     assert times[300] == pytest.approx(DURATION / 1e9)
 
 
+def test_a_burst_of_arrivals_is_one_sweep():
+    """With stamps of arrival a backlog comes microseconds apart; that is no clock step."""
+    stream = Stream(packets=38)
+    for _ in range(38):
+        stream.push(gap_ns=10_000)
+    (sweep,) = stream.sweeps
+    assert sweep.packets == 38
+    assert (np.diff(sweep.points["time"]) >= 0).all()
+    assert sweep.end == START + 38 * DURATION
+
+
 def test_missing_packets_are_counted_within_the_sweep():
     stream = Stream(packets=4)
     for missing in (9, 0, 2, 1, 5, 0, 0, 3):
