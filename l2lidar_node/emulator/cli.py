@@ -32,7 +32,7 @@ from l2lidar_node.emulator.port import PortError
 from l2lidar_node.emulator.results import write_ledger, write_whole
 from l2lidar_node.emulator.returns import RangeNoise
 from l2lidar_node.emulator.server import MAX_SPEED, Server
-from l2lidar_node.emulator.studio import Studio
+from l2lidar_node.emulator.studio import Studio, StudioError
 from l2lidar_node.settings import Setting, Value, settings_of, values_of
 
 _LEAD_NS: Final = 100_000_000  # from ready to power-on, so that the first packets are in time
@@ -230,7 +230,7 @@ def main() -> None:
         app(prog_name="l2lidar_emulator", standalone_mode=True)
     except KeyboardInterrupt:  # before there was anything to end
         sys.exit(0)
-    except (PortError, OSError) as error:
+    except (PortError, StudioError, OSError) as error:
         typer.echo(f"l2lidar_emulator: {error}", err=True)
         sys.exit(1)
     except ImportError as error:

@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -24,6 +25,10 @@ _IMU: Final = "imu"
 
 Block = tuple[NDArray[np.void], NDArray[np.float64]]
 _Key = tuple[str | WorkMode, int, int]
+
+
+class StudioError(RuntimeError):
+    """The measuring process was killed."""
 
 
 class Studio:
@@ -85,10 +90,13 @@ class Studio:
         wanted: list[_Key] = [(what, first + ahead * count, count) for ahead in range(_AHEAD + 1)]
         for key in [key for key in self._futures if key[0] == what and key not in wanted]:
             self._futures.pop(key).cancel()
-        for key in wanted:
-            if key not in self._futures:
-                self._futures[key] = self._pool.submit(_measure, *key)
-        return self._futures.pop(wanted[0]).result()
+        try:
+            for key in wanted:
+                if key not in self._futures:
+                    self._futures[key] = self._pool.submit(_measure, *key)
+            return self._futures.pop(wanted[0]).result()
+        except BrokenProcessPool:
+            raise StudioError("the measuring process has come to an end") from None
 
 
 class StudioScanner:
@@ -118,8 +126,9 @@ _state: dict[str, Any] = {}  # of the measuring process
 
 
 def _settle() -> None:
-    """Leave interrupts to the parent, and go when it is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Leave signals, which often go to the whole group, to the parent; go when it is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
     def wait() -> None:
         parent = multiprocessing.parent_process()

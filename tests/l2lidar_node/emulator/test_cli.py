@@ -64,6 +64,7 @@ def started(*options: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     )
     _processes.append(process)
     return process
@@ -122,10 +123,25 @@ def test_a_bounded_run_says_what_it_is_and_what_it_did(host):
 def test_it_ends_cleanly_when_told_to(host, number, world):
     process = started(*QUICK, "--world", world, "--host-port", port_of(host))
     ask(host, lidar_of(process), command(2000, 6, 1))
-    process.send_signal(number)
+    os.killpg(process.pid, number)  # as a terminal or a supervisor does
     out, err = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, err) == (0, "")
     assert "heard: 1 COMMAND" in out
+
+
+@needs_rays
+def test_a_killed_measuring_process_is_one_message(host):
+    process = started(
+        "--world", "box", "--ready", "--lidar-port", "0", "--host-port", port_of(host)
+    )
+    host.recv(2000)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    for child in children:
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+            os.kill(int(child), signal.SIGKILL)
+    _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1
+    assert err == "l2lidar_emulator: the measuring process has come to an end\n"
 
 
 @pytest.mark.parametrize(
