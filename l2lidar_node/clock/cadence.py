@@ -12,8 +12,9 @@ _LEARN: Final = 9  # packets from which the period is learned
 _MEMORY: Final = 512  # packets over which the period is averaged
 _FLOOR_NS: Final = 2_000.0  # deviations this small are never a step
 _CEILING_NS: Final = 150_000.0
-_SIGMAS: Final = 8.0  # in mean absolute deviations
+_SIGMAS: Final = 5.0  # in mean absolute deviations
 _NEAR: Final = 64  # packets that may be missing where numbers wrap for the first time
+_WANDER: Final = 16  # packets over which deviations may add up
 _SLIP: Final = 0.05  # of the advance: more irregular than that a stream is not
 
 
@@ -96,7 +97,8 @@ class Cadence:
             gap += self._modulus
         period = self._period
         off = advance - gap * period - self._lag
-        if gap <= 0 or not -self._tolerance * gap <= off <= self._tolerance * gap:
+        noise = self._tolerance if gap == 1 else self.noise(gap)
+        if gap <= 0 or not -noise <= off <= noise:
             return False
         if seq < self._seq:
             self._sure = True
@@ -135,6 +137,10 @@ class Cadence:
             return counted
         return gap + self._modulus if self._modulus else 1
 
+    def back(self, seq: int) -> int:
+        """Return by how many numbers a packet is before the last one, if numbers did not wrap."""
+        return self._seq - seq
+
     def advance(self, gap: int) -> int:
         """Return the device time from the last packet to one some numbers later [ns]."""
         return round(gap * self._period + self._lag)
@@ -145,7 +151,7 @@ class Cadence:
 
     def noise(self, gap: int) -> float:
         """Return by how much a packet may be off before it is not where it was expected [ns]."""
-        return gap * self._tolerance
+        return min(gap, _WANDER) * self._tolerance
 
     def slip(self, gap: int) -> int:
         """Return by how much a packet may be off without a step being the reason [ns]."""

@@ -30,7 +30,7 @@ _SILENT_NS: Final = 1_000 * _MS
 _STALE_NS: Final = 500 * _MS  # [device]
 _BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
 _BOOT_SEQ: Final = 16  # so can sequence numbers
-_KEEP: Final = 16  # epochs that packets on their way may still belong to
+_KEEP: Final = 64  # packets, and epochs, that may still be on their way
 _SYNCS: Final = 128
 
 
@@ -160,6 +160,8 @@ class DeviceLine:
     ) -> int | None:
         """Place a stamp that is not where the cadence wants it."""
         cadence = track.cadence
+        if self._is_late(track, seq, stamp):
+            return None
         u = stamp - epoch.base
         gap = cadence.gap(seq, u - track.u)
         advance = cadence.advance(gap)
@@ -180,15 +182,22 @@ class DeviceLine:
             return self._accept(track, epoch, seq, stamp, arrival)
         return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)
 
+    def _is_late(self, track: _Track, seq: int, stamp: int) -> bool:
+        """Whether a packet is from before the last one, or is the last one again."""
+        back = track.cadence.back(seq)
+        if not 0 <= back <= _KEEP:
+            return False
+        place = track.u + track.cadence.advance(-back)
+        slip = track.cadence.slip(back)
+        return any(abs(stamp - epoch.base - place) <= slip for epoch in self._epochs)
+
     def _begun(
         self, track: _Track, epoch: _Epoch, stamp: int, expected: int, noise: float
     ) -> _Epoch | None:
         """Return the epoch of the sync of this host that a stamp is just after.
 
-        Clocks faster than the host's pass the value of a sync before it steps them back, so the
-        stamp must also be nearer to where it is expected than without the step. The stream that
-        comes first tells where the epoch lies on the line; the IMU stream, more regular, has the
-        last word.
+        The stream that comes first tells where the epoch lies on the line; the IMU stream, more
+        regular, has the last word.
         """
         base = stamp - expected
         off = abs(base - epoch.base)
@@ -205,7 +214,7 @@ class DeviceLine:
                 self.epochs += 1
                 self._newest = sync
                 self._epochs.append(begun)
-            elif abs(base - begun.base) > off:
+            elif not self._is_after(track, epoch, begun, stamp, base, noise):
                 continue
             elif track is self._imu:
                 if self._points.epoch is begun:
@@ -214,19 +223,37 @@ class DeviceLine:
             return begun
         return None
 
+    def _is_after(
+        self, track: _Track, epoch: _Epoch, begun: _Epoch, stamp: int, base: int, noise: float
+    ) -> bool:
+        """Whether a stamp past the value of a sync is from after the step.
+
+        Clocks faster than the host's pass that value before they are stepped back. The side on
+        which the stamp is nearer to where it is expected counts; where the step is too small for
+        that, the line does, on which the IMU stream has placed the step.
+        """
+        is_nearer = abs(base - begun.base) <= abs(base - epoch.base)
+        if track is self._imu or begun.sync is None or abs(begun.base - epoch.base) > 2.0 * noise:
+            return is_nearer
+        if stamp - epoch.base >= begun.sync.value - begun.base:
+            return True
+        return begun.base < epoch.base and is_nearer
+
     def _synced_since(self, track: _Track) -> bool:
         """Whether a sync may have stepped the clock since the last packet."""
         return any(sync.sent > track.arrival - _LATE_NS for sync in self._syncs)
 
     def _accept(self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int) -> int:
-        u = stamp - epoch.base
-        track.cadence.resume(seq, u - track.u)
+        track.cadence.resume(seq, stamp - epoch.base - track.u)
+        return self._enter(track, epoch, stamp, arrival)
+
+    def _enter(self, track: _Track, epoch: _Epoch, stamp: int, arrival: int) -> int:
         track.epoch = epoch
-        track.u = u
-        self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _STALE_NS
+        track.u = u = stamp - epoch.base
         track.stamp = stamp
         track.arrival = arrival
         track.suspect = None
+        self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _STALE_NS
         return u
 
     def _unexplained(
@@ -262,10 +289,10 @@ class DeviceLine:
         other = self._points if track is self._imu else self._imu
         if other.epoch is None:
             self._epochs.append(_Epoch(0, None))
-            return self._accept(track, self._epochs[-1], seq, stamp, arrival)
+            return self._enter(track, self._epochs[-1], stamp, arrival)
         epoch = self._fitting(other, stamp, arrival)
         if epoch is not None:
-            return self._accept(track, epoch, seq, stamp, arrival)
+            return self._enter(track, epoch, stamp, arrival)
         if arrival - other.arrival > _SILENT_NS:
             self.steps.append((Step.LOST, stamp - other.stamp))
             self.restart()

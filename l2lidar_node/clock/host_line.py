@@ -21,7 +21,8 @@ _SLEW: Final = 0.002  # at most by that much faster or slower
 _SEGMENTS: Final = 8
 
 _STEP_NS: Final = 5 * _MS  # arrivals off by more, and for long enough: the host's clock was set
-_SPREADS: Final = 10.0
+_EARLY_NS: Final = 300_000  # a single block earlier than that is an error, more of them are news
+_SPREADS: Final = 10.0  # these margins grow by that many times the usual delay
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
 _BACKWARD_BLOCKS: Final = 2  # early ones cannot
 _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
@@ -159,17 +160,13 @@ class HostLine:
         off = self._low_at[1] - line.at(self._low_at[0])
         spread = _SPREADS * line.excess
         suspects = self._suspects
-        if off < -_STEP_NS - spread:
-            enough = _BACKWARD_BLOCKS
-        elif off > _STEP_NS + spread:
-            enough = _FORWARD_BLOCKS
-        else:
+        if -_EARLY_NS - spread <= off <= _STEP_NS + spread:
             suspects.clear()
             return False
-        if suspects and (suspects[-1][1] - line.at(suspects[-1][0]) < 0) != (off < 0):
+        if suspects and (suspects[-1][1] < line.at(suspects[-1][0])) != (off < 0):
             suspects.clear()
         suspects.append(self._low_at)
-        if len(suspects) < enough:
+        if len(suspects) < (_BACKWARD_BLOCKS if off < 0 else _FORWARD_BLOCKS):
             return True
         first, last = suspects[0], suspects[-1]
         if last[1] - first[1] < _FLOWING * (last[0] - first[0]) * line.ratio:
@@ -178,8 +175,10 @@ class HostLine:
         before = line.at(u)
         envelope.move(suspects)
         suspects.clear()
-        self.steps.append(envelope.line.at(u) - before)
-        self._go(u, envelope.line.at(u) - self.advance_ns, envelope.line.ratio)
+        step = envelope.line.at(u) - before
+        if abs(step) > _STEP_NS:
+            self.steps.append(step)
+            self._go(u, envelope.line.at(u) - self.advance_ns, envelope.line.ratio)
         return True
 
     def _go(self, u: int, host: int, slope: float) -> None:
