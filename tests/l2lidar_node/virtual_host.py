@@ -1,0 +1,131 @@
+"""A host in virtual time: a real session that takes a moment for a minute, busy on request."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from l2lidar_node import session as session_module
+from l2lidar_node.capture import Endpoint
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver import Driver, Event
+from l2lidar_node.emulator.config import DeviceConfig, FaultConfig, PowerConfig
+from l2lidar_node.emulator.device import VirtualL2
+from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
+from l2lidar_node.recording import RecordingWriter
+from l2lidar_node.session import Session
+from l2lidar_node.settings import build
+from l2lidar_node.transport import Datagram
+from l2lidar_node.types import HostNs, ImuSample, Sweep
+
+EPOCH_NS = 1_700_000_000_000_000_000
+DEVICE = Endpoint("192.168.1.62", 6101)
+HOST = Endpoint("192.168.1.2", 6201)
+READY = PowerConfig(boot_scale=0.0)
+
+
+class MemoryTap(RecordingWriter):
+    """A recorder into memory."""
+
+    def __init__(self) -> None:
+        self.stream = io.BytesIO()
+        super().__init__(self.stream, DEVICE, HOST)
+
+    def close(self) -> None:
+        pass
+
+
+class VirtualHost:
+    """Transport and clock of a session with a virtual L2."""
+
+    foreign = 0
+    kernel_drops = 0
+
+    def __init__(self, device: VirtualL2, seconds: float, busy: float, seed: int) -> None:
+        self.now = EPOCH_NS
+        self.session: Session | None = None
+        self.todo: list[tuple[int, Callable[[], None]]] = []
+        self._device = device
+        self._end = EPOCH_NS + round(seconds * 1e9)
+        self._busy = busy
+        self._rng = np.random.default_rng(seed)
+        self._held: list[Datagram] = []
+
+    def time_ns(self) -> int:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now / 1e9
+
+    def receive(self, timeout_s: float) -> list[Datagram]:
+        is_busy = self._rng.random() < self._busy
+        step_s = self._rng.uniform(0.05, 0.5) if is_busy else self._rng.uniform(0.0, timeout_s)
+        self.now += round(step_s * 1e9)
+        if self.now >= self._end and self.session is not None:
+            self.session.stop()
+        while self.todo and self.todo[0][0] <= self.now:
+            self.todo.pop(0)[1]()
+        self._held += [Datagram(data, HostNs(at)) for at, data in self._device.advance(self.now)]
+        batch, self._held = self._held[:64], self._held[64:]
+        return batch
+
+    def send(self, frame: bytes) -> None:
+        self._device.command(frame, self.now)
+
+    def close(self) -> None:
+        pass
+
+
+def live_run(
+    monkeypatch: pytest.MonkeyPatch,
+    seconds: float = 5.0,
+    *,
+    settings: dict[str, object] | None = None,
+    faults: dict[str, object] | None = None,
+    busy: float = 0.0,
+    calls: Sequence[tuple[float, Callable[[Driver, HostNs], object]]] = (),
+    seed: int = 1,
+) -> tuple[DriverConfig, list[Event], MemoryTap]:
+    """Run a session in virtual time; return its settings, its events and what its tap wrote."""
+    unit = DeviceConfig(power=READY, faults=build(FaultConfig, faults or {}), seed=seed)
+    device = VirtualL2(unit, PatternScanner(), StillInertial(), power_on_ns=EPOCH_NS)
+    host = VirtualHost(device, seconds, busy, seed)
+    clock = SimpleNamespace(time_ns=host.time_ns, monotonic=host.monotonic)
+    monkeypatch.setattr(session_module, "time", clock)
+    config = build(DriverConfig, {"watchdog_action": "wait", **(settings or {})})
+    tap = MemoryTap()
+    events: list[Event] = []
+    session = Session(Driver(config), host, events.append, tap)
+    host.session = session
+
+    def command(function: Callable[[Driver, HostNs], object]) -> None:
+        def run(driver: Driver, now: HostNs) -> None:
+            result = function(driver, now)
+            found = result[1] if isinstance(result, tuple) else result
+            events.extend(found if isinstance(found, list) else [])
+
+        session.call(run)
+
+    host.todo = [
+        (EPOCH_NS + round(at * 1e9), lambda function=function: command(function))
+        for at, function in calls
+    ]
+    session.start()
+    session._thread.join(60)
+    assert session.failure is None
+    return config, events, tap
+
+
+def essence(events: Sequence[Event]) -> list[object]:
+    """Return sweeps and samples in a form that compares equal when every bit is."""
+    return [
+        (event.start, event.end, event.packets, event.missing, event.points.tobytes())
+        if isinstance(event, Sweep)
+        else event
+        for event in events
+        if isinstance(event, Sweep | ImuSample)
+    ]
