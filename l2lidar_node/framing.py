@@ -81,10 +81,10 @@ class Framer:
     def feed(self, data: bytes) -> list[FramingEvent]:
         """Return the frames and errors that these bytes complete, in order."""
         if self._pending and data.startswith(wire.MAGIC):
-            events, rest = _parse(data, 0)
+            events, rest = _parse(data)
             if not rest:
                 return events
-        events, self._pending = _parse(self._pending + data, len(self._pending))
+        events, self._pending = _parse(self._pending + data)
         return events
 
     def reset(self) -> None:
@@ -92,8 +92,8 @@ class Framer:
         self._pending = b""
 
 
-def _parse(data: bytes, seen: int) -> tuple[list[FramingEvent], bytes]:
-    """Return the events in ``data``, whose first ``seen`` bytes are not new, and what is left."""
+def _parse(data: bytes) -> tuple[list[FramingEvent], bytes]:
+    """Return the events in ``data`` and what is left, the beginning of a frame."""
     events: list[FramingEvent] = []
     at = 0
     while at < len(data):
@@ -106,7 +106,7 @@ def _parse(data: bytes, seen: int) -> tuple[list[FramingEvent], bytes]:
             continue
         found = _frame_at(data, at)
         if found is None:
-            return events, _take_out(data, at, seen, events)
+            return events, _take_out(data, at, events)
         if isinstance(found, Frame):
             events.append(found)
             at += len(found.payload) + wire.OVERHEAD
@@ -117,18 +117,18 @@ def _parse(data: bytes, seen: int) -> tuple[list[FramingEvent], bytes]:
     return events, data[at:]
 
 
-def _take_out(data: bytes, at: int, seen: int, events: list[FramingEvent]) -> bytes:
+def _take_out(data: bytes, at: int, events: list[FramingEvent]) -> bytes:
     """Move the good frames behind the incomplete one at ``at`` to the events; return the rest.
 
-    A frame that ends within the bytes seen before was looked at then. Real streams have one or
-    two magics there that begin no good frame; more are not worth the time.
+    Real streams have one or two magics there that begin no good frame; more are not worth the
+    time.
     """
     rest = b""
     begin = at
     misses = 0
     at = data.find(wire.MAGIC, at + 1)
     while at >= 0 and misses < _MAX_MISSES:
-        found = _frame_at(data, at, seen)
+        found = _frame_at(data, at)
         if isinstance(found, Frame):
             events.append(found)
             rest += data[begin:at]
@@ -139,18 +139,15 @@ def _take_out(data: bytes, at: int, seen: int, events: list[FramingEvent]) -> by
     return rest + data[begin:]
 
 
-def _frame_at(data: bytes, at: int, seen: int = 0) -> Frame | Fault | None:
-    """Return the frame that begins here, or what is wrong with it.
-
-    None if it is not complete, or ended within the first ``seen`` bytes.
-    """
+def _frame_at(data: bytes, at: int) -> Frame | Fault | None:
+    """Return the frame that begins here, or what is wrong with it; None if it is incomplete."""
     if len(data) - at < _HEADER_SIZE:
         return None
     _, packet_type, size = wire.HEADER.unpack_from(data, at)
     if not _plausible(packet_type, size):
         return Fault.SIZE
     end = at + size
-    if not seen < end <= len(data):
+    if end > len(data):
         return None
     if data[end - 2 : end] != wire.TAIL_END:
         return Fault.TAIL

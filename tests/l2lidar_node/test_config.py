@@ -167,6 +167,7 @@ def test_several_live_changes_are_made_together_or_not_at_all():
         ("l2", "bot1/lidar/l2lidar_link", "bot1/lidar/l2lidar_link", "bot1/lidar/l2lidar_imu"),
         ("l2lidar", "my_lidar", "my_lidar", "my_lidar_imu"),
         ("rear", "", "rear_link", "rear_imu"),
+        ("blink", "", "blink_link", "blink_imu"),
         ("rear", "roof_link", "roof_link", "roof_imu"),
         ("l2lidar", "link_link_x", "link_link_x", "link_link_x_imu"),
     ],

@@ -234,10 +234,12 @@ def test_the_cost_of_hostile_bytes_grows_with_their_number_only(monkeypatch):
         assert checked_bytes(monkeypatch, pieces) <= 2 * per_byte * length
 
 
-def test_the_cost_of_single_bytes_behind_a_stub_is_bounded(monkeypatch):
-    hostile = header(103, 5536) + dense_magics(5000) + bytes(500)
-    behind = checked_bytes(monkeypatch, [hostile[at : at + 1] for at in range(len(hostile))])
-    assert behind <= 8 * MAX_FRAME
+def test_the_cost_of_a_call_behind_a_stub_is_bounded(monkeypatch):
+    hostile = header(103, 5536) + dense_magics(5000)
+    before = checked_bytes(monkeypatch, [hostile])
+    for calls in (10, 100):
+        cost = checked_bytes(monkeypatch, [hostile, *[b"\0"] * calls]) - before
+        assert cost <= calls * 8 * MAX_FRAME
 
 
 def test_looking_behind_an_incomplete_frame_is_not_repeated_for_every_magic(monkeypatch):

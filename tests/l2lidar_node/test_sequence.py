@@ -165,6 +165,18 @@ def test_another_modulus_is_learned_within_three_turns(modulus):
     assert before <= 1025
 
 
+@pytest.mark.parametrize(("modulus", "window"), [(100, WINDOW), (1025, 256)])
+def test_a_large_window_leaves_room_ahead(modulus, window):
+    order: SequenceOrder[int] = SequenceOrder(window)
+    for number in range(3 * modulus):
+        order.push(number % modulus, number)
+    order.flush()
+    before, first = order.counts.lost, 3 * modulus + 30
+    released = [pair for n in range(first, first + 600) for pair in order.push(n % modulus, n)]
+    assert released[0] == (30, first)
+    assert order.counts == counted(lost=before + 30)
+
+
 @pytest.mark.parametrize("modulus", [65536, 2**32])
 def test_the_wrap_of_a_large_modulus_costs_nothing(modulus):
     numbers = range(modulus - 300, modulus + 300)
