@@ -1,0 +1,108 @@
+"""The clock on input that makes no sense: it answers, keeps its promises and does not grow."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from l2lidar_node.clock import DeviceClock
+from l2lidar_node.config import ClockConfig
+from l2lidar_node.types import DeviceNs, HostNs, Stream
+
+SECONDS = st.integers(0, 2**32 - 1)
+STAMPS = st.one_of(
+    st.builds(lambda sec, nsec: sec * 10**9 + nsec, SECONDS, st.integers(0, 2**32 - 1)),
+    st.integers(0, 10**9),
+)
+PACKETS = st.lists(
+    st.tuples(
+        st.sampled_from(list(Stream)),
+        st.one_of(st.integers(0, 2**32 - 1), st.integers(0, 1200)),
+        STAMPS,
+        st.integers(0, 2**63 - 1),
+        st.integers(0, 10**8),
+        st.sampled_from(["packet", "packet", "packet", "sync", "round trip"]),
+    ),
+    max_size=200,
+)
+CONFIGS = st.builds(
+    ClockConfig,
+    enable_l2_time_correction=st.booleans(),
+    enable_l2_host_sync=st.booleans(),
+    l2_sync_mode=st.sampled_from(["once", "periodic"]),
+    publish_unlocked=st.booleans(),
+    enable_latency_measure=st.booleans(),
+)
+
+
+class Promises:
+    """Checks every answer of a clock."""
+
+    def __init__(self, config: ClockConfig) -> None:
+        self.clock = DeviceClock(config)
+        self.last = dict.fromkeys(Stream, 0)
+
+    def observe(self, stream: Stream, seq: int, stamp: int, arrival: int, duration: int) -> None:
+        answer = self.clock.observe(stream, seq, DeviceNs(stamp), HostNs(arrival), duration)
+        if answer is not None:
+            assert isinstance(answer, int)
+            assert self.last[stream] < answer <= arrival - duration
+            self.last[stream] = answer
+
+
+@given(CONFIGS, PACKETS)
+def test_any_input_is_answered_and_promises_are_kept(
+    config: ClockConfig, packets: list[tuple[Stream, int, int, int, int, str]]
+) -> None:
+    checked = Promises(config)
+    for stream, seq, stamp, arrival, duration, what in packets:
+        if what == "sync":
+            checked.clock.synced(HostNs(stamp), HostNs(arrival))
+        elif what == "round trip":
+            checked.clock.round_trip(duration)
+        else:
+            checked.observe(stream, seq, stamp, arrival, duration)
+        checked.clock.sync_due(HostNs(arrival))
+    checked.clock.status()
+    checked.clock.events()
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.floats(0.3, 4.0), st.integers(1, 60))
+def test_streams_that_are_cut_and_joined_anywhere_keep_the_promises(
+    seed: int, ratio: float, length: int
+) -> None:
+    """Pieces of good streams, each with its own clock, numbers, and host time."""
+    rng = np.random.default_rng(seed)
+    checked = Promises(ClockConfig(l2_sync_mode="periodic"))
+    for _ in range(12):
+        stamp, seq = int(rng.integers(0, 2**62)), int(rng.integers(0, 1200))
+        arrival = 10**18 + int(rng.integers(0, 10**11))
+        checked.clock.synced(HostNs(arrival), HostNs(arrival))
+        for number in range(length * 3):
+            late = int(rng.exponential(10**6))
+            stream = Stream.IMU if number % 2 else Stream.POINTS
+            instant = number * 4_000_000
+            checked.observe(
+                stream, (seq + number // 2) % 1025, stamp + int(instant / ratio),
+                arrival + instant + late, 0,
+            )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_memory_is_bounded(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    checked = Promises(ClockConfig(l2_sync_mode="periodic"))
+    sizes = []
+    for _ in range(4):
+        for number in range(4000):
+            noise = int(rng.integers(0, 2**40)) if rng.random() < 0.05 else 0
+            arrival = 10**18 + number * 4_000_000
+            if rng.random() < 0.1:
+                checked.clock.synced(HostNs(arrival), HostNs(arrival))
+            checked.observe(Stream.IMU, number % 1025, number * 2_000_000 + noise, arrival, 0)
+        sizes.append(len(pickle.dumps(checked.clock.__getstate__())))
+
+    assert max(sizes) < 200_000

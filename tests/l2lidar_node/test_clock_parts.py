@@ -1,0 +1,135 @@
+"""The clock's parts by themselves."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from l2lidar_node.clock.cadence import Cadence
+from l2lidar_node.clock.envelope import supporting_line
+from l2lidar_node.clock.schedule import SyncSchedule
+from l2lidar_node.config import ClockConfig
+from l2lidar_node.types import HostNs
+
+MS = 1_000_000
+PACKETS = st.lists(
+    st.tuples(st.integers(0, 10**6), st.integers(-(10**6), 10**6)),
+    min_size=2,
+    max_size=12,
+    unique_by=lambda packet: packet[0],
+)
+
+
+@given(PACKETS)
+def test_the_supporting_line_is_the_best_one_below_all_packets(
+    packets: list[tuple[int, int]],
+) -> None:
+    packets = sorted(packets)
+
+    line = supporting_line(packets, 1.0)
+
+    assert line is not None
+    heights = [host - line.at(u) for u, host in packets]
+    assert min(heights) >= -2  # rounded to nanoseconds
+    best = min(
+        sum(_heights(packets, pair))
+        for pair in itertools.combinations(packets, 2)
+        if min(_heights(packets, pair)) >= -1e-3
+    )
+    assert sum(heights) <= best + 2 * len(packets)
+
+
+def _heights(
+    packets: list[tuple[int, int]], pair: tuple[tuple[int, int], tuple[int, int]]
+) -> list[float]:
+    (u0, h0), (u1, h1) = pair
+    return [host - h0 - (h1 - h0) / (u1 - u0) * (u - u0) for u, host in packets]
+
+
+def test_the_supporting_line_is_exact_far_from_zero() -> None:
+    begin = 1_760_000_000_123_456_789
+    packets = [(begin + 7 * n, begin + 14 * n + (0 if n % 5 else 3)) for n in range(1000)]
+
+    line = supporting_line(packets, 2.0)
+
+    assert line is not None
+    assert line.ratio == 2.0
+    assert line.at(begin + 7_000_000) == begin + 14_000_000
+
+
+def test_packets_of_one_instant_have_no_line() -> None:
+    assert supporting_line([(5, 1), (5, 2), (5, 3)], 2.0) is None
+
+
+def _learned(period: int, first: int = 0) -> Cadence:
+    cadence = Cadence(0.1)
+    known = [cadence.learn(first + n, n * period) for n in range(9)]
+    assert known == [False] * 8 + [True]
+    return cadence
+
+
+def test_a_cadence_predicts_over_missing_packets() -> None:
+    cadence = _learned(2 * MS)
+
+    assert cadence.follows(11, 3 * 2 * MS)
+    assert not cadence.follows(12, 2 * MS + 30_000)
+    assert cadence.gap(20, 0) == 9
+    assert cadence.advance(9) == 18 * MS
+
+
+@pytest.mark.parametrize("modulus", [16, 1000, 1024, 1025, 65536])
+def test_a_cadence_learns_where_numbers_wrap(modulus: int) -> None:
+    cadence = _learned(2 * MS, first=modulus - 10)
+
+    assert cadence.follows(modulus - 1, 2 * MS)
+    if not cadence.follows(0, 2 * MS):
+        assert cadence.gap(0, 2 * MS) == 1
+        cadence.resume(0, 2 * MS)
+    for number in itertools.chain(range(1, modulus), range(3)):
+        assert cadence.follows(number, 2 * MS)
+
+
+def test_one_step_does_not_spoil_what_is_learned() -> None:
+    cadence = Cadence(0.1)
+    for n in range(9):
+        cadence.learn(n, n * 2 * MS + (25 * MS if n > 4 else 0))
+
+    assert cadence.advance(1) == 2 * MS
+
+
+@pytest.mark.parametrize("correction", [True, False])
+def test_no_sync_is_due_when_none_is_wanted(correction: bool) -> None:
+    config = ClockConfig(enable_l2_host_sync=False, enable_l2_time_correction=correction)
+    schedule = SyncSchedule(config)
+
+    assert not schedule.due(HostNs(10**18))
+    assert schedule.in_force
+
+
+def test_a_single_sync_is_repeated_until_it_is_in_force() -> None:
+    schedule = SyncSchedule(ClockConfig(l2_sync_mode="once"))
+    now = HostNs(10**18)
+
+    assert schedule.due(now)
+    schedule.sent(now, now)
+    assert not schedule.due(HostNs(now + 900 * MS))
+    schedule.seen(stamp=60_000 * MS, arrival=now + 100 * MS)
+    assert schedule.due(HostNs(now + 1000 * MS))
+    schedule.sent(HostNs(now + 1000 * MS), HostNs(now + 1000 * MS))
+    schedule.seen(stamp=now + 1010 * MS, arrival=now + 1020 * MS)
+    assert schedule.in_force
+    assert not schedule.due(HostNs(now + 10**12))
+
+    schedule.reset()
+    assert schedule.due(HostNs(now + 10**12))
+
+
+def test_periodic_syncs_come_at_their_rate_even_if_the_host_clock_is_set_back() -> None:
+    schedule = SyncSchedule(ClockConfig(l2_sync_mode="periodic", l2_sync_rate_ms=50))
+    now = HostNs(10**18)
+    schedule.sent(now, now)
+
+    assert not schedule.due(HostNs(now + 49 * MS))
+    assert schedule.due(HostNs(now + 50 * MS))
+    assert schedule.due(HostNs(now - 1))
