@@ -110,6 +110,11 @@ class Pipeline:
         """When :meth:`poll` should be called at the latest, None if nothing waits."""
         return self._sequencer.due_ns
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a sweep waits to be handed out."""
+        return len(self._sequencer) > 0
+
     def imu(self, samples: Samples) -> None:
         """Take IMU samples, shape (N,), in any order and state."""
         if self.tracker.imu(samples):

@@ -92,7 +92,8 @@ class DeskewNode(Node):
             dtype=IMU_SAMPLE,
         )
         self._pipeline.imu(sample)
-        self._hand_out()
+        if self._pipeline.is_waiting:
+            self._hand_out()
 
     def _mount(self, imu_frame: str) -> None:
         """Take the place of the IMU from TF as soon as both frames are in it."""

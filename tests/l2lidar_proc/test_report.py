@@ -39,8 +39,8 @@ def test_a_sweep(flags, level):
 
 def period(before: int, after: int, last, *, is_levelled: bool = False) -> report.Report:
     return report.of_period(
-        PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, WindowCounts(accepted=9),
-        None, {"no time field": 3}, is_levelled=is_levelled,
+        PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, WindowCounts(), None,
+        {"no time field": 3}, is_levelled=is_levelled,
     )  # fmt: skip
 
 
