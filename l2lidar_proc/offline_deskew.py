@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import yaml
 from rosbags.highlevel import AnyReaderError
 
-from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_proc import bag
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
@@ -27,7 +27,7 @@ _END_NS: Final = 2**62
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be used; the message says why."""
+    """A file that cannot be used; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +178,24 @@ def _chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> st
     raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
 
 
+def _parameters(path: Path) -> dict[str, Any]:
+    """Return what a ROS parameter file says to the deskew node.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        values: dict[str, Any] = {}
+        for heading in ("/**", "deskew_node", "/deskew_node"):
+            values.update((content.get(heading) or {}).get("ros__parameters") or {})
+    except (OSError, yaml.YAMLError, AttributeError) as error:
+        raise RecordingError(f"parameter file '{path}': {error}") from None
+    return values
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run from a command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="l2lidar_proc.offline_deskew", description=__doc__)
@@ -186,9 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--params-file", type=Path, help="parameter file, as for the node")
     given = parser.parse_args(arguments)
     try:
-        values = {}
-        if given.params_file is not None:
-            values = parameters_for(given.params_file, "deskew_node", "/deskew_node")
+        values = _parameters(given.params_file) if given.params_file is not None else {}
         config = build(DeskewNodeConfig, values)
         counts, refused = deskew_recording(given.source, given.target, config)
     except (SettingError, RecordingError, FileExistsError, ValueError) as error:

@@ -139,6 +139,9 @@ def test_the_command_line(recording, tmp_path, capsys):
     parameters.write_text("deskew_node:\n  ros__parameters:\n    range_mxa: 6.0\n")
     assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
     assert "range_max" in capsys.readouterr().err
+    parameters.write_text("{")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "parameter file" in capsys.readouterr().err
 
 
 def test_without_the_needed_topics_it_says_what_there_is(recording, tmp_path):
