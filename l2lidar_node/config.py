@@ -28,6 +28,9 @@ class NetworkConfig:
     l2_port: int = setting(wire.LIDAR_PORT, "UDP port of the L2", lo=1, hi=65535)
     host_ip: str = setting(wire.HOST_IP, "IPv4 address of this host to listen on; 0.0.0.0 for all")
     host_port: int = setting(wire.HOST_PORT, "UDP port to listen on", lo=1, hi=65535)
+    serial_port: str = setting(
+        "", "serial device of the L2, used instead of the network, for example /dev/ttyACM0"
+    )
     receive_buffer_bytes: int = setting(
         4_194_304, "socket receive buffer to ask the kernel for", unit="B", lo=4096, hi=1 << 30
     )
@@ -227,6 +230,25 @@ class WatchdogConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FileConfig:
+    """Captures of what is received and sent (pcap), to write and to read."""
+
+    record_file: str = setting(
+        "", "capture to write; where there is one of that name, a number is added"
+    )
+    replay_file: str = setting("", "capture to read instead of listening for an L2")
+    replay_rate: float = setting(
+        1.0, "speed of the replay, 0 for as fast as possible", lo=0.0, hi=1000.0
+    )
+    replay_loop: bool = setting(
+        False, "begin again at the end, every stamp later by the length of the recording"
+    )
+    replay_clock: bool = setting(
+        True, "publish the recording's time on /clock while replaying, for use_sim_time"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DriverConfig:
     """Everything the driver can be told."""
 
@@ -237,3 +259,4 @@ class DriverConfig:
     frames: FrameConfig = field(default_factory=FrameConfig)
     topics: TopicConfig = field(default_factory=TopicConfig)
     watchdog: WatchdogConfig = field(default_factory=WatchdogConfig)
+    files: FileConfig = field(default_factory=FileConfig)

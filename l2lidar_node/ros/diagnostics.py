@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import CancelledError
 from dataclasses import asdict
 from typing import Any
 
@@ -13,12 +14,13 @@ from std_msgs.msg import String
 
 from l2lidar_node import health
 from l2lidar_node.driver import Driver
+from l2lidar_node.loop import Loop
 from l2lidar_node.metadata import metadata
 from l2lidar_node.ros.conversions import to_time
-from l2lidar_node.session import Session
 from l2lidar_node.types import HostNs
 
 PERIOD_S = 1.0
+_SHORTEST_NS = 500_000_000
 
 
 def diagnostic_array(
@@ -46,14 +48,15 @@ class HealthPublisher:
     Parameters
     ----------
     node : Node
-    session : Session
+    session : Loop
         Whose thread is asked for the figures.
     """
 
-    def __init__(self, node: Node, session: Session) -> None:
+    def __init__(self, node: Node, session: Loop) -> None:
         self._node = node
         self._session = session
         self._before: health.Period | None = None
+        self._driver: Driver | None = None
         self._metadata = ""
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -61,9 +64,10 @@ class HealthPublisher:
         node.create_timer(PERIOD_S, self._publish)
 
     def _publish(self) -> None:
-        if self._session.failure is not None:
+        try:
+            checks, about, now = self._session.call(self._look).result()
+        except CancelledError:  # the session has ended
             return
-        checks, about, now = self._session.call(self._look).result()
         config = self._session.driver.config
         if checks:
             name = self._node.get_fully_qualified_name().lstrip("/")
@@ -77,6 +81,11 @@ class HealthPublisher:
         self, driver: Driver, now: HostNs
     ) -> tuple[list[health.Check], dict[str, Any], HostNs]:
         after = health.observe(driver, self._session.transport, now)
-        before, self._before = self._before, after
+        before = self._before
+        if driver is not self._driver:  # that of a replay's next lap counts from 0
+            self._driver, before = driver, None
+        if before is not None and 0 <= after.now - before.now < _SHORTEST_NS:
+            return [], asdict(metadata(driver)), now  # a slow replay: rates would say nothing
+        self._before = after
         checks = health.judge(driver, before, after) if before is not None else []
         return checks, asdict(metadata(driver)), now

@@ -23,13 +23,13 @@ from l2lidar_node.packets import Parameters, Version
 from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
 from l2lidar_node.ros.diagnostics import HealthPublisher
+from l2lidar_node.ros.driver_source import open_loop
 from l2lidar_node.ros.parameters import ParameterSet
-from l2lidar_node.ros.program import StartError, run
-from l2lidar_node.session import Session
-from l2lidar_node.transport import TransportError, UdpTransport
+from l2lidar_node.ros.program import run
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 
 _ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 0.5
+_NO_DEVICE = "a recording is replayed, there is no device to command"
 _CLOUD_DEPTH = 10
 _IMU_DEPTH = 200
 
@@ -42,7 +42,7 @@ class DriverNode(Node):
     SettingError
         If a parameter is wrong.
     StartError
-        If the socket cannot be opened.
+        If the socket, the serial device or the recording cannot be opened.
     """
 
     def __init__(self) -> None:
@@ -53,18 +53,10 @@ class DriverNode(Node):
         self._settings = ParameterSet(self, DriverConfig, self._configure)
         config = self._settings.value
         self._open_publishers(config)
-        try:
-            transport = UdpTransport(config.network)
-        except TransportError as error:
-            raise StartError(str(error.strerror)) from None
-        self._session = Session(Driver(config), transport, self._handle)
+        self._session = open_loop(self, config, self._handle)
         self.create_service(SetBool, "~/enable", self._enable)
         self.create_service(Trigger, "~/reset", self._reset)
         self._health = HealthPublisher(self, self._session)
-        self.get_logger().info(
-            f"listening on {config.network.host_ip}:{config.network.host_port} "
-            f"for the L2 at {config.network.l2_ip}:{config.network.l2_port}"
-        )
         self._session.start()
 
     def destroy_node(self) -> None:
@@ -153,6 +145,9 @@ class DriverNode(Node):
             future.set_result(answer)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._settings.value.files.replay_file:
+            response.success, response.message = False, _NO_DEVICE
+            return response
         future: Future[Answer] = Future()
 
         def command(driver: Driver, now: HostNs) -> list[Event]:
@@ -175,6 +170,9 @@ class DriverNode(Node):
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         del request
+        if self._settings.value.files.replay_file:
+            response.success, response.message = False, _NO_DEVICE
+            return response
         for event in self._session.call(lambda driver, now: driver.reset_device(now)).result():
             self._handle(event)
         response.success = True
