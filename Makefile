@@ -44,10 +44,10 @@ $(BENCHES:%=bench-%): bench-%: setup
 	$(PYTHON) -m tools.bench_$* $(BENCH_ARGS)
 
 faults: setup ## every fault the virtual L2 can make, and what the driver says to it
-	$(PYTHON) -m tools.faults $(BENCH_ARGS)
+	$(PYTHON) -m tools.bench_faults $(BENCH_ARGS)
 
 soak: setup ## a long run, watched for growth, loss and drift
-	$(PYTHON) -m tools.soak $(BENCH_ARGS)
+	$(PYTHON) -m tools.bench_soak $(BENCH_ARGS)
 
 clean: ## remove .venv and everything built, measured or cached
 	rm -rf .venv build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
