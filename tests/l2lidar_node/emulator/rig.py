@@ -130,8 +130,11 @@ class Bench:
 
     def run(self, seconds: float) -> list[tuple[int, bytes]]:
         """Let time go by and return the datagrams."""
-        self.now += round(seconds * S)
+        before, self.now = self.now, self.now + round(seconds * S)
         new = self.device.advance(self.now)
+        times = [time for time, _ in new]
+        assert times == sorted(times)
+        assert all(before <= time <= self.now for time in times), "neither late nor early"
         self.log += new
         return new
 

@@ -272,8 +272,9 @@ def test_reset_is_a_reboot():
 def test_what_follows_a_reset_in_the_same_datagram_is_forgotten():
     bench = Bench()
     bench.run(1.0)
-    assert bench.ask(client("reset") + client("latency 101")) == []
+    assert bench.ask(client("reset") + command(100, 2, 1)) == []
     assert bench.device.boots == 1
+    assert bench.count(1.0)[104] == 250, "it did not go to standby"
 
 
 def test_network_settings_come_into_force_after_a_reset():
@@ -381,6 +382,13 @@ def test_commands_may_be_split_and_follow_garbage(cut):
     stream = b"\x55\x55\xaa" + client("latency 101")
     assert bench.ask(stream[:cut]) == []
     assert acks(bench.ask(stream[cut:])) == [(2000, 6, 101, OK)]
+
+
+@pytest.mark.parametrize("prefix", [wire.MAGIC, client("start")[:8] + b"\x20\0\0\0\0\0"])
+def test_a_command_may_begin_within_what_looked_like_one(prefix):
+    bench = Bench()
+    bench.run(1.0)
+    assert acks(bench.ask(prefix + client("latency 101") + bytes(20)))[-1] == (2000, 6, 101, OK)
 
 
 def test_half_a_command_costs_itself_alone():
