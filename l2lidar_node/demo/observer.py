@@ -10,7 +10,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
@@ -76,8 +76,10 @@ class Observer(Node):
         self.diagnostics: list[dict[str, dict[str, str]]] = []
         self.transforms: list[tuple[str, str]] = []
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.create_subscription(PointCloud2, "/points", self._cloud, qos_profile_sensor_data)
-        self.create_subscription(Imu, "/imu/data", self._imu, qos_profile_sensor_data)
+        # Deep, so that only the driver can lose something: rclpy takes one message at a time.
+        deep = QoSProfile(depth=500, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.create_subscription(PointCloud2, "/points", self._cloud, deep)
+        self.create_subscription(Imu, "/imu/data", self._imu, deep)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
         self.create_subscription(TFMessage, "/tf_static", self._transform, latched)
 
