@@ -63,7 +63,7 @@ setup(
             "hypothesis>=6.100",
             "import-linter>=2.1",
             "mypy>=1.11",
-            "pytest>=8.4",
+            "pytest>=9",
             "ruff>=0.9",
             "types-PyYAML",
             "xacro>=2.0",
