@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from l2lidar_node.packets import ImuPacket, PointPacket
 from l2lidar_node.sequence import SequenceCounts, SequenceOrder
@@ -13,9 +12,10 @@ from l2lidar_node.watchdog import SILENCE_NS
 REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlier one
 RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this began anew
 
+_FEW: Final = 8  # packets that may be late in a row
 
-@dataclass(slots=True)
-class Timed:
+
+class Timed(NamedTuple):
     """A packet with its arrival."""
 
     packet: PointPacket | ImuPacket
@@ -38,6 +38,7 @@ class Intake:
     def __init__(self, window: int) -> None:
         self._orders = {stream: SequenceOrder[Timed](window) for stream in Stream}
         self._newest: dict[Stream, Timed] = {}
+        self._fallen = dict.fromkeys(Stream, 0)
 
     @property
     def counts(self) -> dict[Stream, SequenceCounts]:
@@ -45,13 +46,23 @@ class Intake:
         return {stream: order.counts for stream, order in self._orders.items()}
 
     def begins_anew(self, stream: Stream, packet: PointPacket | ImuPacket) -> bool:
-        """Tell whether the device restarted before it measured this."""
+        """Tell whether the device restarted before it measured this.
+
+        Its stamps fall then. Those of packets that are late do so too where the device's clock was
+        just set, but their numbers are earlier, and they are few.
+        """
         newest = self._newest.get(stream)
-        return newest is not None and newest.packet.stamp - packet.stamp > RESTART_NS
+        if newest is None or newest.packet.stamp - packet.stamp <= RESTART_NS:
+            self._fallen[stream] = 0
+            return False
+        self._fallen[stream] += 1
+        is_late = self._orders[stream].is_earlier(packet.seq, newest.packet.seq)
+        return not is_late or self._fallen[stream] > _FEW
 
     def restart(self, stream: Stream) -> Released:
         """Return what waits; the next packet of the stream is in order, whatever its number."""
         self._newest.pop(stream, None)
+        self._fallen[stream] = 0
         return self._orders[stream].restart()
 
     def push(self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs) -> Released:
@@ -59,7 +70,10 @@ class Intake:
         order = self._orders[stream]
         newest = self._newest.get(stream)
         timed = Timed(packet, arrival)
-        self._newest[stream] = timed
+        if newest is None or self._fallen[stream] == 0:
+            self._newest[stream] = timed
+        else:
+            self._newest[stream] = newest._replace(arrival=arrival)
         if newest is None:
             return order.restart() + order.push(packet.seq, timed)
         if arrival - newest.arrival > SILENCE_NS:

@@ -20,7 +20,7 @@ class SequenceCounts:
     Attributes
     ----------
     lost : int
-        Numbers that never came.
+        Numbers that never came; of a silence longer than a turn of the numbers, what is beyond it.
     duplicates : int
         Packets that came again.
     late : int
@@ -70,6 +70,10 @@ class SequenceOrder(Generic[T]):
     def oldest(self) -> T | None:
         """What has been waiting the longest; None if nothing waits."""
         return next(iter(self._waiting.values()), None)
+
+    def is_earlier(self, seq: int, than: int) -> bool:
+        """Tell whether a number comes a little before another one that came lately."""
+        return self._next is not None and self._ahead(seq) < self._ahead(than)
 
     def push(self, seq: int, item: T) -> list[tuple[int, T]]:
         """Return what can be released now, each with how many are missing just before it."""

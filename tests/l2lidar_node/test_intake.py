@@ -1,0 +1,156 @@
+"""Both streams on their way from arrival to use."""
+
+from __future__ import annotations
+
+import pytest
+
+from l2lidar_node.framing import Frame
+from l2lidar_node.intake import REORDER_NS, Intake, Released
+from l2lidar_node.packets import ImuPacket, decode
+from l2lidar_node.types import HostNs, Stream
+from l2lidar_node.wire import PacketType
+from tests import build
+
+MS = 1_000_000
+S = 1_000_000_000
+PERIOD = 4 * MS
+IMU = Stream.IMU
+
+
+class Arriving:
+    """An intake that IMU packets arrive at, 4 ms apart, the device's clock running with them."""
+
+    def __init__(self, uptime_s: float = 10.0):
+        self.intake = Intake(8)
+        self.clock_ns = round(uptime_s * S)  # what the device's clock shows for number 0
+        self.now = build.EPOCH_NS
+        self.restarts = 0
+
+    def packet(self, seq: int, clock_ns: int | None = None) -> ImuPacket:
+        stamp = (self.clock_ns if clock_ns is None else clock_ns) + seq * PERIOD // 2
+        packet = decode(Frame(PacketType.IMU, build.imu(seq % 1025, stamp)))
+        assert isinstance(packet, ImuPacket)
+        return packet
+
+    def take(self, packet: ImuPacket) -> list[int]:
+        """Return the numbers a packet releases."""
+        self.now += PERIOD
+        released: Released = []
+        if self.intake.begins_anew(IMU, packet):
+            self.restarts += 1
+            released += self.intake.restart(IMU)
+        released += self.intake.push(IMU, packet, HostNs(self.now))
+        return [timed.packet.seq for _, timed in released]
+
+    def run(self, *numbers: int) -> list[int]:
+        return [seq for number in numbers for seq in self.take(self.packet(number))]
+
+    @property
+    def counts(self):
+        return self.intake.counts[IMU]
+
+
+def test_packets_keep_their_own_arrival():
+    arriving = Arriving()
+    arriving.run(0)
+    waited = arriving.now + PERIOD
+    assert arriving.run(2) == []
+    released = arriving.intake.push(IMU, arriving.packet(1), HostNs(arriving.now + PERIOD))
+    assert [(missing, timed.packet.seq) for missing, timed in released] == [(0, 1), (0, 2)]
+    assert [timed.arrival for _, timed in released] == [waited + PERIOD, waited]
+
+
+def test_streams_do_not_disturb_each_other():
+    arriving = Arriving()
+    assert arriving.run(7) == [7]
+    points = decode(Frame(PacketType.POINTS_3D, build.points_3d(500, 1)))
+    assert not arriving.intake.begins_anew(Stream.POINTS, points)
+    assert len(arriving.intake.push(Stream.POINTS, points, HostNs(arriving.now))) == 1
+    assert arriving.run(8) == [8]
+
+
+def test_what_waits_is_overdue_after_so_long():
+    arriving = Arriving()
+    arriving.run(0, 2, 4)
+    first, second = (HostNs(arriving.now - PERIOD + REORDER_NS + after) for after in (0, PERIOD))
+    assert not arriving.intake.is_overdue(first)
+    assert arriving.intake.settle(first) == []
+    assert arriving.intake.is_overdue(HostNs(first + 1))
+    (released,) = arriving.intake.settle(HostNs(first + 1))
+    assert released[1].packet.seq == 2
+    assert arriving.intake.settle(second) == []
+    assert len(arriving.intake.settle(HostNs(second + 1))) == 1
+    assert not arriving.intake.is_overdue(HostNs(second + S))
+
+
+def test_silence_is_measured_by_stream():
+    arriving = Arriving()
+    assert arriving.intake.silence_ns(IMU, HostNs(arriving.now)) == 0
+    arriving.run(0)
+    assert arriving.intake.silence_ns(IMU, HostNs(arriving.now + 5)) == 5
+    assert arriving.intake.silence_ns(Stream.POINTS, HostNs(arriving.now + 5)) == 0
+
+
+@pytest.mark.parametrize("last", [5, 500, 1024])
+def test_a_reboot_is_told_by_falling_stamps(last):
+    arriving = Arriving(uptime_s=100.0)
+    arriving.run(*range(last + 1))
+    arriving.clock_ns = 4 * S
+    assert arriving.run(*range(200))[-150:] == list(range(50, 200))
+    assert arriving.restarts == 1
+    assert arriving.counts.restarts == 1
+    assert arriving.counts.lost == 0
+
+
+def test_a_reboot_costs_nothing_unless_its_numbers_look_late():
+    arriving = Arriving(uptime_s=100.0)
+    arriving.run(*range(500))
+    arriving.clock_ns = 4 * S
+    assert arriving.run(0, 1, 2) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("late", [[9], [8, 9], [9, 8], [5, 6, 7, 8, 9]])
+def test_late_packets_from_before_a_sync_are_no_reboot(late):
+    """The device's clock is set forward by decades; some packets from before are still to come."""
+    arriving = Arriving(uptime_s=10.0)
+    out = arriving.run(*(n for n in range(10) if n not in late))
+    before, arriving.clock_ns = arriving.clock_ns, build.EPOCH_NS
+    out += arriving.run(10)
+    for number in late:
+        out += arriving.take(arriving.packet(number, before))
+    out += arriving.run(*range(11, 40))
+    assert out == list(range(40))
+    assert arriving.restarts == arriving.counts.lost == 0
+
+
+def test_a_clock_set_back_in_mid_stream_loses_nothing():
+    arriving = Arriving(uptime_s=100.0)
+    out = arriving.run(*range(10))
+    arriving.clock_ns = 50 * S
+    out += arriving.run(*range(10, 30))
+    assert out == list(range(30))
+    assert arriving.counts.lost == 0
+
+
+def test_after_a_silence_numbers_go_on_where_they_are():
+    arriving = Arriving()
+    arriving.run(*range(100))
+    arriving.now += 4 * S
+    assert arriving.run(*range(1100, 1110)) == [n % 1025 for n in range(1100, 1110)]
+    assert arriving.counts.lost == 1000
+    assert arriving.counts.late == arriving.counts.duplicates == 0
+
+
+def test_what_is_forgotten_is_not_missed():
+    arriving = Arriving()
+    arriving.run(*range(100))
+    arriving.intake.forget()
+    assert arriving.run(600, 601) == [600, 601]
+    assert arriving.counts.lost == 0
+
+
+def test_flush_releases_what_waits():
+    arriving = Arriving()
+    arriving.run(0, 2, 5)
+    assert [timed.packet.seq for _, timed in arriving.intake.flush()] == [2, 5]
+    assert arriving.intake.flush() == []
