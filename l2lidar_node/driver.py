@@ -249,7 +249,7 @@ class Driver:
     ) -> list[Event]:
         self._watchdog.heard(stream, arrival)
         events: list[Event] = []
-        if self._intake.begins_anew(stream, packet):
+        if self._intake.begins_anew(stream, packet, arrival):
             events = self._released(self._intake.restart(stream))
             self._forget_device()
         return events + self._released(self._intake.push(stream, packet, arrival))

@@ -45,19 +45,25 @@ class Intake:
         """What the sequence numbers say, by stream; goes on counting."""
         return {stream: order.counts for stream, order in self._orders.items()}
 
-    def begins_anew(self, stream: Stream, packet: PointPacket | ImuPacket) -> bool:
+    def begins_anew(
+        self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
+    ) -> bool:
         """Tell whether the device restarted before it measured this.
 
         Its stamps fall then. Those of packets that are late do so too where the device's clock was
-        just set, but their numbers are earlier, and they are few.
+        just set, but their numbers are earlier, and they are few. An earlier number with a later
+        stamp is not late either.
         """
         newest = self._newest.get(stream)
-        if newest is None or newest.packet.stamp - packet.stamp <= RESTART_NS:
-            self._fallen[stream] = 0
+        if newest is None:
             return False
-        self._fallen[stream] += 1
-        is_late = self._orders[stream].is_earlier(packet.seq, newest.packet.seq)
-        return not is_late or self._fallen[stream] > _FEW
+        is_earlier = self._orders[stream].is_earlier(packet.seq, newest.packet.seq)
+        fall = newest.packet.stamp - packet.stamp
+        if fall > RESTART_NS:
+            self._fallen[stream] += 1
+            return not is_earlier or self._fallen[stream] > _FEW
+        self._fallen[stream] = 0
+        return is_earlier and fall < 0 and arrival - newest.arrival <= SILENCE_NS
 
     def restart(self, stream: Stream) -> Released:
         """Return what waits; the next packet of the stream is in order, whatever its number."""

@@ -175,7 +175,7 @@ def test_impossible_content_is_counted_by_reason(outcome, reason):
 
 
 def test_a_reboot_loses_no_packet(mode):
-    outcome = Outcome({"reboot_at": [1.5]}, mode)
+    outcome = Outcome({"reboot_at": [1.9]}, mode)
     for stream in Stream:
         counts = outcome.driver.counters.sequence[stream]
         assert counts.restarts == 1

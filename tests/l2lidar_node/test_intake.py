@@ -36,7 +36,7 @@ class Arriving:
         """Return the numbers a packet releases."""
         self.now += PERIOD
         released: Released = []
-        if self.intake.begins_anew(IMU, packet):
+        if self.intake.begins_anew(IMU, packet, HostNs(self.now)):
             self.restarts += 1
             released += self.intake.restart(IMU)
         released += self.intake.push(IMU, packet, HostNs(self.now))
@@ -64,7 +64,7 @@ def test_streams_do_not_disturb_each_other():
     arriving = Arriving()
     assert arriving.run(7) == [7]
     points = decode(Frame(PacketType.POINTS_3D, build.points_3d(500, 1)))
-    assert not arriving.intake.begins_anew(Stream.POINTS, points)
+    assert not arriving.intake.begins_anew(Stream.POINTS, points, HostNs(arriving.now))
     assert len(arriving.intake.push(Stream.POINTS, points, HostNs(arriving.now))) == 1
     assert arriving.run(8) == [8]
 
@@ -100,6 +100,15 @@ def test_a_reboot_is_told_by_falling_stamps(last):
     assert arriving.restarts == 1
     assert arriving.counts.restarts == 1
     assert arriving.counts.lost == 0
+
+
+def test_a_reboot_is_told_though_the_clock_was_set_soon_after_it():
+    """The other stream may have shown the reboot already, and the host has set the clock."""
+    arriving = Arriving(uptime_s=100.0)
+    arriving.run(*range(60))
+    arriving.clock_ns = 200 * S
+    assert arriving.run(*range(20)) == list(range(20))
+    assert arriving.restarts == 1
 
 
 def test_a_reboot_costs_nothing_unless_its_numbers_look_late():
