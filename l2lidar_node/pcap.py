@@ -166,6 +166,8 @@ class _Interface(NamedTuple):
         while at + 4 <= len(body):
             code, length = struct.unpack_from(f"{order}2H", body, at)
             value = body[at + 4 : at + 4 + length]
+            if len(value) < length:
+                raise CaptureError("damaged: an interface description contradicts itself")
             if code == _TIME_RESOLUTION and length == 1:
                 ticks = 1 << (value[0] & 0x7F) if value[0] & 0x80 else int(10 ** value[0])
             elif code == _TIME_OFFSET and length == 8:
