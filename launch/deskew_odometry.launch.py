@@ -4,7 +4,7 @@ from launch import LaunchDescription
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 
-from l2lidar_node.ros.bringup import companion, driver, rviz
+from l2lidar_node.ros.bringup import companion, driver, for_deskew, rviz
 from l2lidar_node.ros.launch_arguments import (
     BOOL,
     CUTS,
@@ -23,14 +23,7 @@ def generate_launch_description() -> LaunchDescription:
             *arguments(*RVIZ_ARGUMENTS, rviz_config="rviz/slam.rviz"),
             Argument("turn", "where a cloud ends", CUTS).declare("sweep_cut"),
             Argument("true", "whether to start the odometry node", BOOL).declare("odometry"),
-            # Deskew needs the IMU, and points in the sensor's own frame, not levelled ones.
-            driver(
-                lambda given: {
-                    "enable_IMU_publishing": True,
-                    "imu_adjust": False,
-                    "sweep_cut": given["sweep_cut"],
-                }
-            ),
+            driver(lambda given: for_deskew(given["sweep_cut"])),
             companion("deskew_node"),
             companion("odometry_node", condition=IfCondition(LaunchConfiguration("odometry"))),
             rviz(),

@@ -29,6 +29,9 @@ ARGUMENTS = {
     "l2lidar_with_rviz": DRIVER | RVIZ | {"l2_name"},
     "deskew_odometry": DRIVER | RVIZ | {"l2_name", "proc_params_file", "sweep_cut", "odometry"},
     "lio_input": DRIVER | RVIZ | {"l2_name", "consumer"},
+    "replay": RVIZ
+    | {"file", "rate", "loop", "deskew_odometry", "namespace", "name", "l2_name", "l2_ip"}
+    | {"log_level", "params_file", "proc_params_file"},
     "l2_top_mount_example": DRIVER | RVIZ,
     "l2_forward_mount_example": DRIVER | RVIZ,
 }
@@ -37,10 +40,11 @@ STARTS = {
     "l2lidar_with_rviz": ["l2lidar_node", "rviz2"],
     "deskew_odometry": ["l2lidar_node", "deskew_node", "odometry_node"],
     "lio_input": ["l2lidar_node"],
+    "replay": ["l2lidar_node", "deskew_node", "odometry_node"],
     "l2_top_mount_example": ["robot_state_publisher", "l2lidar_node", "rviz2"],
     "l2_forward_mount_example": ["robot_state_publisher", "l2lidar_node", "rviz2"],
 }
-NEEDED = {"lio_input": {"consumer": "lio_sam"}}
+NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": "recording.pcap"}}
 
 # The folder launch/ of this repository looks like an empty package: ask for more of the real one.
 try:
@@ -236,7 +240,7 @@ def test_driver_gets_parameters_it_takes(launched, name):
 
 
 @needs_launch
-@pytest.mark.parametrize("name", STARTS)
+@pytest.mark.parametrize("name", [name for name in STARTS if "emulator" in ARGUMENTS[name]])
 def test_emulator_is_on_loopback_and_ends_the_launch(launched, name):
     from launch.actions import ExecuteProcess
     from launch_ros.actions import Node
@@ -313,6 +317,35 @@ def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched):
 def test_consumer_goes_over_the_parameter_file(launched, consumer):
     values = launched("lio_input", consumer=consumer).parameters("l2lidar_node")
     assert consumer_driver(consumer).items() <= values.items()
+
+
+@needs_launch
+def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched):
+    made = launched("replay", rate="2", loop="true", rviz="true")
+    values = made.parameters("l2lidar_node")
+    assert (values["replay_file"], values["replay_rate"]) == ("recording.pcap", 2.0)
+    assert values["replay_loop"] is True
+    assert values["imu_adjust"] is False
+    assert "use_sim_time" not in values, "the driver makes that time"
+    assert made.parameters("deskew_node")["use_sim_time"] is True
+    assert made.parameters("odometry_node")["use_sim_time"] is True
+    made = launched("replay", deskew_odometry="false")
+    assert list(made.nodes) == ["l2lidar_node"]
+    assert made.parameters("l2lidar_node")["imu_adjust"] is True
+
+
+@needs_launch
+def test_only_a_driver_of_a_real_sensor_is_started_again(launched):
+    def respawns(name, **given):
+        made = launched(name, **given)
+        node = made.nodes["l2lidar_node"]
+        return perform_typed_substitution(made.context, node._ExecuteLocal__respawn, bool)
+
+    from launch.utilities.type_utils import perform_typed_substitution
+
+    assert respawns("l2lidar")
+    assert not respawns("l2lidar", respawn="false")
+    assert not respawns("replay")
 
 
 @needs_launch

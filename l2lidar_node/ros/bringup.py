@@ -57,12 +57,19 @@ def driver(
     return OpaqueFunction(function=actions)
 
 
-def companion(executable: str, condition: IfCondition | None = None) -> OpaqueFunction:
+def for_deskew(sweep_cut: str = "turn") -> Parameters:
+    """Return what deskew needs of the driver: the IMU, and points in the sensor's own frame."""
+    return {"enable_IMU_publishing": True, "imu_adjust": False, "sweep_cut": sweep_cut}
+
+
+def companion(
+    executable: str, condition: IfCondition | None = None, values: Parameters | None = None
+) -> OpaqueFunction:
     """Return a node of ``l2lidar_proc``, named like its executable."""
 
     def actions(context: LaunchContext) -> list[Any]:
         given = _given(context)
-        return [_node(executable, executable, given, [given["proc_params_file"]], {})]
+        return [_node(executable, executable, given, [given["proc_params_file"]], values or {})]
 
     return OpaqueFunction(function=actions, condition=condition)
 
@@ -79,7 +86,7 @@ def robot(urdf: str) -> Node:
     )
 
 
-def rviz() -> OpaqueFunction:
+def rviz(values: Parameters | None = None) -> OpaqueFunction:
     """Return RViz, started only where the argument ``rviz`` says so."""
 
     def actions(context: LaunchContext) -> list[Any]:
@@ -95,6 +102,7 @@ def rviz() -> OpaqueFunction:
                 name="rviz2",
                 namespace=given["namespace"],
                 arguments=["-d", layout, *frame],
+                parameters=[dict(values)] if values else None,
                 remappings=_relative(SHOWN_TOPICS),
                 output="screen",
             )
@@ -123,7 +131,8 @@ def _node(
         remappings=_relative(DRIVER_TOPICS),
         ros_arguments=["--log-level", given["log_level"]],
         output="screen",
-        respawn=LaunchConfiguration("respawn"),
+        # A replay that ended would begin again.
+        respawn=given["respawn"] == "true" and not merged.get("replay_file"),
         respawn_delay=RESPAWN_DELAY_S,
     )
 
