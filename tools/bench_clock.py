@@ -1,13 +1,14 @@
 """Measures how true the driver's stamps are, against the virtual L2's own ledger.
 
-``make bench-clock`` prints the table and writes ``out/bench/clock.json``; with ``--docs`` the table in
-``docs/clock.md`` is renewed too. The same packets also go through upstream's rule and through stamping
-with the time of arrival.
+``make bench-clock`` prints the table and writes ``out/bench/clock.json``; ``--docs`` renews the
+table in ``docs/clock.md`` too. The same packets also go through upstream's rule and through
+stamping with the time of arrival.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -87,12 +88,22 @@ def rows() -> list[Row]:
         for sync in SYNCS
     ]
     out += [
-        Row("yes", "20 ms tail", "everything", Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=_EVERYTHING))
+        Row(
+            "yes",
+            "20 ms tail",
+            "everything",
+            Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=_EVERYTHING),
+        )
         for ratio in RATIOS
         for sync in SYNCS
     ]
     out += [
-        Row("yes", "0.5 ms", "IMU off", Case(ratio=1.99866, sync=sync, crystal=_DRIFT, faults=_JITTERS["0.5 ms"], imu=False))
+        Row(
+            "yes",
+            "0.5 ms",
+            "IMU off",
+            Case(ratio=1.99866, sync=sync, crystal=_DRIFT, faults=_JITTERS["0.5 ms"], imu=False),
+        )
         for sync in SYNCS
     ]
     return out
@@ -100,7 +111,7 @@ def rows() -> list[Row]:
 
 def measure(row: Row, seed: int) -> dict[str, Any]:
     """Return the figures of one row."""
-    notes, clock = run(row.case, seed)
+    notes, _ = run(row.case, seed)
     used = notes[notes["published"] != 0]
     ours = _errors(used, used["published"], [np.ones(len(used), bool)])
     is_imu = used["type"] == PacketType.IMU
@@ -109,7 +120,6 @@ def measure(row: Row, seed: int) -> dict[str, Any]:
     upstream = _errors(used, elapsed * _UPSTREAM_RATIO + used["sync"], streams)
     arrival = _errors(used, used["arrival"], streams)
     spacing = _spacing(used[is_imu])
-    status = clock.status()
     return {
         "ratio": row.case.ratio,
         "drift": row.drift,
@@ -129,21 +139,21 @@ def measure(row: Row, seed: int) -> dict[str, Any]:
         "upstream_max_ms": _round(float(np.max(np.abs(upstream)))),
         "arrival_p99_ms": _round(_p99(arrival)),
         "arrival_max_ms": _round(float(np.max(np.abs(arrival)))),
-        "held": status.held,
     }
 
 
 def targets(results: list[dict[str, Any]]) -> list[Target]:
     """Return what was asked for."""
-    disturbed = [item for item in results if _is_disturbed(item)]
-    synced = [item for item in results if item["sync"] != "off"]
+    asked = [item for item in results if item["fault"] != "IMU off"]
+    disturbed = [item for item in asked if _is_disturbed(item)]
+    synced = [item for item in asked if item["sync"] != "off"]
     return [
-        at_most("p99 of the error in every row [ms]", _most(results, "p99_ms"), 0.5),
-        at_most("largest error in every row [ms]", _most(results, "max_ms"), 2.0),
+        at_most("p99 of the error in every row (ms)", _most(results, "p99_ms"), 0.5),
+        at_most("largest error in every row (ms)", _most(results, "max_ms"), 2.0),
         at_most("backward steps, all rows", sum(item["backward"] for item in results), 0),
         at_most("stamps after arrival, all rows", sum(item["future"] for item in results), 0),
-        at_most("data until locked [s]", _most(results, "lock_s"), 2.0),
-        at_most("p99 of the IMU spacing error [us]", _most(results, "imu_spacing_p99_us"), 10.0),
+        at_most("data until locked (s)", _most(results, "lock_s"), 2.0),
+        at_most("p99 of the IMU spacing error (us)", _most(results, "imu_spacing_p99_us"), 10.0),
         at_least(
             "p99 of arrival stamping over ours, rows with jitter or bursts",
             _least_gain(disturbed, "arrival_p99_ms"),
@@ -190,7 +200,9 @@ def _lock_s(notes: NDArray[np.void]) -> float:
     for boot in np.unique(notes["boot"]):
         mine = notes[notes["boot"] == boot]
         stamped = mine[mine["published"] != 0]
-        times.append((stamped["arrival"][0] - mine["arrival"][0]) * 1e-9 if len(stamped) else np.inf)
+        times.append(
+            (stamped["arrival"][0] - mine["arrival"][0]) * 1e-9 if len(stamped) else np.inf
+        )
     return float(max(times))
 
 
@@ -216,7 +228,10 @@ def _round(value: float) -> float:
 
 def markdown(results: list[dict[str, Any]]) -> str:
     """Return the results as a table in Markdown."""
-    heads = ["ratio", "drift", "sync", "jitter", "fault", "mean", "p99", "max", "IMU spacing p99 / max [us]", "lock [s]", "upstream p99 / max", "arrival p99 / max"]  # fmt: skip
+    heads = [
+        "ratio", "drift", "sync", "jitter", "fault", "mean", "p99", "max",
+        "IMU spacing p99 / max [us]", "lock [s]", "upstream p99 / max", "arrival p99 / max",
+    ]  # fmt: skip
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for item in results:
         cells = [
@@ -239,6 +254,8 @@ def markdown(results: list[dict[str, Any]]) -> str:
 
 def main() -> int:
     """Run the benchmark; return 0 when every target is met."""
+    if not sys.stdout.isatty():
+        os.environ.setdefault("COLUMNS", "240")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     parser.add_argument("--docs", action="store_true", help=f"renew the table in {_DOCS}")
@@ -250,7 +267,9 @@ def main() -> int:
         running = pool.map(measure, todo, seeds)
         results = list(track(running, "measuring", total=len(todo)))
     found = targets(results)
-    publish("clock", "Error of every published stamp, constant path delay set aside", results, found)
+    publish(
+        "clock", "Error of every published stamp, constant path delay set aside", results, found
+    )
     if arguments.docs:
         text = _DOCS.read_text()
         head, rest = text.split(_MARKS[0])

@@ -1,4 +1,4 @@
-"""Runs the driver against the virtual L2 in simulated time and notes what its clock made of every packet."""
+"""Runs the driver against the virtual L2 in simulated time and notes what its clock answers."""
 
 from __future__ import annotations
 
