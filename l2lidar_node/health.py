@@ -120,6 +120,10 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
         values["seconds to go"] = f"{left:.0f}"
         message = f"spinning up, points in about {left:.0f} s" if left else "points are overdue"
         return Check("device", Level.WARN, message, values)
+    if new.ignored_points > old.ignored_points and new.slots == old.slots:
+        asked, measured = ("3D", "2D") if driver.config.sweep.frame3d else ("2D", "3D")
+        message = f"it measures {measured} where frame3d asks for {asked}"
+        return Check("device", Level.ERROR, message, values)
     nominal = POINTS_3D_HZ if driver.config.sweep.frame3d else POINTS_2D_HZ
     slow = rates[Stream.POINTS] < nominal * (1 - _RATE_TOLERANCE)
     imu_slow = 0 < rates[Stream.IMU] < wire.IMU_RATE_HZ * (1 - _RATE_TOLERANCE)
@@ -127,13 +131,6 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
         return Check("device", Level.WARN, "streaming below its nominal rate", values)
     if not rates[Stream.IMU]:
         return Check("device", Level.WARN, "streaming points but no IMU", values)
-    if driver.counters.ignored_points and not driver.counters.sweeps:
-        return Check(
-            "device",
-            Level.ERROR,
-            "it measures 2D where frame3d asks for 3D, or vice versa",
-            values,
-        )
     return Check("device", Level.OK, "streaming", values)
 
 
@@ -248,6 +245,10 @@ def _hardware(payload: bytes) -> Check:
             (
                 state["packet_lost_up"] + state["packet_lost_down"] > 0.01,
                 "inner links lose packets",
+            ),
+            (
+                not all(np.isfinite(state[name]) for name in state.dtype.names or ()),
+                "it reports values that are no numbers",
             ),
         )
         if wrong
