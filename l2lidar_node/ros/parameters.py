@@ -58,6 +58,10 @@ class ParameterSet(Generic[G]):
                 values[item.name] = _value(node.declare_parameter(*_declaration(item)))
             except (InvalidParameterTypeException, InvalidParameterValueException):
                 values[item.name] = _override(node, item.name)
+            if values[item.name] is None and item.type is tuple:
+                # ROS reads an empty list in a YAML file as a parameter that is not set.
+                node.set_parameters([Parameter(item.name, value=[])])
+                values[item.name] = ()
         self.value: G = build(group, values)
         _warn_of_unknown(node, set(self._settings))
         node.add_on_set_parameters_callback(self._check)
