@@ -68,6 +68,10 @@ class Scenario:
         When the host's clock is set, and by how many seconds.
     silences : tuple of (float, float)
         From when to when nothing arrives, and what is sent is lost.
+    imu_noise_us : float
+        Standard deviation of the instants at which the IMU is sampled.
+    stamp_step : int
+        Resolution of the device's stamps [ns].
     imu, points : bool
         Which streams there are.
     points_from : float
@@ -99,6 +103,7 @@ class Scenario:
     silences: tuple[tuple[float, float], ...] = ()
     imu: bool = True
     imu_noise_us: float = 0.0
+    stamp_step: int = 1
     points: bool = True
     points_from: float = 0.0
     points_jitter: float = 1e-3
@@ -195,7 +200,7 @@ def _packets(
     events = np.zeros(len(instants), EVENT)
     events["kind"] = kind
     events["truth"] = instants
-    events["stamp"] = clock.at(instants)
+    events["stamp"] = clock.at(instants) // scenario.stamp_step * scenario.stamp_step
     events["duration"] = int(duration)
     events["arrival"] = instants + duration + scenario.path_ms * 1e6
     ordinal = np.arange(len(instants)) + (317 if kind == IMU else 801)

@@ -15,7 +15,7 @@ _CEILING_NS: Final = 150_000.0
 _SIGMAS: Final = 5.0  # in mean absolute deviations
 _NEAR: Final = 64  # packets that may be missing where numbers wrap for the first time
 _WANDER: Final = 16  # packets over which deviations may add up
-_SLIP: Final = 0.05  # of the advance: more irregular than that a stream is not
+_SLIP: Final = 0.05  # of the advance, or one period: more irregular than that a stream is not
 
 
 class Cadence:
@@ -155,7 +155,7 @@ class Cadence:
 
     def slip(self, gap: int) -> int:
         """Return by how much a packet may be off without a step being the reason [ns]."""
-        return round(self._tolerance + _SLIP * gap * self._period)
+        return round(self._tolerance + max(_SLIP * gap, 1.0) * self._period)
 
     def regular(self, gap: int, advance: int) -> bool:
         """Whether two packets so many numbers apart are as far apart as they should be."""

@@ -174,9 +174,9 @@ class DeviceLine:
             begun = self._begun(track, epoch, stamp, expected, cadence.noise(gap))
             if begun is not None:
                 return self._accept(track, begun, seq, stamp, arrival)
-            for other in (epoch, *reversed(self._epochs)):
-                if abs(stamp - other.base - expected) <= slip:
-                    return self._accept(track, other, seq, stamp, arrival)
+            nearest = min(self._epochs, key=lambda item: abs(stamp - item.base - expected))
+            if abs(stamp - nearest.base - expected) <= slip and stamp - nearest.base > track.u:
+                return self._accept(track, nearest, seq, stamp, arrival)
         late = u > expected if counted else u > track.u and not self._synced_since(track)
         if late and self._possible(track, u, arrival):
             return self._accept(track, epoch, seq, stamp, arrival)
