@@ -30,6 +30,7 @@ STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 
 _STEP_S: Final = 0.1  # the filter's step
 _WINDOW: Final = 10  # steps that one measurement of gravity or rest spans
+_TURN: Final = 3  # steps that the head needs for a turn, over which its shaking averages out
 _LAG: Final = 5  # steps that the newest velocity may be behind
 _HISTORY: Final = 80  # states remembered, so that a late sweep finds its own
 _BREAK_NS: Final = 500_000_000  # a gap in the samples after which the vertical is unknown again
@@ -143,7 +144,7 @@ class AttitudeFilter:
             return still_like(samples, self._rest)
         if self._steps >= _WINDOW:
             return False
-        return at_rest(samples, None, self._max_bias, least=50) is not None
+        return at_rest(samples, np.zeros(3), self._max_bias, least=25) is not None
 
     def push(self, samples: Samples, velocities: VelocityHistory | None = None) -> None:
         """Follow samples.
@@ -222,9 +223,14 @@ class AttitudeFilter:
             velocities.at(HostNs(int(second["stamp"][-1]))) if velocities is not None else None
         )
         slow = moving is None or float(np.linalg.norm(moving)) < 0.1
-        known = self._bias if self._bias_known else None
-        found = at_rest(second, known, self._max_bias) if slow else None
-        if self._rest is not None and not still_like(self._recent[-1], self._rest):
+        # to miss a rest costs little, but what is taken for one teaches the bias
+        sigmas = 3.0 if self._rest is None else 5.0
+        margin = 3.0 * float(np.sqrt(np.diag(self._kalman.P)[3:].max()))
+        if not self._bias_known:
+            margin = self._max_bias
+        found = at_rest(second, self._bias, margin, sigmas=sigmas) if slow else None
+        newest = second[-len(second) * _TURN // _WINDOW :]
+        if self._rest is not None and not still_like(newest, self._rest):
             found = None
         if found is None:
             self._rest = None

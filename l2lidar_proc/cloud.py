@@ -38,7 +38,7 @@ def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Swee
     Sweep
         ``start`` is the stamp, or the first point where that is earlier; ``end`` the last point.
         The points keep their fields; the time field becomes ``time``, float32. Points that are not
-        finite are left out. A cloud in the driver's own layout is passed through.
+        finite are left out. The driver's own layouts are in seconds.
 
     Raises
     ------
@@ -55,8 +55,8 @@ def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Swee
         cloud = cloud[finite]
     if not len(cloud):
         raise CloudError("no point is finite")
-    if cloud.dtype == POINT and unit == "auto":
-        unit = "s"
+    if unit == "auto" and (cloud.dtype.names or ())[:6] == POINT.names:
+        unit = "s"  # the driver's own layouts, whose sweeps may last for many seconds
     times = _relative_ns(cloud[name], stamp, unit)
     if (np.diff(times) < 0).any():
         order = np.argsort(times, kind="stable")

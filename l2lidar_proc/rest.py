@@ -42,17 +42,21 @@ class Rest:
     force_spread: F64
 
 
-def at_rest(samples: Samples, bias: F64 | None, max_bias: float, least: int = 100) -> Rest | None:
+def at_rest(
+    samples: Samples, bias: F64, margin: float, *, sigmas: float = _SIGMAS, least: int = 100
+) -> Rest | None:
     """Return what the IMU says at rest, None if it moved.
 
     Parameters
     ----------
     samples : ndarray, shape (N,), dtype IMU_SAMPLE
         About a second.
-    bias : ndarray, shape (3,), or None
-        The gyro's bias [rad/s] if it is known already: then the mean rate must agree with it.
-    max_bias : float
-        Largest mean rate [rad/s] that may be a bias while it is not known.
+    bias : ndarray, shape (3,)
+        What is known of the gyro's bias [rad/s].
+    margin : float
+        How wrong that may be [rad/s]: the mean rate may differ so much from it.
+    sigmas : float
+        And so many standard deviations of the mean.
     least : int
         Fewer samples are not enough.
 
@@ -72,9 +76,7 @@ def at_rest(samples: Samples, bias: F64 | None, max_bias: float, least: int = 10
         return None
     if _drifts(forces, found.force_spread, quarter, 2.0 * _FORCE_FLOOR):
         return None
-    if bias is None:
-        return found if float(np.abs(found.rate).max()) <= max_bias else None
-    limit = 2.0 * _RATE_FLOOR + _SIGMAS * found.rate_spread * np.sqrt(1.5 / len(samples))
+    limit = margin + sigmas * found.rate_spread * np.sqrt(1.5 / len(samples))
     return found if (np.abs(found.rate - bias) <= limit).all() else None
 
 

@@ -17,7 +17,8 @@ from l2lidar_proc.imu_window import ImuWindow, Samples
 from l2lidar_proc.path import Path, coverage, integrate, still_path
 from l2lidar_proc.velocity import VelocityHistory
 
-_STILL_NS: Final = 250_000_000  # stillness is judged over a head turn at least
+_STILL_NS: Final = 500_000_000  # stillness is judged over two head turns at least
+_MEMORY_S: Final = 25.0  # the longest sweep that can be had, and more
 
 
 class Flag(Enum):
@@ -88,7 +89,7 @@ class MotionTracker:
 
     def __init__(self, config: MotionConfig, T_cloud_imu: rotations.F64 | None = None) -> None:
         self._T_cloud_imu = config.T_cloud_imu if T_cloud_imu is None else T_cloud_imu
-        self.window = ImuWindow()
+        self.window = ImuWindow(_MEMORY_S)
         self.attitude = AttitudeFilter(self._T_cloud_imu, config.max_gyro_bias)
         self.velocities = VelocityHistory()
         self.configure(config)

@@ -102,18 +102,18 @@ def _real(real: Sequence[tuple[str, float, float, float]]) -> str:
 
 def _draw(clouds: dict[str, F64]) -> None:
     shown = {"as measured": "none", "gyro only": "gyro only", "with odometry": "odometry"}
-    figure = Figure(figsize=(10.5, 3.6), dpi=80, layout="constrained")
+    figure = Figure(figsize=(11, 4.2), dpi=85, layout="constrained")
     FigureCanvasAgg(figure)
     truth = clouds["truth"]
-    inside = np.abs(truth[:, 2]) < 0.6
+    inside = (truth[:, 2] > -0.3) & (truth[:, 2] < 1.6)
     for place, (title, method) in enumerate(shown.items(), start=1):
         plan = figure.add_subplot(1, 3, place)
         error = 1e3 * np.linalg.norm(clouds[method] - truth, axis=1)[inside]
         x, y, _ = clouds[method][inside].T
-        plan.scatter(truth[inside, 0], truth[inside, 1], s=0.5, c="0.8", linewidths=0)
-        dots = plan.scatter(x, y, s=1.5, c=error, cmap="turbo", vmin=0, vmax=400, linewidths=0)
+        plan.scatter(truth[inside, 0], truth[inside, 1], s=3.0, c="0.75", linewidths=0)
+        dots = plan.scatter(x, y, s=3.0, c=error, cmap="turbo", vmin=0, vmax=400, linewidths=0)
         plan.set_aspect("equal")
-        plan.set_title(f"{title}: RMS {np.sqrt((error**2).mean()):.0f} mm", fontsize=10)
+        plan.set_title(f"{title}: RMS {np.sqrt((error**2).mean()):.1f} mm", fontsize=10)
         plan.tick_params(labelsize=7)
     figure.colorbar(dots, ax=figure.axes, label="error [mm]", shrink=0.8)
     figure.savefig(PICTURE)

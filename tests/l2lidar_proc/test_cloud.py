@@ -90,6 +90,9 @@ def test_our_own_long_sweep_is_in_seconds():
     points["time"] = [0, 2, 18]
     assert to_sweep(points, STAMP).end - STAMP == 18_000_000_000
     assert to_sweep(points, STAMP).points.tobytes() == points.tobytes()
+    with_ring = np.zeros(3, dtype=[*POINT.descr, ("ring", "<u2")])
+    with_ring["time"] = [0, 2, 18]
+    assert to_sweep(with_ring, STAMP).end - STAMP == 18_000_000_000
 
 
 def test_a_given_unit_decides():
