@@ -57,13 +57,14 @@ class Intake:
         newest = self._newest.get(stream)
         if newest is None:
             return False
-        is_earlier = self._orders[stream].is_earlier(packet.seq, newest.packet.seq)
         fall = newest.packet.stamp - packet.stamp
         if fall > RESTART_NS:
             self._fallen[stream] += 1
-            return not is_earlier or self._fallen[stream] > _FEW
+            return not self._is_earlier(stream, packet) or self._fallen[stream] > _FEW
         self._fallen[stream] = 0
-        return is_earlier and fall < 0 and arrival - newest.arrival <= SILENCE_NS
+        if fall >= 0 or packet.seq > newest.packet.seq:
+            return False
+        return arrival - newest.arrival <= SILENCE_NS and self._is_earlier(stream, packet)
 
     def restart(self, stream: Stream) -> Released:
         """Return what waits; the next packet of the stream is in order, whatever its number."""
@@ -106,6 +107,9 @@ class Intake:
     def flush(self) -> Released:
         """Return everything that waits."""
         return [item for order in self._orders.values() for item in order.flush()]
+
+    def _is_earlier(self, stream: Stream, packet: PointPacket | ImuPacket) -> bool:
+        return self._orders[stream].is_earlier(packet.seq, self._newest[stream].packet.seq)
 
     def forget(self) -> None:
         """Take the next packet of each stream for the first one."""
