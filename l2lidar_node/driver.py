@@ -172,7 +172,7 @@ class Driver:
             self._watchdog.started(at)
             self._intake.forget()
         elif command.is_standby:
-            self._watchdog.stopped()
+            self._watchdog.stopped(at)
             return self.flush()
         elif command.is_reset:
             self._watchdog.started(at)

@@ -9,6 +9,7 @@ from l2lidar_node.config import WatchdogConfig
 from l2lidar_node.types import HostNs, Stream
 
 SILENCE_NS: Final = 1_000_000_000  # a stream that paused this long has stopped
+RUN_OUT_NS: Final = 5_000_000_000  # points that come so long after a stop say it was none
 MAX_STEP_NS: Final = 5_000_000_000  # time does not pass in larger steps between two questions
 SPIN_UP_NS: Final = 21_000_000_000  # from the first IMU packet to the first points, at power-on
 
@@ -38,7 +39,7 @@ class Watchdog:
         self._watching_since: HostNs | None = None
         self._imu_since: HostNs | None = None
         self._points_seen = False
-        self._standby = False
+        self._standby_since: HostNs | None = None
         self._reported = False
         self._checked: HostNs | None = None
 
@@ -47,17 +48,20 @@ class Watchdog:
         last = self._last.get(stream)
         if stream is Stream.POINTS:
             self._points_seen = True
+            since = self._standby_since
+            if since is not None and now - since > RUN_OUT_NS:
+                self._standby_since = None  # it did not obey, or somebody else started it
         elif last is None or now - last > SILENCE_NS:
             self._imu_since = now
         self._last[stream] = now
 
-    def stopped(self) -> None:
+    def stopped(self, now: HostNs) -> None:
         """Note that the device was told to stop: silence is what is wanted."""
-        self._standby = True
+        self._standby_since = now
 
     def started(self, now: HostNs) -> None:
         """Note that the device was told to start, or rebooted: the time allowed begins now."""
-        self._standby = False
+        self._standby_since = None
         self._watching_since = now
         self._points_seen = False
         self._imu_since = None
@@ -69,7 +73,7 @@ class Watchdog:
         points, imu = (self._fresh(stream, now) for stream in (Stream.POINTS, Stream.IMU))
         if points:
             return DeviceState.STREAMING
-        if self._standby:
+        if self._standby_since is not None:
             return DeviceState.STANDBY
         if imu and not self._points_seen:
             return DeviceState.SPINNING_UP
@@ -83,7 +87,7 @@ class Watchdog:
 
     def silence_ns(self, now: HostNs) -> int:
         """Return how long nothing has been measured, 0 while that is as it should be."""
-        if self._standby or (self._patient and not self._last):
+        if self._standby_since is not None or (self._patient and not self._last):
             return 0
         if self._watching_since is None:
             self._watching_since = now

@@ -6,7 +6,14 @@ import pytest
 
 from l2lidar_node.config import WatchdogConfig
 from l2lidar_node.types import HostNs, Stream
-from l2lidar_node.watchdog import MAX_STEP_NS, SILENCE_NS, SPIN_UP_NS, DeviceState, Watchdog
+from l2lidar_node.watchdog import (
+    MAX_STEP_NS,
+    RUN_OUT_NS,
+    SILENCE_NS,
+    SPIN_UP_NS,
+    DeviceState,
+    Watchdog,
+)
 from tests import build
 
 START = build.EPOCH_NS
@@ -104,7 +111,7 @@ def test_either_stream_keeps_it_alive(stream):
 def test_standby_pauses_it_and_start_gives_the_whole_time_again():
     watched = Watched(timeout_ms=5000)
     watched.run(3, IMU, POINTS)
-    watched.watchdog.stopped()
+    watched.watchdog.stopped(HostNs(watched.now))
     watched.run(2, IMU, POINTS)  # what was in flight
     watched.run(60)
     assert watched.state is DeviceState.STANDBY
@@ -118,10 +125,21 @@ def test_standby_pauses_it_and_start_gives_the_whole_time_again():
     assert len(watched.expiries) == 1
 
 
+def test_a_device_that_does_not_stop_is_watched_again():
+    watched = Watched(timeout_ms=3000)
+    watched.run(3, IMU, POINTS)
+    watched.watchdog.stopped(HostNs(watched.now))
+    watched.run(RUN_OUT_NS / S + 1, IMU, POINTS)
+    assert watched.state is DeviceState.STREAMING
+    watched.run(4)
+    assert watched.state is DeviceState.STALLED
+    assert len(watched.expiries) == 1
+
+
 def test_waking_from_standby_spins_up_again():
     watched = Watched()
     watched.run(3, IMU, POINTS)
-    watched.watchdog.stopped()
+    watched.watchdog.stopped(HostNs(watched.now))
     watched.run(10)
     watched.watchdog.started(HostNs(watched.now))
     watched.run(5, IMU)
