@@ -30,9 +30,10 @@ def organise(points: NDArray[np.void], times: NDArray[np.float32]) -> NDArray[np
 
     Notes
     -----
-    Points do not say which slot they are from; their times do. Packets are told apart by the dark
-    half of the mirror's turn and follow each other at a fixed period, which is fitted; the
-    earliest point within any period is taken for slot 0.
+    Points do not say which slot they are from; their times do. A packet is one half of the mirror's
+    turn, the other half is dark, and slots are equally long: modulo the period, times fill one half
+    only, and within a packet and from packet to packet they differ by whole slots. The earliest point
+    within any period is taken for slot 0.
     """
     empty = np.zeros(1, dtype=points.dtype)
     for name in points.dtype.names or ():
@@ -50,25 +51,37 @@ def places(times: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.int
     """Return the row and the column of each point by its time [s], shape (N,) each; N >= 1."""
     seconds = times.astype(np.float64)
     slot = slot_time(times)
-    dark = SLOTS * slot
-    firsts = np.flatnonzero(np.diff(seconds, prepend=-np.inf) > 0.5 * dark)
-    begins = seconds[firsts]
-    period = _period(begins, 2.0 * dark)
-    packet = np.round((begins - begins[0]) / period).astype(np.intp)
-    late = begins - packet * period
+    period = 2 * SLOTS * slot
+    turn = np.floor((seconds - _dark(seconds, period)) / period).astype(np.intp)
+    firsts = np.flatnonzero(np.diff(turn, prepend=turn[0] - 1))
+    begins, turns = seconds[firsts], turn[firsts] - turn[0]
+    late = begins - turns * _period(begins, turns, slot)
     shift = np.round((late - late.min()) / slot).astype(np.intp)
     index = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=len(seconds)))
     column = shift[index] + np.round((seconds - begins[index]) / slot).astype(np.intp)
-    row = packet - packet[0]
-    return row[index], np.clip(column, 0, SLOTS - 1)
+    return turns[index], np.clip(column, 0, SLOTS - 1)
 
 
-def _period(begins: NDArray[np.float64], usual: float) -> float:
-    """Return the time from packet to packet [s], which is near ``usual``."""
-    steps = np.diff(begins)
-    single = steps[(steps > 0.75 * usual) & (steps < 1.25 * usual)]
-    if not len(single):
+def _dark(seconds: NDArray[np.float64], period: float) -> float:
+    """Return an instant in the middle of the mirror's dark half [s], which no point is in."""
+    phase = np.sort(seconds % period)
+    gaps = np.diff(phase, append=phase[0] + period)
+    widest = int(np.argmax(gaps))
+    return float(phase[widest] + 0.5 * gaps[widest])
+
+
+def _period(begins: NDArray[np.float64], turns: NDArray[np.intp], slot: float) -> float:
+    """Return the time from packet to packet [s] from the packets' first points.
+
+    Those are from different slots, so the steps between them differ by whole slots: the usual whole
+    number is the median, and what is left over is averaged.
+    """
+    usual = 2 * SLOTS * slot
+    if len(begins) < 2:
         return usual
-    period = float(np.median(single))
-    packet = np.round((begins - begins[0]) / period)
-    return float(np.polyfit(packet, begins, 1)[0]) if packet[-1] > 0 else period
+    whole = np.diff(turns)
+    steps = np.diff(begins)[whole == 1] if (whole == 1).any() else np.diff(begins) / whole
+    slots = (steps - usual) / slot
+    middle = float(np.median(slots))
+    left = slots - middle - np.round(slots - middle)
+    return usual + slot * (middle + float(left.mean()))

@@ -39,7 +39,7 @@ def test_every_point_gets_its_place(share):
 
 def test_small_jitter_of_the_stamps_moves_a_row_by_a_slot_at_most():
     returned = np.ones((50, SLOTS), dtype=bool)
-    points, *_ = sweep(returned, jitter=2e-6)
+    points, *_ = sweep(returned, jitter=1e-6)
     image = organise(points, points["time"])
     assert image.shape == (50, SLOTS)
     shift = image["y"] - np.arange(SLOTS)
