@@ -30,10 +30,10 @@ def organise(points: NDArray[np.void], times: NDArray[np.float32]) -> NDArray[np
 
     Notes
     -----
-    Points do not say which slot they are from; their times do. A packet is one half of the mirror's
-    turn, the other half is dark, and slots are equally long: modulo the period, times fill one half
-    only, and within a packet and from packet to packet they differ by whole slots. The earliest point
-    within any period is taken for slot 0.
+    Points do not say which slot they are from; their times do. A packet is one half of the
+    mirror's turn, the other half is dark, and slots are equally long: modulo the period, times
+    fill one half only, and within a packet and from packet to packet they differ by whole slots.
+    The earliest point within any period is taken for slot 0.
     """
     empty = np.zeros(1, dtype=points.dtype)
     for name in points.dtype.names or ():
@@ -73,8 +73,8 @@ def _dark(seconds: NDArray[np.float64], period: float) -> float:
 def _period(begins: NDArray[np.float64], turns: NDArray[np.intp], slot: float) -> float:
     """Return the time from packet to packet [s] from the packets' first points.
 
-    Those are from different slots, so the steps between them differ by whole slots: the usual whole
-    number is the median, and what is left over is averaged.
+    Those are from different slots, so the steps between them differ by whole slots: the usual
+    whole number is the median, and what is left over is averaged.
     """
     usual = 2 * SLOTS * slot
     if len(begins) < 2:
