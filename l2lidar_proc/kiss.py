@@ -1,0 +1,147 @@
+"""KISS-ICP's parts for the odometry, and KISS-ICP as it is; the only importer of kiss_icp.
+
+kiss_icp ends the whole process, without an exception, on constant times and on clouds of one
+point: nothing of that kind gets past this module.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.kiss_icp import KissICP
+from kiss_icp.mapping import get_voxel_hash_map
+from kiss_icp.registration import get_registration
+from kiss_icp.threshold import get_threshold_estimator
+from kiss_icp.voxelization import voxel_down_sample
+from numpy.typing import NDArray
+
+from l2lidar_proc.odometry_config import OdometryConfig
+
+F64 = NDArray[np.float64]
+
+LEAST_POINTS = 10  # kiss_icp aborts below 2; below this there is nothing to register
+
+
+def kiss_config(config: OdometryConfig) -> KISSConfig:
+    """Return KISS-ICP's configuration, the voxel size included (it stays unset by itself)."""
+    kiss = config.kiss
+    out = KISSConfig()
+    out.data.max_range, out.data.min_range = config.max_range, config.min_range
+    out.mapping.voxel_size = kiss.kiss_voxel_size
+    out.mapping.max_points_per_voxel = kiss.kiss_max_points_per_voxel
+    out.adaptive_threshold.initial_threshold = kiss.kiss_initial_threshold
+    out.adaptive_threshold.min_motion_th = kiss.kiss_min_motion
+    out.registration.max_num_iterations = kiss.kiss_iterations
+    out.registration.convergence_criterion = kiss.kiss_convergence
+    out.registration.max_num_threads = kiss.threads
+    return out
+
+
+class KissMatcher:
+    """Scan matching with KISS-ICP's public parts; deskew and initial guess are the caller's.
+
+    Parameters
+    ----------
+    config : OdometryConfig
+    """
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self._config = kiss_config(config)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the map and what was learnt about the predictions."""
+        self._map = get_voxel_hash_map(self._config)
+        self._registration = get_registration(self._config)
+        self._threshold = get_threshold_estimator(self._config)
+
+    @property
+    def threshold(self) -> float:
+        """How far predictions have lately been off [m]."""
+        return float(self._threshold.get_threshold())
+
+    def register(self, points: F64, guess: F64) -> F64 | None:
+        """Return the pose (4, 4) that aligns points (N, 3) with the map, None without a map.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            Deskewed [m].
+        guess : ndarray, shape (4, 4)
+        """
+        if self._map.empty() or len(points) < LEAST_POINTS:
+            return None
+        sigma = self.threshold
+        source = voxel_down_sample(points, 1.5 * self._config.mapping.voxel_size)
+        pose = self._registration.align_points_to_map(
+            points=source,
+            voxel_map=self._map,
+            initial_guess=guess,
+            max_correspondance_distance=3.0 * sigma,
+            kernel=sigma,
+        )
+        return np.asarray(pose) if np.isfinite(pose).all() else None
+
+    def update(self, points: F64, pose: F64, guess: F64) -> None:
+        """Add points (N, 3) [m] at a pose (4, 4) to the map; learn how good its guess (4, 4) was."""
+        if len(points) < LEAST_POINTS:
+            return
+        self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
+        self._map.update(voxel_down_sample(points, 0.5 * self._config.mapping.voxel_size), pose)
+
+    def points(self) -> F64:
+        """Return the map's points [m], shape (N, 3)."""
+        return np.asarray(self._map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+
+
+class PlainKiss:
+    """KISS-ICP as it is: its own deskew and prediction, no IMU.
+
+    Parameters
+    ----------
+    config : OdometryConfig
+    """
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self._config = kiss_config(config)
+        self.clear()
+
+    def clear(self) -> None:
+        """Start again."""
+        self._kiss = KissICP(self._config)
+
+    @property
+    def pose(self) -> F64:
+        """Pose (4, 4) of the latest sweep's last point."""
+        return np.asarray(self._kiss.last_pose)
+
+    def register(self, points: F64, times: F64) -> F64 | None:
+        """Return the cloud (N, 3) as KISS-ICP deskewed it to the last point, None if too small.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            Finite [m].
+        times : ndarray, shape (N,)
+            Finite; constant times turn KISS-ICP's deskew off.
+        """
+        if len(points) < LEAST_POINTS:
+            return None
+        moving = times if np.ptp(times) > 0.0 else np.empty(0)
+        frame, _ = self._kiss.register_frame(points, moving)
+        return np.asarray(frame)
+
+    def points(self) -> F64:
+        """Return the map's points [m], shape (N, 3)."""
+        return np.asarray(self._kiss.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+
+
+def thinned(points: F64, size: float) -> NDArray[np.intp]:
+    """Return which points (N, 3) KISS-ICP's voxelisation keeps: the first in each voxel [m]."""
+    if len(points) < LEAST_POINTS:
+        return np.arange(len(points))
+    kept = voxel_down_sample(points, size)
+    # kiss_icp returns the points themselves, not which they were
+    order = np.argsort(points[:, 0], kind="stable")
+    place = np.searchsorted(points[order, 0], kept[:, 0])
+    return np.sort(order[np.minimum(place, len(points) - 1)])

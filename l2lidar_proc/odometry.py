@@ -1,0 +1,446 @@
+"""Estimates where the sensor is: sweeps and IMU samples in, one estimate per sweep out."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc import startup, sweep_motion
+from l2lidar_proc.alignment import Alignment, Source, align
+from l2lidar_proc.imu_window import ImuWindow, Samples
+from l2lidar_proc.inertial_filter import GYRO_BIAS, POSITION, TURN, VELOCITY, InertialState, Noise
+from l2lidar_proc.kiss import KissMatcher, thinned
+from l2lidar_proc.odometry_config import OdometryConfig
+from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status, weakest
+from l2lidar_proc.relocation import likely_places
+from l2lidar_proc.surfels import SurfelMap
+from l2lidar_proc.sweep_motion import SweepMotion
+
+F64 = NDArray[np.float64]
+
+_WINDOW_S: Final = 6.0
+_OPENING_NS: Final = 450_000_000  # the first sweeps are held for so long
+_OPENING_ROUNDS: Final = 6
+_OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the rounds
+_WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
+_LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
+_PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
+_DEGENERATE: Final = 0.01  # share of points below which a direction counts as not observed
+_LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
+_AGREEMENT: Final = (
+    0.6,
+    0.92,
+)  # that an alignment needs after a good prediction, after a loose one
+_OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
+_LOST_SWEEPS: Final = 25
+_STEADY_SIGMA: Final = 0.5  # [rad/s] of the assumption that the rate stays, where there is no gyro
+
+
+class Odometry:
+    """LiDAR-inertial odometry.
+
+    The IMU carries the state from sweep to sweep and through each sweep; the deskewed sweep is
+    aligned with a map of surfaces; what the alignment says of velocity and biases deskews the
+    sweep again before it extends the map. KISS-ICP thins the points, keeps a map of points, tells
+    from its adaptive threshold how good predictions are, and registers sweeps whose prediction is
+    loose.
+
+    Parameters
+    ----------
+    config : OdometryConfig
+    T_cloud_imu : ndarray, shape (4, 4)
+        IMU coordinates to cloud coordinates.
+
+    Attributes
+    ----------
+    config : OdometryConfig
+    surfaces : SurfelMap
+        IMU's first place is its origin.
+    kiss : KissMatcher
+    """
+
+    def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
+        self._turn = np.asarray(T_cloud_imu, dtype=np.float64)[:3, :3]
+        self._lever = np.asarray(T_cloud_imu, dtype=np.float64)[:3, 3]
+        self._imu = ImuWindow(_WINDOW_S)
+        self.config = config
+        self.reset()
+
+    def configure(self, config: OdometryConfig) -> None:
+        """Take new live settings; the others come into force with :meth:`reset`."""
+        self.config = config
+
+    def reset(self) -> None:
+        """Forget map and motion; the next sweep begins a new map."""
+        settings = self.config.surfaces
+        self.surfaces = SurfelMap(
+            settings.surface_sizes,
+            thickness=settings.surface_thickness,
+            least=settings.surface_points,
+            capacity=settings.surface_capacity,
+        )
+        self.kiss = KissMatcher(self.config)
+        self._held: list[Sweep] = []
+        self._state: InertialState | None = None
+        self._covariance: F64 = np.zeros((18, 18))
+        self._trusts_gravity = False
+        self._steady: F64 = np.zeros(3)
+        self._lost_sweeps = 0
+        self._pruned_at: F64 = np.zeros(3)
+        self._last: OdometryEstimate | None = None
+
+    def imu(self, samples: Samples) -> None:
+        """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
+        if not np.array_equal(self._turn, np.eye(3)):
+            samples = samples.copy()
+            for name in ("angular_velocity", "linear_acceleration"):
+                samples[name] = samples[name] @ self._turn.T
+        self._imu.push(samples)
+
+    def register(self, sweep: Sweep) -> list[OdometryEstimate]:
+        """Return where the sensor was at the references of sweeps, oldest first.
+
+        The first sweeps are held until they can be solved together (then their estimates come at
+        once); from then on each sweep gives one estimate.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            Any layout of points with x, y, z and time; IMU samples up to its end should have come.
+        """
+        reference = self._reference(sweep)
+        status: list[Status] = []
+        if self._last is not None and reference <= self._last.stamp:
+            if reference > self._last.stamp - _LONG_GAP_NS:
+                return [
+                    dataclasses.replace(
+                        self._last, points=sweep.points[:0], status=(Status.REFUSED,)
+                    )
+                ]
+            self._restart(reference)
+            status.append(Status.RESTARTED)
+        sweep = self._cropped(sweep)
+        if self._state is None:
+            return self._opened(sweep)
+        motion = self._predicted(sweep, self._state, self._covariance)
+        status += self._imu_status(motion)
+        source = self._source(sweep, motion)
+        found = self._aligned(source, motion)
+        if found is None:
+            few = len(source.points) < self.config.min_points
+            status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
+            self._lost_sweeps += not few
+        else:
+            motion = motion.corrected(found.state, found.covariance)
+            self._lost_sweeps = 0
+        self._keep(motion)
+        moved = motion.deskewed(sweep, self._lever)
+        if self._lost_sweeps >= _LOST_SWEEPS:
+            status.append(Status.LOST)
+            self._forget_map()
+        if found is not None or Status.LOST in status:
+            self._extend(moved, motion)
+        return [self._estimate(motion, moved, status, self._quality(source, found))]
+
+    def extrapolated(self, stamp: HostNs) -> InertialState | None:
+        """Return the state that the IMU leads to since the latest reference, None before it.
+
+        Parameters
+        ----------
+        stamp : HostNs
+            Not before the latest reference; best not after the newest IMU sample.
+        """
+        state = self._state
+        if state is None or stamp < state.stamp:
+            return None
+        motion = self._predicted_over(state, self._covariance, (state.stamp, stamp), stamp)
+        return motion.state
+
+    def pose_of(self, state: InertialState) -> F64:
+        """Return the pose of the cloud frame in a state, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3] = state.rotation
+        pose[:3, 3] = state.position - state.rotation @ self._lever
+        return pose
+
+    # ---- beginnings
+
+    def _opened(self, sweep: Sweep) -> list[OdometryEstimate]:
+        """Hold the first sweeps until they tell how the sensor moves, then begin the map."""
+        held = self._held
+        if held and not 0 < sweep.start - held[-1].start < _LONG_GAP_NS:
+            held.clear()
+        held.append(sweep)
+        if held[-1].end - held[0].start < _OPENING_NS or len(held) < 2:
+            return []
+        # the very first sweep is seldom whole
+        most = max(len(one.points) for one in held)
+        seed = next(k for k, one in enumerate(held) if len(one.points) >= _WHOLE * most)
+        motions = self._solved(held[seed:], held[0].start) if most > self.config.min_points else []
+        if not motions:
+            del held[0]
+            return []
+        first = motions[0]
+        earlier = [
+            first.corrected(first.state_at(self._reference(one)), first.covariance)
+            for one in held[:seed]
+        ]
+        estimates = []
+        for one, motion in zip(held, earlier + motions, strict=True):
+            status = [Status.STARTING, *self._imu_status(motion)]
+            quality = AlignmentQuality(points=len(one.points), map_cells=len(self.surfaces))
+            moved = motion.deskewed(one, self._lever)
+            estimates.append(self._estimate(motion, moved, status, quality))
+        held.clear()
+        return estimates
+
+    def _solved(self, sweeps: list[Sweep], since: HostNs) -> list[SweepMotion]:
+        """Begin the map with the first sweeps; return their motions, empty if they do not fit.
+
+        As long as the velocity is not known the map's first sweep is smeared: what the following
+        ones say of the velocity then deskews it better, in a few rounds.
+        """
+        reference = self._reference(sweeps[0])
+        samples = self._imu.between(HostNs(since - _OPENING_NS), sweeps[-1].end)
+        opening = startup.opening(samples, reference)
+        self._trusts_gravity = opening.gravity_trusted
+        start = opening.state
+        for _ in range(_OPENING_ROUNDS):
+            self._forget_map()
+            first = self._predicted(sweeps[0], start, opening.covariance, since)
+            motions = [first]
+            self._extend(first.deskewed(sweeps[0], self._lever), first)
+            for sweep in sweeps[1:]:
+                motion = self._predicted(sweep, motions[-1].state, motions[-1].covariance)
+                found = self._aligned(self._source(sweep, motion), motion, opening=True)
+                if found is None:
+                    return []
+                motion = motion.corrected(found.state, found.covariance)
+                motions.append(motion)
+                self._extend(motion.deskewed(sweep, self._lever), motion)
+            velocity = motions[1].state_at(reference).velocity
+            if np.linalg.norm(velocity - start.velocity) < _OPENING_STEP:
+                break
+            start = dataclasses.replace(start, velocity=velocity)
+        self._keep(motions[-1])
+        return motions
+
+    def _restart(self, reference: HostNs) -> None:
+        """Keep pose and map, forget the motion."""
+        assert self._state is not None
+        self._state = dataclasses.replace(
+            self._state, stamp=HostNs(reference - 1), velocity=np.zeros(3)
+        )
+        self._covariance = self._covariance.copy()
+        for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
+            self._loosen(errors, sigma)
+
+    def _loosen(self, errors: slice, sigma: float) -> None:
+        self._covariance[errors, :] = 0.0
+        self._covariance[:, errors] = 0.0
+        self._covariance[errors, errors] = sigma**2 * np.eye(3)
+
+    def _forget_map(self) -> None:
+        self.surfaces.clear()
+        self.kiss.clear()
+        self._lost_sweeps = 0
+
+    # ---- steps
+
+    def _reference(self, sweep: Sweep) -> HostNs:
+        if self.config.reference == "start":
+            return sweep.start
+        if self.config.reference == "end":
+            return sweep.end
+        return HostNs((sweep.start + sweep.end) // 2)
+
+    def _cropped(self, sweep: Sweep) -> Sweep:
+        """Return the sweep without points that are not finite or out of range."""
+        xyz = _xyz(sweep.points)
+        squared = (xyz * xyz).sum(axis=1)
+        inside = (squared >= self.config.min_range**2) & (squared <= self.config.max_range**2)
+        inside &= np.isfinite(sweep.points["time"])
+        if inside.all():
+            return sweep
+        return dataclasses.replace(sweep, points=sweep.points[inside])
+
+    def _predicted(
+        self, sweep: Sweep, state: InertialState, covariance: F64, since: HostNs | None = None
+    ) -> SweepMotion:
+        span = (sweep.start if since is None else since, sweep.end)
+        return self._predicted_over(state, covariance, span, self._reference(sweep))
+
+    def _predicted_over(
+        self, state: InertialState, covariance: F64, span: tuple[HostNs, HostNs], reference: HostNs
+    ) -> SweepMotion:
+        samples = self._imu.between(min(span[0], state.stamp), max(span[1], reference))
+        gap = reference - state.stamp
+        if gap > _LONG_GAP_NS and len(samples) * _PERIOD_S * 1e9 < 0.5 * gap:
+            state = dataclasses.replace(state, velocity=np.zeros(3))
+        settings = self.config.inertial
+        scale = float(np.sqrt(_PERIOD_S))
+        noise = Noise(
+            max(settings.gyro_noise, startup.white_noise(samples["angular_velocity"])) * scale,
+            max(settings.accel_noise, startup.white_noise(samples["linear_acceleration"])) * scale,
+            settings.gyro_bias_walk,
+            settings.accel_bias_walk,
+        )
+        return sweep_motion.predict(
+            state,
+            covariance,
+            samples,
+            span,
+            reference,
+            noise=noise,
+            gap_ns=round(settings.imu_gap_ms * 1e6),
+            steady_rate=self._steady + state.gyro_bias,
+            uses_forces=self._trusts_gravity and settings.use_accelerometer,
+        )
+
+    def _source(self, sweep: Sweep, motion: SweepMotion) -> Source:
+        """Return the points to align, deskewed along the prediction."""
+        xyz = _xyz(motion.deskewed(sweep, self._lever))
+        chosen = thinned(xyz, self.config.surfaces.source_voxel)
+        chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
+        offset = (sweep.start - motion.state.stamp) * 1e-9
+        return Source(
+            xyz[chosen] - self._lever,
+            offset + sweep.points["time"][chosen].astype(np.float64),
+            np.linalg.norm(xyz[chosen], axis=1),
+        )
+
+    def _aligned(
+        self, source: Source, motion: SweepMotion, opening: bool = False
+    ) -> Alignment | None:
+        """Return the alignment that can be believed, None if there is none."""
+        if len(source.points) < self.config.min_points or not len(self.surfaces):
+            return None
+        sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
+        loose = sigma > _LOOSE_M
+        strict = loose and not opening
+        found = self._align(source, motion, motion.state)
+        if not loose or (strict and _believable(found, source, strict)):
+            return found if _believable(found, source, strict) else None
+        starts = [self._registered(source, motion.state)]
+        if strict:
+            starts += likely_places(motion.state, motion.covariance, source, self.surfaces)
+        others = [found, *(self._align(source, motion, start) for start in starts)]
+        good = [other for other in others if other and _believable(other, source, strict)]
+        return max(good, key=lambda other: other.agreement * other.matched, default=None)
+
+    def _align(
+        self, source: Source, motion: SweepMotion, start: InertialState
+    ) -> Alignment | None:
+        return align(
+            motion.state,
+            motion.covariance,
+            source,
+            self.surfaces,
+            self.config.surfaces,
+            self.config.min_points // 2,
+            start,
+        )
+
+    def _registered(self, source: Source, guess: InertialState) -> InertialState:
+        """Return the guess with the pose that KISS-ICP's registration finds."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = guess.rotation, guess.position
+        better = self.kiss.register(source.points, pose)
+        if better is None:
+            return guess
+        return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
+
+    def _keep(self, motion: SweepMotion) -> None:
+        """Remember the state for the next prediction."""
+        self._state, self._covariance = motion.state, motion.covariance
+        self._steady = motion.rate
+
+    def _extend(self, moved: NDArray[np.void], motion: SweepMotion) -> None:
+        """Add deskewed points to the maps."""
+        points = _xyz(moved) - self._lever
+        state = motion.state
+        self.surfaces.add(points @ state.rotation.T + state.position)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = state.rotation, state.position
+        self.kiss.update(points, pose, pose)
+        if np.linalg.norm(state.position - self._pruned_at) > 0.2 * self.config.max_range:
+            self.surfaces.forget(state.position, self.config.max_range)
+            self._pruned_at = state.position
+
+    # ---- what is reported
+
+    def _imu_status(self, motion: SweepMotion) -> list[Status]:
+        status = []
+        if motion.felt.missing.all():
+            status.append(Status.NO_IMU)
+        elif motion.felt.missing.any():
+            status.append(Status.IMU_GAP)
+        if not self._trusts_gravity:
+            status.append(Status.GRAVITY_UNTRUSTED)
+        return status
+
+    def _quality(self, source: Source, found: Alignment | None) -> AlignmentQuality:
+        quality = AlignmentQuality(
+            points=len(source.points),
+            kiss_threshold_m=self.kiss.threshold,
+            map_cells=len(self.surfaces),
+        )
+        if found is None:
+            return quality
+        return dataclasses.replace(
+            quality,
+            matched=found.matched,
+            agreement=found.agreement,
+            residual_m=found.residual,
+            weakest=weakest(found.information[POSITION, POSITION]),
+        )
+
+    def _estimate(
+        self,
+        motion: SweepMotion,
+        moved: NDArray[np.void],
+        status: list[Status],
+        quality: AlignmentQuality,
+    ) -> OdometryEstimate:
+        state, p = motion.state, motion.covariance
+        if quality.matched and quality.weakest < _DEGENERATE:
+            status.append(Status.DEGENERATE)
+        pose = np.zeros((6, 18))
+        pose[:3, POSITION] = np.eye(3)
+        pose[3:, TURN] = state.rotation
+        twist = np.zeros((6, 18))
+        twist[:3, VELOCITY] = state.rotation.T
+        twist[3:, GYRO_BIAS] = np.eye(3)
+        twist_covariance = twist @ p @ twist.T
+        twist_covariance[3:, 3:] += self.config.inertial.gyro_noise**2 * np.eye(3)
+        self._last = OdometryEstimate(
+            stamp=state.stamp,
+            T_odom_lidar=self.pose_of(state),
+            covariance=pose @ p @ pose.T,
+            velocity=state.rotation.T @ state.velocity - np.cross(motion.rate, self._lever),
+            angular_velocity=motion.rate,
+            twist_covariance=twist_covariance,
+            points=moved,
+            status=tuple(status),
+            quality=quality,
+            gyro_bias=state.gyro_bias,
+            accel_bias=state.accel_bias,
+            gravity=state.gravity,
+        )
+        return self._last
+
+
+def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
+    return (
+        found is not None
+        and found.agreement >= _AGREEMENT[strict]
+        and found.matched >= _OVERLAP[strict] * len(source.points)
+    )
+
+
+def _xyz(points: NDArray[np.void]) -> F64:
+    return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)

@@ -1,0 +1,151 @@
+"""Holds the settings of the odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from l2lidar_node.settings import setting
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InertialConfig:
+    """How far the IMU is trusted between sweeps."""
+
+    gyro_noise: float = setting(
+        0.1,
+        "noise of a gyro axis per sample at 250 Hz, lines included; more is taken where seen",
+        unit="rad/s",
+        lo=1e-4,
+        hi=10.0,
+    )
+    accel_noise: float = setting(
+        0.15,
+        "noise of an accelerometer axis per sample at 250 Hz; more is taken where more is seen",
+        unit="m/s^2",
+        lo=1e-3,
+        hi=100.0,
+    )
+    gyro_bias_walk: float = setting(
+        1e-4, "how fast the gyro's bias may wander", unit="rad/s/sqrt(s)", lo=0.0, hi=1.0
+    )
+    accel_bias_walk: float = setting(
+        1e-3, "how fast the accelerometer's bias may wander", unit="m/s^2/sqrt(s)", lo=0.0, hi=10.0
+    )
+    imu_gap_ms: float = setting(
+        50.0,
+        "a longer stretch without IMU sample is bridged by steady motion",
+        unit="ms",
+        lo=5.0,
+        hi=1000.0,
+    )
+    use_accelerometer: bool = setting(
+        True,
+        "whether the accelerometer is used; off, velocity and gravity come from the clouds alone",
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurfaceConfig:
+    """The map of small flat surfaces that sweeps are aligned with."""
+
+    surface_sizes: tuple[float, ...] = setting(
+        (0.25, 0.6, 1.5),
+        "edges of the cells of each level of the map, fine to coarse",
+        unit="m",
+        lo=0.05,
+        hi=10.0,
+    )
+    surface_thickness: float = setting(
+        0.03,
+        "a cell whose points scatter more than this about a plane is not used",
+        unit="m",
+        lo=0.005,
+        hi=0.5,
+    )
+    surface_points: int = setting(8, "points that a cell needs before it is used", lo=4, hi=100)
+    surface_capacity: int = setting(400, "points after which a cell is final", lo=10, hi=100_000)
+    point_noise: float = setting(
+        0.04,
+        "how far a point may be from its surface, what neighbours share included",
+        unit="m",
+        lo=0.002,
+        hi=1.0,
+        live=True,
+    )
+    outlier_scale: float = setting(
+        0.05,
+        "distance at which a point loses three quarters of its weight",
+        unit="m",
+        lo=0.005,
+        hi=5.0,
+        live=True,
+    )
+    source_voxel: float = setting(
+        0.2, "one point per cube of this size is aligned", unit="m", lo=0.02, hi=5.0, live=True
+    )
+    source_points: int = setting(
+        3000, "largest number of points to align", lo=100, hi=100_000, live=True
+    )
+    iterations: int = setting(
+        5, "largest number of steps of the alignment", lo=1, hi=50, live=True
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KissConfig:
+    """KISS-ICP's own settings: for its registration, its map, and the `plain` mode."""
+
+    kiss_voxel_size: float = setting(
+        0.5, "voxel size of KISS-ICP's local map", unit="m", lo=0.05, hi=10.0
+    )
+    kiss_max_points_per_voxel: int = setting(
+        20, "points kept in a voxel of KISS-ICP's map", lo=1, hi=1000
+    )
+    kiss_initial_threshold: float = setting(
+        1.0, "KISS-ICP's first guess of how wrong the prediction is", unit="m", lo=0.01, hi=20.0
+    )
+    kiss_min_motion: float = setting(
+        0.1,
+        "deviations below this do not sharpen KISS-ICP's threshold",
+        unit="m",
+        lo=0.001,
+        hi=5.0,
+    )
+    kiss_iterations: int = setting(100, "largest number of iterations of KISS-ICP", lo=1, hi=1000)
+    kiss_convergence: float = setting(1e-4, "step at which KISS-ICP is done", lo=1e-8, hi=0.1)
+    threads: int = setting(1, "threads of KISS-ICP; 0 = all cores", lo=0, hi=64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryConfig:
+    """Everything that can be said to the odometry."""
+
+    mode: str = setting(
+        "inertial",
+        "inertial: IMU, KISS-ICP's parts and surfaces; plain: KissICP.register_frame as it is",
+        choices=("inertial", "plain"),
+    )
+    reference: str = setting(
+        "middle", "instant of a sweep whose pose is estimated", choices=("start", "middle", "end")
+    )
+    min_range: float = setting(
+        0.4,
+        "nearer points are left out: the carrier's own parts",
+        unit="m",
+        lo=0.0,
+        hi=100.0,
+        live=True,
+    )
+    max_range: float = setting(
+        100.0,
+        "farther points are left out, and the map is forgotten beyond",
+        unit="m",
+        lo=1.0,
+        hi=1000.0,
+    )
+    min_points: int = setting(
+        200, "a sweep with fewer points to align is not aligned but predicted", lo=10, hi=100_000
+    )
+    inertial: InertialConfig = field(default_factory=InertialConfig)
+    surfaces: SurfaceConfig = field(default_factory=SurfaceConfig)
+    kiss: KissConfig = field(default_factory=KissConfig)

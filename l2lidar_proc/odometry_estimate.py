@@ -1,0 +1,116 @@
+"""Says what the odometry found out from one sweep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import HostNs
+
+F64 = NDArray[np.float64]
+
+
+class Status(Enum):
+    """What is remarkable about an estimate; the value is for people."""
+
+    STARTING = "the map has just begun with this sweep"
+    PREDICTED = "not aligned with the map: the pose is predicted"
+    SPARSE = "too few points"
+    UNMATCHED = "too few points meet the map"
+    DEGENERATE = "the scene does not fix the pose in every direction"
+    IMU_GAP = "IMU samples are missing within the span of this estimate"
+    NO_IMU = "no IMU sample at all: steady motion is assumed"
+    GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"
+    RESTARTED = "time jumped: the motion is unknown, pose and map were kept"
+    LOST = "too long without a match: a new map begins at the predicted pose"
+    REFUSED = "not later than the previous sweep: nothing was done with it"
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentQuality:
+    """How well a sweep could be aligned.
+
+    Attributes
+    ----------
+    points : int
+        Points that were to be aligned.
+    matched : int
+        Of these, points that met a surface of the map.
+    agreement : float
+        Share of the points at known surfaces that are near them, 0 to 1; low at a wrong pose.
+    residual_m : float
+        Root mean square of their distances to it, outliers weighed down.
+    weakest : float
+        Share of the points that speak for the least observed direction, 0 to 1/3.
+    kiss_threshold_m : float
+        How far predictions have lately been off, as KISS-ICP sees it.
+    map_cells : int
+        Cells in the map of surfaces.
+    """
+
+    points: int = 0
+    matched: int = 0
+    agreement: float = 0.0
+    residual_m: float = 0.0
+    weakest: float = 0.0
+    kiss_threshold_m: float = 0.0
+    map_cells: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryEstimate:
+    """Where the sensor was at one instant, and how it moved.
+
+    Attributes
+    ----------
+    stamp : HostNs
+        The instant that pose, velocity and cloud belong to: the reference of the sweep.
+    T_odom_lidar : ndarray, shape (4, 4)
+        Cloud coordinates to odometry coordinates. Where gravity is trusted z is up there.
+    covariance : ndarray, shape (6, 6)
+        Of x, y, z and of the turns about the axes of the odometry frame [m, rad], relative to the
+        map.
+    velocity : ndarray, shape (3,)
+        Of the cloud frame's origin, cloud axes [m/s].
+    angular_velocity : ndarray, shape (3,)
+        Cloud axes, without bias [rad/s].
+    twist_covariance : ndarray, shape (6, 6)
+        Of velocity and angular velocity, cloud axes.
+    points : ndarray, shape (N,)
+        The sweep's points within the range limits, as seen from the reference; fields of the
+        sweep.
+    status : tuple of Status
+        Empty when all is well.
+    quality : AlignmentQuality
+    gyro_bias, accel_bias : ndarray, shape (3,)
+        Cloud axes [rad/s, m/s^2].
+    gravity : ndarray, shape (3,)
+        Odometry axes [m/s^2]; zero when not trusted.
+    """
+
+    stamp: HostNs
+    T_odom_lidar: F64
+    covariance: F64
+    velocity: F64
+    angular_velocity: F64
+    twist_covariance: F64
+    points: NDArray[np.void]
+    status: tuple[Status, ...]
+    quality: AlignmentQuality
+    gyro_bias: F64
+    accel_bias: F64
+    gravity: F64
+
+    @property
+    def is_aligned(self) -> bool:
+        """Whether the sweep was aligned with the map."""
+        return not {Status.PREDICTED, Status.REFUSED} & set(self.status)
+
+
+def weakest(information: F64) -> float:
+    """Return the share of some information (3, 3) that its least observed direction has."""
+    strength = np.linalg.eigvalsh(information)
+    return float(strength[0] / max(float(strength.sum()), 1e-12))

@@ -1,0 +1,244 @@
+"""Keeps the map of small flat surfaces: points binned into cells, a plane fitted to each cell.
+
+A surface averages the range noise of every point that ever fell into its cell, which
+nearest-neighbour methods cannot do. Cells come in several sizes; the finest flat one speaks for a
+place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+CELL: Final = np.dtype(
+    [
+        ("count", "<f8"),
+        ("sum", "<f8", (3,)),  # [m] of the points' offsets from the cell's middle
+        ("products", "<f8", (6,)),  # [m^2] of the offsets: xx xy xz yy yz zz
+        ("mean", "<f8", (3,)),  # [m] map frame
+        ("axes", "<f8", (3, 3)),  # rows: the normal, then the two axes of the surface; unit
+        ("spread", "<f8", (3,)),  # [m^2] variance along each of the axes, ascending
+        ("flat", "?"),
+    ],
+    align=True,
+)
+"""What is known about a cell."""
+
+_PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_BITS: Final = 21
+_MASK: Final = (1 << _BITS) - 1
+_HALF: Final = 1 << (_BITS - 1)
+_ELONGATED: Final = 9.0  # a surface is at least 3 times wider than it is thick
+_WIDTH: Final = 0.08  # and, in its shorter direction, this part of its cell (1 sigma)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """The surfaces that points belong to.
+
+    Attributes
+    ----------
+    index : ndarray, shape (M,)
+        Which of the points.
+    normals : ndarray, shape (M, 3)
+        Unit, map frame, either sign.
+    distances : ndarray, shape (M,)
+        Of the point from the plane along the normal [m].
+    variances : ndarray, shape (M,)
+        Of the plane's place under the point [m^2].
+    """
+
+    index: I64
+    normals: F64
+    distances: F64
+    variances: F64
+
+
+class SurfelMap:
+    """Surfaces of several sizes.
+
+    Parameters
+    ----------
+    sizes : sequence of float
+        Edges of the cells [m], fine to coarse.
+    thickness : float
+        Largest standard deviation across a surface [m].
+    least : int
+        Points a surface needs.
+    capacity : int
+        Points after which a cell changes no more, so that the map does not follow later errors.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[float],
+        *,
+        thickness: float = 0.03,
+        least: int = 8,
+        capacity: int = 400,
+    ) -> None:
+        self._levels = [_Level(size, thickness, least, capacity) for size in sizes]
+
+    def __len__(self) -> int:
+        """Return the number of cells of all sizes."""
+        return sum(len(level) for level in self._levels)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        for level in self._levels:
+            level.clear()
+
+    def add(self, points: F64) -> None:
+        """Add points (N, 3) [m], map frame."""
+        if len(points):
+            for level in self._levels:
+                level.add(points)
+
+    def match(self, points: F64) -> Matches:
+        """Return the surface of every point (N, 3) [m] that has one: the finest at its place."""
+        found: list[tuple[I64, NDArray[np.void]]] = []
+        left = np.arange(len(points))
+        for level in self._levels:
+            cell = level.flat_at(points[left])
+            known = cell >= 0
+            found.append((left[known], level.cells[cell[known]]))
+            left = left[~known]
+        index = np.concatenate([some for some, _ in found])
+        cells = np.concatenate([some for _, some in found])
+        offset = points[index] - cells["mean"]
+        along = np.einsum("nij,nj->ni", cells["axes"], offset)
+        spread = cells["spread"]
+        # a plane fitted to n points is worst known far from their middle
+        reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
+        variances = spread[:, 0] * reach / cells["count"]
+        return Matches(index, cells["axes"][:, 0], along[:, 0], variances)
+
+    def forget(self, origin: F64, distance: float) -> None:
+        """Drop the cells farther than a distance [m] from a place (3,)."""
+        for level in self._levels:
+            level.forget(origin, distance)
+
+    def points(self) -> F64:
+        """Return the middles of the finest level's surfaces [m], shape (N, 3), map frame."""
+        return self._levels[0].points()
+
+
+class _Level:
+    """Cells of one size: rows of ``cells``, found through a sorted array of keys."""
+
+    def __init__(self, size: float, thickness: float, least: int, capacity: int) -> None:
+        self._size = size
+        self._thickness = thickness
+        self._least = least
+        self._capacity = capacity
+        self.clear()
+
+    def clear(self) -> None:
+        self._keys: I64 = np.empty(0, np.int64)
+        self._rows: I64 = np.empty(0, np.int64)
+        self._flat: NDArray[np.bool_] = np.zeros(
+            0, np.bool_
+        )  # by row, a compact copy for look-ups
+        self.cells: NDArray[np.void] = np.zeros(0, CELL)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def flat_at(self, points: F64) -> I64:
+        """Return the row of the flat cell each point lies in, -1 where there is none."""
+        rows = self._find(self._key(points))
+        known = rows >= 0
+        rows[known] = np.where(self._flat[rows[known]], rows[known], -1)
+        return rows
+
+    def add(self, points: F64) -> None:
+        keys, inverse = np.unique(self._key(points), return_inverse=True)
+        rows = self._rows_of(keys)
+        opened = self.cells["count"][rows] < self._capacity
+        middles = self._middle(keys)
+        offsets = points - middles[inverse]
+        bins = len(keys)
+        count = np.bincount(inverse, minlength=bins)
+        total = np.stack([np.bincount(inverse, axis, bins) for axis in offsets.T], axis=1)
+        products = np.stack(
+            [np.bincount(inverse, offsets[:, i] * offsets[:, j], bins) for i, j in _PAIRS], axis=1
+        )
+        rows = rows[opened]
+        self.cells["count"][rows] += count[opened]
+        self.cells["sum"][rows] += total[opened]
+        self.cells["products"][rows] += products[opened]
+        self._fit(rows, middles[opened])
+
+    def forget(self, origin: F64, distance: float) -> None:
+        near = ((self._middle(self._keys) - origin) ** 2).sum(axis=1) <= distance * distance
+        if near.all():
+            return
+        rows = self._rows[near]
+        self._keys, self._rows = self._keys[near], np.arange(len(rows))
+        self.cells, self._flat = self.cells[rows].copy(), self._flat[rows]
+
+    def points(self) -> F64:
+        used = self.cells[: len(self._keys)]
+        return np.asarray(used["mean"][used["flat"]])
+
+    def _fit(self, rows: I64, middles: F64) -> None:
+        enough = self.cells["count"][rows] >= self._least
+        rows, middles = rows[enough], middles[enough]
+        if not len(rows):
+            return
+        count = self.cells["count"][rows][:, None]
+        mean = self.cells["sum"][rows] / count
+        products = self.cells["products"][rows] / count
+        covariance = np.empty((len(rows), 3, 3))
+        for column, (i, j) in enumerate(_PAIRS):
+            covariance[:, i, j] = products[:, column] - mean[:, i] * mean[:, j]
+            covariance[:, j, i] = covariance[:, i, j]
+        spread, axes = np.linalg.eigh(covariance)
+        spread = np.maximum(spread, 1e-8)
+        wide = np.maximum(_ELONGATED * spread[:, 0], (_WIDTH * self._size) ** 2)
+        flat = (spread[:, 0] < self._thickness**2) & (spread[:, 1] > wide)
+        self.cells["mean"][rows] = mean + middles
+        self.cells["axes"][rows] = np.swapaxes(axes, 1, 2)
+        self.cells["spread"][rows] = spread
+        self.cells["flat"][rows] = flat
+        self._flat[rows] = flat
+
+    def _key(self, points: F64) -> I64:
+        cell = np.floor(points * (1.0 / self._size)).astype(np.int64) + _HALF
+        return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])
+
+    def _middle(self, keys: I64) -> F64:
+        cell = np.stack((keys >> 2 * _BITS, (keys >> _BITS) & _MASK, keys & _MASK), axis=1)
+        return np.asarray((cell - (_HALF - 0.5)) * self._size)
+
+    def _find(self, keys: I64) -> I64:
+        if not len(self._keys):
+            return np.full(len(keys), -1)
+        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where(self._keys[place] == keys, self._rows[place], -1)
+
+    def _rows_of(self, keys: I64) -> I64:
+        """Return the row of each key (ascending, unique), making rows for new ones."""
+        rows = self._find(keys)
+        new = np.flatnonzero(rows < 0)
+        if len(new):
+            first = len(self._keys)
+            rows[new] = np.arange(first, first + len(new))
+            place = np.searchsorted(self._keys, keys[new])
+            self._keys = np.insert(self._keys, place, keys[new])
+            self._rows = np.insert(self._rows, place, rows[new])
+            self._reserve(first + len(new))
+        return rows
+
+    def _reserve(self, count: int) -> None:
+        if count > len(self.cells):
+            extra = max(count, 2 * len(self.cells)) - len(self.cells)
+            self.cells = np.concatenate((self.cells, np.zeros(extra, CELL)))
+            self._flat = np.concatenate((self._flat, np.zeros(extra, np.bool_)))
