@@ -215,6 +215,20 @@ def set_mac(mac: bytes) -> Command:
     return Command("MAC", wire.PacketType.MAC, mac + b"\0\0")
 
 
+def set_parameters(payload: bytes) -> Command:
+    """Return the command that stores a parameter block, made from one the device sent.
+
+    Raises
+    ------
+    ValueError
+        If it has not the size of a block.
+    """
+    size = wire.PARAMETERS_PAYLOAD.itemsize
+    if len(payload) != size:
+        raise ValueError(f"payload: {len(payload)} bytes, expected {size}")
+    return Command("parameters", wire.PacketType.PARAMETERS, payload)
+
+
 def _user(name: str, command: wire.UserCommand, value: int) -> Command:
     return Command(name, wire.PacketType.USER_COMMAND, struct.pack("<2I", command, value))
 

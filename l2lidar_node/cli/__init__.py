@@ -1,0 +1,1 @@
+"""The `l2lidar` command: everything that is done with an L2 by hand, without ROS."""

@@ -1,0 +1,195 @@
+"""A connection to one L2 for a verb: asks, waits, and raises where the device does not do it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswerError
+from types import TracebackType
+from typing import Final, TypeVar
+
+from l2lidar_node import commands, health, source
+from l2lidar_node.cli.addresses import local_addresses
+from l2lidar_node.commands import Command
+from l2lidar_node.config import DriverConfig, NetworkConfig
+from l2lidar_node.driver import Driver, Event
+from l2lidar_node.packets import Parameters
+from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
+from l2lidar_node.session import Session, Tap
+from l2lidar_node.settings import build, values_of
+from l2lidar_node.types import HostNs
+
+T = TypeVar("T")
+
+ANSWER_S: Final = TRIES * REPEAT_NS / 1e9 + 0.5
+_LOOK_S: Final = 0.02
+
+
+class DeviceError(RuntimeError):
+    """The device is not there or does not do what it was asked; the message says so."""
+
+
+class Device:
+    """An L2 for as long as a ``with`` statement lasts.
+
+    Nothing about it is changed by connecting: its clock is left alone, only its version and
+    parameters are asked for.
+
+    Parameters
+    ----------
+    network : NetworkConfig
+    on_event : callable, optional
+        Called in the receiving thread with everything that happens.
+    tap : Tap, optional
+        Told everything that is received and sent.
+    settings
+        Further settings of the driver by name.
+
+    Raises
+    ------
+    TransportError
+        If socket or serial device cannot be opened.
+    """
+
+    def __init__(
+        self,
+        network: NetworkConfig,
+        on_event: Callable[[Event], None] | None = None,
+        tap: Tap | None = None,
+        **settings: object,
+    ) -> None:
+        quiet = {
+            "enable_l2_host_sync": False,
+            "watchdog_action": "wait",
+            "standby_on_powerup_enabled": True,
+        }
+        self.network = network
+        self.config = build(DriverConfig, {**values_of(network), **quiet, **settings})
+        self._on_event = on_event
+        self._answers: dict[int, Future[Answer]] = {}
+        self._blocks: list[Parameters] = []
+        self._session = Session(Driver(self.config), source.opened(network), self._handle, tap)
+
+    def __enter__(self) -> Device:
+        """Begin to listen."""
+        self._session.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the connection."""
+        self._session.stop()
+
+    def ask(self, question: Callable[[Driver], T]) -> T:
+        """Return what a question to the driver gives, asked in the thread that owns it."""
+        return self._session.call(lambda driver, now: question(driver)).result()
+
+    def wait_for(self, question: Callable[[Driver], T | None], timeout_s: float) -> T | None:
+        """Ask until the answer is neither None nor False; None if that takes too long."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            answer = self.ask(question)
+            if answer is not None and answer is not False:
+                return answer
+            if time.monotonic() > deadline:
+                return None
+            time.sleep(_LOOK_S)
+
+    def command(self, start: Callable[[Driver, HostNs], int]) -> Answer:
+        """Send what ``start`` queues, wait for its answer and return it.
+
+        Raises
+        ------
+        DeviceError
+            If the device does not acknowledge it, or refuses.
+        """
+        future: Future[Answer] = Future()
+
+        def begin(driver: Driver, now: HostNs) -> None:
+            self._answers[start(driver, now)] = future
+
+        self._session.call(begin).result()
+        try:
+            answer = future.result(ANSWER_S)
+        except NoAnswerError:
+            raise DeviceError("the device did not answer") from None
+        if not answer.ok:
+            raise DeviceError(answer.text)
+        return answer
+
+    def tell(self, function: Callable[[Driver, HostNs], object]) -> None:
+        """Have something queued that the device does not answer."""
+        self._session.call(function).result()
+
+    def send(self, command: Command) -> Answer:
+        """Send a command that is acknowledged; see :meth:`command`."""
+        return self.command(lambda driver, now: driver.send(command, now))
+
+    def read_parameters(self) -> Parameters:
+        """Return the device's parameter block as it is now.
+
+        Raises
+        ------
+        DeviceError
+            If the device does not send it.
+        """
+
+        def begin(driver: Driver, now: HostNs) -> None:
+            self._blocks.clear()
+            driver.send(commands.request_parameters(), now)
+
+        self._session.call(begin).result()
+        found = self.wait_for(lambda driver: self._blocks[-1] if self._blocks else None, ANSWER_S)
+        if found is None:
+            raise DeviceError(f"the L2 did not send its parameters; {self.advice()}")
+        return found
+
+    def period(self) -> health.Period:
+        """Return what has been counted so far."""
+        return self._session.call(
+            lambda driver, now: health.observe(driver, self._session.transport, now)
+        ).result()
+
+    def checks(self, before: health.Period) -> tuple[list[health.Check], health.Period]:
+        """Return how the time since is judged, and what has been counted by now."""
+
+        def look(driver: Driver, now: HostNs) -> tuple[list[health.Check], health.Period]:
+            after = health.observe(driver, self._session.transport, now)
+            return health.judge(driver, before, after), after
+
+        return self._session.call(look).result()
+
+    def is_measuring(self, seconds: float) -> bool:
+        """Listen for so long at the most; return whether points or IMU samples come."""
+        before = self.ask(lambda driver: driver.counters.frames.total())
+        return bool(
+            self.wait_for(lambda driver: driver.counters.frames.total() > before + 10, seconds)
+        )
+
+    def advice(self) -> str:
+        """Return what may be wrong when nothing is heard."""
+        if self.network.serial_port:
+            return (
+                f"is it at {self.network.serial_port}, has it power, and is its work mode set to "
+                "serial?"
+            )
+        addresses = ", ".join(local_addresses()) or "none"
+        return (
+            f"is it at {self.network.l2_ip}, does it send to one of this machine's addresses "
+            f"({addresses}), port {self.network.host_port}, and has it power?"
+        )
+
+    def _handle(self, event: Event) -> None:
+        if isinstance(event, Answer):
+            future = self._answers.pop(event.ticket, None)
+            if future is not None:
+                future.set_result(event)
+        elif isinstance(event, Parameters):
+            self._blocks.append(event)
+        if self._on_event is not None:
+            self._on_event(event)

@@ -1,0 +1,109 @@
+"""`l2lidar info` and `l2lidar monitor`: what the unit is, and how it is doing."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import typer
+from rich.live import Live
+
+from l2lidar_node import health
+from l2lidar_node.cli.console import as_data, facts, judgement, out, print_json
+from l2lidar_node.cli.device import Device, DeviceError
+from l2lidar_node.cli.options import JsonOption, with_network
+from l2lidar_node.config import NetworkConfig
+from l2lidar_node.driver import Driver
+from l2lidar_node.metadata import metadata
+
+_WAIT_S = 3.0
+_TOLD_BY_POINTS = (
+    "slots",
+    "angle_min_rad",
+    "angle_increment_rad",
+    "time_increment_s",
+    "range_min_m",
+    "range_max_m",
+)
+
+
+@with_network
+def info(network: NetworkConfig, json_: JsonOption = False) -> None:
+    """Say what the unit is: versions, work mode, calibration, scan geometry, and its state."""
+    with Device(network) as device:
+        if device.wait_for(lambda driver: driver.counters.frames.total() > 0, _WAIT_S) is None:
+            raise DeviceError(f"nothing heard from the L2; {device.advice()}")
+        device.wait_for(_is_known, _WAIT_S)
+        before = device.period()
+        time.sleep(1.0)
+        checks, _ = device.checks(before)
+        about: dict[str, Any] = dataclasses.asdict(device.ask(metadata))
+    if json_:
+        print_json({**about, "health": as_data(checks)})
+        return
+    calibration = about.pop("calibration") if about["slots"] else {}
+    if not calibration:
+        about |= dict.fromkeys(_TOLD_BY_POINTS)
+    mode = about.pop("work_mode_names") or []
+    for name, value in about.items():
+        about[name] = "not known" if value in ("", None) else _text(value)
+    about["work_mode"] = f"{about['work_mode']} ({', '.join(mode) or 'standard'})"
+    out.print(facts("Unit", about))
+    if calibration:
+        named = {name: _text(value) for name, value in calibration.items()}
+        out.print(facts("\nCalibration", named))
+    out.print()
+    out.print(judgement(checks))
+
+
+@with_network
+def monitor(
+    network: NetworkConfig,
+    duration: Annotated[
+        float, typer.Option(min=0.0, help="Seconds to watch; for ever if left out.")
+    ] = math.inf,
+    json_: JsonOption = False,
+) -> None:
+    """Watch the unit live: one line per aspect, as on /diagnostics. Ctrl-C ends it.
+
+    The exit code is 1 if any aspect was in error at the end. With --json one line per second.
+    """
+    with Device(network, enable_latency_measure=True) as device:
+        judged: list[health.Check] = []
+        try:
+            with Live(console=out, auto_refresh=False, transient=False) as live:
+                for judged in _seconds(device, duration):
+                    if json_:
+                        typer.echo(json.dumps(as_data(judged)))
+                    else:
+                        live.update(judgement(judged), refresh=True)
+        except KeyboardInterrupt:
+            pass
+    if any(check.level is health.Level.ERROR for check in judged):
+        raise typer.Exit(1)
+
+
+def _seconds(device: Device, duration: float) -> Iterator[list[health.Check]]:
+    end = time.monotonic() + duration
+    before = device.period()
+    while time.monotonic() < end:
+        time.sleep(min(1.0, max(end - time.monotonic(), 0.0)))
+        checks, before = device.checks(before)
+        yield checks
+
+
+def _is_known(driver: Driver) -> bool:
+    is_answered = driver.version is not None and driver.parameters is not None
+    return is_answered and driver.last_points is not None
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    if isinstance(value, tuple | list):
+        return ", ".join(_text(item) for item in value)
+    return str(value)
