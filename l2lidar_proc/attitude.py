@@ -1,11 +1,10 @@
 """Tracks the gyro's bias and the direction of gravity through rest and motion.
 
-An error-state Kalman filter (filterpy) over the tilt of the estimated vertical and the gyro's
-bias. The vertical is carried along by the gyro. At rest the mean rate is the bias and the mean
-force is gravity. In motion the force, turned into one frame and averaged over a second, is gravity
-plus the change of velocity in that second: known when a velocity source says so, otherwise a
-larger uncertainty. That ties roll and pitch, and with them the bias across the vertical, to
-gravity; about the vertical the bias rests on what was learned at rest. Yaw is of no interest here.
+At rest the mean rate is the bias and the mean force is gravity. In motion the force, turned into
+one frame and averaged over a second, is gravity plus the change of velocity in that second: known
+when a velocity source says so, otherwise a larger uncertainty. That ties roll and pitch, and with
+them the bias across the vertical, to gravity; about the vertical the bias rests on what was
+learned at rest. Yaw is of no interest here.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
@@ -25,6 +23,7 @@ from l2lidar_proc.path import Gravity
 from l2lidar_proc.rest import Rest, at_rest, blended, still_like
 from l2lidar_proc.rotations import F64
 from l2lidar_proc.velocity import VelocityHistory
+from l2lidar_proc.vertical import VerticalFilter
 
 STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
 
@@ -37,10 +36,6 @@ _BREAK_NS: Final = 500_000_000  # a gap in the samples after which the vertical 
 _PLAUSIBLE: Final = (8.8, 10.8)  # [m/s^2] what |a| at rest may be
 _PLAUSIBLE_MOVING: Final = (7.5, 12.5)  # its mean over a second of motion
 
-_GYRO_NOISE: Final = 0.005  # [rad/sqrt(s)]
-_BIAS_WALK: Final = 3e-4  # [rad/s/sqrt(s)]
-_FIRST_TILT: Final = 0.3  # [rad]
-_FIRST_BIAS: Final = 0.05  # [rad/s]
 _TRUSTED_TILT: Final = 0.06  # [rad] largest deviation with which gravity is of use
 _FORCE_AT_REST: Final = 0.05  # [m/s^2]
 _FORCE_MOVING: Final = (0.25, 1.5)  # [m/s^2] with and without known velocities
@@ -97,11 +92,8 @@ class AttitudeFilter:
 
     def reset(self) -> None:
         """Forget everything, as after a jump of the clock."""
-        self._kalman = KalmanFilter(dim_x=6, dim_z=3)
-        self._kalman.P = np.diag([_FIRST_TILT**2] * 3 + [_FIRST_BIAS**2] * 3)
-        self._bias = np.zeros(3)
+        self._vertical = VerticalFilter()
         self._bias_known = False
-        self._up: F64 | None = None
         self._gravity = STANDARD_GRAVITY
         self._rest: Rest | None = None
         self._faulty = False
@@ -118,7 +110,7 @@ class AttitudeFilter:
     @property
     def bias(self) -> F64:
         """The newest bias [rad/s], IMU axes, shape (3,); zero while nothing is known."""
-        return self._bias.copy()
+        return self._vertical.bias.copy()
 
     def at(self, stamp: HostNs) -> Attitude | None:
         """Return the last state not later than an instant, else the first one, if any."""
@@ -180,21 +172,18 @@ class AttitudeFilter:
         sigma : float
             Its standard deviation [rad/s].
         """
-        if self._up is not None:
-            observed = np.hstack((np.zeros((3, 3)), np.eye(3)))
-            self._correct(bias - self._bias, observed, sigma**2 * np.eye(3))
+        self._vertical.measure_bias(bias, np.full(3, sigma**2))
 
     def _follow(self, step: Samples, velocities: VelocityHistory | None) -> None:
         """Take one step of about a tenth of a second."""
         before = self._recent[-1] if self._recent else None
         if before is not None and int(step["stamp"][0] - before["stamp"][-1]) > _BREAK_NS:
             self._recent.clear()
-            self._up, self._rest, before = None, None, None
-        if self._up is None:
-            self._up = rotations.normalised(step["linear_acceleration"].mean(axis=0))
-            self._kalman.P[:3, :3] = np.eye(3) * _FIRST_TILT**2
-        elif before is not None:
-            self._predict(np.concatenate((before[-1:], step)))
+            self._rest, before = None, None
+        if before is None:
+            self._vertical.begin(step["linear_acceleration"].mean(axis=0))
+        else:
+            self._vertical.predict(np.concatenate((before[-1:], step)))
         self._recent.append(step)
         self._steps += 1
         if len(self._recent) >= _WINDOW:
@@ -202,17 +191,16 @@ class AttitudeFilter:
         self._states.append(self._state(HostNs(int(step["stamp"][-1]))))
 
     def _state(self, stamp: HostNs) -> Attitude:
-        assert self._up is not None
-        covariance = self._kalman.P
-        tilt = np.trace(covariance[:3, :3]) - self._up @ covariance[:3, :3] @ self._up
+        vertical = self._vertical
+        assert vertical.up is not None
         return Attitude(
             stamp=stamp,
-            up=self._up,
+            up=vertical.up,
             gravity=self._gravity,
-            bias=self._bias.copy(),
-            bias_sigma=float(np.sqrt(np.diag(covariance)[3:].max())),
+            bias=vertical.bias.copy(),
+            bias_sigma=vertical.bias_sigma,
             is_still=self._rest is not None,
-            is_trusted=not self._faulty and float(tilt) < _TRUSTED_TILT**2,
+            is_trusted=not self._faulty and vertical.tilt_sigma < _TRUSTED_TILT,
             is_faulty=self._faulty,
         )
 
@@ -225,10 +213,8 @@ class AttitudeFilter:
         slow = moving is None or float(np.linalg.norm(moving)) < 0.1
         # to miss a rest costs little, but what is taken for one teaches the bias
         sigmas = 3.0 if self._rest is None else 5.0
-        margin = 3.0 * float(np.sqrt(np.diag(self._kalman.P)[3:].max()))
-        if not self._bias_known:
-            margin = self._max_bias
-        found = at_rest(second, self._bias, margin, sigmas=sigmas) if slow else None
+        margin = 3.0 * self._vertical.bias_sigma if self._bias_known else self._max_bias
+        found = at_rest(second, self._vertical.bias, margin, sigmas=sigmas) if slow else None
         newest = second[-len(second) * _TURN // _WINDOW :]
         if self._rest is not None and not still_like(newest, self._rest):
             found = None
@@ -245,29 +231,15 @@ class AttitudeFilter:
         else:
             self._measure_motion(velocities)
 
-    def _predict(self, samples: Samples) -> None:
-        """Carry vertical and uncertainty over samples; the first one was there before."""
-        back = self._turned_to_last(samples)[0]
-        span = float(samples["stamp"][-1] - samples["stamp"][0]) * 1e-9
-        transition = np.eye(6)
-        transition[:3, :3] = rotations.matrices(back)
-        transition[:3, 3:] = span * np.eye(3)
-        growth = np.diag([_GYRO_NOISE**2 * span] * 3 + [_BIAS_WALK**2 * span] * 3)
-        self._kalman.predict(F=transition, Q=growth)
-        assert self._up is not None
-        self._up = rotations.normalised(rotations.rotate(back, self._up))
-
     def _measure_rest(self, rest: Rest, count: int) -> None:
         size = float(np.linalg.norm(rest.force))
         self._faulty = not _PLAUSIBLE[0] <= size <= _PLAUSIBLE[1]
-        observed = np.hstack((np.zeros((3, 3)), np.eye(3)))
-        noise = np.diag(1.5 * rest.rate_spread**2 / count + 1e-8)
-        self._correct(rest.rate - self._bias, observed, noise)
+        self._vertical.measure_bias(rest.rate, 1.5 * rest.rate_spread**2 / count + 1e-8)
         self._bias_known = True
         if not self._faulty:
             share = 1.0 if self._gravity == STANDARD_GRAVITY else 0.2
             self._gravity += share * (size - self._gravity)
-            self._measure_force(rest.force, _FORCE_AT_REST)
+            self._vertical.measure_force(rest.force, self._gravity, _FORCE_AT_REST)
 
     def _measure_motion(self, velocities: VelocityHistory | None) -> None:
         """Take the mean force of a second for gravity, less what the velocity gained in it.
@@ -287,23 +259,15 @@ class AttitudeFilter:
         if newest is not None and stamps[0] + span <= newest < end:
             end = newest
         second = slice(*np.searchsorted(stamps, [end - span, end]))
-        to_now = self._turned_to_last(samples)
+        to_now = self._vertical.turned_to_last(samples)
         force = rotations.rotate(to_now, forces)[second].mean(axis=0)
         ends = [second.start, second.stop - 1]
         gained = self._gained(stamps[ends], to_now[ends], velocities)
         known, unknown = _FORCE_MOVING
         if gained is None:
-            self._measure_force(force, unknown)
+            self._vertical.measure_force(force, self._gravity, unknown)
         else:
-            self._measure_force(force - gained, known)
-
-    def _turned_to_last(self, samples: Samples) -> F64:
-        """Return the rotations from each sample's axes to the last one's, shape (N, 4)."""
-        dt = np.diff(samples["stamp"])[:, None] * 1e-9
-        rates = samples["angular_velocity"] - self._bias
-        turns = rotations.exp(0.5 * dt * (rates[:-1] + rates[1:]))
-        q = rotations.cumulative(np.concatenate((np.array([[1.0, 0.0, 0.0, 0.0]]), turns)))
-        return rotations.multiply(rotations.conjugate(q[-1]), q)
+            self._vertical.measure_force(force - gained, self._gravity, known)
 
     def _gained(
         self, stamps: NDArray[np.int64], to_now: F64, velocities: VelocityHistory | None
@@ -316,25 +280,3 @@ class AttitudeFilter:
             return None
         v = rotations.rotate(to_now, np.stack((before, after)) @ self._R_cloud_imu)
         return np.asarray((v[1] - v[0]) / ((stamps[1] - stamps[0]) * 1e-9))
-
-    def _measure_force(self, force: F64, sigma: float) -> None:
-        """Correct with a force [m/s^2] that should be gravity alone."""
-        assert self._up is not None
-        x, y, z = self._gravity * self._up
-        observed = np.zeros((3, 6))
-        observed[:, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        self._correct(force - self._gravity * self._up, observed, sigma**2 * np.eye(3))
-
-    def _correct(self, innovation: F64, observed: F64, noise: F64) -> None:
-        """Apply one measurement and fold the error state into vertical and bias."""
-        self._kalman.x = np.zeros((6, 1))
-        self._kalman.update(innovation[:, None], R=noise, H=observed)
-        error = self._kalman.x[:, 0]
-        assert self._up is not None
-        gained = error[3:]
-        if not observed[:, 3:].any():
-            # a force says nothing about turning around the vertical: what is left there is error
-            gained = gained - (gained @ self._up) * self._up
-        self._bias = self._bias + gained
-        self._up = rotations.normalised(rotations.rotate(rotations.exp(error[:3]), self._up))
-        self._kalman.x = np.zeros((6, 1))
