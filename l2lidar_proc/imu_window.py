@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,10 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs
 
 Samples = NDArray[np.void]
 """Array of dtype IMU_SAMPLE, shape (N,)."""
+
+
+_MOST_RATE: Final = 100.0  # [rad/s] no gyro measures more
+_MOST_FORCE: Final = 5000.0  # [m/s^2] no accelerometer
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +31,7 @@ class WindowCounts:
     duplicate : int
         Samples with a stamp that was already there; refused.
     invalid : int
-        Samples with a number that is not finite; refused.
+        Samples with a number that is not finite or that no sensor can measure; refused.
     stale : int
         Samples older than everything that is kept; refused.
     jumps : int
@@ -103,12 +108,12 @@ class ImuWindow:
         ndarray, shape (M,), dtype IMU_SAMPLE
             Those that continue the window in order: what a filter that runs along may use.
         """
-        finite = np.isfinite(samples["angular_velocity"]).all(axis=1) & np.isfinite(
-            samples["linear_acceleration"]
-        ).all(axis=1)
-        if not finite.all():
-            self._tally["invalid"] += int((~finite).sum())
-            samples = samples[finite]
+        # NaN compares as false
+        possible = (np.abs(samples["angular_velocity"]) <= _MOST_RATE).all(axis=1)
+        possible &= (np.abs(samples["linear_acceleration"]) <= _MOST_FORCE).all(axis=1)
+        if not possible.all():
+            self._tally["invalid"] += int((~possible).sum())
+            samples = samples[possible]
         if not len(samples):
             return samples
         stamps = samples["stamp"]

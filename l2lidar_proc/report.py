@@ -94,7 +94,7 @@ def of_period(
         "IMU samples": str(window.accepted),
         "IMU samples put in order": str(window.reordered),
         "IMU samples refused: duplicate": str(window.duplicate),
-        "IMU samples refused: not finite": str(window.invalid),
+        "IMU samples refused: impossible": str(window.invalid),
         "IMU samples refused: too old": str(window.stale),
         **{f"clouds refused: {reason}": str(count) for reason, count in refused.items()},
         **({f"last: {name}": value for name, value in last.values.items()} if last else {}),

@@ -12,6 +12,7 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc.path import VELOCITY
 from l2lidar_proc.rotations import F64, cross
 
+_MOST_SPEED: Final = 1000.0  # [m/s]
 _MOST: Final = 400  # two seconds of an odometry at IMU rate
 
 
@@ -48,7 +49,7 @@ class VelocityHistory:
             Where it comes from, for reports; a new source empties the history.
         """
         vector = np.array(velocity, dtype=np.float64)
-        if vector.shape != (3,) or not np.isfinite(vector).all():
+        if vector.shape != (3,) or not (np.abs(vector) <= _MOST_SPEED).all():
             return False
         if source != self.source:
             self.clear()

@@ -55,7 +55,8 @@ class VerticalFilter:
 
     def begin(self, force: F64) -> None:
         """Take a force for the vertical, roughly; the bias stays as it is known."""
-        self.up = rotations.normalised(force)
+        size = float(np.linalg.norm(force))
+        self.up = force / size if size > 1e-3 else np.array([0.0, 0.0, 1.0])
         covariance = self._kalman.P
         covariance[:3, :] = covariance[:, :3] = 0.0
         covariance[:3, :3] = np.eye(3) * _FIRST_TILT**2
