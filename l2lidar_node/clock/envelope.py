@@ -25,12 +25,18 @@ SHORT_BLOCKS: Final = 30
 LONG_BLOCKS: Final = 160
 _QUIET_NS: Final = 20_000.0  # excess of the block minima at which the short window starts to grow
 _MIN_SPAN_NS: Final = 1_400_000_000  # [ns host] shorter data say nothing about the ratio
+_RATIOS: Final = (0.45, 3.3)
 _FORGET: Final = (
     2 * LONG_BLOCKS
 )  # [blocks] a packet this old is no longer used, however few there are
 
 BLOCK_NS: Final = int(_BLOCK_S * 1e9)
 """Length of a block [ns host]: of the packets in one, only the least delayed one is kept."""
+
+
+def is_credible(ratio: float) -> bool:
+    """Whether a clock can run at this ratio: those of units lie between 0.5 and 3."""
+    return _RATIOS[0] < ratio < _RATIOS[1]
 
 
 class Line(NamedTuple):
@@ -137,7 +143,7 @@ class Envelope:
             self._shift(recent)
             return
         line = supporting_line(recent, ratio)
-        if line is None:
+        if line is None or not is_credible(line.ratio):
             return
         self.line = line
         wanted = SHORT_BLOCKS * (max(line.excess, 0.0) / _QUIET_NS) ** 0.5

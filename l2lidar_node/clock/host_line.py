@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from l2lidar_node.clock.envelope import BLOCK_NS, Envelope, Line, supporting_line
+from l2lidar_node.clock.envelope import (
+    BLOCK_NS,
+    Envelope,
+    Line,
+    is_credible,
+    supporting_line,
+)
 
 _MS: Final = 1_000_000
 _TRY_NS: Final = 100 * _MS  # between attempts to lock
@@ -14,7 +20,6 @@ _LOCK_NS: Final = 1_600 * _MS  # data that must suffice
 _QUIET_NS: Final = 50_000.0  # median delay above the line below which arrivals hardly vary
 _FEWEST: Final = 40
 _MOST: Final = 4096  # packets kept while not locked
-_RATIOS: Final = (0.45, 3.3)
 
 _SETTLE_NS: Final = 500.0 * _MS  # time constant with which what is published follows the fit
 _SLEW: Final = 0.002  # at most by that much faster or slower
@@ -39,6 +44,10 @@ class HostLine:
         Place on the device line at which :meth:`update` wants to be called.
     steps : deque of int
         Steps of the host's clock [ns]; whoever reads it takes it out.
+    advance_ns : int
+        How much earlier than the envelope stamps shall be: the constant part of the path delay.
+    line : Line
+        The latest fit; before the first, only its ratio means something: the guess.
 
     Notes
     -----
@@ -67,9 +76,7 @@ class HostLine:
 
     def __init__(self, ratio: float) -> None:
         self.line = Line(0, 0, ratio, 0.0)
-        self.advance_ns = (
-            0  # how much earlier than the envelope stamps shall be: the constant path delay
-        )
+        self.advance_ns = 0
         self.steps: deque[int] = deque(maxlen=64)
         self.reset()
 
@@ -128,7 +135,7 @@ class HostLine:
         if len(packets) < _FEWEST or span < _QUIET_LOCK_NS:
             return
         line = supporting_line(packets, self.line.ratio)
-        if line is None or not _RATIOS[0] < line.ratio < _RATIOS[1]:
+        if line is None or not is_credible(line.ratio):
             self._drop_first_half(span)
             return
         if span < _LOCK_NS and line.excess > _QUIET_NS:

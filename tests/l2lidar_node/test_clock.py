@@ -228,6 +228,19 @@ def test_one_stamp_of_nonsense_is_dropped() -> None:
     assert [event.kind for event in clock.events()] == [ClockEventKind.LOCKED]
 
 
+@pytest.mark.parametrize("ratio", [0.3, 5.0])
+def test_a_ratio_no_unit_has_is_not_believed(ratio: float) -> None:
+    clock = DeviceClock(ClockConfig())
+
+    stamps = [
+        observe_imu(clock, n, int(n * 4_000_000 / ratio), 10**18 + n * 4_000_000)
+        for n in range(1000)
+    ]
+
+    assert set(stamps) == {None}
+    assert not clock.status().locked
+
+
 def test_without_time_correction_device_stamps_pass_unscaled() -> None:
     config = ClockConfig(enable_l2_time_correction=False)
     replay = Replay(Scenario(seconds=5.0, sync="once"), seed=1, config=config)
