@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -15,6 +17,8 @@ from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.ros.conversions import from_cloud, from_time
+
+_PAIRS: Final = 60
 
 
 @dataclass(slots=True)
@@ -70,6 +74,10 @@ class Observer(Node):
         super().__init__("l2lidar_demo_observer")
         self.clouds = TopicRecord()
         self.imu = TopicRecord()
+        self.deskewed = TopicRecord()
+        self.odometry = TopicRecord()
+        self.positions: list[tuple[float, float, float]] = []
+        self.pairs: dict[int, list[NDArray[np.void] | None]] = {}
         self.points: list[int] = []
         self.cloud: NDArray[np.void] | None = None
         self.fields: list[str] = []
@@ -80,8 +88,15 @@ class Observer(Node):
         deep = QoSProfile(depth=500, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(PointCloud2, "/points", self._cloud, deep)
         self.create_subscription(Imu, "/imu/data", self._imu, deep)
+        self.create_subscription(PointCloud2, "/points_deskewed", self._deskewed, deep)
+        self.create_subscription(Odometry, "/odometry", self._odometry, deep)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
         self.create_subscription(TFMessage, "/tf_static", self._transform, latched)
+
+    @property
+    def checks(self) -> dict[str, dict[str, str]]:
+        """The latest value of every check by name, of all nodes."""
+        return {name: check for entry in self.diagnostics for name, check in entry.items()}
 
     def watch(self, until: float) -> None:
         """Handle what arrives until a monotonic time [s]."""
@@ -93,6 +108,23 @@ class Observer(Node):
         self.cloud = from_cloud(message)
         self.fields = [item.name for item in message.fields]
         self.points.append(message.width * message.height)
+        self._pair(from_time(message.header.stamp), 0, self.cloud)
+
+    def _deskewed(self, message: PointCloud2) -> None:
+        stamp = from_time(message.header.stamp)
+        self.deskewed.add(stamp, message.header.frame_id)
+        self._pair(stamp, 1, from_cloud(message))
+
+    def _odometry(self, message: Odometry) -> None:
+        self.odometry.add(from_time(message.header.stamp), message.header.frame_id)
+        place = message.pose.pose.position
+        self.positions.append((place.x, place.y, place.z))
+
+    def _pair(self, stamp: int, side: int, points: NDArray[np.void]) -> None:
+        """Keep the clouds of the last few stamps, raw beside deskewed."""
+        self.pairs.setdefault(stamp, [None, None])[side] = points
+        for old in sorted(self.pairs)[:-_PAIRS]:
+            del self.pairs[old]
 
     def _imu(self, message: Imu) -> None:
         self.imu.add(from_time(message.header.stamp), message.header.frame_id)

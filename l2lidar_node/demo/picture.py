@@ -1,4 +1,4 @@
-"""Draws a cloud, coloured by range, without a screen."""
+"""Draws clouds and tracks without a screen."""
 
 from __future__ import annotations
 
@@ -38,4 +38,55 @@ def save_cloud(points: NDArray[np.void], path: Path, title: str) -> None:
     plan.set_aspect("equal")
     plan.set(xlabel="x [m]", ylabel="y [m]", title="from above")
     figure.colorbar(dots, ax=plan, label="range [m]")
+    figure.savefig(path)
+
+
+def save_comparison(raw: NDArray[np.void], deskewed: NDArray[np.void], path: Path) -> None:
+    """Write a picture of one sweep from above, as measured and deskewed.
+
+    Parameters
+    ----------
+    raw, deskewed : ndarray, shape (N,), dtype with x, y, z
+        Cloud frame [m].
+    path : Path
+        PNG file; missing folders are made.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(13, 6.5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    for column, (title, points) in enumerate((("as measured", raw), ("deskewed", deskewed))):
+        plan = figure.add_subplot(1, 2, column + 1)
+        height: dict[str, Any] = {"c": points["z"], "cmap": "viridis", "vmin": 0.0, "vmax": 3.0}
+        plan.scatter(points["x"], points["y"], s=1.5, linewidths=0, **height)
+        plan.set_aspect("equal")
+        plan.set(xlabel="x [m]", ylabel="y [m]", title=title)
+    figure.savefig(path)
+
+
+def save_track(
+    estimated: NDArray[np.float64], true: NDArray[np.float64], path: Path, title: str
+) -> None:
+    """Write a picture of an estimated track over the true one, from above and over time.
+
+    Parameters
+    ----------
+    estimated, true : ndarray, shape (N, 3)
+        In the world [m].
+    path : Path
+        PNG file; missing folders are made.
+    title : str
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(13, 6), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    plan = figure.add_subplot(1, 2, 1)
+    plan.plot(true[:, 0], true[:, 1], color="0.6", linewidth=4, label="truth")
+    plan.plot(estimated[:, 0], estimated[:, 1], "tab:red", linewidth=1.2, label="odometry")
+    plan.set_aspect("equal")
+    plan.set(xlabel="x [m]", ylabel="y [m]")
+    plan.legend()
+    errors = figure.add_subplot(1, 2, 2)
+    errors.plot(1e3 * np.linalg.norm(estimated - true, axis=1), "tab:red")
+    errors.set(xlabel="sweep", ylabel="distance from the truth [mm]", ylim=(0, None))
     figure.savefig(path)

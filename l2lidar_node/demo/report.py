@@ -1,0 +1,125 @@
+"""Tells what was seen in the demo, how right it was, and where the pictures are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from l2lidar_node.demo import accuracy, picture
+from l2lidar_node.demo.observer import Observer
+from l2lidar_node.emulator.results import Results
+from l2lidar_node.wire import PacketType
+
+_NOMINAL: Final = {"point packets [1/s]": 215.6, "IMU packets [1/s]": 250.0}
+_TOLERANCE: Final = 0.02
+_MAX_ATE_M: Final = 0.05
+_MIN_POSES: Final = 10
+
+
+def report(console: Console, observer: Observer, folder: Path, with_odometry: bool) -> list[str]:
+    """Print what was seen, write pictures, and return what is wrong.
+
+    Parameters
+    ----------
+    console : Console
+    observer : Observer
+    folder : Path
+        Of the pictures; its subfolder ``truth`` is what the virtual L2 wrote.
+    with_odometry : bool
+        Whether deskew and odometry took part.
+    """
+    console.print(_topics(observer, with_odometry))
+    troubles = _troubles(observer)
+    truth = Results(folder / "truth")
+    if observer.points:
+        console.print(
+            f"{np.mean(observer.points):.0f} points per cloud, fields "
+            f"{', '.join(observer.fields)}; /tf_static: "
+            f"{', '.join(f'{parent} -> {child}' for parent, child in observer.transforms)}"
+        )
+    if len(observer.imu.stamps) > 1:
+        spacing = observer.imu.intervals_ms
+        errors = accuracy.stamp_errors_ms(truth, PacketType.IMU, observer.imu.stamps)
+        console.print(
+            f"IMU stamps {spacing.mean():.4f} ms apart (standard deviation {spacing.std():.4f}), "
+            f"off the truth by {np.median(errors):.3f} ms, p99 {np.percentile(errors, 99):.3f} ms"
+        )
+    console.print(f"lost packets: {_lost(observer.checks.get('link', {}))}")
+    if observer.cloud is not None:
+        picture.save_cloud(observer.cloud, folder / "cloud.png", "one cloud, as measured")
+    if with_odometry:
+        troubles += _odometry(console, observer, truth, folder)
+    console.print(f"pictures: {', '.join(str(path) for path in sorted(folder.glob('*.png')))}")
+    return troubles
+
+
+def _topics(observer: Observer, with_odometry: bool) -> Table:
+    table = Table("topic", "rate [1/s]", "frame", "stamps", "age p50 / p99 [ms]")
+    records = {"/points": observer.clouds, "/imu/data": observer.imu}
+    if with_odometry:
+        records |= {"/points_deskewed": observer.deskewed, "/odometry": observer.odometry}
+    for name, record in records.items():
+        ages = np.percentile(record.ages_s, [50, 99]) * 1e3 if record.ages_s else [np.nan, np.nan]
+        steps = record.backward_steps
+        table.add_row(
+            name,
+            f"{record.rate_hz:.2f}",
+            record.frame,
+            "ascending" if not steps else f"{steps} steps back",
+            f"{ages[0]:.1f} / {ages[1]:.1f}",
+        )
+    return table
+
+
+def _odometry(console: Console, observer: Observer, truth: Results, folder: Path) -> list[str]:
+    """Judge the track and draw it; return what is wrong."""
+    if len(observer.positions) < _MIN_POSES:
+        return [f"/odometry: {len(observer.positions)} poses, expected {_MIN_POSES} and more"]
+    positions = np.array(observer.positions)
+    track = accuracy.track_error(truth, observer.odometry.stamps, positions)
+    text = (
+        f"odometry: {1e3 * track.ate_m:.1f} mm RMS off the truth "
+        f"(at most {1e3 * track.worst_m:.1f} mm) over {track.length_m:.1f} m"
+    )
+    console.print(text)
+    picture.save_track(track.estimated, track.true, folder / "track.png", text)
+    moved = [(raw, deskewed) for raw, deskewed in observer.pairs.values() if raw is not None
+             and deskewed is not None]  # fmt: skip
+    if moved:
+        picture.save_comparison(*moved[len(moved) // 2], folder / "deskew.png")
+    if not observer.deskewed.stamps:
+        return ["/points_deskewed: nothing received"]
+    if track.ate_m > _MAX_ATE_M:
+        return [f"odometry is off by {track.ate_m:.3f} m, expected less than {_MAX_ATE_M} m"]
+    return []
+
+
+def _troubles(observer: Observer) -> list[str]:
+    troubles = []
+    for name, record in (("/points", observer.clouds), ("/imu/data", observer.imu)):
+        if not record.stamps:
+            troubles.append(f"{name}: nothing received")
+        elif record.backward_steps:
+            troubles.append(f"{name}: stamps step back")
+    if not observer.diagnostics:
+        return [*troubles, "/diagnostics: nothing received"]
+    for name, nominal in _NOMINAL.items():
+        rates = [
+            float(entry["device"][name])
+            for entry in observer.diagnostics
+            if name in entry.get("device", {})
+        ]
+        if abs(np.mean(rates) - nominal) > _TOLERANCE * nominal:
+            troubles.append(f"{name} is {np.mean(rates):.1f}, expected {nominal}")
+    lost = _lost(observer.checks.get("link", {}))
+    if lost:
+        troubles.append(f"{lost} packets lost")
+    return troubles
+
+
+def _lost(link: dict[str, str]) -> int:
+    return sum(int(link.get(f"{stream} lost", 0)) for stream in ("points", "imu"))
