@@ -83,7 +83,7 @@ class KissMatcher:
         return np.asarray(pose) if np.isfinite(pose).all() else None
 
     def update(self, points: F64, pose: F64, guess: F64) -> None:
-        """Add points (N, 3) [m] at a pose (4, 4) to the map; learn how good its guess (4, 4) was."""
+        """Add points (N, 3) [m] at a pose (4, 4) to the map; learn how good its guess was."""
         if len(points) < LEAST_POINTS:
             return
         self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)

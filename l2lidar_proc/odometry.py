@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import startup, sweep_motion
-from l2lidar_proc.alignment import Alignment, Source, align
 from l2lidar_proc.imu_window import ImuWindow, Samples
 from l2lidar_proc.inertial_filter import GYRO_BIAS, POSITION, TURN, VELOCITY, InertialState, Noise
-from l2lidar_proc.kiss import KissMatcher, thinned
 from l2lidar_proc.odometry_config import OdometryConfig
-from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status, weakest
-from l2lidar_proc.relocation import likely_places
-from l2lidar_proc.surfels import SurfelMap
+from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
+from l2lidar_proc.sweep_matcher import SweepMatcher, xyz
 from l2lidar_proc.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
@@ -28,14 +25,10 @@ _OPENING_ROUNDS: Final = 6
 _OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the rounds
 _WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
 _LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
+_COAST_NS: Final = 3_000_000_000  # an unconfirmed velocity is kept for so long,
+_COAST_S: Final = 1.0  # and then fades with this time constant
 _PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
 _DEGENERATE: Final = 0.01  # share of points below which a direction counts as not observed
-_LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
-_AGREEMENT: Final = (
-    0.6,
-    0.92,
-)  # that an alignment needs after a good prediction, after a loose one
-_OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
 _LOST_SWEEPS: Final = 25
 _STEADY_SIGMA: Final = 0.5  # [rad/s] of the assumption that the rate stays, where there is no gyro
 
@@ -58,9 +51,8 @@ class Odometry:
     Attributes
     ----------
     config : OdometryConfig
-    surfaces : SurfelMap
-        IMU's first place is its origin.
-    kiss : KissMatcher
+    matcher : SweepMatcher
+        Holds the maps, whose origin is the IMU's first place.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
@@ -73,24 +65,18 @@ class Odometry:
     def configure(self, config: OdometryConfig) -> None:
         """Take new live settings; the others come into force with :meth:`reset`."""
         self.config = config
+        self.matcher.config = config
 
     def reset(self) -> None:
         """Forget map and motion; the next sweep begins a new map."""
-        settings = self.config.surfaces
-        self.surfaces = SurfelMap(
-            settings.surface_sizes,
-            thickness=settings.surface_thickness,
-            least=settings.surface_points,
-            capacity=settings.surface_capacity,
-        )
-        self.kiss = KissMatcher(self.config)
+        self.matcher = SweepMatcher(self.config, self._lever)
         self._held: list[Sweep] = []
         self._state: InertialState | None = None
         self._covariance: F64 = np.zeros((18, 18))
         self._trusts_gravity = False
         self._steady: F64 = np.zeros(3)
         self._lost_sweeps = 0
-        self._pruned_at: F64 = np.zeros(3)
+        self._aligned_at = HostNs(0)
         self._last: OdometryEstimate | None = None
 
     def imu(self, samples: Samples) -> None:
@@ -128,14 +114,17 @@ class Odometry:
             return self._opened(sweep)
         motion = self._predicted(sweep, self._state, self._covariance)
         status += self._imu_status(motion)
-        source = self._source(sweep, motion)
-        found = self._aligned(source, motion)
+        source = self.matcher.source(sweep, motion)
+        found = self.matcher.match(source, motion)
+        guess = motion.state
         if found is None:
+            motion = self._coasted(motion)
             few = len(source.points) < self.config.min_points
             status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
             self._lost_sweeps += not few
         else:
             motion = motion.corrected(found.state, found.covariance)
+            self._aligned_at = motion.state.stamp
             self._lost_sweeps = 0
         self._keep(motion)
         moved = motion.deskewed(sweep, self._lever)
@@ -143,8 +132,9 @@ class Odometry:
             status.append(Status.LOST)
             self._forget_map()
         if found is not None or Status.LOST in status:
-            self._extend(moved, motion)
-        return [self._estimate(motion, moved, status, self._quality(source, found))]
+            self.matcher.extend(moved, motion, guess)
+        quality = self.matcher.quality(len(source.points), found)
+        return [self._estimate(motion, moved, status, quality)]
 
     def extrapolated(self, stamp: HostNs) -> InertialState | None:
         """Return the state that the IMU leads to since the latest reference, None before it.
@@ -192,7 +182,7 @@ class Odometry:
         estimates = []
         for one, motion in zip(held, earlier + motions, strict=True):
             status = [Status.STARTING, *self._imu_status(motion)]
-            quality = AlignmentQuality(points=len(one.points), map_cells=len(self.surfaces))
+            quality = self.matcher.quality(len(one.points), None)
             moved = motion.deskewed(one, self._lever)
             estimates.append(self._estimate(motion, moved, status, quality))
         held.clear()
@@ -213,20 +203,22 @@ class Odometry:
             self._forget_map()
             first = self._predicted(sweeps[0], start, opening.covariance, since)
             motions = [first]
-            self._extend(first.deskewed(sweeps[0], self._lever), first)
+            self.matcher.extend(first.deskewed(sweeps[0], self._lever), first, first.state)
             for sweep in sweeps[1:]:
                 motion = self._predicted(sweep, motions[-1].state, motions[-1].covariance)
-                found = self._aligned(self._source(sweep, motion), motion, opening=True)
+                source = self.matcher.source(sweep, motion)
+                found = self.matcher.match(source, motion, opening=True)
                 if found is None:
                     return []
                 motion = motion.corrected(found.state, found.covariance)
                 motions.append(motion)
-                self._extend(motion.deskewed(sweep, self._lever), motion)
+                self.matcher.extend(motion.deskewed(sweep, self._lever), motion, motion.state)
             velocity = motions[1].state_at(reference).velocity
             if np.linalg.norm(velocity - start.velocity) < _OPENING_STEP:
                 break
             start = dataclasses.replace(start, velocity=velocity)
         self._keep(motions[-1])
+        self._aligned_at = motions[-1].state.stamp
         return motions
 
     def _restart(self, reference: HostNs) -> None:
@@ -235,18 +227,20 @@ class Odometry:
         self._state = dataclasses.replace(
             self._state, stamp=HostNs(reference - 1), velocity=np.zeros(3)
         )
-        self._covariance = self._covariance.copy()
         for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
-            self._loosen(errors, sigma)
+            self._covariance = _loosened(self._covariance, errors, sigma)
 
-    def _loosen(self, errors: slice, sigma: float) -> None:
-        self._covariance[errors, :] = 0.0
-        self._covariance[:, errors] = 0.0
-        self._covariance[errors, errors] = sigma**2 * np.eye(3)
+    def _coasted(self, motion: SweepMotion) -> SweepMotion:
+        """Return a motion that slows down when nothing has confirmed the velocity for long."""
+        state = motion.state
+        if self._state is None or state.stamp - self._aligned_at < _COAST_NS:
+            return motion
+        kept = float(np.exp(-(state.stamp - self._state.stamp) * 1e-9 / _COAST_S))
+        state = dataclasses.replace(state, velocity=kept * state.velocity)
+        return motion.corrected(state, motion.covariance)
 
     def _forget_map(self) -> None:
-        self.surfaces.clear()
-        self.kiss.clear()
+        self.matcher.clear()
         self._lost_sweeps = 0
 
     # ---- steps
@@ -260,8 +254,7 @@ class Odometry:
 
     def _cropped(self, sweep: Sweep) -> Sweep:
         """Return the sweep without points that are not finite or out of range."""
-        xyz = _xyz(sweep.points)
-        squared = (xyz * xyz).sum(axis=1)
+        squared = (xyz(sweep.points) ** 2).sum(axis=1)
         inside = (squared >= self.config.min_range**2) & (squared <= self.config.max_range**2)
         inside &= np.isfinite(sweep.points["time"])
         if inside.all():
@@ -278,6 +271,10 @@ class Odometry:
         self, state: InertialState, covariance: F64, span: tuple[HostNs, HostNs], reference: HostNs
     ) -> SweepMotion:
         samples = self._imu.between(min(span[0], state.stamp), max(span[1], reference))
+        inside = (samples["stamp"] >= state.stamp) & (samples["stamp"] <= max(span[1], reference))
+        if not inside.any():
+            # the bias stands for what the rate has changed by: the sweep itself will tell
+            covariance = _loosened(covariance, GYRO_BIAS, _STEADY_SIGMA)
         gap = reference - state.stamp
         if gap > _LONG_GAP_NS and len(samples) * _PERIOD_S * 1e9 < 0.5 * gap:
             state = dataclasses.replace(state, velocity=np.zeros(3))
@@ -301,75 +298,16 @@ class Odometry:
             uses_forces=self._trusts_gravity and settings.use_accelerometer,
         )
 
-    def _source(self, sweep: Sweep, motion: SweepMotion) -> Source:
-        """Return the points to align, deskewed along the prediction."""
-        xyz = _xyz(motion.deskewed(sweep, self._lever))
-        chosen = thinned(xyz, self.config.surfaces.source_voxel)
-        chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
-        offset = (sweep.start - motion.state.stamp) * 1e-9
-        return Source(
-            xyz[chosen] - self._lever,
-            offset + sweep.points["time"][chosen].astype(np.float64),
-            np.linalg.norm(xyz[chosen], axis=1),
-        )
-
-    def _aligned(
-        self, source: Source, motion: SweepMotion, opening: bool = False
-    ) -> Alignment | None:
-        """Return the alignment that can be believed, None if there is none."""
-        if len(source.points) < self.config.min_points or not len(self.surfaces):
-            return None
-        sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
-        loose = sigma > _LOOSE_M
-        strict = loose and not opening
-        found = self._align(source, motion, motion.state)
-        if not loose or (strict and _believable(found, source, strict)):
-            return found if _believable(found, source, strict) else None
-        starts = [self._registered(source, motion.state)]
-        if strict:
-            starts += likely_places(motion.state, motion.covariance, source, self.surfaces)
-        others = [found, *(self._align(source, motion, start) for start in starts)]
-        good = [other for other in others if other and _believable(other, source, strict)]
-        return max(good, key=lambda other: other.agreement * other.matched, default=None)
-
-    def _align(
-        self, source: Source, motion: SweepMotion, start: InertialState
-    ) -> Alignment | None:
-        return align(
-            motion.state,
-            motion.covariance,
-            source,
-            self.surfaces,
-            self.config.surfaces,
-            self.config.min_points // 2,
-            start,
-        )
-
-    def _registered(self, source: Source, guess: InertialState) -> InertialState:
-        """Return the guess with the pose that KISS-ICP's registration finds."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = guess.rotation, guess.position
-        better = self.kiss.register(source.points, pose)
-        if better is None:
-            return guess
-        return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
-
     def _keep(self, motion: SweepMotion) -> None:
         """Remember the state for the next prediction."""
-        self._state, self._covariance = motion.state, motion.covariance
+        state, covariance = motion.state, motion.covariance
+        if motion.felt.missing.all() and self._state is not None:
+            bias = self._covariance[GYRO_BIAS, GYRO_BIAS]
+            covariance = _loosened(covariance, GYRO_BIAS, 0.0)
+            covariance[GYRO_BIAS, GYRO_BIAS] = bias
+            state = dataclasses.replace(state, gyro_bias=self._state.gyro_bias)
+        self._state, self._covariance = state, covariance
         self._steady = motion.rate
-
-    def _extend(self, moved: NDArray[np.void], motion: SweepMotion) -> None:
-        """Add deskewed points to the maps."""
-        points = _xyz(moved) - self._lever
-        state = motion.state
-        self.surfaces.add(points @ state.rotation.T + state.position)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = state.rotation, state.position
-        self.kiss.update(points, pose, pose)
-        if np.linalg.norm(state.position - self._pruned_at) > 0.2 * self.config.max_range:
-            self.surfaces.forget(state.position, self.config.max_range)
-            self._pruned_at = state.position
 
     # ---- what is reported
 
@@ -382,22 +320,6 @@ class Odometry:
         if not self._trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
         return status
-
-    def _quality(self, source: Source, found: Alignment | None) -> AlignmentQuality:
-        quality = AlignmentQuality(
-            points=len(source.points),
-            kiss_threshold_m=self.kiss.threshold,
-            map_cells=len(self.surfaces),
-        )
-        if found is None:
-            return quality
-        return dataclasses.replace(
-            quality,
-            matched=found.matched,
-            agreement=found.agreement,
-            residual_m=found.residual,
-            weakest=weakest(found.information[POSITION, POSITION]),
-        )
 
     def _estimate(
         self,
@@ -434,13 +356,10 @@ class Odometry:
         return self._last
 
 
-def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
-    return (
-        found is not None
-        and found.agreement >= _AGREEMENT[strict]
-        and found.matched >= _OVERLAP[strict] * len(source.points)
-    )
-
-
-def _xyz(points: NDArray[np.void]) -> F64:
-    return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+def _loosened(covariance: F64, errors: slice, sigma: float) -> F64:
+    """Return a covariance (18, 18) in which three errors are independent of all others."""
+    out = covariance.copy()
+    out[errors, :] = 0.0
+    out[:, errors] = 0.0
+    out[errors, errors] = sigma**2 * np.eye(3)
+    return out

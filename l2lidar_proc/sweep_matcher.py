@@ -1,0 +1,180 @@
+"""Keeps the maps and matches sweeps with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import Sweep
+from l2lidar_proc.alignment import Alignment, Source, align
+from l2lidar_proc.inertial_filter import POSITION, InertialState
+from l2lidar_proc.kiss import KissMatcher, thinned
+from l2lidar_proc.odometry_config import OdometryConfig
+from l2lidar_proc.odometry_estimate import AlignmentQuality, weakest
+from l2lidar_proc.relocation import likely_places
+from l2lidar_proc.surfels import SurfelMap
+from l2lidar_proc.sweep_motion import SweepMotion
+
+F64 = NDArray[np.float64]
+
+_LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
+_AGREEMENT: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
+_OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
+_PRUNING: Final = 0.2  # the map is pruned whenever this part of its radius was travelled
+
+
+class SweepMatcher:
+    """Two maps of the same points, surfaces and KISS-ICP's, and the matching of sweeps with them.
+
+    Parameters
+    ----------
+    config : OdometryConfig
+    lever : ndarray, shape (3,)
+        Place of the IMU in the cloud frame [m].
+
+    Attributes
+    ----------
+    config : OdometryConfig
+        May be replaced; what is not live comes into force with a new matcher.
+    surfaces : SurfelMap
+    kiss : KissMatcher
+    """
+
+    def __init__(self, config: OdometryConfig, lever: F64) -> None:
+        self.config = config
+        self._lever = lever
+        settings = config.surfaces
+        self.surfaces = SurfelMap(
+            settings.surface_sizes,
+            thickness=settings.surface_thickness,
+            least=settings.surface_points,
+            capacity=settings.surface_capacity,
+        )
+        self.kiss = KissMatcher(config)
+        self._pruned_at = np.zeros(3)
+
+    def clear(self) -> None:
+        """Forget the maps."""
+        self.surfaces.clear()
+        self.kiss.clear()
+
+    def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
+        """Return the points to align, deskewed along a predicted motion."""
+        points = xyz(motion.deskewed(sweep, self._lever))
+        chosen = thinned(points, self.config.surfaces.source_voxel)
+        chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
+        offset = (sweep.start - motion.state.stamp) * 1e-9
+        return Source(
+            points[chosen] - self._lever,
+            offset + sweep.points["time"][chosen].astype(np.float64),
+            np.linalg.norm(points[chosen], axis=1),
+        )
+
+    def match(
+        self, source: Source, motion: SweepMotion, *, opening: bool = False
+    ) -> Alignment | None:
+        """Return the alignment that can be believed, None if there is none.
+
+        A prediction that may be a surface off is not the only one to begin from: KISS-ICP's
+        registration and a search around it give others, and the result has to fit the map as
+        wrong ones do not.
+
+        Parameters
+        ----------
+        source : Source
+        motion : SweepMotion
+            The one that deskewed the source.
+        opening : bool
+            The map has only just begun: it cannot be searched, and wrong results are sorted out
+            later.
+        """
+        if len(source.points) < self.config.min_points or not len(self.surfaces):
+            return None
+        sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
+        loose = sigma > _LOOSE_M
+        strict = loose and not opening
+        found = self._align(source, motion, motion.state)
+        if not loose or (strict and _believable(found, source, strict)):
+            return found if _believable(found, source, strict) else None
+        starts = [self._registered(source, motion.state)]
+        if strict:
+            starts += likely_places(motion.state, motion.covariance, source, self.surfaces)
+        others = [found, *(self._align(source, motion, start) for start in starts)]
+        good = [other for other in others if other and _believable(other, source, strict)]
+        return max(good, key=lambda other: other.agreement * other.matched, default=None)
+
+    def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> None:
+        """Add the deskewed points (N,) of a sweep to the maps.
+
+        Parameters
+        ----------
+        moved : ndarray, shape (N,)
+        motion : SweepMotion
+            The one that deskewed them.
+        guess : InertialState
+            What was predicted: from it KISS-ICP learns how good predictions are.
+        """
+        state = motion.state
+        points = xyz(moved) - self._lever
+        self.surfaces.add(points @ state.rotation.T + state.position)
+        self.kiss.update(points, _pose(state), _pose(guess))
+        if np.linalg.norm(state.position - self._pruned_at) > _PRUNING * self.config.max_range:
+            self.surfaces.forget(state.position, self.config.max_range)
+            self._pruned_at = state.position
+
+    def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
+        """Return how well a sweep with so many points to align could be matched."""
+        quality = AlignmentQuality(
+            points=points, kiss_threshold_m=self.kiss.threshold, map_cells=len(self.surfaces)
+        )
+        if found is None:
+            return quality
+        return dataclasses.replace(
+            quality,
+            matched=found.matched,
+            agreement=found.agreement,
+            residual_m=found.residual,
+            weakest=weakest(found.information[POSITION, POSITION]),
+        )
+
+    def _align(
+        self, source: Source, motion: SweepMotion, start: InertialState
+    ) -> Alignment | None:
+        return align(
+            motion.state,
+            motion.covariance,
+            source,
+            self.surfaces,
+            self.config.surfaces,
+            self.config.min_points // 2,
+            start,
+        )
+
+    def _registered(self, source: Source, guess: InertialState) -> InertialState:
+        """Return the guess with the pose that KISS-ICP's registration finds."""
+        better = self.kiss.register(source.points, _pose(guess))
+        if better is None:
+            return guess
+        return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
+
+
+def xyz(points: NDArray[np.void]) -> F64:
+    """Return the coordinates of structured points (N,) as float64, shape (N, 3)."""
+    return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+
+
+def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
+    return (
+        found is not None
+        and found.agreement >= _AGREEMENT[strict]
+        and found.matched >= _OVERLAP[strict] * len(source.points)
+    )
+
+
+def _pose(state: InertialState) -> F64:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = state.rotation, state.position
+    return pose
