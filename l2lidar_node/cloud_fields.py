@@ -1,0 +1,90 @@
+"""Reads fields and points of a PointCloud2, whoever deserialised it: rclpy or rosbags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+DATATYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Type code by the number that PointField has for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A field of a cloud, as PointField says it."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+    @property
+    def code(self) -> str:
+        """Type such as ``f4``, ``f4[3]`` for more than one, ``?9`` for an unknown number."""
+        code = DATATYPES.get(self.datatype, f"?{self.datatype}")
+        return code if self.count <= 1 else f"{code}[{self.count}]"
+
+
+def fields_of(message: Any) -> tuple[Field, ...]:
+    """Return the fields of a PointCloud2."""
+    return tuple(
+        Field(str(item.name), int(item.offset), int(item.datatype), int(item.count))
+        for item in message.fields
+    )
+
+
+def dtype_of(fields: Iterable[Field], point_step: int, is_bigendian: bool) -> np.dtype[np.void]:
+    """Return the structured dtype of points.
+
+    Raises
+    ------
+    ValueError
+        If there is no field, one does not fit ``point_step`` or stands twice, or its type is
+        unknown, naming the field.
+    """
+    order = ">" if is_bigendian else "<"
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    for item in fields:
+        code = DATATYPES.get(item.datatype)
+        if code is None:
+            raise ValueError(f"field '{item.name}': datatype {item.datatype} is not known")
+        count = max(item.count, 1)
+        if item.offset + int(code[1]) * count > point_step:
+            raise ValueError(f"field '{item.name}': does not fit point_step {point_step}")
+        if not item.name or item.name in names:
+            raise ValueError(f"field '{item.name}': {'stands twice' if item.name else 'no name'}")
+        names.append(item.name)
+        formats.append(f"{order}{code}" if count == 1 else (f"{order}{code}", (count,)))
+        offsets.append(item.offset)
+    if not names:
+        raise ValueError("there are no fields")
+    return np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step}
+    )
+
+
+def points_of(message: Any) -> NDArray[np.void]:
+    """Return the points of a PointCloud2, row by row, shape (N,), where possible without a copy.
+
+    Raises
+    ------
+    ValueError
+        If sizes and data do not agree, or a field is impossible.
+    """
+    layout = dtype_of(fields_of(message), message.point_step, message.is_bigendian)
+    data = np.frombuffer(message.data, np.uint8)
+    used = message.width * message.point_step
+    row_step = message.row_step or used
+    if row_step < used or len(data) < row_step * message.height:
+        raise ValueError(
+            f"cloud of {message.width} x {message.height} points of {message.point_step} B has "
+            f"row_step {message.row_step} and {len(data)} B of data"
+        )
+    rows = data[: row_step * message.height].reshape(message.height, row_step)[:, :used]
+    return np.ascontiguousarray(rows).reshape(-1).view(layout)
