@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-import threading
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as NoAnswerError
 
 import rclpy
@@ -48,8 +47,7 @@ class DriverNode(Node):
     def __init__(self) -> None:
         super().__init__("l2lidar_node")
         self.exit_code = 0
-        self._answers: dict[int, Future[Answer]] = {}
-        self._answers_lock = threading.Lock()
+        self._answers: dict[int, Future[Answer]] = {}  # touched by the session's thread only
         self._settings = ParameterSet(self, DriverConfig, self._configure)
         config = self._settings.value
         self._open_publishers(config)
@@ -139,8 +137,7 @@ class DriverNode(Node):
         rclpy.try_shutdown()
 
     def _answered(self, answer: Answer) -> None:
-        with self._answers_lock:
-            future = self._answers.pop(answer.ticket, None)
+        future = self._answers.pop(answer.ticket, None)
         if future is not None:
             future.set_result(answer)
 
@@ -150,21 +147,20 @@ class DriverNode(Node):
             return response
         future: Future[Answer] = Future()
 
-        def command(driver: Driver, now: HostNs) -> list[Event]:
+        def command(driver: Driver, now: HostNs) -> None:
             if request.data:
                 ticket, events = driver.start_rotation(now), list[Event]()
             else:
                 ticket, events = driver.stop_rotation(now)
-            with self._answers_lock:
-                self._answers[ticket] = future
-            return events
+            self._answers[ticket] = future
+            for event in events:
+                self._handle(event)
 
         try:
-            for event in self._session.call(command).result(_ANSWER_TIMEOUT_S):
-                self._handle(event)
+            self._session.call(command).result(_ANSWER_TIMEOUT_S)
             answer = future.result(_ANSWER_TIMEOUT_S)
             response.success, response.message = answer.ok, answer.text
-        except NoAnswerError:
+        except (NoAnswerError, CancelledError):
             response.success, response.message = False, "the driver did not get to it in time"
         return response
 
@@ -173,12 +169,19 @@ class DriverNode(Node):
         if self._settings.value.files.replay_file:
             response.success, response.message = False, _NO_DEVICE
             return response
-        for event in self._session.call(lambda driver, now: driver.reset_device(now)).result():
-            self._handle(event)
-        response.success = True
-        response.message = (
-            "reset sent; the device does not acknowledge it and is back in about 25 s"
-        )
+
+        def command(driver: Driver, now: HostNs) -> None:
+            for event in driver.reset_device(now):
+                self._handle(event)
+
+        try:
+            self._session.call(command).result(_ANSWER_TIMEOUT_S)
+            response.success = True
+            response.message = (
+                "reset sent; the device does not acknowledge it and is back in about 25 s"
+            )
+        except (NoAnswerError, CancelledError):
+            response.success, response.message = False, "the driver did not get to it in time"
         return response
 
 
