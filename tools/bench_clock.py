@@ -155,12 +155,12 @@ def targets(results: list[dict[str, Any]]) -> list[Target]:
         at_most("data until locked (s)", _most(results, "lock_s"), 2.0),
         at_most("p99 of the IMU spacing error (us)", _most(results, "imu_spacing_p99_us"), 10.0),
         at_least(
-            "p99 of arrival stamping over ours, rows with jitter or bursts",
+            "p99 of arrival stamping over ours, IMU on, rows with jitter or bursts",
             _least_gain(disturbed, "arrival_p99_ms"),
             20.0,
         ),
         at_least(
-            "p99 of upstream's rule over ours, rows with jitter, bursts or sync",
+            "p99 of upstream's rule over ours, IMU on, rows with jitter, bursts or sync",
             _least_gain(disturbed + synced, "upstream_p99_ms"),
             20.0,
         ),
