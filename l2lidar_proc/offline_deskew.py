@@ -1,7 +1,8 @@
 """Deskews and filters the clouds of a recording with the same code as the node, without ROS.
 
 ``python -m l2lidar_proc.offline_deskew IN OUT``: IN and OUT are rosbag2 folders or MCAP files.
-Everything that is in IN is in OUT, and the deskewed clouds besides.
+Everything that is in IN is in OUT, and the deskewed clouds besides. Where IN has no velocity, this
+package's odometry estimates it on the way.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from l2lidar_proc import bag
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig
 from l2lidar_proc.frames import FrameTree
+from l2lidar_proc.odometry import Odometry
+from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.velocity import carried_over
 
@@ -38,7 +41,7 @@ class Topics:
     ----------
     cloud, imu : str
     velocity : str
-        Empty where there is none.
+        Empty where there is none: then this package's odometry estimates it.
     """
 
     cloud: str
@@ -57,6 +60,9 @@ class _Deskewer:
         self._output = config.topics.output_topic
         self._topics = topics
         self._writer = writer
+        self._odometry: Odometry | None = None
+        if not topics.velocity and config.topics.velocity_type == "odometry":
+            self._odometry = Odometry(OdometryConfig(), config.proc.motion.T_cloud_imu)
         self._frames = FrameTree()
         self._cloud_frame = ""
 
@@ -65,10 +71,11 @@ class _Deskewer:
         if topic == self._topics.cloud:
             self._cloud(message, now)
         elif topic == self._topics.imu:
-            T_cloud_imu = self._frames.find(self._cloud_frame, message.header.frame_id)
-            if T_cloud_imu is not None and self._cloud_frame != message.header.frame_id:
-                self.pipeline.tracker.mount(T_cloud_imu)
-            self.pipeline.imu(bag.sample_of(message))
+            self._mount(message.header.frame_id)
+            sample = bag.sample_of(message)
+            self.pipeline.imu(sample)
+            if self._odometry is not None:
+                self._odometry.imu(sample)
         elif topic == self._topics.velocity:
             self._velocity(message)
         elif kind == bag.TRANSFORMS and topic.endswith("tf_static") and self._uses_tf:
@@ -76,10 +83,20 @@ class _Deskewer:
                 self._frames.add(parent, child, transform)
         self.finish(now)
 
+    def _mount(self, imu_frame: str) -> None:
+        T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
+        if T_cloud_imu is None or self._cloud_frame == imu_frame:
+            return
+        if self.pipeline.tracker.mount(T_cloud_imu) and self._odometry is not None:
+            self._odometry = Odometry(OdometryConfig(), T_cloud_imu)
+
     def finish(self, now: int) -> None:
         """Write what is finished by ``now`` [ns]."""
         for item in self.pipeline.poll(now):
             self._write(item, min(now, int(item.sweep.end) + item.waited_ns))
+            if self._odometry is not None:
+                for estimate in self._odometry.register(item.sweep):
+                    self.pipeline.velocity(estimate.stamp, estimate.velocity, "own odometry")
 
     def _write(self, item: Deskewed, now: int) -> None:
         self._writer.cloud(self._output, now, item.points, item.stamp, self._cloud_frame)

@@ -99,11 +99,16 @@ class MotionTracker:
         self._config = config
         self.velocities.max_age_ns = config.velocity_max_age_ms * 1_000_000
 
-    def mount(self, T_cloud_imu: rotations.F64) -> None:
-        """Take another place of the IMU, shape (4, 4); if it differs, what was learned is void."""
-        if not np.allclose(T_cloud_imu, self._T_cloud_imu, rtol=0.0, atol=1e-9):
-            self._T_cloud_imu = T_cloud_imu
-            self.attitude = AttitudeFilter(T_cloud_imu, self._config.max_gyro_bias)
+    def mount(self, T_cloud_imu: rotations.F64) -> bool:
+        """Take the place of the IMU, shape (4, 4); return whether it is another one.
+
+        Then what was learned is void.
+        """
+        if np.allclose(T_cloud_imu, self._T_cloud_imu, rtol=0.0, atol=1e-9):
+            return False
+        self._T_cloud_imu = T_cloud_imu
+        self.attitude = AttitudeFilter(T_cloud_imu, self._config.max_gyro_bias)
+        return True
 
     def reset(self) -> None:
         """Forget all motion, as after a jump of the clock."""

@@ -141,8 +141,8 @@ def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]
 
 def _follow(odometry: Odometry, tracker: MotionTracker, item: TrueSweep) -> None:
     """Let the odometry tell the tracker how the sensor moved: of use from the next sweep on."""
-    estimate = odometry.register(item.sweep)
-    tracker.velocity(estimate.stamp, estimate.velocity, "odometry")
+    for estimate in odometry.register(item.sweep):
+        tracker.velocity(estimate.stamp, estimate.velocity, "odometry")
 
 
 def _ours(tracker: MotionTracker, item: TrueSweep) -> F64:

@@ -15,6 +15,7 @@ from l2lidar_proc import bag
 from l2lidar_proc.config import DeskewNodeConfig
 from l2lidar_proc.offline_deskew import RecordingError, deskew_recording, main
 from tests.l2lidar_proc.analytic import Motion, at, rms, seen, xyz
+from tools.deskew_scenarios import Scenario, record
 
 WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -32,12 +33,12 @@ def vector(values):
     return T["geometry_msgs/msg/Vector3"](*(float(v) for v in values))
 
 
-def imu(sample):
+def imu(sample, frame="imu"):
     seconds = (int(sample["stamp"]) - at(0)) * 1e-9
     q = T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     none = np.zeros(9)
     rate, force = vector(sample["angular_velocity"]), vector(sample["linear_acceleration"])
-    return T[bag.IMU](header(seconds, "imu"), q, none, rate, none, force, none)
+    return T[bag.IMU](header(seconds, frame), q, none, rate, none, force, none)
 
 
 def odometry(seconds: float):
@@ -167,3 +168,32 @@ def test_clouds_without_plain_times_are_passed_on_without_them(recording, tmp_pa
     assert refused == {"all 5 times are equal": 1}
     (cloud,) = read(tmp_path / "x")["points_deskewed"]
     assert "time" not in [item.name for item in cloud.fields]
+
+
+def test_without_a_velocity_our_odometry_finds_it(tmp_path):
+    walk = record(Scenario("walk", "walk", 1.0, world="box", seconds=6.0))
+    shift = at(0) - int(walk.samples["stamp"][0])
+    path = tmp_path / "imu"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        line = writer.add_connection("/imu/data", bag.IMU, typestore=TYPES)
+        for sample in walk.samples.copy():
+            sample["stamp"] += shift
+            data = TYPES.serialize_cdr(imu(sample), bag.IMU)
+            writer.write(line, int(sample["stamp"]), data)
+    source, target = tmp_path / "source", tmp_path / "target"
+    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as writer:
+        waiting = [item.sweep for item in walk.sweeps]
+        for connection, recorded, data in bag.messages(reader):
+            while waiting and recorded > waiting[0].end + shift:
+                sweep = waiting.pop(0)
+                start = sweep.start + shift
+                writer.cloud("/points", recorded, sweep.points, start, "lidar")
+            writer.copy(connection, recorded, data)
+    deskew_recording(source, target, DeskewNodeConfig())
+    clouds = {bag.stamp_of(message): message for message in read(target)["points_deskewed"]}
+    late = [item for item in walk.sweeps[-6:] if item.sweep.start + shift in clouds]
+    assert len(late) >= 5
+    for item in late:
+        points = bag.points_of(clouds[item.sweep.start + shift])
+        assert rms(xyz(points) - item.at_start) < 0.01
+        assert rms(xyz(item.sweep.points) - item.at_start) > 0.1
