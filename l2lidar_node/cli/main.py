@@ -10,6 +10,7 @@ import typer
 
 from l2lidar_node.cli import changes, readings
 from l2lidar_node.cli.changes import UsageError
+from l2lidar_node.cli.check import check
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.cli.discover import discover
 from l2lidar_node.cli.record import convert, record
@@ -17,6 +18,7 @@ from l2lidar_node.cli.replay import replay
 from l2lidar_node.cli.rotation import reset, start, stop
 from l2lidar_node.cli.status import info, monitor
 from l2lidar_node.cli.sync_check import sync_check
+from l2lidar_node.cli.view import view
 from l2lidar_node.settings import SettingError
 from l2lidar_node.transport import TransportError
 
@@ -40,7 +42,7 @@ def app() -> typer.Typer:
     made.add_typer(readings.app, name="get", rich_help_panel=_UNIT)
     made.add_typer(changes.app, name="set", rich_help_panel=_UNIT)
     made.command("sync-check", rich_help_panel=_UNIT)(sync_check)
-    for verb in (record, replay, convert):
+    for verb in (record, replay, convert, view):
         made.command(rich_help_panel=_DATA)(verb)
     made.command(
         rich_help_panel=_DATA,

@@ -1,0 +1,51 @@
+"""The rerun viewer on live topics."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(
+        importlib.util.find_spec("rerun") is None, reason="the viewer needs rerun-sdk"
+    ),
+]
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    with open_rig() as rig:
+        rig.driver(aggregateNframes=38)
+        rig.emulator("--ready")
+        rig.wait_for(lambda: rig.observer.clouds.stamps, "clouds")
+        yield rig
+
+
+def _view(*options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "l2lidar_node.cli.main", "view", *options],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+
+
+def test_what_is_published_is_written_for_the_viewer(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+    result = _view("--save", str(path), "--seconds", "4")
+    assert result.returncode == 0, result.stderr
+    shown = int(result.stdout.split()[0])
+    assert shown > 500  # 250 IMU samples a second
+    assert path.stat().st_size > 200_000
+
+
+def test_silence_is_said(tmp_path: Path) -> None:
+    result = _view("--save", str(tmp_path / "none.rrd"), "--seconds", "1")
+    assert result.returncode == 1
+    assert "is the driver running" in result.stderr
