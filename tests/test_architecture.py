@@ -22,6 +22,7 @@ MAX_LINES = 350
 OPENERS = {"open", "read_text", "read_bytes", "write_text", "write_bytes"}
 # Reads or writes files although it is not at the rim, each for a reason.
 FILE_MODULES = {
+    "l2lidar_node.bag": "writes bags",
     "l2lidar_node.emulator.assembly": "reads what the virtual unit was configured to",
     "l2lidar_node.emulator.backlog": "asks the kernel how full the receiver's socket is",
     "l2lidar_node.emulator.results": "writes the truth of a run",

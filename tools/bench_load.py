@@ -42,7 +42,7 @@ def decode_rate(rounds: int) -> float:
 
     payloads, _ = PatternScanner().packets(0, _SYNTHETIC_PACKETS)
     datagrams = [wire.encode_frame(wire.PacketType.POINTS_3D, item.tobytes()) for item in payloads]
-    starts = np.arange(FULL_TURN) * wire.MIRROR_PERIOD_S
+    starts = np.arange(FULL_TURN, dtype=np.float64) * wire.MIRROR_PERIOD_S
     rates = []
     for _ in range(rounds):
         framer, projector = Framer(), Projector(wire.PacketType.POINTS_3D)
