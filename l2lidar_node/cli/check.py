@@ -1,0 +1,119 @@
+"""`l2lidar check`: judges whether an odometry or mapping package can work with the topics."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from l2lidar_node.cli import recorded
+from l2lidar_node.cli.changes import UsageError
+from l2lidar_node.cli.console import out, print_json
+from l2lidar_node.cli.options import JsonOption
+from l2lidar_node.readiness.consumers import CONSUMERS
+from l2lidar_node.readiness.demands import Consumer, Use
+from l2lidar_node.readiness.findings import Finding, Level, worst
+from l2lidar_node.readiness.report import as_data, verdict
+from l2lidar_node.readiness.topics import SourceError, Topics
+from l2lidar_node.readiness.verdict import judge
+
+if TYPE_CHECKING:
+    from l2lidar_node.readiness.observation import Observation
+
+_COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
+_LISTEN_S: Final = 10.0
+_TOPIC: Final = re.compile(r"[~/]?[A-Za-z_]\w*(/[A-Za-z_]\w*)*")
+
+
+def _known(name: str) -> str:
+    if name not in CONSUMERS:
+        raise typer.BadParameter(f"'{name}' is not known, expected one of {', '.join(CONSUMERS)}")
+    return name
+
+
+def check(
+    for_: Annotated[
+        str,
+        typer.Option(
+            "--for",
+            callback=_known,
+            metavar="CONSUMER",
+            help=f"Who is to work with the topics: {', '.join(CONSUMERS)}.",
+        ),
+    ],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="[TOPIC|BAG]",
+            help="A topic of clouds, live; or a rosbag2 folder or MCAP file. "
+            "The only live topic of clouds if left out.",
+        ),
+    ] = "",
+    cloud: Annotated[
+        str, typer.Option(help="Topic of the clouds, if there are several.", metavar="TOPIC")
+    ] = "",
+    imu: Annotated[
+        str, typer.Option(help="Topic of the IMU, if there are several.", metavar="TOPIC")
+    ] = "",
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            help=f"How long to look; {_LISTEN_S:g} for topics, a recording whole if left out.",
+        ),
+    ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
+    json_: JsonOption = False,
+) -> None:
+    """Judge fields, times, rates, gaps, IMU, frames and QoS for one consumer, a line for each.
+
+    The exit code is 0 if nothing is in error, 1 if something is (with --strict: or warned of),
+    2 if there is nothing to judge.
+    """
+    consumer = CONSUMERS[for_]
+    try:
+        seen, topics = _observe(source, Topics(cloud, imu), consumer, seconds)
+    except SourceError as error:
+        raise UsageError(str(error)) from None
+    findings = judge(seen, consumer)
+    if json_:
+        print_json(as_data(findings, consumer, source, topics))
+    else:
+        _print(findings, consumer)
+    if worst(findings) >= (Level.WARN if strict else Level.ERROR):
+        raise typer.Exit(1)
+
+
+def _observe(
+    source: str, asked: Topics, consumer: Consumer, seconds: float | None
+) -> tuple[Observation, Topics]:
+    needs_imu = consumer.imu is not Use.IGNORED
+    path = Path(source)
+    if source and (path.exists() or not _TOPIC.fullmatch(source)):
+        return recorded.observe(path, asked, needs_imu, seconds)
+    try:
+        from l2lidar_node.ros import topic_source
+    except ImportError as error:
+        what = f"{source} is no file; topics" if source else "topics"
+        raise SourceError(f"{what} need a sourced ROS 2 ({error})") from None
+    if source and asked.cloud:
+        raise SourceError(f"topic '{source}' and --cloud {asked.cloud} say two things")
+    seconds = _LISTEN_S if seconds is None else seconds
+    with Console(stderr=True).status(f"listening for {seconds:g} s"):
+        return topic_source.observe(Topics(source or asked.cloud, asked.imu), needs_imu, seconds)
+
+
+def _print(findings: list[Finding], consumer: Consumer) -> None:
+    width = max(len(item.subject) for item in findings)
+    for item in findings:
+        line = Text(f"{item.level.name:5} ", style=_COLOURS[item.level])
+        line.append(f"{item.subject:{width}}  ", style="cyan")
+        line.append(item.text, style="default")
+        if item.fix:
+            line.append(f"; {item.fix}", style="bold default")
+        out.print(line, soft_wrap=True)
+    out.print(Text(verdict(findings, consumer), style=f"bold {_COLOURS[worst(findings)]}"))

@@ -1,0 +1,155 @@
+"""Gathers what comes on a pair of live topics, and what their publishers say of themselves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import rclpy
+from rcl_interfaces.srv import GetParameters
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, PointCloud2
+from tf2_msgs.msg import TFMessage
+
+from l2lidar_node.readiness.observation import Gathering, Observation, Qos
+from l2lidar_node.readiness.topics import SourceError, Topics, choose
+
+_DISCOVERY_S: Final = 3.0
+_LOOK_S: Final = 0.1
+_LEVELLING: Final = "imu_adjust"  # the driver's parameter, and upstream's
+
+
+def observe(asked: Topics, needs_imu: bool, seconds: float) -> tuple[Observation, Topics]:
+    """Return what comes within some seconds.
+
+    Parameters
+    ----------
+    asked : Topics
+    needs_imu : bool
+        Whether the consumer reads an IMU topic.
+    seconds : float
+        How long to listen once the topics are found.
+
+    Raises
+    ------
+    SourceError
+        If there are no such topics, or which to use is not plain.
+    """
+    rclpy.init(args=[])
+    node = Node("l2lidar_check")
+    try:
+        return _observe(node, asked, needs_imu, seconds)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _observe(
+    node: Node, asked: Topics, needs_imu: bool, seconds: float
+) -> tuple[Observation, Topics]:
+    asked = Topics(*(node.resolve_topic_name(topic) if topic else "" for topic in asked))
+    topics = _found(node, asked, needs_imu)
+    gathering = Gathering()
+    _listen(node, topics, gathering)
+    levelling = _Levelling(node, topics.cloud)
+    _spin(node, seconds)
+    return (
+        gathering.observation(
+            cloud_qos=_offers(node, topics.cloud),
+            imu_qos=_offers(node, topics.imu),
+            is_levelled=levelling.answer,
+        ),
+        topics,
+    )
+
+
+def _found(node: Node, asked: Topics, needs_imu: bool) -> Topics:
+    """Return the topics once they are there; other nodes take a while to be seen."""
+    deadline = time.monotonic() + _DISCOVERY_S
+    while True:
+        kinds = {
+            topic: types[0]
+            for topic, types in node.get_topic_names_and_types()
+            if node.count_publishers(topic)
+        }
+        is_late = time.monotonic() > deadline
+        try:
+            topics = choose(kinds, asked, needs_imu)
+        except SourceError:
+            if is_late:
+                raise
+        else:
+            if topics.imu or is_late:
+                return topics
+        rclpy.spin_once(node, timeout_sec=_LOOK_S)
+
+
+def _listen(node: Node, topics: Topics, gathering: Gathering) -> None:
+    def timed(take: Callable[[Any, int], None]) -> Callable[[Any], None]:
+        return lambda message: take(message, time.time_ns())
+
+    # Best effort takes from every publisher, and deep queues lose nothing of what comes.
+    deep = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(PointCloud2, topics.cloud, timed(gathering.cloud), deep)
+    if topics.imu:
+        node.create_subscription(Imu, topics.imu, timed(gathering.imu), deep)
+    node.create_subscription(TFMessage, "/tf", gathering.transforms, deep)
+    node.create_subscription(TFMessage, "/tf_static", gathering.transforms, latched)
+
+
+def _spin(node: Node, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        rclpy.spin_once(node, timeout_sec=min(left, _LOOK_S))
+
+
+def _offers(node: Node, topic: str) -> tuple[Qos, ...]:
+    if not topic:
+        return ()
+    names = {
+        ReliabilityPolicy.RELIABLE: "reliable",
+        ReliabilityPolicy.BEST_EFFORT: "best_effort",
+    }
+    return tuple(
+        Qos(names.get(info.qos_profile.reliability, "unknown"), info.qos_profile.depth)
+        for info in node.get_publishers_info_by_topic(topic)
+    )
+
+
+class _Levelling:
+    """Asks the publishers of a topic whether they level their clouds.
+
+    Attributes
+    ----------
+    answer : bool or None
+        None while nobody has said.
+    """
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self.answer: bool | None = None
+        self._asked: set[str] = set()
+        self._node = node
+        self._topic = topic
+        self._clients: list[Any] = []
+        self._timer = node.create_timer(_LOOK_S, self._ask)
+
+    def _ask(self) -> None:
+        for info in self._node.get_publishers_info_by_topic(self._topic):
+            name = f"{info.node_namespace.rstrip('/')}/{info.node_name}/get_parameters"
+            if name not in self._asked:
+                self._asked.add(name)
+                self._clients.append(self._node.create_client(GetParameters, name))
+        for client in list(self._clients):
+            if client.service_is_ready():
+                self._clients.remove(client)
+                future = client.call_async(GetParameters.Request(names=[_LEVELLING]))
+                future.add_done_callback(self._answered)
+
+    def _answered(self, future: Any) -> None:
+        response = future.result()
+        for value in response.values if response else ():
+            if value.type:  # 0 where a node has no such parameter
+                self.answer = bool(self.answer) or bool(value.bool_value)
