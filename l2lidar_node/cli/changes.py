@@ -11,7 +11,7 @@ import typer
 
 from l2lidar_node import commands
 from l2lidar_node.cli.addresses import hardware_address
-from l2lidar_node.cli.console import change, out
+from l2lidar_node.cli.console import change, out, say
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import YesOption, with_network
 from l2lidar_node.cli.readings import addresses_in_use
@@ -64,10 +64,10 @@ def work_mode(
         old, new = ({"work mode": work_mode_text(value)} for value in (before, after))
         out.print(change(old, new))
         if before == after:
-            out.print("nothing to change")
+            say("nothing to change")
             return
         if after & ~before & WorkMode.SERIAL and not network.serial_port:
-            out.print(
+            say(
                 "[bold red]After the next restart this unit will be reached by its serial port "
                 "only: Ethernet is gone until the mode is set back over the serial line."
             )
@@ -77,7 +77,7 @@ def work_mode(
             found = device.read_parameters().work_mode
         if found != after:
             raise DeviceError(f"acknowledged, but its work mode is {work_mode_text(found)}")
-    out.print("stored and read back" + ("; " + _RESTART if needs_restart(before, after) else ""))
+    say("stored and read back" + ("; " + _RESTART if needs_restart(before, after) else ""))
 
 
 @app.command()
@@ -102,17 +102,17 @@ def parameters(
         old, new = (parameter_fields(block) for block in (before, after))
         changed = {name: value for name, value in new.items() if value != old[name]}
         if not changed:
-            out.print("nothing to change")
+            say("nothing to change")
             return
         out.print(change(old, changed))
-        out.print("[bold yellow]Writing parameters is experimental.")
+        say("[bold yellow]Writing parameters is experimental.")
         _ask(yes)
         with _undone_by(device, lambda: commands.set_parameters(before)):
             device.send(commands.set_parameters(after))
             found = device.read_parameters().payload
         if found != after:
             raise DeviceError("acknowledged, but it does not send back what was stored")
-    out.print("stored and read back")
+    say("stored and read back")
 
 
 @app.command("network")
@@ -151,7 +151,7 @@ def network_(
     _ask(yes)
     with Device(network) as device:
         _send_for_good(device, command)
-    out.print(f"stored; {_RESTART}")
+    say(f"stored; {_RESTART}")
 
 
 @app.command()
@@ -169,7 +169,7 @@ def mac(
         device.read_parameters()  # so that nobody is asked in vain
         _ask(yes)
         _send_for_good(device, command)
-    out.print(f"stored; {_RESTART}")
+    say(f"stored; {_RESTART}")
 
 
 def _checked(make: Callable[[], T]) -> T:
@@ -192,9 +192,9 @@ def _undone_by(device: Device, make: Callable[[], Command]) -> Iterator[None]:
     except KeyboardInterrupt:
         try:
             device.send(make())
-            out.print("interrupted: the unit has stored what it had before")
+            say("interrupted: the unit has stored what it had before")
         except DeviceError as error:
-            out.print(f"[red]interrupted, and the old value could not be stored again: {error}")
+            say(f"[red]interrupted, and the old value could not be stored again: {error}")
         raise
 
 
@@ -202,7 +202,7 @@ def _send_for_good(device: Device, command: Command) -> None:
     try:
         device.send(command)
     except KeyboardInterrupt:
-        out.print("[red]interrupted after the command had gone out: it may have been stored")
+        say("[red]interrupted after the command had gone out: it may have been stored")
         raise
 
 

@@ -16,6 +16,11 @@ out: Final = Console(highlight=False)
 _COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "dim"}
 
 
+def say(text: str) -> None:
+    """Print a sentence, not cut into lines: names of files in it can be copied."""
+    out.print(text, soft_wrap=True)
+
+
 def print_json(value: object) -> None:
     """Print a value as indented JSON."""
     typer.echo(json.dumps(value, indent=2))

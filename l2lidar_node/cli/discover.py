@@ -13,7 +13,7 @@ from rich.table import Table
 
 from l2lidar_node import commands, wire
 from l2lidar_node.cli.addresses import hardware_address, local_addresses
-from l2lidar_node.cli.console import out, print_json
+from l2lidar_node.cli.console import out, print_json, say
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.cli.options import JsonOption
 from l2lidar_node.framing import Frame, Framer
@@ -166,4 +166,4 @@ def _show(rows: list[dict[str, Any]], others: list[str]) -> None:
             table.add_row(*("?" if value is None else str(value) for value in row.values()))
         out.print(table)
     if others:
-        out.print(f"not an L2, but sending here: {', '.join(others)}")
+        say(f"not an L2, but sending here: {', '.join(others)}")

@@ -42,7 +42,7 @@ def app() -> typer.Typer:
     made.add_typer(readings.app, name="get", rich_help_panel=_UNIT)
     made.add_typer(changes.app, name="set", rich_help_panel=_UNIT)
     made.command("sync-check", rich_help_panel=_UNIT)(sync_check)
-    for verb in (record, replay, convert, view):
+    for verb in (record, replay, convert, check, view):
         made.command(rich_help_panel=_DATA)(verb)
     made.command(
         rich_help_panel=_DATA,

@@ -7,7 +7,7 @@ from typing import Any, Final
 import typer
 
 from l2lidar_node.cli.addresses import hardware_address
-from l2lidar_node.cli.console import facts, out, print_json
+from l2lidar_node.cli.console import facts, out, print_json, say
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import JsonOption, with_network
 from l2lidar_node.cli.stored import parameter_fields, work_mode_text
@@ -28,7 +28,7 @@ def work_mode(network: NetworkConfig, json_: JsonOption = False) -> None:
     if json_:
         print_json({"work_mode": mode})
     else:
-        out.print(work_mode_text(mode))
+        say(work_mode_text(mode))
 
 
 @app.command()
@@ -58,7 +58,7 @@ def network_(network: NetworkConfig, json_: JsonOption = False) -> None:
         print_json(values)
     else:
         out.print(facts("In use", values))
-        out.print("[dim]what is stored cannot be read")
+        say("[dim]what is stored cannot be read")
 
 
 @app.command()
@@ -72,7 +72,7 @@ def mac(network: NetworkConfig, json_: JsonOption = False) -> None:
     elif found is None:
         raise DeviceError(f"this machine has seen no hardware address for {network.l2_ip}")
     else:
-        out.print(found)
+        say(found)
 
 
 def addresses_in_use(network: NetworkConfig) -> dict[str, str | int]:

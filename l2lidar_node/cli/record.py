@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from l2lidar_node.bag import BagWriter
-from l2lidar_node.cli.console import out
+from l2lidar_node.cli.console import out, say
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import with_network
 from l2lidar_node.config import DriverConfig, NetworkConfig
@@ -88,7 +88,7 @@ def record(
     if failures:
         raise DeviceError(failures[0])
     what = f"{bag.clouds} clouds, {bag.samples} IMU samples" if bag else _size(recorder)
-    out.print(f"{file}: {what}")
+    say(f"{file}: {what}")
 
 
 def convert(
@@ -116,7 +116,7 @@ def convert(
     except (OSError, CaptureError) as error:
         raise DeviceError(f"{capture}: {error}") from None
     cut = "; the capture is cut off at its end" if recording.is_cut_off else ""
-    out.print(f"{bag}: {writer.clouds} clouds, {writer.samples} IMU samples{cut}")
+    say(f"{bag}: {writer.clouds} clouds, {writer.samples} IMU samples{cut}")
 
 
 def _watch(
@@ -125,7 +125,7 @@ def _watch(
     begun = time.monotonic()
     try:
         if device.wait_for(_is_heard, min(_HEAR_S, duration)) is None:
-            out.print(f"[yellow]nothing heard from the L2 yet; {device.advice()}")
+            say(f"[yellow]nothing heard from the L2 yet; {device.advice()}")
         with Live(console=out, auto_refresh=False, transient=True) as live:
             while (passed := time.monotonic() - begun) < duration and not failures:
                 time.sleep(min(_LOOK_S, duration - passed))

@@ -12,7 +12,7 @@ import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from l2lidar_node import wire
-from l2lidar_node.cli.console import out
+from l2lidar_node.cli.console import out, say
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.pcap import CaptureError
 from l2lidar_node.recording import Received, Recording
@@ -61,7 +61,7 @@ def replay(
         raise DeviceError(f"{file}: {error}") from None
     with stream, _bound(recording, source) as sender, _progress() as progress:
         address = sender.getsockname()
-        out.print(
+        say(
             f"{file}: the L2 at {recording.device}; sending from {address[0]}:{address[1]} to {to}"
         )
         task = progress.add_task("", total=file.stat().st_size, seconds=0.0, lap=1)
@@ -84,7 +84,7 @@ def replay(
         except KeyboardInterrupt:
             pass
     cut = "; the file is cut off at its end" if recording.is_cut_off else ""
-    out.print(f"{sent} datagrams sent{cut}")
+    say(f"{sent} datagrams sent{cut}")
 
 
 def _paced(
@@ -130,7 +130,7 @@ def _bound(recording: Recording, source: str | None) -> socket.socket:
             sender.close()
             raise DeviceError(f"cannot send from {source}: {error.strerror}") from None
         sender.bind(("0.0.0.0", 0))
-        out.print(
+        say(
             f"[yellow]this machine cannot send from {recording.device} ({error.strerror}): tell "
             "the driver the address that is sent from (l2_ip)"
         )

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from l2lidar_node import wire
-from l2lidar_node.cli.console import out
+from l2lidar_node.cli.console import say
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import with_network
 from l2lidar_node.config import NetworkConfig
@@ -17,6 +17,7 @@ from l2lidar_node.driver import Driver
 
 _LISTEN_S = 1.0
 _SILENT_S = 0.5
+_LOCK_S = 2.5
 _RESTART_S = 60.0
 
 WaitOption = Annotated[
@@ -41,7 +42,7 @@ def start(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
             if not was_running:
                 _restore(device, to_running=False)
             raise
-        out.print("it was running already" if was_running else "started")
+        say("it was running already" if was_running else "started")
 
 
 @with_network
@@ -60,7 +61,7 @@ def stop(network: NetworkConfig) -> None:
             if was_running:
                 _restore(device, to_running=True)
             raise
-        out.print("stopped" if was_running else "nothing was coming before; it is in standby")
+        say("stopped" if was_running else "nothing was coming before; it is in standby")
 
 
 @with_network
@@ -70,12 +71,14 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
     The unit does not acknowledge it; with --wait its clock tells that it began anew.
     """
     with Device(network) as device:
-        if not device.is_measuring(_LISTEN_S) and device.ask(lambda driver: not _heard(driver)):
-            out.print("[yellow]nothing is heard from it: the command is sent all the same")
+        if device.is_measuring(_LISTEN_S):
+            device.wait_for(lambda driver: driver.last_points is not None, _LOCK_S)
+        elif device.ask(lambda driver: not _heard(driver)):
+            say("[yellow]nothing is heard from it: the command is sent all the same")
         before = device.ask(_stamp_s)
         device.tell(lambda driver, now: driver.reset_device(now))
         if not wait:
-            out.print("reset sent")
+            say("reset sent")
             return
         points = _points(device)
 
@@ -84,7 +87,7 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
 
         if device.wait_for(is_back, wait) is None:
             raise DeviceError(f"no sign of a restart within {wait:g} s")
-        out.print("it has restarted, points are back")
+        say("it has restarted, points are back")
 
 
 def _restore(device: Device, *, to_running: bool) -> None:
@@ -93,9 +96,9 @@ def _restore(device: Device, *, to_running: bool) -> None:
             device.command(lambda driver, now: driver.start_rotation(now))
         else:
             device.command(lambda driver, now: driver.stop_rotation(now)[0])
-        out.print("interrupted: it is running again" if to_running else "interrupted: in standby")
+        say("interrupted: it is running again" if to_running else "interrupted: in standby")
         return
-    out.print("[red]interrupted, and it did not take the command to undo it")
+    say("[red]interrupted, and it did not take the command to undo it")
 
 
 def _points(device: Device) -> int:

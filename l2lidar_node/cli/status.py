@@ -16,6 +16,7 @@ from l2lidar_node import health
 from l2lidar_node.cli.console import as_data, facts, judgement, out, print_json
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import JsonOption, with_network
+from l2lidar_node.cli.stored import work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver import Driver
 from l2lidar_node.metadata import metadata
@@ -48,10 +49,11 @@ def info(network: NetworkConfig, json_: JsonOption = False) -> None:
     calibration = about.pop("calibration") if about["slots"] else {}
     if not calibration:
         about |= dict.fromkeys(_TOLD_BY_POINTS)
-    mode = about.pop("work_mode_names") or []
+    del about["work_mode_names"]
+    mode = about["work_mode"]
+    about["work_mode"] = None if mode is None else work_mode_text(mode)
     for name, value in about.items():
         about[name] = "not known" if value in ("", None) else _text(value)
-    about["work_mode"] = f"{about['work_mode']} ({', '.join(mode) or 'standard'})"
     out.print(facts("Unit", about))
     if calibration:
         named = {name: _text(value) for name, value in calibration.items()}

@@ -102,7 +102,7 @@ def with_parameters(payload: bytes, changes: list[str]) -> bytes:
             number = float(value)
         except ValueError:
             number = math.nan
-        if not math.isfinite(np.float32(number)):
+        if not abs(number) <= float(np.finfo(np.float32).max):
             raise ValueError(f"{name}: '{value}' is no finite number")
         *groups, field = name.split(".")
         part: Any = block

@@ -11,7 +11,7 @@ import typer
 from rich.progress import track
 from rich.table import Table
 
-from l2lidar_node.cli.console import out, print_json
+from l2lidar_node.cli.console import out, print_json, say
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import JsonOption, with_network
 from l2lidar_node.clock import ClockEvent
@@ -138,7 +138,7 @@ def judged(seen: list[tuple[int, int]], ratio: float) -> dict[str, float]:
 
 
 def _show(result: dict[str, Any]) -> None:
-    out.print(
+    say(
         f"clock ratio [bold]{result['ratio']:.6f}[/]: it runs at {result['rate']:.6f} of the true "
         f"rate and falls behind by {result['slow_by_s_per_hour']:.1f} s an hour"
     )
@@ -161,7 +161,7 @@ def _show(result: dict[str, Any]) -> None:
     trips = result["round_trip_ms"]
     if trips:
         mean = sum(trips) / len(trips)
-        out.print(f"round trip min {min(trips):.3f}, mean {mean:.3f}, max {max(trips):.3f} ms")
+        say(f"round trip min {min(trips):.3f}, mean {mean:.3f}, max {max(trips):.3f} ms")
     for name, count in result["events"].items():
         if name != "locked":
-            out.print(f"[yellow]{name}: {count} times")
+            say(f"[yellow]{name}: {count} times")

@@ -1,0 +1,119 @@
+"""A virtual unit over real sockets, and the command line run in this process."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from l2lidar_node.cli.main import main
+from l2lidar_node.emulator.config import (
+    AddressConfig,
+    DeviceConfig,
+    FaultConfig,
+    IdentityConfig,
+    PowerConfig,
+)
+from l2lidar_node.emulator.device import VirtualL2
+from l2lidar_node.emulator.flash import Flash
+from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.port import UdpPort
+from l2lidar_node.emulator.server import Server
+
+LIMIT_S = 20.0
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as item:
+        item.bind(("127.0.0.1", 0))
+        return int(item.getsockname()[1])
+
+
+class Unit:
+    """A virtual L2 that runs in a thread; what it stores can be looked at."""
+
+    def __init__(self, faults: FaultConfig, power: PowerConfig, mode: int) -> None:
+        self.host_port = free_port()
+        addresses = AddressConfig(lidar_port=free_port(), host_port=self.host_port)
+        config = DeviceConfig(
+            addresses=addresses,
+            power=power,
+            faults=faults,
+            identity=IdentityConfig(work_mode=mode),
+        )
+        flash = Flash.factory(config.addresses, config.identity)
+        self.port = UdpPort(flash.network)
+        self.lidar_port = self.port.address[1]
+        self.device = VirtualL2(
+            config, PatternScanner(), StillInertial(), flash=flash, power_on_ns=time.time_ns()
+        )
+        self.server = Server(self.device, self.port)
+        self._thread = threading.Thread(target=self.server.run)
+        self._thread.start()
+
+    @property
+    def flash(self) -> Flash:
+        return self.device.flash
+
+    @property
+    def options(self) -> list[str]:
+        return [
+            "--l2-ip", "127.0.0.1", "--l2-port", str(self.lidar_port),
+            "--host-port", str(self.host_port),
+        ]  # fmt: skip
+
+    def stop(self) -> None:
+        self.server.stop()
+        self._thread.join(LIMIT_S)
+        self.port.close()
+
+
+@pytest.fixture
+def make_unit() -> Iterator[Callable[..., Unit]]:
+    units: list[Unit] = []
+
+    def make(mode: int = 0, faults: FaultConfig | None = None, **power: float) -> Unit:
+        settings = dataclasses.replace(PowerConfig(boot_scale=0.0), **power)
+        units.append(Unit(faults or FaultConfig(), settings, mode))
+        return units[-1]
+
+    yield make
+    for unit in units:
+        unit.stop()
+
+
+@pytest.fixture
+def unit(make_unit: Callable[..., Unit]) -> Unit:
+    return make_unit()
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run ``l2lidar`` with these arguments; nobody is there to answer questions."""
+
+    def invoke(*arguments: str, answer: str = "") -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["l2lidar", *arguments])
+        monkeypatch.setattr(sys, "stdin", io.StringIO(f"{answer}\n" if answer else ""))
+        code = main()
+        captured = capsys.readouterr()
+        return Outcome(code, captured.out, captured.err)
+
+    return invoke

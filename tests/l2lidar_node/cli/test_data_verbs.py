@@ -1,0 +1,333 @@
+"""Recording, replaying and converting, over real sockets and in processes that are interrupted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import dpkt
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from l2lidar_node import wire
+from l2lidar_node.config import DriverConfig, NetworkConfig
+from l2lidar_node.driver import Driver, Event
+from l2lidar_node.recorder import Recorder, endpoints, free_name
+from l2lidar_node.recording import Received, Recording
+from l2lidar_node.replay import events
+from l2lidar_node.session import Session
+from l2lidar_node.settings import build
+from l2lidar_node.transport import UdpTransport
+from l2lidar_node.types import HostNs, ImuSample, Sweep
+from tests.build import SHARED_DATA
+from tests.l2lidar_node.cli.conftest import LIMIT_S, Run, Unit, free_port
+from tests.l2lidar_node.virtual_host import essence
+
+ROOT = Path(__file__).parents[3]
+
+
+def live(
+    unit: Unit, path: Path, seconds: float, **settings: object
+) -> tuple[DriverConfig, list[Event]]:
+    """Run a driver on a unit, recorded; return its settings and what it handed out."""
+    network = {
+        "l2_ip": "127.0.0.1", "l2_port": unit.lidar_port,
+        "host_ip": "127.0.0.1", "host_port": unit.host_port,
+    }  # fmt: skip
+    config = build(DriverConfig, {**network, **settings})
+    found: list[Event] = []
+    failures: list[str] = []
+    recorder = Recorder(path, config.network, failures.append)
+    session = Session(Driver(config), UdpTransport(config.network), found.append, recorder)
+    session.start()
+    assert not session.wait(seconds)
+    session.stop()
+    assert not failures
+    return config, found
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"enable_latency_measure": True, "sweep_cut": "turn"},
+        {"l2_sync_mode": "periodic", "reorder_window": 3},
+    ],
+    ids=str,
+)
+def test_a_recorded_run_replays_bit_for_bit(unit: Unit, tmp_path: Path, settings) -> None:
+    config, found = live(unit, tmp_path / "run.pcap", 2.5, **settings)
+    with (tmp_path / "run.pcap").open("rb") as stream:
+        replayed = list(events(Recording(stream), config))
+    assert sum(isinstance(event, Sweep) for event in found) >= 3
+    assert essence(replayed) == essence(found)
+
+
+def test_what_is_recorded_opens_elsewhere(unit: Unit, tmp_path: Path) -> None:
+    live(unit, tmp_path / "run.pcap", 1.0)
+    with (tmp_path / "run.pcap").open("rb") as stream:
+        packets = [
+            (int(stamp * 10**9), dpkt.ethernet.Ethernet(data).data)
+            for stamp, data in dpkt.pcap.Reader(stream)
+        ]
+    ports = {packet.data.sport for _, packet in packets}
+    assert ports == {unit.lidar_port, unit.host_port}
+    assert all(abs(stamp - time.time_ns()) < 60e9 for stamp, _ in packets)
+    commands = [
+        bytes(packet.data.data) for _, packet in packets if packet.data.sport == unit.host_port
+    ]
+    assert any(wire.HEADER.unpack(data[:12])[1] == wire.PacketType.TIME_SYNC for data in commands)
+
+
+def test_record_writes_a_capture_while_it_runs(run: Run, unit: Unit, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "run.pcap"
+    outcome = run("record", str(path), *unit.options, "--duration", "1.2")
+    assert (outcome.code, outcome.err) == (0, "")
+    with path.open("rb") as stream:
+        recording = Recording(stream)
+        assert sum(isinstance(entry, Received) for entry in recording) > 200
+        assert not recording.is_cut_off
+    outcome = run("record", str(path), *unit.options)
+    assert outcome.code == 2
+    assert "exists already" in outcome.err
+
+
+def test_record_without_a_unit_fails(run: Run, tmp_path: Path) -> None:
+    outcome = run(
+        "record", str(tmp_path / "a.pcap"), "--l2-ip", "127.0.0.1", "--l2-port", "9",
+        "--host-port", str(free_port()), "--duration", "0.3",
+    )  # fmt: skip
+    assert outcome.code == 1
+    assert "nothing was heard" in outcome.err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
+def test_a_full_disk_ends_the_recording_and_not_the_driver(unit: Unit, tmp_path: Path) -> None:
+    failures: list[str] = []
+    network = NetworkConfig(l2_ip="127.0.0.1", l2_port=unit.lidar_port)
+    recorder = Recorder(tmp_path / "a.pcap", network, failures.append)
+    full = open("/dev/full", "wb", buffering=4096)  # noqa: SIM115 - the recorder closes it
+    recorder._file.close()
+    recorder._file = recorder._writer._capture._packets._stream = full
+    for number in range(2000):
+        recorder.received(bytes(100), HostNs(number))
+    recorder.close()
+    (failure,) = failures
+    assert "No space left" in failure
+    assert str(tmp_path / "a.pcap") in failure
+
+
+def test_a_name_that_is_taken_gets_a_number(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcap"
+    assert free_name(path) == path
+    path.touch()
+    assert free_name(path).name == "a-1.pcap"
+    (tmp_path / "a-1.pcap").touch()
+    assert free_name(path).name == "a-2.pcap"
+
+
+def test_the_capture_names_an_address_of_this_machine() -> None:
+    network = NetworkConfig(l2_ip="127.0.0.1", host_ip="0.0.0.0", host_port=77)
+    assert endpoints(network) == (("127.0.0.1", 6101), ("127.0.0.1", 77))
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "bag"])
+def test_convert_writes_what_the_driver_hands_out(
+    run: Run, unit: Unit, tmp_path: Path, name: str
+) -> None:
+    capture = tmp_path / "run.pcap"
+    config, found = live(unit, capture, 2.2, imu_adjust=False, sweep_cut="turn")
+    outcome = run("convert", str(capture), str(tmp_path / name))
+    assert (outcome.code, outcome.err) == (0, "")
+    sweeps = [event for event in found if isinstance(event, Sweep)]
+    samples = [event for event in found if isinstance(event, ImuSample)]
+    assert f"{len(sweeps)} clouds, {len(samples)} IMU samples" in outcome.out
+    clouds, imus, transforms = [], [], []
+    with AnyReader([tmp_path / name]) as reader:
+        for connection, _, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            {"/points": clouds, "/imu/data": imus, "/tf_static": transforms}[
+                connection.topic
+            ].append(message)
+    assert [stamp(cloud) for cloud in clouds] == [sweep.start for sweep in sweeps]
+    assert bytes(clouds[1].data) == sweeps[1].points.tobytes()
+    assert [field.name for field in clouds[1].fields] == list(sweeps[1].points.dtype.names)
+    assert clouds[1].header.frame_id == config.frames.cloud
+    assert [stamp(imu) for imu in imus] == [sample.stamp for sample in samples]
+    assert imus[5].orientation.w == samples[5].orientation_wxyz[0]
+    assert np.diag(imus[5].orientation_covariance.reshape(3, 3))[2] == config.imu.yaw_covar
+    (message,) = transforms
+    (transform,) = message.transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("l2lidar_link", "l2lidar_imu")
+    assert transform.transform.translation.x == wire.IMU_POSITION_M[0]
+    assert transform.transform.rotation.w == 1.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name, "run.pcap"]
+    assert run("convert", str(capture), str(tmp_path / name)).code == 2
+
+
+def stamp(message: object) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec  # type: ignore[attr-defined]
+
+
+def test_record_writes_bags(run: Run, unit: Unit, tmp_path: Path) -> None:
+    outcome = run("record", str(tmp_path / "a.mcap"), *unit.options, "--duration", "2.5")
+    assert (outcome.code, outcome.err) == (0, "")
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        assert reader.topics["/points"].msgcount >= 3
+        assert reader.topics["/imu/data"].msgcount > 100
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"no capture at all", "no capture file"), (b"", "no capture file")]
+)
+def test_what_is_no_capture_is_refused(run: Run, tmp_path: Path, content: bytes, words) -> None:
+    path = tmp_path / "a.pcap"
+    path.write_bytes(content)
+    for verb in (["replay", str(path)], ["convert", str(path), str(tmp_path / "bag")]):
+        outcome = run(*verb)
+        assert outcome.code == 1
+        assert words in outcome.err
+
+
+@pytest.mark.skipif(not SHARED_DATA.exists(), reason="the recordings are not here")
+def test_a_capture_of_another_sensor_is_refused(run: Run) -> None:
+    (path,) = (SHARED_DATA / "ouster_os1").glob("*.pcap")
+    outcome = run("replay", str(path))
+    assert outcome.code == 1
+    assert "no L2 packets in it" in outcome.err
+
+
+@pytest.mark.parametrize("text", ["here", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x"])
+def test_replay_refuses_wrong_ends(run: Run, tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.pcap"
+    path.touch()
+    assert run("replay", str(path), "--to", text).code == 2
+
+
+@pytest.fixture
+def capture(unit: Unit, tmp_path: Path) -> tuple[Path, list[Received]]:
+    path = tmp_path / "run.pcap"
+    live(unit, path, 1.5)
+    unit.stop()
+    with path.open("rb") as stream:
+        return path, [entry for entry in Recording(stream) if isinstance(entry, Received)]
+
+
+class Listener:
+    """A socket that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        network = NetworkConfig(l2_ip="127.0.0.1", host_ip="127.0.0.1", host_port=self.port)
+        self._transport = UdpTransport(network)
+        self.data: list[bytes] = []
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while not self._stopping.is_set():
+            self.data += [item.data for item in self._transport.receive(0.05)]
+
+    def stop(self) -> list[bytes]:
+        self._stopping.set()
+        self._thread.join(LIMIT_S)
+        self.data += [item.data for item in self._transport.receive(0.05)]
+        self._transport.close()
+        return self.data
+
+
+def replayed(run: Run, path: Path, *options: str) -> tuple[list[bytes], str]:
+    listener = Listener()
+    outcome = run("replay", str(path), "--to", f"127.0.0.1:{listener.port}", *options)
+    assert (outcome.code, outcome.err) == (0, "")
+    return listener.stop(), outcome.out
+
+
+def test_replay_sends_what_was_received(run: Run, capture) -> None:
+    path, entries = capture
+    begun = time.monotonic()
+    data, said = replayed(run, path, "--rate", "2")
+    assert data == [entry.data for entry in entries]
+    lasted = (entries[-1].time - entries[0].time) / 1e9
+    assert time.monotonic() - begun > lasted / 2
+    assert f"{len(entries)} datagrams sent" in said
+
+
+def test_replay_seeks_and_stops(run: Run, capture) -> None:
+    path, entries = capture
+    data, _ = replayed(run, path, "--rate", "20", "--start", "0.5", "--duration", "0.6")
+    first = entries[0].time
+    within = [e.data for e in entries if 0.5e9 <= e.time - first <= 1.1e9]
+    assert data == within
+
+
+def test_replay_from_beyond_the_end_says_so(run: Run, capture) -> None:
+    path, _ = capture
+    outcome = run("replay", str(path), "--start", "1000", "--to", f"127.0.0.1:{free_port()}")
+    assert outcome.code == 1
+    assert "nothing in" in outcome.err
+
+
+def started(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "l2lidar_node.cli.main", *arguments],
+        cwd=ROOT,
+        env={**os.environ, "COLUMNS": "200", "NO_COLOR": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_until(condition, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + LIMIT_S
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_ctrl_c_ends_a_recording_well(unit: Unit, tmp_path: Path) -> None:
+    path = tmp_path / "run.pcap"
+    process = started("record", str(path), *unit.options)
+    wait_until(lambda: path.exists() and path.stat().st_size > 100_000, process)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, err) == (0, "")
+    assert "MB" in out
+    with path.open("rb") as stream:
+        recording = Recording(stream)
+        assert sum(1 for _ in recording) > 100
+        assert not recording.is_cut_off
+
+
+def test_a_killed_recording_is_there_but_for_its_end(unit: Unit, tmp_path: Path) -> None:
+    path = tmp_path / "run.pcap"
+    process = started("record", str(path), *unit.options)
+    wait_until(lambda: path.exists() and path.stat().st_size > 300_000, process)
+    process.kill()
+    process.communicate()
+    with path.open("rb") as stream:
+        recording = Recording(stream)
+        assert sum(isinstance(entry, Received) for entry in recording) > 300
+
+
+def test_ctrl_c_ends_a_loop(run: Run, capture) -> None:
+    path, entries = capture
+    listener = Listener()
+    process = started(
+        "replay", str(path), "--to", f"127.0.0.1:{listener.port}", "--loop", "--rate", "20"
+    )
+    wait_until(lambda: len(listener.data) > 2 * len(entries), process)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=LIMIT_S)
+    data = listener.stop()
+    assert (process.returncode, err) == (0, "")
+    assert "datagrams sent" in out
+    assert data[: len(entries)] == data[len(entries) : 2 * len(entries)]
