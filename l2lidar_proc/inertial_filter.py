@@ -226,6 +226,15 @@ def corrected(
     return at.moved(np.asarray(error)), 0.5 * (posterior + posterior.T)
 
 
+def loosened(covariance: F64, errors: slice, sigma: float) -> F64:
+    """Return a covariance (18, 18) in which three errors are independent of all others."""
+    out = covariance.copy()
+    out[errors, :] = 0.0
+    out[:, errors] = 0.0
+    out[errors, errors] = sigma**2 * np.eye(3)
+    return out
+
+
 def skew(v: F64) -> F64:
     """Return the matrix of the cross product, shape (3, 3)."""
     x, y, z = v.tolist()

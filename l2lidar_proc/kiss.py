@@ -115,20 +115,17 @@ class PlainKiss:
         """Pose (4, 4) of the latest sweep's last point."""
         return np.asarray(self._kiss.last_pose)
 
-    def register(self, points: F64, times: F64) -> F64 | None:
-        """Return the cloud (N, 3) as KISS-ICP deskewed it to the last point, None if too small.
+    def register(self, points: F64, times: F64) -> F64:
+        """Return the cloud (N, 3) as KISS-ICP deskewed it to the last point.
 
         Parameters
         ----------
         points : ndarray, shape (N, 3)
-            Finite [m].
-        times : ndarray, shape (N,)
-            Finite; constant times turn KISS-ICP's deskew off.
+            N >= LEAST_POINTS, finite, within the range limits [m].
+        times : ndarray, shape (N,) or (0,)
+            Finite and not all equal; none turns KISS-ICP's deskew off.
         """
-        if len(points) < LEAST_POINTS:
-            return None
-        moving = times if np.ptp(times) > 0.0 else np.empty(0)
-        frame, _ = self._kiss.register_frame(points, moving)
+        frame, _ = self._kiss.register_frame(points, times)
         return np.asarray(frame)
 
     def points(self) -> F64:

@@ -11,9 +11,18 @@ from numpy.typing import NDArray
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import startup, sweep_motion
 from l2lidar_proc.imu_window import ImuWindow, Samples
-from l2lidar_proc.inertial_filter import GYRO_BIAS, POSITION, TURN, VELOCITY, InertialState, Noise
+from l2lidar_proc.inertial_filter import (
+    GYRO_BIAS,
+    POSITION,
+    TURN,
+    VELOCITY,
+    InertialState,
+    Noise,
+    loosened,
+)
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
+from l2lidar_proc.odometry_report import cloud_pose, estimate_of, gaps_in
 from l2lidar_proc.sweep_matcher import SweepMatcher, xyz
 from l2lidar_proc.sweep_motion import SweepMotion
 
@@ -28,7 +37,6 @@ _LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity 
 _COAST_NS: Final = 3_000_000_000  # an unconfirmed velocity is kept for so long,
 _COAST_S: Final = 1.0  # and then fades with this time constant
 _PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
-_DEGENERATE: Final = 0.01  # share of points below which a direction counts as not observed
 _LOST_SWEEPS: Final = 25
 _STEADY_SIGMA: Final = 0.5  # [rad/s] of the assumption that the rate stays, where there is no gyro
 
@@ -113,7 +121,7 @@ class Odometry:
         if self._state is None:
             return self._opened(sweep)
         motion = self._predicted(sweep, self._state, self._covariance)
-        status += self._imu_status(motion)
+        status += gaps_in(motion)
         source = self.matcher.source(sweep, motion)
         found = self.matcher.match(source, motion)
         guess = motion.state
@@ -152,10 +160,7 @@ class Odometry:
 
     def pose_of(self, state: InertialState) -> F64:
         """Return the pose of the cloud frame in a state, shape (4, 4)."""
-        pose = np.eye(4)
-        pose[:3, :3] = state.rotation
-        pose[:3, 3] = state.position - state.rotation @ self._lever
-        return pose
+        return cloud_pose(state, self._lever)
 
     # ---- beginnings
 
@@ -181,7 +186,7 @@ class Odometry:
         ]
         estimates = []
         for one, motion in zip(held, earlier + motions, strict=True):
-            status = [Status.STARTING, *self._imu_status(motion)]
+            status = [Status.STARTING, *gaps_in(motion)]
             quality = self.matcher.quality(len(one.points), None)
             moved = motion.deskewed(one, self._lever)
             estimates.append(self._estimate(motion, moved, status, quality))
@@ -198,7 +203,8 @@ class Odometry:
         samples = self._imu.between(HostNs(since - _OPENING_NS), sweeps[-1].end)
         opening = startup.opening(samples, reference)
         self._trusts_gravity = opening.gravity_trusted
-        start = opening.state
+        # the odometry frame begins at the cloud frame's origin, the state is the IMU's
+        start = dataclasses.replace(opening.state, position=opening.state.rotation @ self._lever)
         for _ in range(_OPENING_ROUNDS):
             self._forget_map()
             first = self._predicted(sweeps[0], start, opening.covariance, since)
@@ -228,7 +234,7 @@ class Odometry:
             self._state, stamp=HostNs(reference - 1), velocity=np.zeros(3)
         )
         for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
-            self._covariance = _loosened(self._covariance, errors, sigma)
+            self._covariance = loosened(self._covariance, errors, sigma)
 
     def _coasted(self, motion: SweepMotion) -> SweepMotion:
         """Return a motion that slows down when nothing has confirmed the velocity for long."""
@@ -274,7 +280,7 @@ class Odometry:
         inside = (samples["stamp"] >= state.stamp) & (samples["stamp"] <= max(span[1], reference))
         if not inside.any():
             # the bias stands for what the rate has changed by: the sweep itself will tell
-            covariance = _loosened(covariance, GYRO_BIAS, _STEADY_SIGMA)
+            covariance = loosened(covariance, GYRO_BIAS, _STEADY_SIGMA)
         gap = reference - state.stamp
         if gap > _LONG_GAP_NS and len(samples) * _PERIOD_S * 1e9 < 0.5 * gap:
             state = dataclasses.replace(state, velocity=np.zeros(3))
@@ -303,23 +309,11 @@ class Odometry:
         state, covariance = motion.state, motion.covariance
         if motion.felt.missing.all() and self._state is not None:
             bias = self._covariance[GYRO_BIAS, GYRO_BIAS]
-            covariance = _loosened(covariance, GYRO_BIAS, 0.0)
+            covariance = loosened(covariance, GYRO_BIAS, 0.0)
             covariance[GYRO_BIAS, GYRO_BIAS] = bias
             state = dataclasses.replace(state, gyro_bias=self._state.gyro_bias)
         self._state, self._covariance = state, covariance
         self._steady = motion.rate
-
-    # ---- what is reported
-
-    def _imu_status(self, motion: SweepMotion) -> list[Status]:
-        status = []
-        if motion.felt.missing.all():
-            status.append(Status.NO_IMU)
-        elif motion.felt.missing.any():
-            status.append(Status.IMU_GAP)
-        if not self._trusts_gravity:
-            status.append(Status.GRAVITY_UNTRUSTED)
-        return status
 
     def _estimate(
         self,
@@ -328,38 +322,13 @@ class Odometry:
         status: list[Status],
         quality: AlignmentQuality,
     ) -> OdometryEstimate:
-        state, p = motion.state, motion.covariance
-        if quality.matched and quality.weakest < _DEGENERATE:
-            status.append(Status.DEGENERATE)
-        pose = np.zeros((6, 18))
-        pose[:3, POSITION] = np.eye(3)
-        pose[3:, TURN] = state.rotation
-        twist = np.zeros((6, 18))
-        twist[:3, VELOCITY] = state.rotation.T
-        twist[3:, GYRO_BIAS] = np.eye(3)
-        twist_covariance = twist @ p @ twist.T
-        twist_covariance[3:, 3:] += self.config.inertial.gyro_noise**2 * np.eye(3)
-        self._last = OdometryEstimate(
-            stamp=state.stamp,
-            T_odom_lidar=self.pose_of(state),
-            covariance=pose @ p @ pose.T,
-            velocity=state.rotation.T @ state.velocity - np.cross(motion.rate, self._lever),
-            angular_velocity=motion.rate,
-            twist_covariance=twist_covariance,
-            points=moved,
-            status=tuple(status),
-            quality=quality,
-            gyro_bias=state.gyro_bias,
-            accel_bias=state.accel_bias,
-            gravity=state.gravity,
+        if not self._trusts_gravity:
+            status.append(Status.GRAVITY_UNTRUSTED)
+        self._last = estimate_of(
+            motion, self._lever, moved, tuple(status), quality, self.config.inertial.gyro_noise
         )
         return self._last
 
-
-def _loosened(covariance: F64, errors: slice, sigma: float) -> F64:
-    """Return a covariance (18, 18) in which three errors are independent of all others."""
-    out = covariance.copy()
-    out[errors, :] = 0.0
-    out[:, errors] = 0.0
-    out[errors, errors] = sigma**2 * np.eye(3)
-    return out
+    def map_points(self) -> F64:
+        """Return the points of KISS-ICP's local map [m], shape (N, 3), odometry frame."""
+        return self.matcher.kiss.points()
