@@ -1,0 +1,70 @@
+"""The demo, as a newcomer runs it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.ros
+
+COMMAND = [sys.executable, "-m", "l2lidar_node.demo"]
+TIMEOUT_S = 120
+
+
+def test_the_driver_alone_streams_without_loss_and_draws_a_cloud(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [*COMMAND, "--driver-only", "--duration", "4", "--folder", str(tmp_path)],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "lost packets: 0" in result.stdout
+    assert (tmp_path / "cloud.png").stat().st_size > 20_000
+
+
+def test_the_whole_chain_is_judged_against_the_truth(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [*COMMAND, "--duration", "8", "--folder", str(tmp_path)],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "mm RMS off the truth" in result.stdout
+    for name in ("cloud.png", "deskew.png", "track.png"):
+        assert (tmp_path / name).stat().st_size > 20_000
+
+
+def test_an_interrupt_ends_it_and_everything_it_started(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "--driver-only", "--duration", "300", "--folder", str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "packets/s" in line:
+            break
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 130, said
+    assert "Traceback" not in said
+    assert not [line for line in _command_lines() if str(tmp_path) in line]
+
+
+def _command_lines() -> list[str]:
+    lines = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            lines.append(path.read_text(errors="replace"))
+    return lines
+
+
+def test_a_wrong_option_is_explained() -> None:
+    result = subprocess.run(
+        [*COMMAND, "--duration", "1"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert result.returncode == 2
+    assert "--duration" in result.stderr
+    assert "3 to 3600" in result.stderr

@@ -1,0 +1,70 @@
+"""Every command in README and docs is run by a test, or listed here with the reason why not."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+ROS = "needs the ros2 command line, which no registry has"
+SENSOR = "needs a sensor or its network"
+ADMIN = "changes the machine"
+
+RUN_BY = {
+    r"git clone .*": "CI, which starts in a fresh clone",
+    r"make (test|setup)\b.*": "CI itself",
+    r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
+    r"l2lidar (discover|info).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
+    r"l2lidar view.*": "tests/l2lidar_node/ros/test_viewer.py",
+    r"ros2 launch l2lidar_node .*": "tests/test_launch_files.py",
+}
+"""Commands that a test runs, itself or the file behind them, by the test."""
+
+NOT_RUN = {
+    r"ros2 (topic|service|param|run) .*": ROS,
+    r"source .*": ROS,
+    r"rosdep .*": ROS,
+    r"colcon build .*": "tests/test_packaging.py looks at what is installed",
+    r"mkdir -p ~/ros2_ws/src.*": ADMIN,
+    r"cd .*": ADMIN,
+    r"pip install .*": ADMIN,
+    r"sudo .*": ADMIN,
+    r"nmcli .*": ADMIN,
+    r"ping .*": SENSOR,
+}
+"""Commands that no test runs, with the reason."""
+
+
+def commands() -> list[tuple[str, str]]:
+    """Return every command of a shell block with the page it stands on."""
+    found = []
+    for page in PAGES:
+        for block in re.findall(r"^```(?:bash|console)\n(.*?)^```", page.read_text(), re.M | re.S):
+            joined = re.sub(r"\\\n\s*", " ", block)
+            for line in joined.splitlines():
+                command = line.partition("  #")[0].removeprefix("$ ").strip()
+                if command and not command.startswith("#"):
+                    found.append((page.name, command))
+    return found
+
+
+@pytest.mark.parametrize(("page", "command"), commands())
+def test_a_command_is_run_or_excused(page, command):
+    known = [*RUN_BY, *NOT_RUN]
+    assert any(re.fullmatch(pattern, command) for pattern in known), f"{page}: {command}"
+
+
+@pytest.mark.parametrize("where", [text for text in RUN_BY.values() if text.startswith("tests/")])
+def test_the_tests_named_exist(where):
+    assert (ROOT / where).exists()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
