@@ -15,10 +15,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.conversions import CloudTemplate, from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import IMU_SAMPLE
+from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc import report
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig
@@ -47,6 +47,7 @@ class DeskewNode(Node):
         self._frames = StaticFrames(self) if config.topics.use_tf else None
         self._mounted: tuple[str, str, int] | None = None
         self._cloud_frame = ""
+        self._template: tuple[tuple[np.dtype[np.void], str], CloudTemplate] | None = None
         self._refused: Counter[str] = Counter()
         self._last: report.Report | None = None
         self._before = self._pipeline.counts
@@ -167,10 +168,19 @@ class DeskewNode(Node):
             self._overdue.reset()
 
     def _publish(self, item: Deskewed) -> None:
-        self._output.publish(to_cloud(item.points, item.stamp, self._cloud_frame))
+        self._output.publish(self._serialised(item.points, item.stamp))
         self._last = report.of_sweep(item.quality, item.waited_ns)
         if self._statistics.get_subscription_count():
             self._statistics.publish(self._status(self._last, "sweep"))
+
+    def _serialised(self, points: NDArray[np.void], stamp: HostNs) -> bytes | PointCloud2:
+        """Return a cloud to publish; a plain one is put together as bytes, three times as fast."""
+        if points.ndim == 2:
+            return to_cloud(points, stamp, self._cloud_frame)
+        kind = (points.dtype, self._cloud_frame)
+        if self._template is None or self._template[0] != kind:
+            self._template = kind, CloudTemplate(*kind)
+        return self._template[1].serialize(points, stamp)
 
     def _diagnose(self) -> None:
         tracker = self._pipeline.tracker
