@@ -61,7 +61,8 @@ def _check_parameter_file(path: Path) -> None:
         content = yaml.safe_load(path.read_text())
     except OSError as error:
         raise UsageError(f"parameter file '{path}': {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:
+        # The last three are PyYAML's on dates that are none, `!!int` alone, endless brackets.
         reason = " ".join(str(error).split())
         raise UsageError(f"parameter file '{path}': is not YAML: {reason}") from None
     if not isinstance(content, dict) or not all(_is_node(entry) for entry in content.values()):

@@ -53,7 +53,8 @@ def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ValueError(f"parameter file '{path}': {error.strerror}") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:
+        # The last three are PyYAML's on dates that are none, `!!int` alone, endless brackets.
         reason = " ".join(str(error).split())
         raise ValueError(f"parameter file '{path}': is not YAML: {reason}") from None
     values: dict[str, Any] = {}
@@ -79,6 +80,8 @@ def _sections(content: object, above: str, path: Path) -> Iterator[tuple[str, Ma
         )
     for name, below in content.items():
         if name == "ros__parameters":
+            if not isinstance(below, dict | None):
+                raise ValueError(f"parameter file '{path}': no parameters below {above}/{name}")
             yield above, below or {}
         else:
             yield from _sections(below, f"{above}/{str(name).strip('/')}", path)

@@ -77,10 +77,16 @@ def test_nothing_said_is_nothing_set(tmp_path, text):
     assert parameters_for(file, "l2lidar_node", "/l2lidar_node") == {}
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", "l2_port: 6101", "a: {b: [}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1, 2]", "l2_port: 6101", "a: {b: [}", "l2lidar_node: {ros__parameters: 5}",
+        "a: 2001-99-99", "a: !!int ", "a: " + "[" * 2000, "a: \xff",
+    ],
+)  # fmt: skip
 def test_other_content_is_refused_with_the_files_name(tmp_path, text):
     file = tmp_path / "mine.yaml"
-    file.write_text(text)
+    file.write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=r"mine\.yaml"):
         parameters_for(file, "l2lidar_node", "/l2lidar_node")
 
