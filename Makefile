@@ -7,7 +7,7 @@ BENCH_ARGS ?=
 BENCHES := $(patsubst tools/bench_%.py,%,$(wildcard tools/bench_*.py))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak clean
+.PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -44,10 +44,13 @@ $(BENCHES:%=bench-%): bench-%: setup
 	$(PYTHON) -m tools.bench_$* $(BENCH_ARGS)
 
 faults: setup ## every fault the virtual L2 can make, and what the driver says to it
-	$(PYTHON) -m tools.bench_faults $(BENCH_ARGS)
+	$(PYTHON) -m tools.faults $(BENCH_ARGS)
 
 soak: setup ## a long run, watched for growth, loss and drift
-	$(PYTHON) -m tools.bench_soak $(BENCH_ARGS)
+	$(PYTHON) -m tools.soak $(BENCH_ARGS)
+
+fuzz: setup ## hostile input for everything that reads input from outside
+	$(PYTHON) -m tools.fuzz $(BENCH_ARGS)
 
 clean: ## remove .venv and everything built, measured or cached
 	rm -rf .venv build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
