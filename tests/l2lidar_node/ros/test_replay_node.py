@@ -1,0 +1,171 @@
+"""The node with a capture: what it publishes is what the live node published, bit for bit."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, PointCloud2
+from std_srvs.srv import SetBool, Trigger
+
+from l2lidar_node.demo.processes import Program
+from l2lidar_node.ros.conversions import from_time
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
+
+SETTINGS = {"qos_reliability": "reliable", "sweep_cut": "half_turn", "imu_adjust": True}
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    with open_rig() as item:
+        yield item
+
+
+class Ear:
+    """Keeps the messages of a driver, by stamp."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.clouds: dict[int, PointCloud2] = {}
+        self.samples: dict[int, Imu] = {}
+        self.times: list[int] = []
+        node = rig.observer
+        reliable = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+        self._node = node
+        self._subscriptions = [
+            node.create_subscription(PointCloud2, "/points", self._cloud, reliable),
+            node.create_subscription(Imu, "/imu/data", self._sample, reliable),
+            node.create_subscription(Clock, "/clock", self._clock, 100),
+        ]
+
+    def close(self) -> None:
+        for item in self._subscriptions:
+            self._node.destroy_subscription(item)
+
+    def _cloud(self, message: PointCloud2) -> None:
+        self.clouds[from_time(message.header.stamp)] = message
+
+    def _sample(self, message: Imu) -> None:
+        self.samples[from_time(message.header.stamp)] = message
+
+    def _clock(self, message: Clock) -> None:
+        self.times.append(from_time(message.clock))
+
+
+def end_of(program: Program, rig: Rig) -> int:
+    """Spin until a program ends by itself."""
+    deadline = time.monotonic() + TIMEOUT_S
+    while program._process.poll() is None:
+        rclpy.spin_once(rig.observer, timeout_sec=0.05)
+        assert time.monotonic() < deadline
+    for _ in range(200):
+        rclpy.spin_once(rig.observer, timeout_sec=0.001)
+    return int(program._process.returncode)
+
+
+def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "run.pcap"
+    ear = Ear(rig)
+    rig.emulator("--ready", "--loss", "0.01", "--reorder", "0.01")
+    driver = rig.driver(**SETTINGS, record_file=path)
+    rig.wait_for(lambda: len(ear.clouds) > 20, "clouds")
+    code, said = driver.stop()
+    assert code == 0
+    assert f"recording to {path}" in said
+    for _ in range(200):
+        rclpy.spin_once(rig.observer, timeout_sec=0.001)
+    assert not ear.times
+    ear.close()
+
+    again = Ear(rig)
+    program = Program("l2lidar_node.ros.driver_node", rig.arguments(**SETTINGS, replay_file=path))
+    try:
+        assert end_of(program, rig) == 0
+    finally:
+        program.stop()
+    for live, replayed, few in (
+        (ear.clouds, again.clouds, 10),
+        (ear.samples, again.samples, 100),
+    ):
+        # But for what came before the subscribers had found their publisher, and for the sweep
+        # that the signal cut short.
+        first, last = max(min(live), min(replayed)), min(max(live), max(replayed))
+        within = [stamp for stamp in live if first <= stamp <= last]
+        assert len(within) > few
+        assert within == [stamp for stamp in replayed if first <= stamp <= last]
+        assert all(live[stamp] == replayed[stamp] for stamp in within)
+    # The recording's time, never the wall's.
+    assert len(again.times) > 50
+    assert again.times == sorted(again.times)
+    assert min(ear.samples) - 2e9 < again.times[0] < again.times[-1] < max(ear.samples) + 1e9
+    again.close()
+
+
+def test_a_loop_goes_on_in_time_and_obeys_nobody(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "run.pcap"
+    ear = Ear(rig)
+    rig.emulator("--ready")
+    driver = Program("l2lidar_node.ros.driver_node", rig.arguments(**SETTINGS, record_file=path))
+    try:
+        rig.wait_for(lambda: len(ear.clouds) > 6, "clouds")
+    finally:
+        driver.stop()
+    ear.close()
+
+    again = Ear(rig)
+    rig.driver(**SETTINGS, replay_file=path, replay_loop=True, replay_rate=2.0)
+    last = max(ear.samples)
+    rig.wait_for(lambda: again.samples and max(again.samples) > last + 3e9, "another lap")
+    stamps = list(again.samples)
+    assert stamps == sorted(stamps)
+    assert again.times == sorted(again.times)
+    for kind, name, request in (
+        (SetBool, "/l2lidar_node/enable", SetBool.Request(data=False)),
+        (Trigger, "/l2lidar_node/reset", Trigger.Request()),
+    ):
+        answer = rig.call(kind, name, request)
+        assert not answer.success
+        assert "no device" in answer.message
+    again.close()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"replay_file": "no/such.pcap"}, "cannot replay no/such.pcap: No such file"),
+        ({"replay_file": "README.md"}, "no capture file"),
+        ({"record_file": "/proc/no/a.pcap"}, "cannot record to /proc/no/a.pcap"),
+        ({"serial_port": "/dev/null"}, "no serial device"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_opened_ends_the_start(parameters: dict[str, str], words: str) -> None:
+    arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+    done = subprocess.run(
+        [sys.executable, "-m", "l2lidar_node.ros.driver_node", "--ros-args", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_serial_line_feeds_the_node(rig: Rig) -> None:
+    emulator = rig.programs.start(
+        "l2lidar_node.emulator", ["--serial", "pty", "--ready", "--world", "pattern"]
+    )
+    assert emulator._process.stdout is not None
+    name = ""
+    while not name.startswith("serial "):
+        name = emulator._process.stdout.readline()
+    rig.driver(serial_port=name.split()[1].rstrip(","))
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= 3, "clouds")
