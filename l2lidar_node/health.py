@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from l2lidar_node import wire
-from l2lidar_node.clock import ClockStatus
+from l2lidar_node.clock import ClockEventKind, ClockStatus
 from l2lidar_node.counters import Counters
 from l2lidar_node.driver import Driver
 from l2lidar_node.gravity import GRAVITY, GravityReport
@@ -31,6 +31,13 @@ _MAX_DIRT_PERCENT: Final = 5.0
 _MAX_APD_CELSIUS: Final = 80.0
 _MAX_IMU_CELSIUS: Final = 85.0
 _GRAVITY_TOLERANCE: Final = 0.9  # [m/s^2]; units at rest have shown 9.6 to 10.1
+_CLOCK_TROUBLES: Final = {
+    ClockEventKind.REBOOT: "the device restarted",
+    ClockEventKind.FOREIGN_SYNC: "somebody else sets the device's clock",
+    ClockEventKind.HOST_STEP: "this host's clock was stepped",
+    ClockEventKind.SILENCE: "the device was silent",
+    ClockEventKind.LOST: "the device's clock had been lost track of",
+}
 _WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
 _MAX_TILT_DEG: Final = 10.0
 
@@ -72,11 +79,18 @@ class Period:
     counters: Counters
     foreign: int
     kernel_drops: int
+    clock_events: dict[ClockEventKind, int]
 
 
 def observe(driver: Driver, transport: Transport, now: HostNs) -> Period:
     """Return the counts of this instant."""
-    return Period(now, driver.counters.snapshot(), transport.foreign, transport.kernel_drops)
+    return Period(
+        now,
+        driver.counters.snapshot(),
+        transport.foreign,
+        transport.kernel_drops,
+        driver.clock_status().events,
+    )
 
 
 def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
@@ -85,7 +99,7 @@ def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
     checks = [
         _device(driver, before, after, seconds),
         _link(before, after),
-        _clock(driver.clock_status(), driver.round_trips, before.counters, after.counters),
+        _clock(driver.clock_status(), driver.round_trips, before, after),
         _points(before.counters, after.counters, seconds),
     ]
     if driver.last_points is not None:
@@ -180,8 +194,9 @@ def _link(before: Period, after: Period) -> Check:
 
 
 def _clock(
-    status: ClockStatus, round_trips: Collection[int], old: Counters, new: Counters
+    status: ClockStatus, round_trips: Collection[int], before: Period, after: Period
 ) -> Check:
+    old, new = before.counters, after.counters
     unlocked = sum(new.unlocked.values()) - sum(old.unlocked.values())
     values = {
         "mode": status.mode,
@@ -202,6 +217,13 @@ def _clock(
     if not status.locked:
         level = Level.WARN if unlocked else Level.OK
         return Check("clock", level, "not locked yet" if unlocked else "no data yet", values)
+    troubles = [
+        text
+        for kind, text in _CLOCK_TROUBLES.items()
+        if after.clock_events.get(kind, 0) > before.clock_events.get(kind, 0)
+    ]
+    if troubles:
+        return Check("clock", Level.WARN, f"locked; {', '.join(troubles)}", values)
     return Check("clock", Level.OK, "locked", values)
 
 

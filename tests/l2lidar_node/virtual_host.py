@@ -13,7 +13,7 @@ from l2lidar_node import session as session_module
 from l2lidar_node.capture import Endpoint
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event
-from l2lidar_node.emulator.config import DeviceConfig, FaultConfig, PowerConfig
+from l2lidar_node.emulator.config import DeviceConfig, FaultConfig, IdentityConfig, PowerConfig
 from l2lidar_node.emulator.device import VirtualL2
 from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
 from l2lidar_node.recording import RecordingWriter
@@ -21,11 +21,13 @@ from l2lidar_node.session import Session
 from l2lidar_node.settings import build
 from l2lidar_node.transport import Datagram
 from l2lidar_node.types import HostNs, ImuSample, Sweep
+from l2lidar_node.wire import WorkMode
 
 EPOCH_NS = 1_700_000_000_000_000_000
 DEVICE = Endpoint("192.168.1.62", 6101)
 HOST = Endpoint("192.168.1.2", 6201)
 READY = PowerConfig(boot_scale=0.0)
+STANDARD = WorkMode(0)
 
 
 class MemoryTap(RecordingWriter):
@@ -89,10 +91,19 @@ def live_run(
     busy: float = 0.0,
     calls: Sequence[tuple[float, Callable[[Driver, HostNs], object]]] = (),
     seed: int = 1,
+    power: PowerConfig = READY,
+    mode: WorkMode = STANDARD,
+    empty: bool = False,
 ) -> tuple[DriverConfig, list[Event], MemoryTap]:
     """Run a session in virtual time; return its settings, its events and what its tap wrote."""
-    unit = DeviceConfig(power=READY, faults=build(FaultConfig, faults or {}), seed=seed)
-    device = VirtualL2(unit, PatternScanner(), StillInertial(), power_on_ns=EPOCH_NS)
+    unit = DeviceConfig(
+        power=power,
+        identity=IdentityConfig(work_mode=int(mode)),
+        faults=build(FaultConfig, faults or {}),
+        seed=seed,
+    )
+    scanner = PatternScanner(flat=bool(mode & WorkMode.MODE_2D), empty=empty)
+    device = VirtualL2(unit, scanner, StillInertial(), power_on_ns=EPOCH_NS, modes={mode: scanner})
     host = VirtualHost(device, seconds, busy, seed)
     clock = SimpleNamespace(time_ns=host.time_ns, monotonic=host.monotonic)
     monkeypatch.setattr(session_module, "time", clock)
