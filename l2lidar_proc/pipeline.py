@@ -36,7 +36,8 @@ class Deskewed:
     stamp : HostNs
         The instant whose cloud frame the points are in.
     points : ndarray, shape (N,) or, organised, (P, 300)
-        Fields of the sweep; ``time`` only if asked for, in seconds after ``stamp``.
+        Fields of the sweep; ``time`` only if asked for or not deskewed, in seconds after
+        ``stamp``, and never constant.
     sweep : Sweep
         What came in.
     quality : Quality
@@ -144,27 +145,42 @@ class Pipeline:
         path, quality = self.tracker.path(sweep.start, sweep.end)
         if release.reason is Reason.CLOCK_JUMP:
             quality = replace(quality, flags=(*quality.flags, Flag.CLOCK_JUMP))
-        stamp, points, problems = self._assemble(sweep, path)
+        deskews = Flag.NO_IMU not in quality.flags
+        stamp, points, problems = self._assemble(sweep, path if deskews else None)
         if problems:
             quality = replace(quality, flags=(*quality.flags, Flag.FILTER_LEFT_OUT))
             self.problems = problems
         self._count(quality)
         return Deskewed(stamp, points, sweep, quality, release.waited_ns)
 
-    def _assemble(self, sweep: Sweep, path: Path) -> tuple[HostNs, NDArray[np.void], str]:
-        """Filter, deskew, filter again; return stamp, points to publish, what went wrong."""
+    def _assemble(self, sweep: Sweep, path: Path | None) -> tuple[HostNs, NDArray[np.void], str]:
+        """Filter, deskew, filter again; return stamp, points to publish, what went wrong.
+
+        Without a path the points stay as they are and keep their times.
+        """
         chain = self._config.filters
         before, problem = self._kept(sweep.points, chain.filters_before)
         points = sweep.points if len(before) == len(sweep.points) else sweep.points[before]
-        stamp = self._reference(sweep, points)
-        moved = deskew(points, sweep.start, path, stamp)
+        reference = self._config.deskew.reference if path is not None else "start"
+        stamp = _instant(reference, sweep, points)
+        moved = deskew(points, sweep.start, path, stamp) if path is not None else points
         after, another = self._kept(moved, chain.filters_after)
         if len(after) < len(moved):
             points, moved = points[after], moved[after]
-            if self._reference(sweep, points) != stamp:
-                stamp = self._reference(sweep, points)
-                moved = deskew(points, sweep.start, path, stamp)
-        return stamp, self._finished(moved, points["time"], sweep.start, stamp), problem or another
+            if _instant(reference, sweep, points) != stamp:
+                stamp = _instant(reference, sweep, points)
+                moved = deskew(points, sweep.start, path, stamp) if path is not None else points
+        times = points["time"]
+        # a constant time ends some consumers
+        keeps = (
+            (self._config.deskew.keep_time or path is None)
+            and len(times) > 0
+            and bool(np.ptp(times) > 0.0)
+        )
+        moved = _timed(moved, times, sweep.start, stamp) if keeps else without_time(moved)
+        if self._config.deskew.organised:
+            moved = organise(moved, times)
+        return stamp, moved, problem or another
 
     def _kept(
         self, points: NDArray[np.void], names: tuple[str, ...]
@@ -173,29 +189,6 @@ class Pipeline:
             return filters.apply(points, names, self._config.filters), ""
         except FilterError as error:
             return np.arange(len(points)), str(error)
-
-    def _reference(self, sweep: Sweep, points: NDArray[np.void]) -> HostNs:
-        """Return the instant to move the points to."""
-        reference = self._config.deskew.reference
-        if reference == "middle":
-            return HostNs((sweep.start + sweep.end) // 2)
-        if reference == "end":
-            return sweep.end
-        if not len(points) or len(points) == len(sweep.points):
-            return sweep.start
-        return HostNs(sweep.start + round(float(points["time"][0]) * 1e9))
-
-    def _finished(
-        self, moved: NDArray[np.void], times: NDArray[np.float32], start: HostNs, stamp: HostNs
-    ) -> NDArray[np.void]:
-        if self._config.deskew.keep_time:
-            if stamp != start:
-                moved = moved.copy()
-                # to whole nanoseconds, so that the first is exactly 0
-                moved["time"] = np.round(times - np.float64((stamp - start) * 1e-9), 9) + 0.0
-        else:
-            moved = without_time(moved)
-        return organise(moved, times) if self._config.deskew.organised else moved
 
     def _count(self, quality: Quality) -> None:
         passed_on = Flag.NO_IMU in quality.flags
@@ -211,3 +204,26 @@ class Pipeline:
 
     def _jumped(self) -> None:
         self.counts = replace(self.counts, jumps=self.counts.jumps + 1)
+
+
+def _instant(reference: str, sweep: Sweep, points: NDArray[np.void]) -> HostNs:
+    """Return the instant to move the points to."""
+    if reference == "middle":
+        return HostNs((sweep.start + sweep.end) // 2)
+    if reference == "end":
+        return sweep.end
+    if not len(points) or len(points) == len(sweep.points):
+        return sweep.start
+    return HostNs(sweep.start + round(float(points["time"][0]) * 1e9))
+
+
+def _timed(
+    points: NDArray[np.void], times: NDArray[np.float32], start: HostNs, stamp: HostNs
+) -> NDArray[np.void]:
+    """Return the points with times after the stamp in place of times after the start."""
+    if stamp == start:
+        return points
+    timed = points.copy()
+    # to whole nanoseconds, so that the first is exactly 0
+    timed["time"] = np.round(times - np.float64((stamp - start) * 1e-9), 9) + 0.0
+    return timed

@@ -94,6 +94,17 @@ def test_after_filtering_the_first_point_has_time_0_and_the_stamp(chain):
     assert any(item.stamp > item.sweep.start for item in done)
 
 
+def test_a_constant_time_is_never_kept():
+    points, _ = seen(STILL, 1.0, 1.2, 1.0, count=3)
+    points["range"] = points["x"] = points["y"] = points["z"] = (1.0, 5.0, 5.0)
+    pipeline = Pipeline(build(ProcConfig, {"keep_time": True, "range_max": 3.0}))
+    pipeline.imu(STILL.imu(0, 2))
+    pipeline.sweep(Sweep(at(1.0), at(1.2), points, 1, 0), 0)
+    (item,) = pipeline.poll(0)
+    assert len(item.points) == 1
+    assert "time" not in item.points.dtype.names
+
+
 def test_everything_filtered_away_is_an_empty_cloud_not_a_lost_one():
     _, done = run(WALK, 1.0, {"range_min": 500.0})
     assert done
@@ -101,13 +112,14 @@ def test_everything_filtered_away_is_an_empty_cloud_not_a_lost_one():
 
 
 def test_without_imu_sweeps_pass_through_and_say_so():
-    pipeline = Pipeline(build(ProcConfig, {"imu_wait_ms": 30, "keep_time": True}))
+    pipeline = Pipeline(build(ProcConfig, {"imu_wait_ms": 30, "reference": "end"}))
     sweep = sweep_at(WALK, 1.0)
     pipeline.sweep(sweep, 0)
     assert pipeline.due_ns == 30 * MS
     assert pipeline.poll(29 * MS) == []
     (item,) = pipeline.poll(30 * MS)
     assert item.points.tobytes() == sweep.points.tobytes()
+    assert item.stamp == sweep.start
     assert Flag.NO_IMU in item.quality.flags
     assert pipeline.counts.passed_on == pipeline.counts.uncovered == 1
     assert item.waited_ns == 30 * MS
