@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from pathlib import Path
 from types import TracebackType
@@ -36,20 +37,13 @@ _DATATYPES: Final = {
 """Numbers of ``sensor_msgs/PointField`` by the kind and size of a NumPy type."""
 
 
-class BagWriter:
-    """A bag of clouds, IMU samples and the static transform; use it in a ``with``.
+class BagFile:
+    """A bag that serialised messages are written into; use it in a ``with``.
 
     Parameters
     ----------
     path : Path
         A new MCAP file where the name ends in ``.mcap``, else a new rosbag2 folder.
-    config : DriverConfig
-        Topics, frames, point layout and covariances.
-
-    Attributes
-    ----------
-    clouds, samples : int
-        What has been written.
 
     Raises
     ------
@@ -57,30 +51,19 @@ class BagWriter:
         If there is something of that name.
     """
 
-    def __init__(self, path: Path, config: DriverConfig) -> None:
+    def __init__(self, path: Path) -> None:
         if path.exists():
-            raise FileExistsError(f"{path} exists already")
-        self.clouds = 0
-        self.samples = 0
+            raise FileExistsError(errno.EEXIST, "it exists already", str(path))
         self._path = path
-        self._config = config
-        self._layout = LAYOUTS[config.topics.point_layout]
-        self._store = get_typestore(Stores.ROS2_JAZZY)
-        self._types: Any = self._store.types
         # rosbags writes folders: for a single file, what is in one is taken out at the end.
         self._folder = path.with_suffix(".unfinished") if path.suffix == ".mcap" else path
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
+        self.store = get_typestore(Stores.ROS2_JAZZY)
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> BagFile:
         """Make the file."""
         self._writer.open()
-        topics = self._config.topics
-        reliable = topics.qos_reliability == "reliable"
-        self._connect(topics.point_cloud_topic_id, _CLOUD, _qos(10, reliable, latched=False))
-        self._connect(topics.imu_topic_id, _IMU, _qos(200, reliable, latched=False))
-        if self._config.frames.publish_tf:
-            self._connect("/tf_static", _TF, _qos(1, reliable=True, latched=True))
         return self
 
     def __exit__(
@@ -96,6 +79,68 @@ class BagWriter:
             content.replace(self._path)
             shutil.rmtree(self._folder)
 
+    def connect(self, topic: str, kind: str, depth: int, reliable: bool, latched: bool) -> None:
+        """Announce a topic, its message type such as ``sensor_msgs/msg/Imu`` and its QoS."""
+        self._connections[topic] = self._writer.add_connection(
+            topic,
+            kind,
+            typestore=self.store,
+            offered_qos_profiles=[_qos(depth, reliable, latched)],
+        )
+
+    def write(self, topic: str, now: int, data: bytes | memoryview) -> None:
+        """Append a serialised (CDR) message that was received at an instant [ns]."""
+        self._writer.write(self._connections[topic], now, data)
+
+
+class BagWriter:
+    """A bag of clouds, IMU samples and the static transform; use it in a ``with``.
+
+    Parameters
+    ----------
+    path : Path
+        See :class:`BagFile`.
+    config : DriverConfig
+        Topics, frames, point layout and covariances.
+
+    Attributes
+    ----------
+    clouds, samples : int
+        What has been written.
+    """
+
+    def __init__(self, path: Path, config: DriverConfig) -> None:
+        self.clouds = 0
+        self.samples = 0
+        self._file = BagFile(path)
+        self._config = config
+        self._layout = LAYOUTS[config.topics.point_layout]
+        self._store = self._file.store
+        self._types: Any = self._store.types
+
+    def __enter__(self) -> BagWriter:
+        """Make the file."""
+        self._file.__enter__()
+        topics = self._config.topics
+        reliable = topics.qos_reliability == "reliable"
+        for topic, kind, depth in (
+            (topics.point_cloud_topic_id, _CLOUD, 10),
+            (topics.imu_topic_id, _IMU, 200),
+        ):
+            self._file.connect(topic, kind, depth, reliable, latched=False)
+        if self._config.frames.publish_tf:
+            self._file.connect("/tf_static", _TF, 1, reliable=True, latched=True)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the file."""
+        self._file.__exit__(kind, error, trace)
+
     def add(self, event: Event) -> None:
         """Write a sweep or a sample; everything else is passed over.
 
@@ -104,11 +149,12 @@ class BagWriter:
         if isinstance(event, Sweep):
             self._begin(event.start)
             topic = self._config.topics.point_cloud_topic_id
-            self._write(topic, event.end, self._cloud(event))
+            self._write(topic, _CLOUD, event.end, self._cloud(event))
             self.clouds += 1
         elif isinstance(event, ImuSample):
             self._begin(event.stamp)
-            self._write(self._config.topics.imu_topic_id, event.stamp, self._imu(event))
+            topic = self._config.topics.imu_topic_id
+            self._write(topic, _IMU, event.stamp, self._imu(event))
             self.samples += 1
 
     def _begin(self, now: HostNs) -> None:
@@ -125,7 +171,7 @@ class BagWriter:
                 rotation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
             ),
         )
-        self._write("/tf_static", now, types[_TF](transforms=[transform]))
+        self._write("/tf_static", _TF, now, types[_TF](transforms=[transform]))
 
     def _cloud(self, sweep: Sweep) -> Any:
         points = self._layout.convert(sweep.points, sweep.start)
@@ -172,15 +218,8 @@ class BagWriter:
         time = self._types["builtin_interfaces/msg/Time"](*divmod(int(stamp), _NS))
         return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
-    def _connect(self, topic: str, kind: str, qos: Qos) -> None:
-        self._connections[topic] = self._writer.add_connection(
-            topic, kind, typestore=self._store, offered_qos_profiles=[qos]
-        )
-
-    def _write(self, topic: str, now: HostNs, message: Any) -> None:
-        connection = self._connections[topic]
-        data = self._store.serialize_cdr(message, connection.msgtype)
-        self._writer.write(connection, int(now), data)
+    def _write(self, topic: str, kind: str, now: HostNs, message: Any) -> None:
+        self._file.write(topic, now, self._store.serialize_cdr(message, kind))
 
 
 def _diagonal(*variances: float) -> Any:

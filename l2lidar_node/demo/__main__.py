@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import rclpy
@@ -17,6 +18,7 @@ from l2lidar_node.demo.processes import (
     free_udp_ports,
     isolate_ros,
 )
+from l2lidar_node.demo.recorder import TopicRecorder
 from l2lidar_node.demo.report import report
 
 _WARM_UP_S = 3.0
@@ -37,7 +39,10 @@ def main() -> int:
     rclpy.init()
     observer = Observer()
     try:
-        with Programs() as programs:
+        with ExitStack() as stack:
+            if options.record is not None:
+                recorder = stack.enter_context(TopicRecorder(observer, options.record))
+            programs = stack.enter_context(Programs())
             _start(programs, options)
             _wait_for_data(observer, programs)
             end = time.monotonic() + options.duration
@@ -45,7 +50,7 @@ def main() -> int:
                 observer.watch(min(end, time.monotonic() + 1.0))
                 programs.check()
                 _tell(console, observer)
-    except ProgramError as error:
+    except (ProgramError, OSError) as error:
         console.print(f"[red]{error}")
         return 1
     except KeyboardInterrupt:
@@ -54,6 +59,8 @@ def main() -> int:
     finally:
         observer.destroy_node()
         rclpy.try_shutdown()
+    if options.record is not None:
+        console.print(f"{recorder.messages} messages recorded in {options.record}")
     troubles = report(console, observer, options.folder, with_odometry=not options.driver_only)
     for trouble in troubles:
         console.print(f"[red]{trouble}")
@@ -72,6 +79,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--driver-only", action="store_true", help="leave deskew and odometry out")
     parser.add_argument(
         "--folder", type=Path, default=Path("out/demo"), help="where pictures and truth go"
+    )
+    parser.add_argument(
+        "--record", type=Path, help="bag to write: FILE.mcap, or a folder for rosbag2"
     )
     options = parser.parse_args()
     if not 3 <= options.duration <= 3600:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from rosbags.highlevel import AnyReader
 
 pytestmark = pytest.mark.ros
 
@@ -17,13 +18,23 @@ TIMEOUT_S = 120
 
 
 def test_the_driver_alone_streams_without_loss_and_draws_a_cloud(tmp_path: Path) -> None:
+    bag = tmp_path / "run.mcap"
     result = subprocess.run(
-        [*COMMAND, "--driver-only", "--duration", "4", "--folder", str(tmp_path)],
+        [*COMMAND, "--driver-only", "--duration", "4", "--folder", str(tmp_path)]
+        + ["--record", str(bag)],
         capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
     assert "lost packets: 0" in result.stdout
     assert (tmp_path / "cloud.png").stat().st_size > 20_000
+    with AnyReader([bag]) as reader:
+        assert reader.topics["/points"].msgcount > 10
+        assert reader.topics["/imu/data"].msgcount > 500
+        assert reader.topics["/tf_static"].msgcount == 1
+        assert reader.topics["/diagnostics"].msgcount > 2
+        clouds = [connection for connection in reader.connections if connection.topic == "/points"]
+        _, _, data = next(reader.messages(connections=clouds))
+        assert reader.deserialize(data, clouds[0].msgtype).header.frame_id == "l2lidar_link"
 
 
 def test_the_whole_chain_is_judged_against_the_truth(tmp_path: Path) -> None:
