@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from l2lidar_node.settings import setting
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.settings import SettingError, setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,3 +152,79 @@ class OdometryConfig:
     inertial: InertialConfig = field(default_factory=InertialConfig)
     surfaces: SurfaceConfig = field(default_factory=SurfaceConfig)
     kiss: KissConfig = field(default_factory=KissConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryTopics:
+    """Where an odometry node listens and speaks, and which frames it names."""
+
+    cloud_topic: str = setting("/points", "clouds with one time per point, not deskewed")
+    imu_topic: str = setting("/imu/data", "IMU samples")
+    odometry_topic: str = setting("odometry", "pose and twist of base_frame, once per sweep")
+    fast_odometry_topic: str = setting(
+        "odometry_imu", "pose and twist carried on by the IMU, see imu_rate"
+    )
+    path_topic: str = setting("path", "where base_frame has been")
+    map_topic: str = setting("local_map", "local map in odom_frame")
+    registered_topic: str = setting("registered_points", "deskewed cloud in odom_frame")
+    qos_reliability: str = setting(
+        "reliable", "reliability of what is published", choices=("best_effort", "reliable")
+    )
+    odom_frame: str = setting("odom", "frame in which poses are given")
+    base_frame: str = setting(
+        "", "frame whose pose is given, tied to the cloud frame by /tf_static; empty = cloud frame"
+    )
+    publish_tf: bool = setting(True, "publish the transform between odom_frame and base_frame")
+    invert_tf: bool = setting(
+        False, "make base_frame the parent of odom_frame, for a base_frame that has a parent"
+    )
+    use_tf: bool = setting(
+        True, "take the mounts from /tf_static where it has them; else imu_xyz holds"
+    )
+    imu_xyz: tuple[float, ...] = setting(
+        (-0.007698, -0.014655, 0.00667), "place of the IMU in the cloud frame", unit="m"
+    )
+    imu_wait_ms: int = setting(
+        50, "longest wait for IMU samples up to the end of a sweep", unit="ms", lo=0, hi=1000
+    )
+    imu_rate: float = setting(
+        0.0, "rate of the odometry carried on by the IMU, 0 = none", unit="Hz", lo=0.0, hi=250.0
+    )
+    map_period_s: float = setting(
+        2.0, "time between local maps, 0 = none", unit="s", lo=0.0, hi=3600.0, live=True
+    )
+    path_length: int = setting(
+        2000,
+        "poses that path keeps, 5 cm or 5 degrees apart; the oldest go first",
+        lo=1,
+        hi=100_000,
+        live=True,
+    )
+    map_file: str = setting("map.ply", "what ~/save_map writes; .ply or .pcd", live=True)
+    trajectory_file: str = setting(
+        "trajectory.tum",
+        "what ~/save_trajectory writes as TUM, and beside it as KITTI",
+        live=True,
+    )
+
+    def __post_init__(self) -> None:
+        """Check what a single setting cannot."""
+        if len(self.imu_xyz) != 3:
+            raise SettingError(f"parameter 'imu_xyz': {self.imu_xyz!r} has not three numbers")
+        if not self.map_file.endswith((".ply", ".pcd")):
+            raise SettingError(f"parameter 'map_file': '{self.map_file}' is not a .ply or .pcd")
+
+    @property
+    def T_cloud_imu(self) -> NDArray[np.float64]:
+        """IMU coordinates to cloud coordinates where TF does not say, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, 3] = self.imu_xyz
+        return pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryNodeConfig:
+    """Everything the odometry node can be told."""
+
+    topics: OdometryTopics = field(default_factory=OdometryTopics)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
