@@ -59,6 +59,8 @@ class Layout:
         Parameters
         ----------
         points : ndarray, shape (N,), dtype POINT
+            Or any other with x, y and z, and with ``time`` where the layout has a time: a missing
+            range is computed, a missing intensity is 0.
         start : HostNs
             Instant at which ``time`` is 0.
 
@@ -73,7 +75,7 @@ class Layout:
         for name in self.dtype.names or ():
             converted[name] = _field(name, points, start)
         if self.name == "ouster_legacy":
-            converted["range"] = np.rint(points["range"] * 1e3)  # whole millimetres
+            converted["range"] = np.rint(_range(points) * 1e3)  # whole millimetres
         return converted
 
 
@@ -88,17 +90,24 @@ def _field(name: str, points: NDArray[np.void], start: HostNs) -> NDArray[Any]:
         return np.float64(start / 1e9) + points["time"].astype(np.float64)
     if name in ("ring", "channel"):
         return rings(points)
-    if name == "distance":
-        return np.asarray(points["range"])
+    if name in ("range", "distance"):
+        return _range(points)
     if name == "azimuth":
         return np.asarray(np.arctan2(points["y"], points["x"]))
     if name == "elevation":
         return np.asarray(np.arctan2(points["z"], np.hypot(points["x"], points["y"])))
-    if name == "reflectivity":
-        return np.asarray(points["intensity"])
+    if name in ("intensity", "reflectivity"):
+        known = "intensity" in (points.dtype.names or ())
+        return np.asarray(points["intensity"]) if known else np.zeros(len(points))
     if name in ("noise", "return_type"):
         return np.full(len(points), _CONSTANTS[name])
     return np.asarray(points[name])
+
+
+def _range(points: NDArray[np.void]) -> NDArray[Any]:
+    if "range" in (points.dtype.names or ()):
+        return np.asarray(points["range"])
+    return np.asarray(np.sqrt(points["x"] ** 2 + points["y"] ** 2 + points["z"] ** 2))
 
 
 _CONSTANTS: Final = {

@@ -6,9 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from l2lidar_node.layouts import LAYOUTS
 from l2lidar_node.settings import SettingError, setting
 from l2lidar_proc import rotations
 from l2lidar_proc.rotations import F64
+
+AS_INPUT = "as_input"
+"""Choice of a layout: whatever the input has."""
 
 FILTERS = (
     "range",
@@ -121,16 +125,16 @@ class FilterConfig:
         90.0, "filter vertical: highest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
     )
     azimuth_min: float = setting(
-        -180.0, "filter azimuth: where the window begins; x ahead, counter-clockwise", unit="deg",
-        lo=-360.0, hi=360.0, live=True,
+        -180.0, "filter azimuth: where the window begins; x ahead, counter-clockwise",
+        unit="deg", lo=-360.0, hi=360.0, live=True,
     )  # fmt: skip
     azimuth_max: float = setting(
-        180.0, "filter azimuth: where the window ends; below the beginning it goes across 180 degrees",
+        180.0, "filter azimuth: where the window ends; below the beginning it goes across 180 deg",
         unit="deg", lo=-360.0, hi=360.0, live=True,
     )  # fmt: skip
     keep_boxes: tuple[float, ...] = setting(
-        (), "filter keep_boxes: x y z of one corner and of the opposite one, box after box", unit="m",
-        live=True,
+        (), "filter keep_boxes: x y z of one corner and of the opposite one, box after box",
+        unit="m", live=True,
     )  # fmt: skip
     remove_boxes: tuple[float, ...] = setting(
         (), "filter remove_boxes: likewise, such as the robot's own body", unit="m", live=True
@@ -156,15 +160,15 @@ class FilterConfig:
         65535.0, "filter isolated: brighter points stay in any case", lo=0.0, hi=65535.0, live=True
     )
     voxel_size: float = setting(
-        0.1, "filter voxel: edge of the cubes of which one point is kept", unit="m", lo=0.001, hi=100.0,
-        live=True,
+        0.1, "filter voxel: edge of the cubes of which one point is kept", unit="m",
+        lo=0.001, hi=100.0, live=True,
     )  # fmt: skip
     statistical_neighbours: int = setting(
         16, "filter statistical: neighbours to average the distance to", lo=1, hi=200, live=True
     )
     statistical_ratio: float = setting(
-        2.0, "filter statistical: standard deviations above the mean to be left out", lo=0.01, hi=100.0,
-        live=True,
+        2.0, "filter statistical: standard deviations above the mean to be left out", lo=0.01,
+        hi=100.0, live=True,
     )  # fmt: skip
     radius: float = setting(
         0.3, "filter radius: where neighbours are counted", unit="m", lo=0.001, hi=100.0, live=True
@@ -210,6 +214,11 @@ class DeskewTopics:
     output_topic: str = setting("points_deskewed", "deskewed clouds")
     qos_reliability: str = setting(
         "reliable", "reliability of the output", choices=("best_effort", "reliable")
+    )
+    point_layout: str = setting(
+        AS_INPUT,
+        "fields of the output, without the time field once points are deskewed",
+        choices=(AS_INPUT, *LAYOUTS),
     )
     use_tf: bool = setting(
         True, "take the mounts from /tf_static where it has them; else imu_xyz and imu_rpy hold"

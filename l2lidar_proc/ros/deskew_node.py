@@ -16,13 +16,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
+from l2lidar_node.layouts import LAYOUTS
 from l2lidar_node.ros.conversions import CloudTemplate, from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc import report
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
-from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.pipeline import Deskewed, Pipeline
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.static_frames import StaticFrames
@@ -178,6 +179,11 @@ class DeskewNode(Node):
         """Return a cloud to publish; a plain one is put together as bytes, three times as fast."""
         if points.ndim == 2:
             return to_cloud(points, stamp, self._cloud_frame)
+        name = self._settings.value.topics.point_layout
+        if name != AS_INPUT:
+            layout = LAYOUTS[name]
+            has_time = "time" in (points.dtype.names or ())
+            points = (layout if has_time else layout.without_time()).convert(points, stamp)
         kind = (points.dtype, self._cloud_frame)
         if self._template is None or self._template[0] != kind:
             self._template = kind, CloudTemplate(*kind)

@@ -135,3 +135,13 @@ def test_lio_sam_keeps_nearly_all_points():
     column = np.where(column >= columns, column - columns, column)
     cells = np.unique(rings(points).astype(int) * columns + column)
     assert len(cells) > 0.95 * len(points)
+
+
+def test_points_of_other_drivers_get_what_they_lack(points):
+    bare = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f4")])
+    for name in bare.dtype.names:
+        bare[name] = points[name]
+    converted = LAYOUTS["native"].convert(bare, START)
+    norms = np.linalg.norm([points["x"], points["y"], points["z"]], axis=0)
+    np.testing.assert_allclose(converted["range"], norms, rtol=1e-6)
+    assert not converted["intensity"].any()

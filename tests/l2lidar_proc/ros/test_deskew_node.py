@@ -149,6 +149,20 @@ def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench):
     assert status.name == "deskew_node: deskew"
 
 
+@pytest.mark.parametrize(
+    "bench", [("imu_wait_ms:=1000", "point_layout:=velodyne")], indirect=True
+)
+def test_the_output_has_the_layout_asked_for_without_a_time(bench):
+    prime(bench, 2.1)
+    points, _ = seen(WALK, 2.0, 2.23, 2.0, count=3000)
+    bench.send_cloud(points, 2.0)
+    bench.send_imu(WALK.imu(2.104, 2.232))
+    bench.until(lambda: bench.clouds)
+    deskewed = from_cloud(bench.clouds[0])
+    assert deskewed.dtype.names == ("x", "y", "z", "intensity", "ring")
+    assert deskewed.dtype.itemsize == 22
+
+
 def test_a_cloud_without_plain_times_passes_with_the_reason(bench):
     points, _ = seen(WALK, 0, 0.23, 0)
     points["time"] = 0.05
