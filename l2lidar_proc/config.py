@@ -133,7 +133,7 @@ class FilterConfig:
         unit="deg", lo=-360.0, hi=360.0, live=True,
     )  # fmt: skip
     keep_boxes: tuple[float, ...] = setting(
-        (), "filter keep_boxes: x y z of one corner and of the opposite one, box after box",
+        (), "filter keep_boxes: x y z of one corner and of the opposite, box after box",
         unit="m", live=True,
     )  # fmt: skip
     remove_boxes: tuple[float, ...] = setting(

@@ -149,9 +149,7 @@ def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench):
     assert status.name == "deskew_node: deskew"
 
 
-@pytest.mark.parametrize(
-    "bench", [("imu_wait_ms:=1000", "point_layout:=velodyne")], indirect=True
-)
+@pytest.mark.parametrize("bench", [("imu_wait_ms:=1000", "point_layout:=velodyne")], indirect=True)
 def test_the_output_has_the_layout_asked_for_without_a_time(bench):
     prime(bench, 2.1)
     points, _ = seen(WALK, 2.0, 2.23, 2.0, count=3000)
