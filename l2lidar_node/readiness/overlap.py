@@ -18,7 +18,7 @@ _APART_S: Final = 0.05
 def check(clouds: Track, imu: Track) -> Iterator[Finding]:
     """Yield findings on how the two topics fit together; neither is empty."""
     starts = clouds.stamps
-    ends = starts + np.round(clouds.lengths_s * 1e9).astype(np.int64)
+    ends = starts + np.round(np.nan_to_num(clouds.lengths_s) * 1e9).astype(np.int64)
     samples = np.sort(imu.stamps)
     offset = float(np.median(starts) - np.median(samples)) / 1e9
     if samples[-1] < starts.min() or samples[0] > ends.max():
@@ -47,7 +47,7 @@ def check(clouds: Track, imu: Track) -> Iterator[Finding]:
         yield ok(
             _SUBJECT, "covered", f"samples cover {len(starts) - bare} of {len(starts)} clouds"
         )
-    if not (clouds.has_arrivals and imu.has_arrivals):
+    if not (clouds.has_lengths and clouds.has_arrivals and imu.has_arrivals):
         return
     apart = clouds.latency_s - imu.latency_s
     if abs(apart) > _APART_S:

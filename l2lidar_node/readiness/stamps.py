@@ -35,7 +35,7 @@ class Track:
     stamps, arrivals : ndarray, shape (N,), int64
         [ns], in the order they came.
     lengths_s : ndarray, shape (N,), float64
-        From the stamp to the end of what was measured [s].
+        From the stamp to the end of what was measured [s], NaN where that is not known.
     jitter : float
         Share of the period that intervals may deviate from it.
     """
@@ -53,8 +53,14 @@ class Track:
 
     @property
     def latency_s(self) -> float:
-        """Median time from the end of a measurement to its arrival [s]."""
-        return float(np.median((self.arrivals - self.stamps) / 1e9 - self.lengths_s))
+        """Median time from the end of a measurement to its arrival [s]; or from its stamp."""
+        lengths = self.lengths_s if self.has_lengths else np.zeros(len(self.stamps))
+        return float(np.nanmedian((self.arrivals - self.stamps) / 1e9 - lengths))
+
+    @property
+    def has_lengths(self) -> bool:
+        """Whether any length is known."""
+        return bool(np.isfinite(self.lengths_s).any())
 
 
 def cloud_track(seen: Observation, lengths_s: F64) -> Track:

@@ -93,7 +93,7 @@ def _check_origin(times: Timing, consumer: Consumer) -> Iterator[Finding]:
             "time-origin",
             f"{times.refused} of {total} clouds have times that are near neither 0 nor the stamp "
             f"(first {times.least[0] * 1e3:.3f} ms); {consumer.title} refuses them",
-            "stamp the cloud at its first point: filter in deskew_node, which does so",
+            "stamp the cloud at its first point, as the filters of deskew_node do",
         )
         return
     first = times.least
@@ -106,7 +106,7 @@ def _check_origin(times: Timing, consumer: Consumer) -> Iterator[Finding]:
             "time-origin",
             f"the first point is {_signed(worst)} the stamp in {late} of {total} clouds, read as "
             f"{times.unit}; demanded are times from 0 at the stamp",
-            "stamp the cloud at its first point: filter in deskew_node, which does so",
+            "stamp the cloud at its first point, as the filters of deskew_node do",
         )
     else:
         yield ok(_SUBJECT, "time-origin", f"read as {times.unit}, the first point at the stamp")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +23,14 @@ from l2lidar_node.readiness.demands import Consumer, Use
 from l2lidar_node.readiness.findings import Finding, Level
 from l2lidar_node.readiness.observation import Observation
 
+_OVERLONG: Final = 1.25
+_LONGEST_S: Final = 20.0
+
 
 def judge(seen: Observation, consumer: Consumer) -> list[Finding]:
     """Return what there is to say about an observation for a consumer, in a fixed order."""
-    return list(_judge(seen, consumer))
+    with np.errstate(all="ignore"):  # any number may stand in a message
+        return list(_judge(seen, consumer))
 
 
 def _judge(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
@@ -56,15 +61,20 @@ def _judge(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
 
 
 def _lengths(seen: Observation, consumer: Consumer) -> NDArray[np.float64]:
-    """Return the time from each cloud's stamp to its last point [s], 0 where it is not known."""
+    """Return the time from each cloud's stamp to its last point [s], NaN where it is not known.
+
+    Times that are wrong, and said to be, say nothing about it.
+    """
+    lengths = np.full(len(seen.clouds), np.nan)
     found = times.timed(seen, consumer)
-    lengths = np.zeros(len(seen.clouds))
     if found is None:
         return lengths
     clouds, timing = found
+    steps = np.diff(np.array([cloud.stamp for cloud in seen.clouds], np.int64)) / 1e9
+    steps = steps[steps > 0]
+    longest = _OVERLONG * float(np.median(steps)) if len(steps) else _LONGEST_S
     index = {id(cloud): at for at, cloud in enumerate(seen.clouds)}
     places = [index[id(cloud)] for cloud in clouds]
-    with np.errstate(all="ignore"):
-        plausible = (timing.greatest >= 0.0) & (timing.greatest < 20.0)
-        lengths[places] = np.where(plausible, timing.greatest, 0.0)
+    is_plausible = (timing.greatest > 0.0) & (timing.greatest <= longest)
+    lengths[places] = np.where(is_plausible, timing.greatest, np.nan)
     return lengths

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -37,7 +38,7 @@ TF = "tf2_msgs/msg/TFMessage"
 NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 RELIABLE = ("fast_lio", "genz_icp", "dlio", "point_lio", "rtabmap", "autoware")
-DURATION_S = 2.5
+DURATION_S = 2.2
 TILT = 0.4  # rad
 
 
@@ -55,6 +56,7 @@ class Recording:
     reliability: str = "best_effort"
     imu_reliability: str = ""
     is_levelled: bool | None = None
+    depth: int = 0
 
     def points(self, change: Callable[[np.ndarray], np.ndarray | None]) -> None:
         """Replace every cloud's points by what a function makes of them (None: in place)."""
@@ -73,8 +75,8 @@ class Recording:
             gathering.imu(message, arrival)
         gathering.transforms(tf(self.transforms))
         return gathering.observation(
-            (Qos(self.reliability),),
-            (Qos(self.imu_reliability or self.reliability),),
+            (Qos(self.reliability, self.depth),),
+            (Qos(self.imu_reliability or self.reliability, self.depth),),
             self.is_levelled,
         )
 
@@ -102,6 +104,7 @@ class Recording:
         return path
 
 
+@cache
 def good(consumer: str) -> Recording:
     """Return what the driver publishes with our configuration for a consumer."""
     layout = LAYOUTS[CONSUMERS[consumer].inputs[0].layout]
@@ -143,6 +146,26 @@ def imu_messages() -> list[Any]:
     return [
         imu(build.EPOCH_NS + round(at[i] * 1e9), q[i], rates[i], up[i]) for i in range(len(at))
     ]
+
+
+def copied(recording: Recording) -> Recording:
+    """Return a recording that can be changed without changing this one."""
+    made = copy.copy(recording)
+    made.clouds = [_copied(message, "header") for message in recording.clouds]
+    for message in made.clouds:
+        message.fields = [copy.copy(item) for item in message.fields]
+    parts = ("header", "orientation", "angular_velocity", "linear_acceleration")
+    made.imu = [_copied(message, *parts) for message in recording.imu]
+    made.cloud_arrivals = list(recording.cloud_arrivals)
+    made.imu_arrivals = list(recording.imu_arrivals)
+    return made
+
+
+def _copied(message: Any, *parts: str) -> Any:
+    made = copy.copy(message)
+    for name in parts:
+        setattr(made, name, copy.copy(getattr(message, name)))
+    return made
 
 
 def header(stamp: int, frame: str) -> Any:
