@@ -220,6 +220,11 @@ class DeskewTopics:
         "fields of the output, without the time field once points are deskewed",
         choices=(AS_INPUT, *LAYOUTS),
     )
+    input_reliability: str = setting(
+        "best_effort",
+        "reliability asked of clouds and IMU samples; reliable hears reliable publishers only",
+        choices=("best_effort", "reliable"),
+    )
     use_tf: bool = setting(
         True, "take the mounts from /tf_static where it has them; else imu_xyz and imu_rpy hold"
     )

@@ -30,6 +30,10 @@ from l2lidar_proc.ros.static_frames import StaticFrames
 from l2lidar_proc.velocity import carried_over
 
 _IMU_DEPTH = 500
+_RELIABILITY = {
+    "best_effort": ReliabilityPolicy.BEST_EFFORT,
+    "reliable": ReliabilityPolicy.RELIABLE,
+}
 
 
 class DeskewNode(Node):
@@ -61,21 +65,20 @@ class DeskewNode(Node):
 
     def _open(self, config: DeskewNodeConfig) -> None:
         topics = config.topics
-        reliable = topics.qos_reliability == "reliable"
-        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        self._output = self.create_publisher(
-            PointCloud2, topics.output_topic, QoSProfile(depth=10, reliability=reliability)
-        )
+        speaking = QoSProfile(depth=10, reliability=_RELIABILITY[topics.qos_reliability])
+        self._output = self.create_publisher(PointCloud2, topics.output_topic, speaking)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._statistics = self.create_publisher(DiagnosticStatus, "~/statistics", 10)
-        listening = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        often = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        asked = _RELIABILITY[topics.input_reliability]
+        listening = QoSProfile(depth=10, reliability=asked)
+        often = QoSProfile(depth=_IMU_DEPTH, reliability=asked)
         self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
         self.create_subscription(Imu, topics.imu_topic, self._imu, often)
+        velocities = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
-            self.create_subscription(Odometry, topics.velocity_topic, self._odometry, often)
+            self.create_subscription(Odometry, topics.velocity_topic, self._odometry, velocities)
         elif topics.velocity_type == "twist":
-            self.create_subscription(TwistStamped, topics.velocity_topic, self._twist, often)
+            self.create_subscription(TwistStamped, topics.velocity_topic, self._twist, velocities)
 
     def _configure(self, config: DeskewNodeConfig) -> None:
         self._pipeline.configure(config.proc)
