@@ -144,7 +144,7 @@ class FilterConfig:
         65535.0, "filter intensity: most", lo=0.0, hi=65535.0, live=True
     )
     isolated_slots: int = setting(
-        3, "filter isolated: neighbours are this many slots away at most, in the same packet", lo=1,
+        3, "filter isolated: neighbours are at most so many slots away, in the same packet", lo=1,
         hi=50, live=True,
     )  # fmt: skip
     isolated_neighbours: int = setting(
