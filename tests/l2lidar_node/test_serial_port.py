@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from l2lidar_node import commands, wire
+from l2lidar_node import commands, replay, wire
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver import Driver, Event
 from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
@@ -21,6 +21,7 @@ from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
 from l2lidar_node.emulator.port import SerialPort
 from l2lidar_node.emulator.server import Server
 from l2lidar_node.packets import Version
+from l2lidar_node.recording import Recording
 from l2lidar_node.requests import Answer
 from l2lidar_node.serial_port import SerialTransport
 from l2lidar_node.session import Session
@@ -29,6 +30,7 @@ from l2lidar_node.source import described, opened
 from l2lidar_node.transport import Datagram, TransportError
 from l2lidar_node.types import Stream, Sweep
 from l2lidar_node.wire import WorkMode
+from tests.l2lidar_node.virtual_host import MemoryTap, essence
 
 LIMIT_S = 20.0
 
@@ -190,7 +192,8 @@ def test_a_driver_works_over_a_serial_line():
             enough.set()
 
     driver = Driver(build(DriverConfig, {"sweep_cut": "turn", "imu_adjust": False}))
-    session = Session(driver, SerialTransport(port.name.split()[1]), keep)
+    tap = MemoryTap()
+    session = Session(driver, SerialTransport(port.name.split()[1]), keep, tap)
     thread.start()
     session.start()
     try:
@@ -214,5 +217,7 @@ def test_a_driver_works_over_a_serial_line():
     assert any(isinstance(item, Version) for item in events)
     assert counters.frames[wire.PacketType.POINTS_3D] > 200
     assert driver.clock_status().locked
+    replayed = replay.events(Recording(tap.stream), driver.config)
+    assert essence(list(replayed)) == essence(events)
     sweeps = [item for item in events if isinstance(item, Sweep)]
     assert sweeps[2].packets in (49, 50)

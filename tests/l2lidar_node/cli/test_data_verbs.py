@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
+from decimal import Decimal
 from pathlib import Path
 
 import dpkt
@@ -66,6 +69,62 @@ def test_a_recorded_run_replays_bit_for_bit(unit: Unit, tmp_path: Path, settings
         replayed = list(events(Recording(stream), config))
     assert sum(isinstance(event, Sweep) for event in found) >= 3
     assert essence(replayed) == essence(found)
+
+
+class Sniffer:
+    """Captures the loopback interface as tcpdump does, with the kernel's own times."""
+
+    def __init__(self, path: Path, port: int) -> None:
+        self._port = port
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0x0003))
+        self._socket.bind(("lo", 0))
+        self._socket.setsockopt(socket.SOL_SOCKET, 35, 1)  # SO_TIMESTAMPNS
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
+        self._socket.settimeout(0.1)
+        self._file = path.open("wb")
+        self._writer = dpkt.pcap.Writer(self._file, nano=True)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._capture)
+        self._thread.start()
+
+    def _capture(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                data, ancillary, _, sender = self._socket.recvmsg(65536, 256)
+            except TimeoutError:
+                continue
+            if sender[2] == socket.PACKET_OUTGOING or data[12:14] != b"\x08\x00":
+                continue
+            ports = struct.unpack_from(">2H", data, 34)
+            if self._port in ports:
+                seconds, nanoseconds = struct.unpack("@ll", ancillary[0][2])
+                self._writer.writepkt(data, Decimal(seconds) + Decimal(nanoseconds) / 10**9)
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._thread.join(LIMIT_S)
+        self._file.close()
+        self._socket.close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may capture packets")
+@pytest.mark.parametrize(
+    "settings", [{"sweep_cut": "turn"}, {"l2_sync_mode": "periodic", "imu_adjust": False}], ids=str
+)
+def test_a_tcpdump_of_a_run_replays_bit_for_bit(make_unit, tmp_path: Path, settings) -> None:
+    unit = make_unit(imu_s=0.5, points_s=0.5, boot_scale=1.0, link_s=0.3)
+    sniffer = Sniffer(tmp_path / "tcpdump.pcap", unit.host_port)
+    config, found = live(unit, tmp_path / "own.pcap", 3.0, **settings)
+    sniffer.stop()
+    with (tmp_path / "tcpdump.pcap").open("rb") as stream:
+        replayed = list(events(Recording(stream), config))
+    run, again = essence(found), essence(replayed)
+    samples = [item for item in run if isinstance(item, ImuSample)]
+    assert len(samples) > 60
+    assert [item for item in again if isinstance(item, ImuSample)][: len(samples)] == samples
+    sweeps = [item for item in run if not isinstance(item, ImuSample)][:-1]  # the end cut the last
+    assert sweeps
+    assert [item for item in again if not isinstance(item, ImuSample)][: len(sweeps)] == sweeps
 
 
 def test_what_is_recorded_opens_elsewhere(unit: Unit, tmp_path: Path) -> None:

@@ -20,8 +20,10 @@ TIMEOUT_S = 120
 def test_the_driver_alone_streams_without_loss_and_draws_a_cloud(tmp_path: Path) -> None:
     bag = tmp_path / "run.mcap"
     result = subprocess.run(
-        [*COMMAND, "--driver-only", "--duration", "4", "--folder", str(tmp_path)]
-        + ["--record", str(bag)],
+        [
+            *COMMAND, "--driver-only", "--duration", "4", "--folder", str(tmp_path),
+            "--record", str(bag),
+        ],
         capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
     )  # fmt: skip
     assert result.returncode == 0, result.stdout + result.stderr
