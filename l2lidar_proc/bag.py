@@ -16,6 +16,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from l2lidar_node import cloud_fields
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.rotations import F64, normalised, transform
 
@@ -25,8 +26,7 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 TWIST: Final = "geometry_msgs/msg/TwistStamped"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 
-_DATATYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_NUMBERS: Final = {code: number for number, code in _DATATYPES.items()}
+_NUMBERS: Final = {code: number for number, code in cloud_fields.DATATYPES.items()}
 
 
 def open_bag(path: Path) -> AnyReader:
@@ -52,28 +52,7 @@ def points_of(message: Any) -> NDArray[np.void]:
     ValueError
         If fields and sizes do not agree.
     """
-    order = ">" if message.is_bigendian else "<"
-    formats = []
-    for item in message.fields:
-        if item.datatype not in _DATATYPES:
-            raise ValueError(f"field '{item.name}': datatype {item.datatype} is not known")
-        code = f"{order}{_DATATYPES[item.datatype]}"
-        formats.append(code if item.count <= 1 else (code, (item.count,)))
-    layout = np.dtype(
-        {
-            "names": [item.name for item in message.fields],
-            "formats": formats,
-            "offsets": [item.offset for item in message.fields],
-            "itemsize": message.point_step,
-        }
-    )
-    used = message.width * message.point_step
-    row_step = message.row_step or used
-    if row_step < used or len(message.data) < row_step * message.height:
-        raise ValueError(f"{len(message.data)} B of data are too few")
-    rows = np.asarray(message.data[: row_step * message.height], dtype=np.uint8)
-    rows = rows.reshape(message.height, row_step)[:, :used]
-    return np.ascontiguousarray(rows).reshape(-1).view(layout)
+    return cloud_fields.points_of(message)
 
 
 def sample_of(message: Any) -> NDArray[np.void]:

@@ -116,4 +116,7 @@ def _print(findings: list[Finding], consumer: Consumer) -> None:
         if item.fix:
             line.append(f"; {item.fix}", style="bold default")
         out.print(line, soft_wrap=True)
-    out.print(Text(verdict(findings, consumer), style=f"bold {_COLOURS[worst(findings)]}"))
+    out.print(
+        Text(verdict(findings, consumer), style=f"bold {_COLOURS[worst(findings)]}"),
+        soft_wrap=True,
+    )

@@ -84,7 +84,7 @@ def _check_rate(rates: F64) -> Finding:
             _SUBJECT,
             "gyro",
             "all rates are exactly 0, as no gyro measures",
-            "set the work mode's bit for the IMU to on",
+            "compare with the driver's own IMU topic",
         )
     return ok(_SUBJECT, "gyro", f"rates are up to {greatest:.3g} rad/s")
 

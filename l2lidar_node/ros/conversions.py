@@ -18,20 +18,11 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, PointCloud2, PointField
 
 from l2lidar_node import wire
+from l2lidar_node.cloud_fields import DATATYPES, points_of
 from l2lidar_node.config import FrameConfig, ImuConfig
 from l2lidar_node.types import HostNs, ImuSample
 
-_FIELD_TYPES: Final = {
-    "i1": PointField.INT8,
-    "u1": PointField.UINT8,
-    "i2": PointField.INT16,
-    "u2": PointField.UINT16,
-    "i4": PointField.INT32,
-    "u4": PointField.UINT32,
-    "f4": PointField.FLOAT32,
-    "f8": PointField.FLOAT64,
-}
-_DTYPES: Final = {number: code for code, number in _FIELD_TYPES.items()}
+_NUMBERS: Final = {code: number for number, code in DATATYPES.items()}
 
 NS: Final = 1_000_000_000
 
@@ -59,41 +50,12 @@ def point_fields(layout: np.dtype[Any]) -> list[PointField]:
     for name, (item, offset, *_) in (layout.fields or {}).items():
         base, shape = item.subdtype or (item, (1,))
         code = f"{base.kind}{base.itemsize}"
-        if code not in _FIELD_TYPES:
+        if code not in _NUMBERS:
             raise ValueError(f"field '{name}': type {base} has no PointField counterpart")
         fields.append(
-            PointField(name=name, offset=offset, datatype=_FIELD_TYPES[code], count=shape[0])
+            PointField(name=name, offset=offset, datatype=_NUMBERS[code], count=shape[0])
         )
     return fields
-
-
-def cloud_dtype(message: PointCloud2) -> np.dtype[np.void]:
-    """Return the structured dtype of a cloud's points.
-
-    Raises
-    ------
-    ValueError
-        If the fields do not fit ``point_step``, or a type or count is unknown, naming the field.
-    """
-    order = ">" if message.is_bigendian else "<"
-    names: list[str] = []
-    formats: list[Any] = []
-    offsets: list[int] = []
-    for item in message.fields:
-        code = _DTYPES.get(item.datatype)
-        if code is None:
-            raise ValueError(f"field '{item.name}': datatype {item.datatype} is not known")
-        count = max(item.count, 1)
-        if item.offset + int(code[1]) * count > message.point_step:
-            raise ValueError(f"field '{item.name}': does not fit point_step {message.point_step}")
-        if item.name in names:
-            raise ValueError(f"field '{item.name}': stands twice")
-        names.append(item.name)
-        formats.append(f"{order}{code}" if count == 1 else (f"{order}{code}", (count,)))
-        offsets.append(item.offset)
-    return np.dtype(
-        {"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step}
-    )
 
 
 def from_cloud(message: PointCloud2) -> NDArray[np.void]:
@@ -104,17 +66,7 @@ def from_cloud(message: PointCloud2) -> NDArray[np.void]:
     ValueError
         If sizes and data do not agree, or a field is impossible.
     """
-    layout = cloud_dtype(message)
-    data = np.frombuffer(message.data, np.uint8)
-    used = message.width * message.point_step
-    row_step = message.row_step or used
-    if row_step < used or len(data) < row_step * message.height:
-        raise ValueError(
-            f"cloud of {message.width} x {message.height} points of {message.point_step} B has "
-            f"row_step {message.row_step} and {len(data)} B of data"
-        )
-    rows = data[: row_step * message.height].reshape(message.height, row_step)[:, :used]
-    return np.ascontiguousarray(rows).reshape(-1).view(layout)
+    return points_of(message)
 
 
 def to_cloud(points: NDArray[np.void], stamp: HostNs, frame: str) -> PointCloud2:

@@ -16,7 +16,7 @@ from tf2_msgs.msg import TFMessage
 from l2lidar_node.readiness.observation import Gathering, Observation, Qos
 from l2lidar_node.readiness.topics import SourceError, Topics, choose
 
-_DISCOVERY_S: Final = 3.0
+_DISCOVERY_S: Final = 6.0
 _LOOK_S: Final = 0.1
 _LEVELLING: Final = "imu_adjust"  # the driver's parameter, and upstream's
 
@@ -81,7 +81,7 @@ def _found(node: Node, asked: Topics, needs_imu: bool) -> Topics:
             if is_late:
                 raise
         else:
-            if topics.imu or is_late:
+            if topics.imu or not needs_imu or is_late:
                 return topics
         rclpy.spin_once(node, timeout_sec=_LOOK_S)
 

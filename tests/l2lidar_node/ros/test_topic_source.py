@@ -1,0 +1,85 @@
+"""`l2lidar check` on live topics of the driver and a virtual L2."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.l2lidar_node.ros.rig import Rig, open_rig
+
+pytestmark = pytest.mark.ros
+
+CONSUMERS = ("lio_sam", "fast_lio", "nav2")
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Rig]:
+    """A driver that streams as LIO-SAM wants it, but for the levelling."""
+    with open_rig() as rig:
+        rig.driver(point_layout="velodyne", sweep_cut="turn", imu_adjust=True)
+        rig.emulator("--boot-scale", "0.02")
+        rig.wait_for(lambda: len(rig.observer.clouds.stamps) > 3, "clouds")
+        yield rig
+
+
+@pytest.fixture(scope="module")
+def results(rig: Rig) -> dict[str, tuple[int, dict[str, Any]]]:
+    """Exit code and JSON of a check for each consumer, all at the same time."""
+    running = {
+        consumer: check("/points", "--for", consumer, "--seconds", "4", "--json")
+        for consumer in CONSUMERS
+    }
+    results = {}
+    for consumer, process in running.items():
+        said, error = process.communicate(timeout=60)
+        assert process.returncode in (0, 1), error
+        results[consumer] = (process.returncode, json.loads(said))
+    return results
+
+
+def check(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "l2lidar_node.cli.main", "check", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def errors(data: dict[str, Any]) -> set[str]:
+    return {item["check"] for item in data["findings"] if item["level"] == "ERROR"}
+
+
+def test_the_publishers_parameter_and_qos_are_asked_for(results) -> None:
+    code, data = results["fast_lio"]
+    assert code == 1
+    assert data["topics"] == {"cloud": "/points", "imu": "/imu/data"}
+    assert errors(data) == {"levelled", "qos-imu"}
+    (said,) = [item["text"] for item in data["findings"] if item["check"] == "levelled"]
+    assert "imu_adjust is true" in said
+
+
+def test_only_the_levelling_is_wrong_for_lio_sam(results) -> None:
+    code, data = results["lio_sam"]
+    assert code == 1
+    assert errors(data) == {"levelled"}
+    judged = {item["check"]: item["text"] for item in data["findings"]}
+    assert judged["tf-imu"] == "the IMU's place is known"
+    assert judged["fields"].endswith("read with sensor: velodyne")
+
+
+def test_levelled_clouds_are_right_for_nav2(results) -> None:
+    code, data = results["nav2"]
+    assert (code, errors(data)) == (0, set())
+
+
+def test_a_topic_that_is_not_there_is_a_usage_error(rig: Rig) -> None:
+    process = check("/nothing", "--for", "lio_sam")
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert (
+        "there is no topic '/nothing'; topics of type sensor_msgs/msg/PointCloud2 are: " in error
+    )
+    assert "/points" in error
+    assert "Traceback" not in error
