@@ -247,6 +247,14 @@ class FileConfig:
         True, "publish the recording's time on /clock while replaying, for use_sim_time"
     )
 
+    def __post_init__(self) -> None:
+        """Check that nothing is recorded that is a recording already."""
+        if self.record_file and self.replay_file:
+            raise SettingError(
+                f"parameter 'record_file': {self.record_file!r} cannot be written while "
+                "replay_file is read; give one of them"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriverConfig:

@@ -24,6 +24,7 @@ from l2lidar_node.cli.stored import (
 from l2lidar_node.cli.stored import work_mode as parsed_mode
 from l2lidar_node.commands import Command
 from l2lidar_node.config import NetworkConfig
+from l2lidar_node.requests import TRIES
 from l2lidar_node.wire import WorkMode
 
 T = TypeVar("T")
@@ -128,20 +129,32 @@ def network_(
         typer.Option(help="New gateway; the unit's address, ending in .1, if left out."),
     ] = None,
     subnet_mask: Annotated[str, typer.Option(help="New subnet mask.")] = "255.255.255.0",
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind",
+            help="The unit sends elsewhere: do not wait to hear from it. Needs all four.",
+        ),
+    ] = False,
     yes: YesOption = False,
 ) -> None:
     """Store addresses; what is left out stays as it is in use now.
 
     The unit never tells what it has stored, so its acknowledgement is all there is. Gateway and
-    mask cannot be known beforehand and are always written.
+    mask cannot be known beforehand and are always written. Over a serial line, or for a unit that
+    sends to an address nobody knows any more, give both addresses and both ports.
     """
-    before = addresses_in_use(network)
     given = {
         "lidar_ip": lidar_ip,
         "lidar_port": lidar_port,
         "user_ip": user_ip,
         "user_port": user_port,
     }
+    is_hidden = blind or bool(network.serial_port)
+    if is_hidden and None in given.values():
+        missing = [f"--{name.replace('_', '-')}" for name in given if given[name] is None]
+        raise UsageError(f"what is in use cannot be seen: give {', '.join(missing)} as well")
+    before = {} if is_hidden else addresses_in_use(network)
     after = before | {name: value for name, value in given.items() if value is not None}
     after["gateway"] = gateway or str(after["lidar_ip"]).rpartition(".")[0] + ".1"
     after["subnet_mask"] = subnet_mask
@@ -150,6 +163,11 @@ def network_(
     out.print(change(before, after))
     _ask(yes)
     with Device(network) as device:
+        if blind:
+            for _ in range(TRIES):
+                device.tell(lambda driver, now: driver.send(command, now))
+            say(f"sent, whether it has arrived is not known; {_RESTART}")
+            return
         _send_for_good(device, command)
     say(f"stored; {_RESTART}")
 

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +18,7 @@ from l2lidar_node.config import NetworkConfig
 from l2lidar_node.emulator.config import FaultConfig
 from l2lidar_node.emulator.flash import parameters_payload
 from l2lidar_node.wire import WorkMode
-from tests.l2lidar_node.cli.conftest import Run, Unit, free_port
+from tests.l2lidar_node.cli.conftest import LIMIT_S, Run, Unit, free_port
 
 SILENT = ["--l2-ip", "127.0.0.1", "--l2-port", "9", "--host-port"]
 
@@ -391,6 +395,51 @@ def test_wrong_networks_are_refused(run: Run, unit: Unit, change: list[str], wor
     assert outcome.code == 2
     assert words in outcome.err
     assert unit.flash == before
+
+
+def test_a_unit_that_sends_elsewhere_can_be_told_to_come_back(run: Run, make_unit) -> None:
+    unit = make_unit()
+    elsewhere = ["--l2-ip", "127.0.0.1", "--l2-port", str(unit.lidar_port)]
+    elsewhere += ["--host-port", str(free_port())]
+    wanted = ["--lidar-ip", "127.0.0.8", "--lidar-port", "7000", "--user-ip", "127.0.0.1"]
+    outcome = run("set", "network", *wanted, *elsewhere, "--blind", "--yes")
+    assert outcome.code == 2
+    assert "give --user-port" in outcome.err
+    wanted += ["--user-port", "7001"]
+    outcome = run("set", "network", *wanted, *elsewhere, "--yes")
+    assert outcome.code == 1
+    outcome = run("set", "network", *wanted, *elsewhere, "--blind", "--yes")
+    assert outcome.code == 0
+    assert "not known" in outcome.out
+    deadline = time.monotonic() + LIMIT_S
+    while unit.flash.network.lidar_ip != "127.0.0.8":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert unit.flash.network.user_port == 7001
+
+
+def test_ctrl_c_while_it_waits_for_points_puts_the_unit_back(make_unit) -> None:
+    unit = make_unit(
+        int(WorkMode.WAIT_FOR_START), boot_scale=1.0, link_s=0.0, wake_imu_s=0.0,
+        wake_points_s=120.0,
+    )  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-m", "l2lidar_node.cli.main", "start", *unit.options, "--wait", "60"],
+        cwd=Path(__file__).parents[3],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    deadline = time.monotonic() + LIMIT_S
+    while not unit.device.sent[wire.PacketType.IMU]:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode != 0
+    assert "interrupted: in standby" in said
+    assert "Traceback" not in said
+    assert not is_measuring(unit)
 
 
 def test_two_ends_of_one_address_are_refused(run: Run, unit: Unit) -> None:
