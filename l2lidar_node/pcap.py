@@ -31,6 +31,14 @@ class CaptureError(ValueError):
     """A file that is no capture, or one that cannot be used; the message says why."""
 
 
+def is_capture(start: bytes) -> bool:
+    """Tell from its first four bytes whether a file is a capture that can be read."""
+    if len(start) < 4:
+        return False
+    numbers = {struct.unpack_from(f"{order}I", start)[0] for order in "<>"}
+    return bool(numbers & {_MICRO, _NANO, _SECTION})
+
+
 class RawPacket(NamedTuple):
     """One captured packet.
 

@@ -10,7 +10,6 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from l2lidar_node.cli import recorded
 from l2lidar_node.cli.changes import UsageError
 from l2lidar_node.cli.console import out, print_json
 from l2lidar_node.cli.options import JsonOption
@@ -94,6 +93,8 @@ def _observe(
     needs_imu = consumer.imu is not Use.IGNORED
     path = Path(source)
     if source and (path.exists() or not _TOPIC.fullmatch(source)):
+        from l2lidar_node.cli import recorded
+
         return recorded.observe(path, asked, needs_imu, seconds)
     try:
         from l2lidar_node.ros import topic_source

@@ -13,6 +13,7 @@ from l2lidar_node.cli.changes import UsageError
 from l2lidar_node.cli.check import check
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.cli.discover import discover
+from l2lidar_node.cli.odometry import odometry
 from l2lidar_node.cli.record import convert, record
 from l2lidar_node.cli.replay import replay
 from l2lidar_node.cli.rotation import reset, start, stop
@@ -42,7 +43,7 @@ def app() -> typer.Typer:
     made.add_typer(readings.app, name="get", rich_help_panel=_UNIT)
     made.add_typer(changes.app, name="set", rich_help_panel=_UNIT)
     made.command("sync-check", rich_help_panel=_UNIT)(sync_check)
-    for verb in (record, replay, convert, check, view):
+    for verb in (record, replay, convert, check, odometry, view):
         made.command(rich_help_panel=_DATA)(verb)
     made.command(
         rich_help_panel=_DATA,

@@ -241,6 +241,34 @@ def test_record_writes_bags(run: Run, unit: Unit, tmp_path: Path) -> None:
         assert reader.topics["/imu/data"].msgcount > 100
 
 
+def test_odometry_of_a_capture_and_of_its_bag(run: Run, unit: Unit, tmp_path: Path) -> None:
+    capture = tmp_path / "run.pcap"
+    live(unit, capture, 2.5)
+    assert run("convert", str(capture), str(tmp_path / "bag")).code == 0
+    poses = []
+    for source in ("run.pcap", "bag"):
+        folder = tmp_path / f"of {source}"
+        outcome = run("odometry", str(tmp_path / source), str(folder))
+        assert (outcome.code, outcome.err) == (0, "")
+        assert (folder / "map.ply").exists()
+        assert (folder / "trajectory.png").stat().st_size > 1000
+        poses.append(np.loadtxt(folder / "trajectory.tum", ndmin=2))
+    assert len(poses[0]) >= 3
+    assert poses[0] == pytest.approx(poses[1], abs=1e-3)
+
+
+def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    outcome = run("odometry", str(tmp_path / "a.mcap"), str(tmp_path / "out"))
+    assert outcome.code == 1
+    assert "a.mcap" in outcome.err
+    assert run("odometry", str(tmp_path / "no such")).code == 2
+    (tmp_path / "a.yaml").write_text("odometry_node: {ros__parameters: {mode: best}}")
+    outcome = run("odometry", str(tmp_path / "a.mcap"), "--params-file", str(tmp_path / "a.yaml"))
+    assert outcome.code == 2
+    assert "mode" in outcome.err
+
+
 @pytest.mark.parametrize(
     ("content", "words"), [(b"no capture at all", "no capture file"), (b"", "no capture file")]
 )

@@ -1,0 +1,118 @@
+"""`l2lidar odometry`: the sensor's way through a bag or a capture, with a map and a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import numpy as np
+import typer
+from rich.progress import Progress
+
+from l2lidar_node.cli.changes import UsageError
+from l2lidar_node.cli.console import out, say
+from l2lidar_node.cli.device import DeviceError
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver import Driver, Event
+from l2lidar_node.pcap import CaptureError, is_capture
+from l2lidar_node.recording import Recording
+from l2lidar_node.replay import feed
+from l2lidar_node.settings import build
+from l2lidar_node.types import IMU_SAMPLE, ImuSample, Sweep
+
+if TYPE_CHECKING:
+    from l2lidar_proc.offline_odometry import OdometryRun
+
+_CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
+_STEP: Final = 1000  # entries between two looks at the progress
+
+
+def odometry(
+    source: Annotated[
+        Path,
+        typer.Argument(help="rosbag2 folder, MCAP file, or capture (pcap).", exists=True),
+    ],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder for trajectory (TUM and KITTI), map and plot.")
+    ] = Path("out/odometry"),
+    params_file: Annotated[
+        Path | None, typer.Option(help="Parameter file, as for odometry_node.", exists=True)
+    ] = None,
+    l2_ip: Annotated[
+        str, typer.Option(help="Whose packets, if a capture holds those of several units.")
+    ] = "",
+) -> None:
+    """Estimate the way of the sensor through a recording, as odometry_node does live.
+
+    The trajectory in TUM format is what evo reads. Of a capture, sweeps of a full turn are used.
+    """
+    from l2lidar_node.ros.parameter_files import parameters_for
+    from l2lidar_proc import offline_odometry
+    from l2lidar_proc.odometry_config import OdometryNodeConfig
+
+    try:
+        values = (
+            {}
+            if params_file is None
+            else parameters_for(params_file, "odometry_node", "/odometry_node")
+        )
+        config = build(OdometryNodeConfig, values)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    try:
+        with Progress(console=out) as bar:
+            task = bar.add_task("odometry", total=1.0)
+
+            def progress(share: float) -> None:
+                bar.update(task, completed=share)
+
+            if source.is_file() and is_capture(_start_of(source)):
+                with source.open("rb") as stream:
+                    recording = Recording(stream, l2_ip)
+                    taken = _events(recording, source.stat().st_size, progress)
+                    run = offline_odometry.run_events(taken, config)
+            else:
+                run = offline_odometry.run_bag(source, config, progress)
+            progress(1.0)
+        files = offline_odometry.write(run, folder)
+    except (CaptureError, offline_odometry.RecordingError, OSError) as error:
+        raise DeviceError(f"{source}: {error}") from None
+    _say(run, files)
+
+
+def _start_of(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(4)
+
+
+def _events(recording: Recording, size: int, progress: Any) -> Iterator[tuple[int, Any]]:
+    """Yield what the driver hands out, each with the time at which it could."""
+    driver = Driver(build(DriverConfig, _CAPTURE))
+    now = int(recording.start)
+    for number, entry in enumerate(recording):
+        now = int(entry.time)
+        yield from _taken(now, feed(driver, entry))
+        if number % _STEP == 0:
+            progress(recording.position / size)
+    yield from _taken(now, driver.flush())
+
+
+def _taken(now: int, events: list[Event]) -> Iterator[tuple[int, Any]]:
+    for event in events:
+        if isinstance(event, Sweep):
+            yield now, event
+        elif isinstance(event, ImuSample):
+            yield now, np.array([tuple(event)], IMU_SAMPLE)
+
+
+def _say(run: OdometryRun, files: list[Path]) -> None:
+    say(f"{len(run.poses)} poses from {run.sweeps} sweeps")
+    for status, count in run.counts.items():
+        say(f"{count} sweeps: {status.value}")
+    for reason, count in run.refused.items():
+        say(f"{count} clouds not used: {reason}")
+    for path in files:
+        say(f"wrote {path}")
+    if not run.poses:
+        raise DeviceError("no way was found: are there clouds with times, and IMU samples?")
