@@ -12,12 +12,17 @@ RECORDED_TIME = {"use_sim_time": True}
 
 
 def _needs(given):
-    values = for_deskew() if given["deskew_odometry"] == "true" else {}
+    is_followed, is_loop = (given[name] == "true" for name in ("deskew_odometry", "loop"))
+    if is_followed and is_loop:
+        raise ValueError(
+            "loop:=true takes the sensor back to where the recording began, "
+            "which no odometry can follow; add deskew_odometry:=false"
+        )
     return {
-        **values,
+        **(for_deskew() if is_followed else {}),
         "replay_file": given["file"],
         "replay_rate": float(given["rate"]),
-        "replay_loop": given["loop"] == "true",
+        "replay_loop": is_loop,
     }
 
 
@@ -28,7 +33,9 @@ def generate_launch_description() -> LaunchDescription:
         [
             Argument(None, "capture (pcap) to play").declare("file"),
             Argument("1.0", "speed, 0 for as fast as possible").declare("rate"),
-            Argument("false", "whether to begin again at the end", BOOL).declare("loop"),
+            Argument("false", "whether to begin again at the end, without odometry", BOOL).declare(
+                "loop"
+            ),
             Argument("true", "whether to start deskew and odometry", BOOL).declare(
                 "deskew_odometry"
             ),

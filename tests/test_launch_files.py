@@ -321,17 +321,24 @@ def test_consumer_goes_over_the_parameter_file(launched, consumer):
 
 @needs_launch
 def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched):
-    made = launched("replay", rate="2", loop="true", rviz="true")
+    made = launched("replay", rate="2", rviz="true")
     values = made.parameters("l2lidar_node")
     assert (values["replay_file"], values["replay_rate"]) == ("recording.pcap", 2.0)
-    assert values["replay_loop"] is True
+    assert values["replay_loop"] is False
     assert values["imu_adjust"] is False
     assert "use_sim_time" not in values, "the driver makes that time"
     assert made.parameters("deskew_node")["use_sim_time"] is True
     assert made.parameters("odometry_node")["use_sim_time"] is True
-    made = launched("replay", deskew_odometry="false")
+    made = launched("replay", deskew_odometry="false", loop="true")
     assert list(made.nodes) == ["l2lidar_node"]
     assert made.parameters("l2lidar_node")["imu_adjust"] is True
+    assert made.parameters("l2lidar_node")["replay_loop"] is True
+
+
+@needs_launch
+def test_odometry_is_not_taken_back_to_the_start_of_a_recording(launched):
+    with pytest.raises(ValueError, match="deskew_odometry:=false"):
+        launched("replay", loop="true")
 
 
 @needs_launch
