@@ -123,7 +123,8 @@ def _column(points: NDArray[np.void], name: str) -> F64 | None:
     """Return a field's values, None if there is no such field of plain numbers."""
     if name not in (points.dtype.names or ()) or points.dtype[name].shape:
         return None
-    return np.asarray(points[name], np.float64)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        return np.asarray(points[name], np.float64)
 
 
 def _times(values: F64) -> Times:

@@ -139,6 +139,7 @@ def _check_rings(inside: list[Contents], consumer: Consumer) -> Iterator[Finding
     )
     if kept < _KEPT_WELL:
         level = Level.WARN if kept >= _KEPT_AT_ALL else Level.ERROR
-        yield Finding(level, _SUBJECT, "ring-cells", text, f"set point_layout: {layout}")
+        fix = f"set point_layout: {layout} and imu_adjust: false"
+        yield Finding(level, _SUBJECT, "ring-cells", text, fix)
     else:
         yield ok(_SUBJECT, "ring-cells", text)

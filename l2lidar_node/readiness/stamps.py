@@ -18,6 +18,7 @@ F64 = NDArray[np.float64]
 
 _RATIO_MIN_S: Final = 1.0
 _RATIO_TOLERANCE: Final = 0.05
+_LATENCY_TOLERANCE_S: Final = 0.5  # on a busy machine messages come late at either end
 _HALF: Final = (0.45, 0.55)
 _MUCH_LOST: Final = 0.2
 _OLD_S: Final = 2.0
@@ -53,9 +54,12 @@ class Track:
 
     @property
     def latency_s(self) -> float:
-        """Median time from the end of a measurement to its arrival [s]; or from its stamp."""
+        """Usual time from the end of a measurement to its arrival [s]; or from its stamp.
+
+        Exceeded by nine of ten messages, so that those held up on a busy machine do not count.
+        """
         lengths = self.lengths_s if self.has_lengths else np.zeros(len(self.stamps))
-        return float(np.nanmedian((self.arrivals - self.stamps) / 1e9 - lengths))
+        return float(np.nanpercentile((self.arrivals - self.stamps) / 1e9 - lengths, 10))
 
     @property
     def has_lengths(self) -> bool:
@@ -186,7 +190,7 @@ def _check_pace(track: Track) -> Iterator[Finding]:
             f"{text}: that is the L2's own clock, which is half as fast",
             "set enable_l2_time_correction: true and timeScaleNum: 2",
         )
-    elif abs(ratio - 1.0) > _RATIO_TOLERANCE:
+    elif abs(ratio - 1.0) > _RATIO_TOLERANCE + _LATENCY_TOLERANCE_S / passed:
         yield Finding(
             Level.WARN,
             track.subject,
