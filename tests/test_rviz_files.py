@@ -8,6 +8,8 @@ import yaml
 from l2lidar_node.config import FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.types import POINT
+from l2lidar_proc.config import DeskewTopics
+from l2lidar_proc.odometry_config import OdometryTopics
 
 LAYOUTS = Path(__file__).resolve().parent.parent / "rviz"
 FIXED_FRAMES = {
@@ -68,6 +70,19 @@ def topic_of(display):
     return display.get("Topic") or display.get("Description Topic")
 
 
+def test_topics_and_frame_are_those_of_the_companions():
+    deskew, odometry = DeskewTopics(), OdometryTopics()
+    assert (deskew.cloud_topic, deskew.imu_topic) == topics.DRIVER_TOPICS
+    assert (odometry.cloud_topic, odometry.imu_topic) == topics.DRIVER_TOPICS
+    # Named without a slash: they follow the namespace by themselves.
+    assert f"/{deskew.output_topic}" == topics.POINTS_DESKEWED
+    assert f"/{odometry.registered_topic}" == topics.REGISTERED_POINTS
+    assert f"/{odometry.map_topic}" == topics.LOCAL_MAP
+    assert f"/{odometry.path_topic}" == topics.PATH
+    assert f"/{odometry.odometry_topic}" == f"/{deskew.velocity_topic}" == topics.ODOMETRY
+    assert odometry.odom_frame == FIXED_FRAMES["slam.rviz"]
+
+
 def test_layouts_are_those_known():
     assert {path.name for path in LAYOUTS.iterdir()} == set(FIXED_FRAMES)
 
@@ -123,7 +138,7 @@ def test_qos_reaches_every_publisher(name):
         else:
             # Asking for more than the publisher offers would mean no messages at all.
             assert topic["Durability Policy"] == "Volatile"
-            if display["Class"].endswith("PointCloud2"):
+            if display["Class"].endswith(("PointCloud2", "Odometry")):  # selectable on both
                 assert topic["Reliability Policy"] == "Best Effort"
 
 
