@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+
+_WALLS_M: Final = 1.5
 
 
 def save_cloud(points: NDArray[np.void], path: Path, title: str) -> None:
@@ -56,7 +58,13 @@ def save_comparison(raw: NDArray[np.void], deskewed: NDArray[np.void], path: Pat
     FigureCanvasAgg(figure)
     for column, (title, points) in enumerate((("as measured", raw), ("deskewed", deskewed))):
         plan = figure.add_subplot(1, 2, column + 1)
-        height: dict[str, Any] = {"c": points["z"], "cmap": "viridis", "vmin": 0.0, "vmax": 3.0}
+        points = points[points["z"] < _WALLS_M]  # a ceiling would hide the walls
+        height: dict[str, Any] = {
+            "c": points["z"],
+            "cmap": "viridis",
+            "vmin": 0.0,
+            "vmax": _WALLS_M,
+        }
         plan.scatter(points["x"], points["y"], s=1.5, linewidths=0, **height)
         plan.set_aspect("equal")
         plan.set(xlabel="x [m]", ylabel="y [m]", title=title)
