@@ -167,5 +167,6 @@ def test_a_serial_line_feeds_the_node(rig: Rig) -> None:
     name = ""
     while not name.startswith("serial "):
         name = emulator._process.stdout.readline()
+        assert name, "the emulator ended"
     rig.driver(serial_port=name.split()[1].rstrip(","))
     rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= 3, "clouds")
