@@ -13,15 +13,23 @@ from pathlib import Path
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import Setting, markdown_table, settings_of
 from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.odometry_config import OdometryNodeConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 FILES: dict[str, dict[str, type]] = {
     "l2lidar_node.yaml": {"/**": DriverConfig},
-    "l2lidar_proc.yaml": {"deskew_node": DeskewNodeConfig},
+    "l2lidar_proc.yaml": {
+        "deskew_node": DeskewNodeConfig,
+        "odometry_node": OdometryNodeConfig,
+    },
 }
 """Parameter files: the settings of each node they are for."""
-TABLES: dict[str, type] = {"driver": DriverConfig, "deskew": DeskewNodeConfig}
+TABLES: dict[str, type] = {
+    "driver": DriverConfig,
+    "deskew": DeskewNodeConfig,
+    "odometry": OdometryNodeConfig,
+}
 """Tables of the README."""
 
 SHIPPED = {"enable_IMU_publishing": True}
