@@ -20,6 +20,8 @@ RUN_BY = {
     r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
     r"l2lidar (discover|info|set work-mode).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
+    r"l2lidar check .*\.mcap .*": "tests/l2lidar_node/readiness/test_recordings.py",
+    r"l2lidar check /.*": "tests/l2lidar_node/ros/test_topic_source.py",
     r"l2lidar view.*": "tests/l2lidar_node/ros/test_viewer.py",
     r"ros2 launch l2lidar_node .*": "tests/test_launch_files.py",
 }
