@@ -7,23 +7,22 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Final
 
+import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Imu, PointCloud2
 
-from l2lidar_node.demo.observer import TopicRecord
+from l2lidar_node import wire
 from l2lidar_node.demo.processes import Program, Programs, free_udp_ports, isolate_ros
-from l2lidar_node.ros.conversions import from_time
 from tools.cpu import resident_mb
 from tools.fault_world import Finding
+from tools.topic_watch import CLOUDS, IMU, TopicWatch, backward_steps, missing
 
 _MODULE: Final = "tools.fault_ros"
-_PACKETS_PER_TURN: Final = 49.53
-_PACKETS_PER_S: Final = 1 / 0.004639
+_TURN_S: Final = 0.229769  # of the head
 _START_S: Final = 30.0
 
 
@@ -38,7 +37,7 @@ def run() -> list[Finding]:
     }  # fmt: skip
     assignments = [part for key, value in values.items() for part in ("-p", f"{key}:={value}")]
     rclpy.init()
-    observer = _Watcher()
+    watch = TopicWatch([CLOUDS, IMU], reliable=True)
     try:
         with Programs() as programs:
             driver = programs.start("l2lidar_node.ros.driver_node", ["--ros-args", *assignments])
@@ -49,24 +48,24 @@ def run() -> list[Finding]:
             )  # fmt: skip
             slow = programs.start(_MODULE, [])
             deadline = time.monotonic() + _START_S
-            while len(observer.clouds.stamps) < 10 or observer.count_subscribers("/points") < 2:
-                observer.watch(time.monotonic() + 0.2)
+            while len(watch.seen(CLOUDS)) < 10 or watch.count_subscribers(CLOUDS) < 2:
+                watch.watch(0.2)
                 programs.check()
                 if time.monotonic() > deadline:
                     raise TimeoutError("no clouds, or no second subscriber")
             return [
-                _watched(observer, driver, "two reliable subscribers", lambda: None),
+                _watched(watch, driver, "two reliable subscribers", lambda: None),
                 _watched(
-                    observer, driver, "one of them stopped 6 s",
+                    watch, driver, "one of them stopped 6 s",
                     lambda: _signal(slow, signal.SIGSTOP),
                 ),
                 _watched(
-                    observer, driver, "that one killed",
+                    watch, driver, "that one killed",
                     lambda: _signal(slow, signal.SIGKILL),
                 ),
             ]  # fmt: skip
     finally:
-        observer.destroy_node()
+        watch.destroy_node()
         rclpy.try_shutdown()
 
 
@@ -74,26 +73,17 @@ def _signal(program: Program, number: signal.Signals) -> None:
     os.kill(program.pid, number)
 
 
-def _watched(
-    observer: _Watcher, driver: Program, name: str, happen: Callable[[], None]
-) -> Finding:
-    observer.clouds, observer.imu = TopicRecord(), TopicRecord()
+def _watched(watch: TopicWatch, driver: Program, name: str, happen: Callable[[], None]) -> Finding:
+    watch.forget()
     before_mb = resident_mb(driver.pid)
     happen()
-    observer.watch(time.monotonic() + 6.0)
-    clouds, imu = observer.clouds, observer.imu
-    finding = Finding(name, published=len(clouds.stamps) + len(imu.stamps))
-    finding.backwards = clouds.backward_steps + imu.backward_steps
-    # An IMU sample comes every 4 ms, a turn takes 49.53 packets.
-    turn_ns = _PACKETS_PER_TURN / _PACKETS_PER_S * 1e9
-    finding.missing = sum(
-        max(round((after - before) / period) - 1, 0)
-        for stamps, period in ((imu.stamps, 4e6), (clouds.stamps, turn_ns))
-        for before, after in pairwise(stamps)
-    )
+    watch.watch(6.0)
+    clouds, imu = watch.seen(CLOUDS), watch.seen(IMU)
+    finding = Finding(name, published=len(clouds) + len(imu))
+    finding.backwards = backward_steps(clouds) + backward_steps(imu)
+    finding.missing = missing(imu, 1 / wire.IMU_RATE_HZ) + missing(clouds, _TURN_S)
+    finding.recovery_s = float(np.diff(imu[:, 1]).max(initial=0)) / 1e9
     growth = resident_mb(driver.pid) - before_mb
-    gaps = [b - a for a, b in pairwise(imu.arrivals)]
-    finding.recovery_s = max(gaps, default=0.0)
     finding.remark = (
         f"longest pause of the other {finding.recovery_s * 1e3:.0f} ms, "
         f"driver grows by {growth:.1f} MB"
@@ -102,29 +92,7 @@ def _watched(
     return finding
 
 
-class _Watcher(Node):
-    """Takes everything, reliably, with a long queue, and notes the stamps."""
-
-    def __init__(self) -> None:
-        super().__init__("watcher")
-        self.clouds, self.imu = TopicRecord(), TopicRecord()
-        deep = QoSProfile(depth=500)
-        self.create_subscription(PointCloud2, "/points", self._cloud, deep)
-        self.create_subscription(Imu, "/imu/data", self._sample, deep)
-
-    def watch(self, until: float) -> None:
-        """Handle what arrives until a monotonic time [s]."""
-        while (left := until - time.monotonic()) > 0:
-            rclpy.spin_once(self, timeout_sec=min(left, 0.1))
-
-    def _cloud(self, message: PointCloud2) -> None:
-        self.clouds.add(from_time(message.header.stamp), message.header.frame_id)
-
-    def _sample(self, message: Imu) -> None:
-        self.imu.add(from_time(message.header.stamp), message.header.frame_id)
-
-
-class _Subscriber(Node):
+class _Subscriber(Node):  # type: ignore[misc]  # rclpy is used as if it had no types
     """Takes everything, reliably, with a short queue."""
 
     def __init__(self) -> None:

@@ -1,0 +1,52 @@
+"""Starts the whole chain: a virtual L2, the driver, deskew and odometry nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from typing import Final
+
+from l2lidar_node.demo.processes import Program, Programs, free_udp_ports
+
+EMULATOR: Final = "l2lidar_node.emulator"
+DRIVER: Final = "l2lidar_node.ros.driver_node"
+DESKEW: Final = "l2lidar_proc.ros.deskew_node"
+ODOMETRY: Final = "l2lidar_proc.ros.odometry_node"
+
+
+def start(
+    programs: Programs,
+    unit: Sequence[str],
+    values: Mapping[str, object] | None = None,
+    nodes: Sequence[str] = (DRIVER, DESKEW, ODOMETRY),
+) -> dict[str, Program]:
+    """Start the nodes that there are and then a unit; return them by name.
+
+    Parameters
+    ----------
+    programs : Programs
+    unit : sequence of str
+        Options of the virtual L2.
+    values : mapping, optional
+        Parameters of the driver beside addresses and IMU.
+    nodes : sequence of str
+        Modules.
+    """
+    host_port, lidar_port = free_udp_ports(2)
+    parameters = {
+        "l2_ip": "127.0.0.1", "l2_port": lidar_port, "host_ip": "127.0.0.1",
+        "host_port": host_port, "enable_IMU_publishing": "true", "imu_adjust": "false",
+        **(values or {}),
+    }  # fmt: skip
+    assignments = [
+        part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")
+    ]
+    started = {
+        module.rpartition(".")[2]: programs.start(
+            module, ["--ros-args", *assignments] if module == DRIVER else []
+        )
+        for module in nodes
+        if find_spec(module)
+    }
+    ports = ["--host-port", str(host_port), "--lidar-port", str(lidar_port)]
+    return {**started, "emulator": programs.start(EMULATOR, [*ports, *unit])}

@@ -1,0 +1,90 @@
+"""Notes stamp and arrival of every message of the chain's topics, as cheaply as rclpy can."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, PointCloud2
+
+_STAMP: Final = struct.Struct("<iI")
+_ENCAPSULATION: Final = 4  # bytes before a serialised message, which begins with its stamp
+
+CLOUDS: Final = "/points"
+IMU: Final = "/imu/data"
+DESKEWED: Final = "/points_deskewed"
+ODOMETRY: Final = "/odometry"
+_KINDS: Final = {CLOUDS: PointCloud2, IMU: Imu, DESKEWED: PointCloud2, ODOMETRY: Odometry}
+
+
+class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no types
+    """Subscribes to topics and keeps what arrives, stamps and times alone.
+
+    Parameters
+    ----------
+    topics : sequence of str
+    reliable : bool
+        Ask for reliable delivery: the publisher then has to offer it.
+    """
+
+    def __init__(self, topics: Sequence[str], *, reliable: bool = False) -> None:
+        super().__init__("watch")
+        self.checks: dict[str, dict[str, str]] = {}
+        self._seen: dict[str, list[tuple[int, int]]] = defaultdict(list)
+        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        for topic in topics:
+            self.create_subscription(
+                _KINDS[topic],
+                topic,
+                lambda data, topic=topic: self._note(topic, data),
+                QoSProfile(depth=500, reliability=policy),
+                raw=True,
+            )
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
+
+    def watch(self, seconds: float) -> None:
+        """Handle what arrives for a while."""
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            rclpy.spin_once(self, timeout_sec=min(left, 0.1))
+
+    def seen(self, topic: str) -> NDArray[np.int64]:
+        """Return stamp and arrival of the messages so far [ns, host clock], shape (N, 2)."""
+        return np.array(self._seen[topic], np.int64).reshape(-1, 2)
+
+    def forget(self) -> None:
+        """Forget all messages."""
+        self._seen.clear()
+
+    def _note(self, topic: str, data: bytes) -> None:
+        seconds, nanoseconds = _STAMP.unpack_from(data, _ENCAPSULATION)
+        self._seen[topic].append((seconds * 10**9 + nanoseconds, time.time_ns()))
+
+    def _diagnose(self, message: Any) -> None:
+        for status in message.status:
+            name = status.name.rpartition(": ")[2]
+            self.checks[name] = {
+                "message": status.message,
+                **{item.key: item.value for item in status.values},
+            }
+
+
+def backward_steps(seen: NDArray[np.int64]) -> int:
+    """Return how many stamps are not later than the one before."""
+    return int((np.diff(seen[:, 0]) <= 0).sum())
+
+
+def missing(seen: NDArray[np.int64], period_s: float) -> int:
+    """Return how many messages of a steady topic are missing between the first and the last."""
+    steps = np.rint(np.diff(seen[:, 0]) / (period_s * 1e9)).astype(np.int64) - 1
+    return int(np.maximum(steps, 0).sum())
