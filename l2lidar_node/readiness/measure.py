@@ -47,15 +47,12 @@ class Rings(NamedTuple):
     Attributes
     ----------
     least, greatest : int
-    distinct : int
-        How many values there are.
     kept : float
         Share of the points that LIO-SAM's projection keeps if it has enough rings.
     """
 
     least: int
     greatest: int
-    distinct: int
     kept: float
 
 
@@ -147,6 +144,5 @@ def _rings(ring: F64, positions: F64) -> Rings:
     return Rings(
         int(rows.min()),
         int(rows.max()),
-        len(np.unique(rows)),
         kept_share(rows, positions[:, 0], positions[:, 1]),
     )

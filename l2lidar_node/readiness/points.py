@@ -104,7 +104,7 @@ def _check_rings(inside: list[Contents], consumer: Consumer) -> Iterator[Finding
     greatest = max(item.greatest for item in rings)
     kept = float(np.median([item.kept for item in rings]))
     layout = consumer.inputs[0].layout
-    if max(item.distinct for item in rings) == 1:
+    if least == greatest:
         yield Finding(
             Level.ERROR,
             _SUBJECT,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from l2lidar_node.cli import main
 from l2lidar_node.readiness.consumers import CONSUMERS
+from l2lidar_node.readiness.topics import CLOUD, IMU, SourceError, Topics, choose
 from tests.l2lidar_node.readiness.recordings import Recording, copied, good
 
 Said = tuple[int, str, str]
@@ -198,8 +201,6 @@ def test_a_recording_that_was_cut_off_is_refused_or_judged(check, share, tmp_pat
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_recording_with_wrong_bytes_is_refused_or_judged(check, seed, tmp_path):
-    import numpy as np
-
     draw = np.random.default_rng(seed)
     (file,) = small().write(tmp_path / "bag").glob("*.mcap")
     data = np.frombuffer(file.read_bytes(), np.uint8).copy()
@@ -207,3 +208,25 @@ def test_a_recording_with_wrong_bytes_is_refused_or_judged(check, seed, tmp_path
     data[places] = draw.integers(0, 256, 200)
     file.write_bytes(data.tobytes())
     assert check(file, "--for", "rko_lio")[0] in (0, 1, 2)
+
+
+@pytest.mark.parametrize("source", [("/points",), ()])
+def test_without_ros_a_topic_is_a_usage_error(check, monkeypatch, source):
+    monkeypatch.setitem(sys.modules, "l2lidar_node.ros.topic_source", None)
+    monkeypatch.delattr("l2lidar_node.ros.topic_source", raising=False)
+    code, _, error = check(*source, "--for", "lio_sam")
+    assert code == 2
+    assert "need a sourced ROS 2" in error
+
+
+def test_several_topics_have_to_be_told_apart():
+    kinds = {"/points": CLOUD, "/points_deskewed": CLOUD, "/imu/data": IMU, "/camera/imu": IMU}
+    with pytest.raises(SourceError, match="--cloud: /points, /points_deskewed"):
+        choose(kinds, Topics(), needs_imu=True)
+    with pytest.raises(SourceError, match="--imu: /camera/imu, /imu/data"):
+        choose(kinds, Topics(cloud="/points"), needs_imu=True)
+    assert choose(kinds, Topics(cloud="/points"), needs_imu=False) == ("/points", "")
+    assert choose(kinds, Topics("/points", "/imu/data"), needs_imu=True) == (
+        "/points",
+        "/imu/data",
+    )

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node.layouts import LAYOUTS
 from l2lidar_node.readiness.consumers import CONSUMERS
 from l2lidar_node.readiness.demands import TimeField, TimeUnit
 from l2lidar_node.readiness.fields import reading
 from l2lidar_node.readiness.observation import Gathering, Observation
 from l2lidar_node.readiness.projection import kept_share
 from l2lidar_node.readiness.timing import Timing, timing
+from l2lidar_node.readiness.verdict import judge
 from tests.l2lidar_node.readiness import recordings
 
 STAMP = 1_700_000_000_250_000_000
@@ -88,9 +90,6 @@ def test_the_input_that_fits_best_is_taken(consumer, name, code, when):
 
 
 def test_an_ouster_cloud_is_judged_as_such():
-    from l2lidar_node.layouts import LAYOUTS
-    from l2lidar_node.readiness.verdict import judge
-
     made = recordings.copied(recordings.good("lio_sam"))
     layout = LAYOUTS["ouster_legacy"]
     made.clouds = [
