@@ -17,7 +17,7 @@ from l2lidar_node.readiness.verdict import judge
 from l2lidar_node.settings import build, settings_of
 from l2lidar_proc.config import DeskewNodeConfig
 from tests.l2lidar_node.readiness.defects import DEFECTS, Defect, damaged
-from tests.l2lidar_node.readiness.recordings import good
+from tests.l2lidar_node.readiness.recordings import cloud, copied, good, points_of, stamp_of
 
 
 def bad(findings: list[Finding]) -> dict[str, Level]:
@@ -35,6 +35,16 @@ def test_what_the_driver_publishes_for_a_consumer_is_right(consumer: str) -> Non
     assert bad(findings) == {}
     assert len(findings) >= 10
     assert not [item for item in findings if item.text.startswith("not judged")]
+
+
+def test_a_first_sweep_that_is_a_part_of_one_is_no_defect() -> None:
+    made = copied(good("lio_sam"))
+    points, stamp = points_of(made.clouds[0]), stamp_of(made.clouds[0])
+    rest = points[points["time"] > 0.1].copy()
+    late = rest["time"][0]
+    rest["time"] -= late
+    made.clouds[0] = cloud(rest, stamp + round(float(late) * 1e9))
+    assert bad(judge(made.observe(), CONSUMERS["lio_sam"])) == {}
 
 
 @pytest.mark.parametrize("item", DEFECTS, ids=lambda item: f"{item.name}-{item.consumer}")
