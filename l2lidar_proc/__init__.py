@@ -1,1 +1,1 @@
-"""Companion of l2lidar_node: deskew, filters and odometry on sweeps; imports no ROS outside ``ros/``."""
+"""What is done with the driver's sweeps: deskew, filters, odometry; no ROS outside ``ros``."""
