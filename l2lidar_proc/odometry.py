@@ -22,7 +22,7 @@ from l2lidar_proc.inertial_filter import (
 )
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
-from l2lidar_proc.odometry_report import cloud_pose, estimate_of, gaps_in
+from l2lidar_proc.odometry_report import estimate_of, gaps_in
 from l2lidar_proc.sweep_matcher import SweepMatcher, xyz
 from l2lidar_proc.sweep_motion import SweepMotion
 
@@ -32,6 +32,7 @@ _WINDOW_S: Final = 6.0
 _OPENING_NS: Final = 450_000_000  # the first sweeps are held for so long
 _OPENING_ROUNDS: Final = 6
 _OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the rounds
+_REST_SPEED: Final = 0.06  # [m/s] faster, the sensor did not rest, however quiet the IMU
 _WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
 _LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
 _COAST_NS: Final = 3_000_000_000  # an unconfirmed velocity is kept for so long,
@@ -59,13 +60,14 @@ class Odometry:
     Attributes
     ----------
     config : OdometryConfig
+    T_cloud_imu : ndarray, shape (4, 4)
     matcher : SweepMatcher
         Holds the maps, whose origin is the IMU's first place.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
-        self._turn = np.asarray(T_cloud_imu, dtype=np.float64)[:3, :3]
-        self._lever = np.asarray(T_cloud_imu, dtype=np.float64)[:3, 3]
+        self.T_cloud_imu = np.array(T_cloud_imu, dtype=np.float64)
+        self._lever: F64 = self.T_cloud_imu[:3, 3]
         self._imu = ImuWindow(_WINDOW_S)
         self.config = config
         self.reset()
@@ -89,10 +91,11 @@ class Odometry:
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
-        if not np.array_equal(self._turn, np.eye(3)):
+        turn = self.T_cloud_imu[:3, :3]
+        if not np.array_equal(turn, np.eye(3)):
             samples = samples.copy()
             for name in ("angular_velocity", "linear_acceleration"):
-                samples[name] = samples[name] @ self._turn.T
+                samples[name] = samples[name] @ turn.T
         self._imu.push(samples)
 
     def register(self, sweep: Sweep) -> list[OdometryEstimate]:
@@ -144,8 +147,8 @@ class Odometry:
         quality = self.matcher.quality(len(source.points), found)
         return [self._estimate(motion, moved, status, quality)]
 
-    def extrapolated(self, stamp: HostNs) -> InertialState | None:
-        """Return the state that the IMU leads to since the latest reference, None before it.
+    def extrapolated(self, stamp: HostNs) -> OdometryEstimate | None:
+        """Return what the IMU leads to since the latest reference, None before the first.
 
         Parameters
         ----------
@@ -153,14 +156,13 @@ class Odometry:
             Not before the latest reference; best not after the newest IMU sample.
         """
         state = self._state
-        if state is None or stamp < state.stamp:
+        if state is None or self._last is None or stamp <= state.stamp:
             return None
         motion = self._predicted_over(state, self._covariance, (state.stamp, stamp), stamp)
-        return motion.state
-
-    def pose_of(self, state: InertialState) -> F64:
-        """Return the pose of the cloud frame in a state, shape (4, 4)."""
-        return cloud_pose(state, self._lever)
+        nothing = self._last.points[:0]
+        status = (Status.PREDICTED,)
+        noise = self.config.inertial.gyro_noise
+        return estimate_of(motion, self._lever, nothing, status, AlignmentQuality(), noise)
 
     # ---- beginnings
 
@@ -175,6 +177,8 @@ class Odometry:
         # the very first sweep is seldom whole
         most = max(len(one.points) for one in held)
         seed = next(k for k, one in enumerate(held) if len(one.points) >= _WHOLE * most)
+        if seed == len(held) - 1 and most:
+            return []
         motions = self._solved(held[seed:], held[0].start) if most > self.config.min_points else []
         if not motions:
             del held[0]
@@ -193,7 +197,9 @@ class Odometry:
         held.clear()
         return estimates
 
-    def _solved(self, sweeps: list[Sweep], since: HostNs) -> list[SweepMotion]:
+    def _solved(
+        self, sweeps: list[Sweep], since: HostNs, may_rest: bool = True
+    ) -> list[SweepMotion]:
         """Begin the map with the first sweeps; return their motions, empty if they do not fit.
 
         As long as the velocity is not known the map's first sweep is smeared: what the following
@@ -201,7 +207,7 @@ class Odometry:
         """
         reference = self._reference(sweeps[0])
         samples = self._imu.between(HostNs(since - _OPENING_NS), sweeps[-1].end)
-        opening = startup.opening(samples, reference)
+        opening = startup.opening(samples, reference, may_rest)
         self._trusts_gravity = opening.gravity_trusted
         # the odometry frame begins at the cloud frame's origin, the state is the IMU's
         start = dataclasses.replace(opening.state, position=opening.state.rotation @ self._lever)
@@ -214,12 +220,16 @@ class Odometry:
                 motion = self._predicted(sweep, motions[-1].state, motions[-1].covariance)
                 source = self.matcher.source(sweep, motion)
                 found = self.matcher.match(source, motion, opening=True)
+                if found is None and opening.at_rest:
+                    return self._solved(sweeps, since, may_rest=False)
                 if found is None:
                     return []
                 motion = motion.corrected(found.state, found.covariance)
                 motions.append(motion)
                 self.matcher.extend(motion.deskewed(sweep, self._lever), motion, motion.state)
             velocity = motions[1].state_at(reference).velocity
+            if opening.at_rest and np.linalg.norm(velocity) > _REST_SPEED:
+                return self._solved(sweeps, since, may_rest=False)
             if np.linalg.norm(velocity - start.velocity) < _OPENING_STEP:
                 break
             start = dataclasses.replace(start, velocity=velocity)

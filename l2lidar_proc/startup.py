@@ -30,6 +30,7 @@ TRUSTED_NORM: Final = (
     10.8,
 )  # mean |a| [m/s^2] of a sound IMU; the known fault reads 16 to 21
 
+_ACCEL_BIAS: Final = 0.15  # [m/s^2]
 _BLOCKS: Final = 6
 _LEAST: Final = 20
 _STILL_RATE: Final = 0.12  # [rad/s] a larger mean rate is no bias
@@ -58,7 +59,7 @@ class Opening:
     gravity_trusted: bool
 
 
-def opening(samples: Samples, stamp: HostNs) -> Opening:
+def opening(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Opening:
     """Return the state at the first reference: the map's origin, level if gravity is trusted.
 
     Parameters
@@ -67,34 +68,48 @@ def opening(samples: Samples, stamp: HostNs) -> Opening:
         Of the last moments up to and around the first sweep, cloud axes; may be empty.
     stamp : HostNs
         The first reference.
+    may_rest : bool
+        False where the clouds have shown that the sensor moves, however quiet the IMU is.
     """
     force = samples["linear_acceleration"].mean(axis=0) if len(samples) else np.zeros(3)
     norm = float(np.linalg.norm(force))
     trusted = bool(TRUSTED_NORM[0] < norm < TRUSTED_NORM[1])
-    at_rest = _at_rest(samples)
-    rotation = (
-        rotations.matrices(rotations.between(force, (0.0, 0.0, 1.0))) if trusted else np.eye(3)
-    )
-    # at rest the size of the force beyond gravity is the accelerometer's own; its direction
-    # cannot tell
+    at_rest = may_rest and _at_rest(samples)
+    rotation = np.eye(3)
+    if trusted:
+        rotation = rotations.matrices(rotations.between(force, (0.0, 0.0, 1.0)))
+    # at rest what the force has beyond gravity is bias; its direction cannot tell
     excess = force * (1.0 - STANDARD_GRAVITY / norm) if trusted and at_rest else np.zeros(3)
     state = InertialState(
         stamp,
-        np.asarray(rotation),
+        rotation,
         np.zeros(3),
         np.zeros(3),
         samples["angular_velocity"].mean(axis=0) if at_rest else np.zeros(3),
         excess,
         np.array([0.0, 0.0, -STANDARD_GRAVITY]) if trusted else np.zeros(3),
     )
+    return Opening(state, _covariance(rotation, at_rest), at_rest, trusted)
+
+
+def _covariance(rotation: F64, at_rest: bool) -> F64:
+    """Return how well the first state is known, shape (18, 18)."""
     sigma = np.zeros(ERRORS)
     sigma[TURN] = sigma[POSITION] = 1e-4  # the first pose is the map's own frame
-    sigma[VELOCITY] = 0.05 if at_rest else 1.0
+    sigma[VELOCITY] = 0.02 if at_rest else 1.0
     sigma[GYRO_BIAS] = 0.01 if at_rest else 0.05
-    sigma[ACCEL_BIAS] = 0.15
-    # the mean force may be off by bias and by motion; the size of gravity is known
-    sigma[GRAVITY] = (0.15, 0.15, 0.01) if at_rest else (0.7, 0.7, 0.1)
-    return Opening(state, np.diag(sigma**2), at_rest, trusted)
+    sigma[ACCEL_BIAS] = 0.02 if at_rest else _ACCEL_BIAS
+    # in motion the mean force is off by the motion too; the size of gravity is known
+    sigma[GRAVITY] = 0.01 if at_rest else (0.7, 0.7, 0.1)
+    covariance = np.diag(sigma**2)
+    if at_rest:
+        # bias and tilt cannot be told apart, but together they are what was felt: so the one
+        # that is wrong across gravity is wrong by as much as the other
+        both = np.zeros((ERRORS, 2))
+        both[GRAVITY] = np.eye(3)[:, :2]
+        both[ACCEL_BIAS] = rotation.T[:, :2]
+        covariance += _ACCEL_BIAS**2 * both @ both.T
+    return covariance
 
 
 def _at_rest(samples: Samples) -> bool:

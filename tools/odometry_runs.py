@@ -117,7 +117,7 @@ def _bounds(run: Run, cut: str) -> tuple[list[int], list[int]]:
 
 def truth(run: Run, stamps: NDArray[np.int64]) -> tuple[F64, F64]:
     """Return positions (N, 3) [m] and quaternions w, x, y, z (N, 4) of the cloud frame."""
-    return run.motion.poses((stamps - EPOCH) * 1e-9)
+    return run.motion.poses(np.asarray((stamps - EPOCH) * 1e-9, dtype=np.float64))
 
 
 def write(run: Run, cut: str, path: Path) -> None:

@@ -1,0 +1,279 @@
+"""Odometry as a ROS 2 node: converts messages, calls the pipeline, publishes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter, deque
+from pathlib import Path as FilePath
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, PointCloud2
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.parameters import ParameterSet
+from l2lidar_node.ros.program import run
+from l2lidar_proc import map_file, odometry_health, rotations, trajectory
+from l2lidar_proc.base_frame import BaseFrame
+from l2lidar_proc.cloud import CloudError, to_sweep
+from l2lidar_proc.odometry import Odometry
+from l2lidar_proc.odometry_config import OdometryNodeConfig
+from l2lidar_proc.odometry_estimate import OdometryEstimate
+from l2lidar_proc.odometry_pipeline import OdometryPipeline
+from l2lidar_proc.ros import odometry_messages as messages
+from l2lidar_proc.ros.samples import to_sample
+from l2lidar_proc.ros.static_frames import StaticFrames
+
+_IMU_DEPTH = 500
+_PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
+
+
+class OdometryNode(Node):
+    """Publishes where the sensor, or what carries it, is.
+
+    Raises
+    ------
+    SettingError
+        If a parameter is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("odometry_node")
+        self._settings = ParameterSet(self, OdometryNodeConfig, self._configure)
+        config = self._settings.value
+        topics = config.topics
+        self._pipeline = OdometryPipeline(config.odometry, topics.T_cloud_imu, topics.imu_wait_ms)
+        self._frames = StaticFrames(self) if topics.use_tf else None
+        self._base = BaseFrame(np.eye(4))
+        self._cloud_frame = ""
+        self._imu_frame = ""
+        self._mounted = -1
+        self._refused: Counter[str] = Counter()
+        self._looked_at = 0
+        self._path: deque[PoseStamped] = deque(maxlen=topics.path_length)
+        self._path_end = np.full((4, 4), np.inf)
+        self._open(config)
+        self._overdue = self.create_timer(0.01, self._hand_out)
+        self._overdue.cancel()
+        self.create_timer(1.0, self._diagnose)
+        if topics.imu_rate > 0.0:
+            self.create_timer(1.0 / topics.imu_rate, self._carry_on)
+        if topics.map_period_s > 0.0:
+            self.create_timer(topics.map_period_s, self._show_map)
+
+    def _open(self, config: OdometryNodeConfig) -> None:
+        topics = config.topics
+        reliable = topics.qos_reliability == "reliable"
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        out = QoSProfile(depth=10, reliability=reliability)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._odometry = self.create_publisher(OdometryMessage, topics.odometry_topic, out)
+        self._fast = self.create_publisher(OdometryMessage, topics.fast_odometry_topic, out)
+        self._path_publisher = self.create_publisher(Path, topics.path_topic, latched)
+        self._map = self.create_publisher(PointCloud2, topics.map_topic, latched)
+        self._registered = self.create_publisher(PointCloud2, topics.registered_topic, out)
+        self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        listening = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        often = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
+        self.create_subscription(Imu, topics.imu_topic, self._imu, often)
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_service(Trigger, "~/save_map", self._save_map)
+        self.create_service(Trigger, "~/save_trajectory", self._save_trajectory)
+
+    def _configure(self, config: OdometryNodeConfig) -> None:
+        self._pipeline.configure(config.odometry)
+
+    def _imu(self, message: Imu) -> None:
+        self._imu_frame = message.header.frame_id
+        self._pipeline.imu(to_sample(message))
+        if self._pipeline.due_ns is not None:
+            self._hand_out()
+
+    def _cloud(self, message: PointCloud2) -> None:
+        self._cloud_frame = message.header.frame_id
+        try:
+            sweep = to_sweep(from_cloud(message), from_time(message.header.stamp))
+        except (CloudError, ValueError) as error:
+            self._refused[str(error)] += 1
+            self.get_logger().warning(f"cloud dropped: {error}", throttle_duration_sec=5.0)
+            return
+        self._mount()
+        self._pipeline.sweep(sweep, time.monotonic_ns())
+        self._hand_out()
+
+    def _mount(self) -> None:
+        """Take the mounts from TF, as long as nothing depends on them yet or they changed."""
+        if self._frames is None or self._frames.version == self._mounted:
+            return
+        self._mounted = self._frames.version
+        if self._imu_frame and self._imu_frame != self._cloud_frame:
+            T_cloud_imu = self._frames.find(self._cloud_frame, self._imu_frame)
+            odometry = self._pipeline.odometry
+            if (
+                T_cloud_imu is not None
+                and isinstance(odometry, Odometry)
+                and not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6)
+            ):
+                self._pipeline.mount(T_cloud_imu)
+        base = self._settings.value.topics.base_frame
+        if base and base != self._cloud_frame:
+            T_cloud_base = self._frames.find(self._cloud_frame, base)
+            if T_cloud_base is not None and not np.allclose(T_cloud_base, self._base.T_lidar_base):
+                self._base = BaseFrame(T_cloud_base)
+
+    def _hand_out(self) -> None:
+        """Publish what is finished, and come back in time for what still waits."""
+        for estimate in self._pipeline.poll(time.monotonic_ns()):
+            self._publish(estimate)
+        due = self._pipeline.due_ns
+        self._overdue.cancel()
+        if due is not None:
+            self._overdue.timer_period_ns = max(due - time.monotonic_ns(), 1_000_000)
+            self._overdue.reset()
+
+    @property
+    def _base_name(self) -> str:
+        return self._settings.value.topics.base_frame or self._cloud_frame
+
+    def _publish(self, estimate: OdometryEstimate) -> None:
+        topics = self._settings.value.topics
+        motion = self._base.motion(estimate)
+        stamp, odom = estimate.stamp, topics.odom_frame
+        self._odometry.publish(messages.odometry(motion, stamp, odom, self._base_name))
+        if topics.publish_tf:
+            self._tf.publish(TFMessage(transforms=[self._transform(motion.T_odom_base, estimate)]))
+        self._extend_path(motion.T_odom_base, estimate)
+        if self._registered.get_subscription_count():
+            pose = self._base.odom_from_map(estimate.T_odom_lidar) @ estimate.T_odom_lidar
+            points = messages.moved(estimate.points, pose)
+            self._registered.publish(to_cloud(points, stamp, odom))
+
+    def _transform(
+        self, T_odom_base: rotations.F64, estimate: OdometryEstimate
+    ) -> TransformStamped:
+        topics = self._settings.value.topics
+        if topics.invert_tf:
+            T_base_odom = rotations.inverse(T_odom_base)
+            return messages.transform(
+                T_base_odom, estimate.stamp, self._base_name, topics.odom_frame
+            )
+        return messages.transform(T_odom_base, estimate.stamp, topics.odom_frame, self._base_name)
+
+    def _extend_path(self, pose: rotations.F64, estimate: OdometryEstimate) -> None:
+        topics = self._settings.value.topics
+        if not messages.are_apart(self._path_end, pose, *_PATH_STEP):
+            return
+        self._path_end = pose
+        if self._path.maxlen != topics.path_length:
+            self._path = deque(self._path, topics.path_length)
+        self._path.append(messages.pose_stamped(pose, estimate.stamp, topics.odom_frame))
+        if self._path_publisher.get_subscription_count():
+            path = Path(poses=list(self._path))
+            path.header = self._path[-1].header
+            self._path_publisher.publish(path)
+
+    def _carry_on(self) -> None:
+        """Publish where the IMU has led to since the latest sweep."""
+        odometry, newest = self._pipeline.odometry, self._pipeline.newest_imu
+        if newest is None or not isinstance(odometry, Odometry):
+            return
+        estimate = odometry.extrapolated(newest)
+        if estimate is not None:
+            motion = self._base.motion(estimate)
+            odom = self._settings.value.topics.odom_frame
+            self._fast.publish(messages.odometry(motion, newest, odom, self._base_name))
+
+    def _show_map(self) -> None:
+        last = self._pipeline.last
+        if last is not None and self._map.get_subscription_count():
+            points = messages.as_cloud(self._map_points(last))
+            odom = self._settings.value.topics.odom_frame
+            self._map.publish(to_cloud(points, last.stamp, odom))
+
+    def _map_points(self, last: OdometryEstimate) -> rotations.F64:
+        """Return the local map in the odometry frame [m], shape (N, 3)."""
+        turn = self._base.odom_from_map(last.T_odom_lidar)
+        return self._pipeline.odometry.map_points() @ turn[:3, :3].T + turn[:3, 3]
+
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        del request
+        self._pipeline.reset()
+        self._base.reset()
+        self._path.clear()
+        self._path_end = np.full((4, 4), np.inf)
+        self._looked_at = 0
+        response.success, response.message = True, "a new map begins with the next clouds"
+        return response
+
+    def _save_map(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        del request
+        last = self._pipeline.last
+        path = FilePath(self._settings.value.topics.map_file)
+        if last is None:
+            response.success, response.message = False, "there is no map yet"
+            return response
+        try:
+            count = map_file.save(path, self._map_points(last))
+            response.success, response.message = True, f"{count} points in {path.absolute()}"
+        except OSError as error:
+            response.success, response.message = False, f"{path}: {error}"
+        return response
+
+    def _save_trajectory(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        del request
+        path = FilePath(self._settings.value.topics.trajectory_file)
+        poses = [
+            trajectory.StampedPose(item.stamp, self._base.pose(item.pose))
+            for item in self._pipeline.trajectory
+        ]
+        try:
+            path.write_text(trajectory.tum(poses), encoding="utf-8")
+            path.with_suffix(".kitti").write_text(trajectory.kitti(poses), encoding="utf-8")
+            response.success = True
+            response.message = f"{len(poses)} poses in {path.absolute()} and beside it"
+        except OSError as error:
+            response.success, response.message = False, f"{path}: {error}"
+        return response
+
+    def _diagnose(self) -> None:
+        since = self._pipeline.sweeps - self._looked_at
+        self._looked_at = self._pipeline.sweeps
+        level, text, values = odometry_health.judged(
+            self._pipeline.last,
+            self._pipeline.sweeps,
+            since,
+            self._pipeline.counts,
+            self._refused,
+        )
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=bytes([level]),
+                name=f"{self.get_fully_qualified_name().lstrip('/')}: odometry",
+                message=text,
+                values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            )
+        ]
+        self._diagnostics.publish(message)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the odometry node; see :func:`l2lidar_node.ros.program.run`."""
+    return run("odometry_node", OdometryNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
