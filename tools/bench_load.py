@@ -10,8 +10,10 @@ import statistics
 import struct
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import rclpy
 
 from l2lidar_node import wire
@@ -26,20 +28,20 @@ from l2lidar_node.packets import PointPacket, decode
 from l2lidar_node.settings import build
 from l2lidar_node.transport import UdpTransport
 from l2lidar_node.types import HostNs, Sweep
-from tools.cpu import process_cpu_s
+from tools import load_chain, load_scale
+from tools.cpu import process_cpu_s, resident_mb
 from tools.results import Target, at_least, at_most, publish
 
 FULL_TURN = 50
 _SYNTHETIC_PACKETS = 5_000
 _STAMP = struct.Struct("<II")
 _CLOCK_RATIO = 1.99866  # of the virtual L2
+Row = Callable[..., None]
 _EPOCH_NS = 1_700_000_000 * 10**9
 
 
 def decode_rate(rounds: int) -> float:
     """Return packets per CPU second of framing, CRC, decoding and geometry, full turns."""
-    import numpy as np
-
     payloads, _ = PatternScanner().packets(0, _SYNTHETIC_PACKETS)
     datagrams = [wire.encode_frame(wire.PacketType.POINTS_3D, item.tobytes()) for item in payloads]
     starts = np.arange(FULL_TURN, dtype=np.float64) * wire.MIRROR_PERIOD_S
@@ -151,17 +153,21 @@ def node_share(seconds: float) -> dict[str, float]:
             share = (process_cpu_s(node.pid) - cpu) / (time.monotonic() - wall)
             clouds = (len(observer.clouds.stamps) - seen[0]) / seconds
             imu = (len(observer.imu.stamps) - seen[1]) / seconds
+            memory = resident_mb(node.pid)
     finally:
         observer.destroy_node()
         rclpy.try_shutdown()
-    return {"share": share, "clouds": clouds, "imu": imu}
+    return {"share": share, "clouds": clouds, "imu": imu, "memory": memory}
 
 
 def main() -> int:
     """Run the measurements; return 0 whatever they found."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
-    seconds: float = parser.parse_args().seconds
+    parser.add_argument("--chain-seconds", type=float, default=0.0, help="of the whole chain")
+    parser.add_argument("--world", default="pattern", help="what the chain sees")
+    options = parser.parse_args()
+    seconds: float = options.seconds
     rows: list[dict[str, Any]] = []
 
     def row(what: str, value: float, unit: str, remark: str = "") -> None:
@@ -185,13 +191,64 @@ def main() -> int:
         "driver node, one subscriber", 100 * node["share"], "% of a core",
         f"{node['clouds']:.2f} clouds/s, {node['imu']:.1f} IMU samples/s received",
     )  # fmt: skip
+    row("driver node, memory", node["memory"], "MB")
     targets: list[Target] = [
         at_least("framing + CRC + decode + geometry [packets per CPU s]", pure, 60_000),
         at_least("socket to sweep [packets per CPU s]", points["rate"], 30_000),
         at_most("driver node [% of a core]", 100 * node["share"], 5.0),
     ]
+    targets += _chain_rows(row, options.chain_seconds or seconds, options.world)
+    targets += _scale_rows(row, min(seconds, 4.0))
     publish("load", "What the driver costs", rows, targets)
     return 0
+
+
+def _chain_rows(row: Row, seconds: float, world: str) -> list[Target]:
+    cost = load_chain.measured(seconds, world)
+    for name, share in cost.shares.items():
+        row(f"chain: {name}", 100 * share, "% of a core", f"{cost.memory_mb[name]:.0f} MB")
+    for topic, values in cost.latencies_ms.items():
+        if not len(values):
+            continue
+        p50, p99 = np.percentile(values, (50, 99))
+        row(
+            f"chain: last packet sent -> {topic} received, p50", p50, "ms",
+            f"p99 {p99:.2f} ms, max {values.max():.2f} ms, {len(values)} messages",
+        )  # fmt: skip
+    clouds = cost.latencies_ms["/points"]
+    return [
+        at_most("chain: publish latency p99 [ms]", float(np.percentile(clouds, 99)), 5.0),
+        at_most("chain: clouds missing", cost.missing, 0),
+    ]
+
+
+def _scale_rows(row: Row, seconds: float) -> list[Target]:
+    targets: list[Target] = []
+    for length, rate in load_scale.by_length(25.0):
+        row(f"datagram to sweep, {length} packets a sweep", rate, "packets per CPU s")
+    for sensors, processes in load_scale.CROWDS:
+        got = load_scale.crowd(sensors, processes, 1.0, seconds)
+        row(f"{sensors} sensors, {processes} processes", got["cpu"], "cores", _crowd_remark(got))
+        if (sensors, processes) == (8, 1):
+            targets.append(at_most("8 sensors in one process: lost", _gone(got), 0))
+    for rate in load_scale.RATES:
+        got = load_scale.crowd(1, 1, rate, seconds)
+        row(f"one sensor, {rate} x the packets", got["cpu"], "cores", _crowd_remark(got))
+        targets.append(at_most(f"{rate} x: lost without being counted", got["unsaid"], 0))
+        if rate == 5:
+            targets.append(at_most("5 x: lost", _gone(got), 0))
+    return targets
+
+
+def _gone(got: dict[str, Any]) -> int:
+    return int(got["sent"] - got["received"])
+
+
+def _crowd_remark(got: dict[str, Any]) -> str:
+    return (
+        f"{got['received']} of {got['sent']} packets, {got['kernel_drops']} dropped by the kernel "
+        f"and counted, {got['sweeps']} sweeps; sender up to {got['latest_ms']:.0f} ms late"
+    )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,85 @@
+"""The measuring commands for faults, hostile input and load, in short."""
+
+from __future__ import annotations
+
+import pytest
+
+from tools import fault_world, faults, load_scale
+from tools.fault_runs import SINGLE, FaultCase, random_case, run
+from tools.fuzz_campaign import campaign
+
+SHORT = [
+    case for case in SINGLE if "2D" in case.name or "host" in case.name or "reboot" in case.name
+]
+INPUTS = {
+    "wire": 100_000,
+    "driver": 5_000,
+    "pcap": 3_000,
+    "cloud": 10_000,
+    "yaml": 400,
+    "tum": 400,
+}
+
+
+@pytest.mark.parametrize("case", SHORT, ids=lambda case: case.name)
+def test_nothing_wrong_is_published_and_nothing_good_lost(case: FaultCase) -> None:
+    verdict = run(case, seed=2)
+    assert faults.is_right(verdict), verdict
+    assert verdict.used > 0.5 * (verdict.sent - verdict.destroyed)
+
+
+@pytest.mark.parametrize("number", range(500, 508))
+def test_random_combinations_of_faults(number: int) -> None:
+    verdict = run(random_case(number, 8.0), number)
+    assert faults.is_right(verdict), verdict
+    assert verdict.used > 200
+
+
+def test_a_wrong_stamp_a_wrong_point_and_a_loss_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    from l2lidar_node.assembler import SweepAssembler
+    from tools.clock_rig import RecordingClock
+
+    good = FaultCase("none", {}, 4.0)
+    observe, push = RecordingClock.observe, SweepAssembler.push
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            RecordingClock,
+            "observe",
+            lambda self, stream, seq, stamp, arrival, duration_ns=0: observe(
+                self, stream, seq, stamp, arrival - 5_000_000, duration_ns
+            ),
+        )
+        assert not faults.is_right(run(good, 1))
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            SweepAssembler,
+            "push",
+            lambda self, packet, start, missing=0: push(
+                self,
+                packet._replace(payload=packet.payload[:300] + b"\0" + packet.payload[301:]),
+                start,
+                missing,
+            ),
+        )
+        assert not faults.is_right(run(good, 1))
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_hostile_input_is_survived(name: str) -> None:
+    if name == "yaml":
+        pytest.importorskip("rclpy")
+    outcome = campaign(name, INPUTS[name], 20.0, seed=5)
+    assert outcome.failures == {}
+    assert outcome.inputs > 0
+
+
+@pytest.mark.parametrize("case", [fault_world.stranger, fault_world.closed, fault_world.disk])
+def test_the_world_outside(case) -> None:
+    finding = fault_world.run(case)
+    assert finding.good, finding
+
+
+def test_every_packet_is_received_or_counted_as_dropped() -> None:
+    got = load_scale.crowd(2, 1, 2.0, 1.0)
+    assert got["unsaid"] == got["failures"] == 0
+    assert got["received"] > 500

@@ -1,0 +1,69 @@
+"""Drivers of several sensors in one process, without ROS; says at the end what they got.
+
+``python -m tools.load_host FIRST PORT...`` hears the sensors of :mod:`tools.load_sender` from
+number FIRST on, one at each port, until it is interrupted, and prints what it counted as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver import Driver, Event
+from l2lidar_node.session import Session
+from l2lidar_node.settings import build
+from l2lidar_node.transport import UdpTransport
+from l2lidar_node.types import Sweep
+from tools.cpu import process_cpu_s
+from tools.load_sender import address
+
+
+def main() -> int:
+    """Run the sessions."""
+    first = int(sys.argv[1])
+    latencies: list[float] = []
+
+    def handle(event: Event) -> None:
+        if isinstance(event, Sweep):
+            latencies.append((time.time_ns() - event.end) / 1e6)
+
+    sessions = []
+    for number, port in enumerate(sys.argv[2:], start=first):
+        values = {
+            "l2_ip": address(number), "host_ip": "127.0.0.1", "host_port": int(port),
+            "watchdog_action": "wait", "imu_adjust": False, "enable_l2_host_sync": False,
+            "publish_unlocked": True,  # a unit so fast that its clock is not believed counts too
+        }  # fmt: skip
+        config = build(DriverConfig, values)
+        sessions.append(Session(Driver(config), UdpTransport(config.network), handle))
+    stopping = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: stopping.set())
+    for session in sessions:
+        session.start()
+    begin = process_cpu_s(os.getpid())
+    print("listening", flush=True)
+    stopping.wait()
+    for session in sessions:
+        session.stop()
+    counts = [session.driver.counters for session in sessions]
+    found = {
+        "received": sum(one.datagrams for one in counts),
+        "lost": sum(item.lost for one in counts for item in one.sequence.values()),
+        "late": sum(item.late for one in counts for item in one.sequence.values()),
+        "kernel_drops": sum(session.transport.kernel_drops for session in sessions),
+        "sweeps": sum(one.sweeps for one in counts),
+        "cpu_s": process_cpu_s(os.getpid()) - begin,
+        "failures": [repr(session.failure) for session in sessions if session.failure],
+        "latencies_ms": latencies,
+    }
+    print(json.dumps(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
