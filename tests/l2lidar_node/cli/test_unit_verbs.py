@@ -50,7 +50,7 @@ def test_info_tells_what_the_unit_is(run: Run, unit: Unit) -> None:
     about = json.loads(outcome.out)
     assert (about["name"], about["firmware"], about["work_mode"]) == ("YS-L2", "2.8.11.1", 0)
     assert about["calibration"]["range_bias"] == -365.625
-    assert about["health"]["device"]["level"] == "OK"
+    assert about["health"]["device"]["state"] == "streaming"
 
 
 def test_info_of_a_unit_in_standby_says_what_is_not_known(run: Run, make_unit) -> None:
@@ -479,6 +479,6 @@ def test_sync_check_measures_the_clock_and_leaves_it_alone(run: Run, unit: Unit)
     assert outcome.code == 0
     found = json.loads(outcome.out)
     assert found["ratio"] == pytest.approx(1.99866, abs=2e-3)
-    assert found["streams"]["points"]["rate_hz"] == pytest.approx(215.6, rel=0.05)
+    assert found["streams"]["points"]["rate_hz"] == pytest.approx(215.6, rel=0.2)
     assert found["streams"]["imu"]["interval_std_us"] < 5
     assert unit.device.received[wire.PacketType.TIME_SYNC] == 0
