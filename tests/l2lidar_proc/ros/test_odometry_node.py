@@ -1,0 +1,193 @@
+"""The odometry node over real topics: pose, twist, TF, path, services and diagnostics."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from nav_msgs.msg import Odometry, Path  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
+
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud, to_time  # noqa: E402
+from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
+from tests.l2lidar_proc.odometry_world import recording  # noqa: E402
+from tools.odometry_runs import sweeps, truth  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+TIMEOUT_S = 40.0
+FRAME = "l2lidar_link"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Bench:
+    """An odometry node and, in another node, everything it talks to."""
+
+    def __init__(self, *overrides: str) -> None:
+        rclpy.init(args=["test", "--ros-args", *(w for o in overrides for w in ("-p", o))])
+        self.node = OdometryNode()
+        self.peer = rclpy.create_node("peer")
+        self.poses: list[Odometry] = []
+        self.fast: list[Odometry] = []
+        self.paths: list[Path] = []
+        self.maps: list[PointCloud2] = []
+        self.registered: list[PointCloud2] = []
+        self.transforms: list[TransformStamped] = []
+        self.diagnostics: list[DiagnosticStatus] = []
+        listen = self.peer.create_subscription
+        listen(Odometry, "odometry", self.poses.append, 50)
+        listen(Odometry, "odometry_imu", self.fast.append, 50)
+        listen(Path, "path", self.paths.append, LATCHED)
+        listen(PointCloud2, "local_map", self.maps.append, LATCHED)
+        listen(PointCloud2, "registered_points", self.registered.append, 50)
+        listen(TFMessage, "/tf", lambda m: self.transforms.extend(m.transforms), 50)
+        listen(DiagnosticArray, "/diagnostics", lambda m: self.diagnostics.extend(m.status), 10)
+        self.clouds = self.peer.create_publisher(PointCloud2, "/points", 10)
+        self.imu = self.peer.create_publisher(Imu, "/imu/data", 500)
+        self.static = self.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.peer)
+        self.until(lambda: self.clouds.get_subscription_count())
+        self.until(lambda: self.imu.get_subscription_count())
+        self.until(lambda: self.node._odometry.get_subscription_count())
+        self.until(lambda: self.node._registered.get_subscription_count())
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.peer.destroy_node()
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+    def until(self, condition) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
+        while not condition():
+            assert time.monotonic() < deadline, "nothing came in time"
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def send(self, run, some) -> None:
+        """Send sweeps, each after the samples that cover it."""
+        pipeline = self.node._pipeline
+        first = 0
+        for sweep in some:
+            last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+            for sample in run.imu[first:last]:
+                message = Imu()
+                message.header.stamp = to_time(int(sample["stamp"]))
+                message.header.frame_id = "l2lidar_imu"
+                rate, force = message.angular_velocity, message.linear_acceleration
+                rate.x, rate.y, rate.z = sample["angular_velocity"].tolist()
+                force.x, force.y, force.z = sample["linear_acceleration"].tolist()
+                self.imu.publish(message)
+                self.executor.spin_once(timeout_sec=0.0)
+            first = last
+            newest = int(run.imu["stamp"][last - 1])
+            self.until(lambda newest=newest: (pipeline.newest_imu or 0) >= newest)
+            before = pipeline.sweeps
+            self.clouds.publish(to_cloud(sweep.points, sweep.start, FRAME))
+            self.until(lambda before=before: pipeline.sweeps > before)
+
+    def call(self, name: str) -> Trigger.Response:
+        client = self.peer.create_client(Trigger, f"odometry_node/{name}")
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        return future.result()
+
+
+@pytest.fixture
+def bench(request):
+    made = Bench(*getattr(request, "param", ()))
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("bench", [("map_period_s:=0.2", "imu_rate:=50.0")], indirect=True)
+def test_everything_that_is_published(bench, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:18]
+    bench.send(run, some)
+    bench.until(lambda: len(bench.poses) == 18 and len(bench.registered) == 18)
+    # a message has no end of its sweep but the last point's time
+    middles = np.array([(s.start + s.end) // 2 for s in some])
+    found = np.array([from_time(m.header.stamp) for m in bench.poses])
+    assert np.abs(found - middles).max() < 200_000
+    last = bench.poses[-1]
+    assert (last.header.frame_id, last.child_frame_id) == ("odom", FRAME)
+    stamps = np.array([from_time(bench.poses[0].header.stamp), from_time(last.header.stamp)])
+    true, _ = truth(run, stamps)
+    place = last.pose.pose.position
+    assert np.linalg.norm([place.x, place.y, place.z]) == pytest.approx(
+        np.linalg.norm(true[1] - true[0]), abs=0.02
+    )
+    assert 0.0 < last.pose.covariance[0] < 1e-3
+    moving = run.motion.kinematics(np.array([(stamps[1] - run.imu["stamp"][0]) * 1e-9]))
+    assert last.twist.twist.linear.x == pytest.approx(moving.velocity_body[0, 0], abs=0.05)
+    bench.until(lambda: len(bench.transforms) == 18)
+    tf = bench.transforms[-1]
+    assert (tf.header.frame_id, tf.child_frame_id) == ("odom", FRAME)
+    assert tf.transform.translation.x == place.x
+    assert bench.registered[-1].header.frame_id == "odom"
+    assert "time" not in from_cloud(bench.registered[-1]).dtype.names
+    bench.until(lambda: bench.maps and bench.fast and bench.paths)
+    assert bench.maps[-1].width > 1000
+    bench.until(lambda: bench.diagnostics)
+    assert bench.diagnostics[-1].name == "odometry_node: odometry"
+    assert bench.call("save_map").success
+    assert (tmp_path / "map.ply").stat().st_size > 10_000
+    assert bench.call("save_trajectory").success
+    lines = (tmp_path / "trajectory.tum").read_text().splitlines()
+    assert len(lines) == len((tmp_path / "trajectory.kitti").read_text().splitlines()) == 18
+    assert lines[0].split()[0] == "{}.{:09d}".format(*divmod(int(stamps[0]), 10**9))
+    assert bench.call("reset").success
+    assert not bench.node._pipeline.trajectory
+
+
+@pytest.mark.parametrize(
+    "bench", [("base_frame:=base_link", "invert_tf:=true", "odom_frame:=map")], indirect=True
+)
+def test_base_frame_from_tf_with_the_transform_inverted(bench):
+    run = recording("room", "walk")
+    mount = TransformStamped(child_frame_id=FRAME)
+    mount.header.frame_id = "base_link"
+    mount.transform.translation.z = 1.0
+    mount.transform.rotation.w = 1.0
+    bench.static.publish(TFMessage(transforms=[mount]))
+    bench.until(lambda: bench.node._frames.version)
+    bench.send(run, list(sweeps(run, "turn"))[:8])
+    bench.until(lambda: len(bench.poses) == 8 and len(bench.transforms) == 8)
+    assert (bench.poses[0].header.frame_id, bench.poses[0].child_frame_id) == ("map", "base_link")
+    tf = bench.transforms[-1]
+    assert (tf.header.frame_id, tf.child_frame_id) == ("base_link", "map")
+    assert abs(bench.poses[0].pose.pose.position.z) < 1e-6
+    assert abs(bench.poses[-1].pose.pose.position.z) < 0.05
+
+
+@pytest.mark.parametrize("bench", [("mode:=plain",)], indirect=True)
+def test_plain_kiss_icp(bench):
+    run = recording("room", "still", 3.0)
+    bench.send(run, list(sweeps(run, "turn"))[:5])
+    bench.until(lambda: len(bench.poses) == 5)
+    assert abs(bench.poses[-1].pose.pose.position.x) < 0.1
+
+
+def test_a_cloud_that_cannot_be_used_is_told_of(bench):
+    run = recording("room", "still", 3.0)
+    points = next(sweeps(run, "turn")).points.copy()
+    points["time"] = 0.0
+    bench.clouds.publish(to_cloud(points, 10**18, FRAME))
+    bench.until(
+        lambda: any("times are equal" in v.key for s in bench.diagnostics for v in s.values)
+    )
+    assert not bench.call("save_map").success
