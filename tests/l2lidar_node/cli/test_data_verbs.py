@@ -96,25 +96,29 @@ class Sniffer:
         self._socket.settimeout(0.1)
         self._file = path.open("wb")
         self._writer = dpkt.pcap.Writer(self._file, nano=True)
-        self._stopping = threading.Event()
+        self._end: float | None = None
         self._thread = threading.Thread(target=self._capture)
         self._thread.start()
 
     def _capture(self) -> None:
-        while not self._stopping.is_set():
+        while True:
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(65536, 256)
             except TimeoutError:
+                if self._end is not None:
+                    return
                 continue
+            seconds, nanoseconds = struct.unpack("@ll", ancillary[0][2])
+            if self._end is not None and seconds + nanoseconds / 1e9 > self._end:
+                return
             if sender[2] == socket.PACKET_OUTGOING or data[12:14] != b"\x08\x00":
                 continue
             ports = struct.unpack_from(">2H", data, 34)
             if self._port in ports:
-                seconds, nanoseconds = struct.unpack("@ll", ancillary[0][2])
                 self._writer.writepkt(data, Decimal(seconds) + Decimal(nanoseconds) / 10**9)
 
     def stop(self) -> None:
-        self._stopping.set()
+        self._end = time.time()
         self._thread.join(LIMIT_S)
         self._file.close()
         self._socket.close()
