@@ -28,6 +28,7 @@ from l2lidar_node.session import Session
 from l2lidar_node.settings import build
 from l2lidar_node.transport import UdpTransport
 from l2lidar_node.types import HostNs, ImuSample, Sweep
+from l2lidar_node.wire import WorkMode
 from tests.build import SHARED_DATA
 from tests.l2lidar_node.cli.conftest import LIMIT_S, Run, Unit, free_port
 from tests.l2lidar_node.virtual_host import essence
@@ -62,6 +63,8 @@ def live(
     recorder = Recorder(path, config.network, failures.append)
     session = Session(Driver(config), UdpTransport(config.network), keep, recorder)
     session.start()
+    if unit.flash.work_mode & WorkMode.WAIT_FOR_START:
+        session.call(lambda driver, now: driver.start_rotation(now)).result()
     assert enough.wait(LIMIT_S)
     session.stop()
     assert not failures
@@ -129,7 +132,7 @@ class Sniffer:
     "settings", [{"sweep_cut": "turn"}, {"l2_sync_mode": "periodic", "imu_adjust": False}], ids=str
 )
 def test_a_tcpdump_of_a_run_replays_bit_for_bit(make_unit, tmp_path: Path, settings) -> None:
-    unit = make_unit(imu_s=0.5, points_s=0.5, boot_scale=1.0, link_s=0.3)
+    unit = make_unit(int(WorkMode.WAIT_FOR_START))  # nothing is sent before all listen
     sniffer = Sniffer(tmp_path / "tcpdump.pcap", unit.host_port)
     config, found = live(unit, tmp_path / "own.pcap", 4, **settings)
     sniffer.stop()
