@@ -51,8 +51,9 @@ class Intake:
         """Tell whether the device restarted before it measured this.
 
         Its stamps fall then. Those of packets that are late do so too where the device's clock was
-        just set, but their numbers are earlier, and they are few. An earlier number with a later
-        stamp is not late either.
+        just set, but their numbers are earlier, they are few, and they come in company of later
+        ones: after a pause nothing is late. An earlier number with a later stamp is not late
+        either.
         """
         newest = self._newest.get(stream)
         if newest is None:
@@ -60,7 +61,9 @@ class Intake:
         fall = newest.packet.stamp - packet.stamp
         if fall > RESTART_NS:
             self._fallen[stream] += 1
-            return not self._is_earlier(stream, packet) or self._fallen[stream] > _FEW
+            is_alone = arrival - newest.arrival > REORDER_NS
+            is_many = self._fallen[stream] > _FEW
+            return is_alone or is_many or not self._is_earlier(stream, packet)
         self._fallen[stream] = 0
         if fall >= 0 or packet.seq > newest.packet.seq:
             return False

@@ -110,7 +110,7 @@ class SequenceOrder(Generic[T]):
         missing = 0 if self._next is None else seq - self._next
         missing = missing % self._modulus if self._modulus != _UNKNOWN else max(missing, 0)
         self.counts.lost += missing
-        self._given_up.clear()
+        self._given_up = self._numbers_before(seq, missing)
         self._next = self._after(seq)
         return [*released, (missing, item)]
 
@@ -123,8 +123,7 @@ class SequenceOrder(Generic[T]):
         if first < self._next:
             missing = self._wrapped(first, missing)
         self.counts.lost += missing
-        lost = range(first - min(missing, self._reach), first)
-        self._given_up.update(number % (self._modulus or _NUMBERS) for number in lost)
+        self._given_up |= self._numbers_before(first, missing)
         self._next = first
         self._given_up = {n for n in self._given_up if -self._reach <= self._ahead(n) < 0}
         return self._run(missing)
@@ -160,6 +159,11 @@ class SequenceOrder(Generic[T]):
         # It wrapped, nobody knows where: after the largest number seen, as far as can be told.
         largest = max((n for n in self._waiting if n >= self._next), default=self._next - 1)
         return largest + 1 - self._next + seq
+
+    def _numbers_before(self, seq: int, count: int) -> set[int]:
+        """Return so many numbers before one, those within reach."""
+        numbers = range(seq - min(count, self._reach), seq)
+        return {number % (self._modulus or _NUMBERS) for number in numbers}
 
     def _count_behind(self, seq: int) -> None:
         if seq in self._given_up:

@@ -118,6 +118,15 @@ def test_a_reboot_costs_nothing_unless_its_numbers_look_late():
     assert arriving.run(0, 1, 2) == [0, 1, 2]
 
 
+def test_a_reboot_after_a_pause_costs_nothing_though_its_numbers_look_late():
+    arriving = Arriving(uptime_s=100.0)
+    arriving.run(*range(43))
+    arriving.clock_ns = 4 * S
+    arriving.now += 2 * REORDER_NS
+    assert arriving.run(*range(12)) == list(range(12))
+    assert arriving.restarts == 1
+
+
 @pytest.mark.parametrize("late", [[9], [8, 9], [9, 8], [5, 6, 7, 8, 9]])
 def test_late_packets_from_before_a_sync_are_no_reboot(late):
     """The device's clock is set forward by decades; some packets from before are still to come."""

@@ -140,6 +140,14 @@ def test_after_a_silence_nothing_is_taken_for_late(outage):
     assert order.counts == counted(lost=outage)
 
 
+def test_what_comes_after_the_one_that_ended_a_silence_is_late_and_not_twice():
+    order: SequenceOrder[int] = SequenceOrder(WINDOW)
+    order.push(0, 0)
+    assert order.resume(10, 10) == [(9, 10)]
+    assert order.push(9, 9) == []
+    assert order.counts == counted(lost=8, late=1)
+
+
 def test_a_silence_releases_what_waits_first():
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in (0, 2):
