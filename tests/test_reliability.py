@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from l2lidar_node.emulator.physics import PhysicsConfig
+from l2lidar_node.emulator.studio import Studio, StudioError
 from tools import fault_world, faults, load_scale
 from tools.fault_runs import SINGLE, FaultCase, random_case, run
 from tools.fuzz_campaign import campaign
@@ -77,6 +81,19 @@ def test_hostile_input_is_survived(name: str) -> None:
 def test_the_world_outside(case) -> None:
     finding = fault_world.run(case)
     assert finding.good, finding
+
+
+def test_a_mesh_that_crashes_its_reader_is_refused_with_a_sentence(tmp_path: Path) -> None:
+    pytest.importorskip("open3d")
+    path = tmp_path / "cut_off.ply"
+    # A face of no corners: open3d's reader dies of it.
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n1 0 0\n0 1 0 1 2\n3 0 1 3\n"
+    )
+    with pytest.raises((StudioError, ValueError), match=r"cut_off\.ply"):
+        Studio(PhysicsConfig(world=str(path)))
 
 
 def test_every_packet_is_received_or_counted_as_dropped() -> None:

@@ -45,6 +45,8 @@ class Studio:
     ------
     ValueError
         For a scene, motion or file that cannot be used; the message names it.
+    StudioError
+        If reading the world killed the process.
     """
 
     def __init__(self, config: PhysicsConfig, truth: Path | None = None) -> None:
@@ -52,6 +54,12 @@ class Studio:
         self._futures: dict[_Key, Future[Block]] = {}
         try:
             self._pool.submit(_prepare, config, truth).result()
+        except BrokenProcessPool:  # open3d's readers crash on some damaged files
+            self.close()
+            raise StudioError(
+                f"world '{config.world}': the process that reads it crashed; a mesh file that is "
+                "damaged or cut off does that"
+            ) from None
         except BaseException:
             self.close()
             raise
