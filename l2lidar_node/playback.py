@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event
 from l2lidar_node.loop import Loop
-from l2lidar_node.recording import Recording
+from l2lidar_node.pcap import CaptureError
+from l2lidar_node.recording import Entry, Recording
 from l2lidar_node.replay import feed, shifted
 from l2lidar_node.transport import Datagram
 from l2lidar_node.types import HostNs
@@ -53,6 +54,11 @@ class Playback(Loop):
         Called at the end of each lap with the nanoseconds by which all that follows is later than
         recorded; None after the last one.
 
+    Attributes
+    ----------
+    damage : str
+        Why the recording could not be read to its end; empty while it could.
+
     Notes
     -----
     Each lap begins with a new driver, so all give the same, each later by the length of those
@@ -75,6 +81,7 @@ class Playback(Loop):
         self._on_lap = on_lap
         self._time = recording.start
         self._shift_ns = 0
+        self.damage = ""
 
     def _now(self) -> HostNs:
         """Return the recording's own time: the driver knows no other."""
@@ -97,7 +104,7 @@ class Playback(Loop):
         first = self._recording.start
         begun = time.monotonic()
         next_clock = 0
-        for entry in self._recording:
+        for entry in self._entries():
             if self._rate:
                 self._wait(begun + (entry.time - first) / (1e9 * self._rate))
             self._run_calls()
@@ -109,6 +116,12 @@ class Playback(Loop):
             self._time = max(self._time, entry.time)
             self._give(feed(self.driver, entry))
         self._give(self.driver.flush())
+
+    def _entries(self) -> Iterator[Entry]:
+        try:
+            yield from self._recording
+        except CaptureError as error:
+            self.damage = str(error)
 
     def _wait(self, until: float) -> None:
         while (left := until - time.monotonic()) > 0 and not self._stopping.is_set():

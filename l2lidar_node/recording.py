@@ -78,7 +78,7 @@ class Recording:
     Raises
     ------
     CaptureError
-        If this is no capture, or there is no L2 in it, or several and none has ``l2_ip``.
+        Also while iterating, where the file is damaged. If this is no capture, or there is no L2 in it, or several and none has ``l2_ip``.
     """
 
     def __init__(self, stream: BinaryIO, l2_ip: str = "") -> None:
@@ -87,9 +87,13 @@ class Recording:
         talks: Counter[tuple[Endpoint, Endpoint]] = Counter()
         starts: dict[Endpoint, HostNs] = {}
         seen: Counter[Endpoint] = Counter()
-        for datagram in islice(_of_devices(self._from_start(), seen), _ENOUGH):
-            talks[datagram.source, datagram.destination] += 1
-            starts.setdefault(datagram.source, datagram.time)
+        try:
+            for datagram in islice(_of_devices(self._from_start(), seen), _ENOUGH):
+                talks[datagram.source, datagram.destination] += 1
+                starts.setdefault(datagram.source, datagram.time)
+        except CaptureError:
+            if not talks:  # what is before the damage can be used
+                raise
         self.device, self.host = _chosen(talks, l2_ip, seen, self._reader)
         self.start = starts[self.device]
 

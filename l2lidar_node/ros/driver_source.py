@@ -74,6 +74,8 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
 
     def on_lap(shift_ns: int | None) -> None:
         cut = ", which is cut off" if recording.is_cut_off else ""
+        if playback.damage:
+            logger.error(f"{path} cannot be read any further: {playback.damage}")
         if shift_ns is not None:
             seconds = shift_ns / 1e9
             logger.info(
@@ -83,4 +85,5 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
             logger.info(f"end of {path}{cut}")
             rclpy.try_shutdown(context=node.context)
 
-    return Playback(recording, config, on_event, on_time, on_lap)
+    playback = Playback(recording, config, on_event, on_time, on_lap)
+    return playback
