@@ -78,7 +78,8 @@ class Recording:
     Raises
     ------
     CaptureError
-        Also while iterating, where the file is damaged. If this is no capture, or there is no L2 in it, or several and none has ``l2_ip``.
+        If this is no capture, or there is no L2 in it, or several and none has ``l2_ip``; while
+        iterating, where the file is damaged.
     """
 
     def __init__(self, stream: BinaryIO, l2_ip: str = "") -> None:
