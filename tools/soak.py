@@ -35,6 +35,7 @@ _PERIODS_S: Final = {
     DESKEWED: _CLOUD_PACKETS * wire.MIRROR_PERIOD_S,
     ODOMETRY: _CLOUD_PACKETS * wire.MIRROR_PERIOD_S,
 }
+_LINK: Final = ("points lost", "imu lost", "points late", "imu late", "kernel drops")
 _STOPS: Final = 8
 
 
@@ -62,10 +63,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unit = ["--boot-scale", "0.1", "--world", options.world]
     unit += ["--motion", options.motion] if options.world != "pattern" else []
     rclpy.init()
-    watch = TopicWatch(list(_PERIODS_S))
+    # Reliable, so that what is missing was lost by a node and not on the way to this one.
+    watch = TopicWatch(list(_PERIODS_S), reliable=True)
     try:
         with Programs() as programs:
-            programs_by_name = chain.start(programs, unit)
+            programs_by_name = chain.start(programs, unit, {"qos_reliability": "reliable"})
             rows, targets = _soaked(watch, programs, programs_by_name, 60 * options.minutes)
         targets += _stopped_anywhere(rows)
     finally:
@@ -96,8 +98,6 @@ def _soaked(
         programs.check()
     lasted = time.monotonic() - begin
     shares = {name: (process_cpu_s(p.pid) - cpu[name]) / lasted for name, p in running.items()}
-    lost = {name: watch.checks.get(name, {}) for name in ("points", "imu", "network", "data")}
-    print({key: value for key, value in lost.items() if value})
     return _reported(watch, running, samples, shares)
 
 
@@ -119,6 +119,9 @@ def _reported(
             at_most(f"{topic}: missing", gone, 0),
             at_most(f"{topic}: steps back", back, 0),
         ]
+    link = watch.checks.get("link", {})
+    counted = {name: int(link.get(name, 0)) for name in _LINK if name in link}
+    rows.append(_row("driver's own count since its start", str(counted or link)))
     for name, program in running.items():
         values = np.array(samples[name])
         memory, threads, files = values.T
