@@ -52,7 +52,7 @@ class SurfaceConfig:
     """The map of small flat surfaces that sweeps are aligned with."""
 
     surface_sizes: tuple[float, ...] = setting(
-        (0.25, 0.6, 1.5),
+        (0.15, 0.3, 0.6, 1.5),
         "edges of the cells of each level of the map, fine to coarse",
         unit="m",
         lo=0.05,
@@ -68,7 +68,7 @@ class SurfaceConfig:
     surface_points: int = setting(8, "points that a cell needs before it is used", lo=4, hi=100)
     surface_capacity: int = setting(400, "points after which a cell is final", lo=10, hi=100_000)
     point_noise: float = setting(
-        0.04,
+        0.05,
         "how far a point may be from its surface, what neighbours share included",
         unit="m",
         lo=0.002,
