@@ -143,10 +143,10 @@ class _Level:
     def clear(self) -> None:
         self._keys: I64 = np.empty(0, np.int64)
         self._rows: I64 = np.empty(0, np.int64)
-        self._flat: NDArray[np.bool_] = np.zeros(
-            0, np.bool_
-        )  # by row, a compact copy for look-ups
-        self.cells: NDArray[np.void] = np.zeros(0, CELL)
+        self.cells: NDArray[np.void] = np.zeros(1, CELL)
+        # by row, compact copies for look-ups
+        self._flat: NDArray[np.bool_] = np.zeros(1, np.bool_)
+        self._count: I64 = np.zeros(1, np.int64)
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -159,9 +159,12 @@ class _Level:
         return rows
 
     def add(self, points: F64) -> None:
-        keys, inverse = np.unique(self._key(points), return_inverse=True)
+        every = self._key(points)
+        rows = self._find(every)
+        opened = (rows < 0) | (self._count[rows] < self._capacity)
+        points = points[opened]
+        keys, inverse = np.unique(every[opened], return_inverse=True)
         rows = self._rows_of(keys)
-        opened = self.cells["count"][rows] < self._capacity
         middles = self._middle(keys)
         offsets = points - middles[inverse]
         bins = len(keys)
@@ -170,11 +173,11 @@ class _Level:
         products = np.stack(
             [np.bincount(inverse, offsets[:, i] * offsets[:, j], bins) for i, j in _PAIRS], axis=1
         )
-        rows = rows[opened]
-        self.cells["count"][rows] += count[opened]
-        self.cells["sum"][rows] += total[opened]
-        self.cells["products"][rows] += products[opened]
-        self._fit(rows, middles[opened])
+        self._count[rows] += count
+        self.cells["count"][rows] = self._count[rows]
+        self.cells["sum"][rows] += total
+        self.cells["products"][rows] += products
+        self._fit(rows, middles)
 
     def forget(self, origin: F64, distance: float) -> None:
         near = ((self._middle(self._keys) - origin) ** 2).sum(axis=1) <= distance * distance
@@ -183,6 +186,8 @@ class _Level:
         rows = self._rows[near]
         self._keys, self._rows = self._keys[near], np.arange(len(rows))
         self.cells, self._flat = self.cells[rows].copy(), self._flat[rows]
+        self._count = self._count[rows]
+        self._reserve(1)
 
     def points(self) -> F64:
         used = self.cells[: len(self._keys)]
@@ -242,3 +247,4 @@ class _Level:
             extra = max(count, 2 * len(self.cells)) - len(self.cells)
             self.cells = np.concatenate((self.cells, np.zeros(extra, CELL)))
             self._flat = np.concatenate((self._flat, np.zeros(extra, np.bool_)))
+            self._count = np.concatenate((self._count, np.zeros(extra, np.int64)))
