@@ -110,10 +110,10 @@ class Playback(Loop):
             self._run_calls()
             if self._stopping.is_set():
                 break
-            if not 0 <= next_clock - entry.time <= _CLOCK_NS:
-                next_clock = entry.time + _CLOCK_NS
-                self._on_time(HostNs(entry.time + self._shift_ns))
             self._time = max(self._time, entry.time)
+            if self._time >= next_clock:
+                next_clock = self._time + _CLOCK_NS
+                self._on_time(HostNs(self._time + self._shift_ns))
             self._give(feed(self.driver, entry))
         self._give(self.driver.flush())
 

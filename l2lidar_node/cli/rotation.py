@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from typing import Annotated
 
 import numpy as np
@@ -12,8 +13,9 @@ from l2lidar_node import wire
 from l2lidar_node.cli.console import say
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import with_network
+from l2lidar_node.clock import ClockEvent, ClockEventKind
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver import Driver
+from l2lidar_node.driver import Driver, Event
 
 _LISTEN_S = 1.0
 _SILENT_S = 0.5
@@ -70,12 +72,21 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
 
     The unit does not acknowledge it; with --wait its clock tells that it began anew.
     """
-    with Device(network) as device:
+    restarted = threading.Event()
+
+    def notice(event: Event) -> None:
+        if isinstance(event, ClockEvent) and event.kind is ClockEventKind.REBOOT:
+            restarted.set()
+
+    with Device(network, notice) as device:
         if device.is_measuring(_LISTEN_S):
-            device.wait_for(lambda driver: driver.last_points is not None, _LOCK_S)
+            if wait:
+                # A clock that is known shows a restart, however young the unit was before it.
+                device.wait_for(lambda driver: driver.clock_status().locked, _LOCK_S)
         elif device.ask(lambda driver: not _heard(driver)):
             say("[yellow]nothing is heard from it: the command is sent all the same")
         before = device.ask(_stamp_s)
+        restarted.clear()
         device.tell(lambda driver, now: driver.reset_device(now))
         if not wait:
             say("reset sent")
@@ -83,7 +94,8 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
         points = _points(device)
 
         def is_back(driver: Driver) -> bool:
-            return _count(driver) > points and _stamp_s(driver) < min(before, _RESTART_S)
+            has_begun_anew = restarted.is_set() or _stamp_s(driver) < min(before, _RESTART_S)
+            return _count(driver) > points and has_begun_anew
 
         if device.wait_for(is_back, wait) is None:
             raise DeviceError(f"no sign of a restart within {wait:g} s")

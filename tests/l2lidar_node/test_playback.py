@@ -68,6 +68,25 @@ def test_its_time_is_the_recordings(recorded):
     assert done.cancelled()
 
 
+def test_its_time_stands_where_the_recordings_goes_back(recorded):
+    config, _, stream = recorded
+    data = bytearray(stream.getvalue())
+    at, number, last = 24, 0, 0
+    while at < len(data):
+        seconds, nanoseconds, length = struct.unpack_from("<3I", data, at)
+        when = 10**9 * seconds + nanoseconds
+        if number % 3 == 2:  # as packets do that waited in the kernel while a command was sent
+            when = last - 15_000_000
+            struct.pack_into("<2I", data, at, *divmod(when, 10**9))
+        last = when
+        at += 16 + length
+        number += 1
+    played = Played(io.BytesIO(bytes(data)), config)
+    assert played.playback.wait(LIMIT_S)
+    assert len(played.times) > 20
+    assert played.times == sorted(played.times)
+
+
 def test_laps_are_alike_and_never_go_back_in_time(recorded):
     config, live, stream = recorded
     played = Played(stream, config, laps=3, replay_loop=True)
