@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l2lidar_node import wire
 from l2lidar_node.config import SweepConfig
-from l2lidar_node.geometry import PointBatch, Projector, RangeCalibration, RangeLimits
+from l2lidar_node.geometry import Projector, RangeCalibration, RangeLimits
 from l2lidar_node.packets import NS, PointPacket
 from l2lidar_node.types import HostNs, Sweep
 
@@ -18,7 +19,7 @@ MAX_GAP_NS: Final = 200_000_000  # a stream that stalled this long starts a new 
 MAX_PACKETS: Final = 4000
 _BACKWARDS_RAD: Final = 1.9 * math.pi  # a head that stands still seems to advance by this or more
 
-Level = Callable[[PointBatch, list[HostNs]], PointBatch]
+Level = Callable[[list[HostNs]], NDArray[np.float64]]
 
 
 class _Placed(NamedTuple):
@@ -37,11 +38,17 @@ class SweepAssembler:
     config : SweepConfig
         How sweeps are cut; may be replaced while running through :meth:`configure`.
     level : callable, optional
-        Applied to each batch of points with the start of every packet, for example to turn points
-        into a levelled frame.
+        Returns a rotation for the start of every packet of a sweep, by which its points are turned
+        into a levelled frame: shape (P, 3, 3), NaN for packets that cannot be.
+
+    Attributes
+    ----------
+    unlevelled : int
+        Points left out because their packet could not be levelled.
     """
 
     def __init__(self, config: SweepConfig, level: Level | None = None) -> None:
+        self.unlevelled = 0
         self._config = config
         self._level = level
         self._packets: list[_Placed] = []
@@ -123,9 +130,9 @@ class SweepAssembler:
             RangeCalibration(config.range_scale, config.range_bias)
             if config.override_range_calibration
             else None,
+            None if self._level is None else self._level(starts),
         )
-        if self._level is not None:
-            batch = self._level(batch, starts)
+        self.unlevelled += batch.left_out
         batch.points.flags.writeable = False
         last = packets[-1]
         return Sweep(

@@ -293,7 +293,7 @@ class Driver:
         if sweep is None:
             return []
         self.counters.sweeps += 1
-        self.counters.unlevelled = self._levelling.dropped
+        self.counters.unlevelled = self._assembler.unlevelled
         self.counters.points += len(sweep.points)
         self.counters.slots += sweep.packets * self._slots
         if not len(sweep.points):

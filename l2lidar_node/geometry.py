@@ -17,7 +17,7 @@ not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -32,9 +32,10 @@ from l2lidar_node.types import POINT
 F8 = NDArray[np.float64]
 
 _TAYLOR_LIMIT_RAD: Final = 2e-3  # third-order remainder below 2e-9, 0.1 um at 50 m
-_CALIBRATION: Final = slice(52, 84)  # bytes of a payload, the same in 3D and 2D
-_LIMITS_3D: Final = slice(96, 112)  # range_min, range_max, angle_min, angle_increment
-_LIMITS_2D: Final = slice(88, 104)
+_BLOCK_SLOTS: Final = 19_200  # projected at once: 64 3D packets, whose work arrays fit the cache
+_CALIBRATION: Final = np.arange(52, 84, 4) // 4  # words of a payload, the same in 3D and 2D
+_LIMITS_3D: Final = np.arange(96, 112, 4) // 4  # range_min, range_max, angle_min, angle_increment
+_LIMITS_2D: Final = np.arange(88, 104, 4) // 4
 
 
 class RangeCalibration(NamedTuple):
@@ -58,16 +59,19 @@ class PointBatch:
     Attributes
     ----------
     points : ndarray, shape (N,), dtype POINT
-        Cloud frame; in the order of packets and slots; ``time`` is relative to the first one.
+        In the order of packets and slots; ``time`` is relative to the first one.
     first_s : float
         Time of the first point on the time line of the packet starts; 0 without points.
     counts : ndarray, shape (P,), int
         Points of each packet.
+    left_out : int
+        Points that are missing because the rotation of their packet is not known.
     """
 
     points: NDArray[np.void]
     first_s: float
     counts: NDArray[np.intp]
+    left_out: int
 
 
 class _Table(NamedTuple):
@@ -86,6 +90,16 @@ class _Table(NamedTuple):
     hi: float
 
 
+class _Work(NamedTuple):
+    """Work arrays over the packets and slots of a block."""
+
+    grid: NDArray[np.void]  # dtype POINT
+    keep: NDArray[np.bool_]
+    distance: F8
+    position: F8
+    lines: F8  # shape (P, 2, n): positions are lines over the distance, slope and offset
+
+
 class Projector:
     """Turns batches of packets of one type into points.
 
@@ -100,10 +114,18 @@ class Projector:
 
     def __init__(self, packet_type: int) -> None:
         self._layout = wire.PAYLOADS[packet_type]
-        self._slots = self._layout["ranges"].shape[0]
         self._is_3d = packet_type == wire.PacketType.POINTS_3D
-        self._limits = _LIMITS_3D if self._is_3d else _LIMITS_2D
-        self._work = _Work(0, self._slots)
+        limits = _LIMITS_3D if self._is_3d else _LIMITS_2D
+        self._constants = np.concatenate((_CALIBRATION, limits))
+        self._slots = slots = self._layout["ranges"].shape[0]
+        self._block = size = _BLOCK_SLOTS // slots
+        self._work = _Work(
+            grid=np.empty((size, slots), POINT),
+            keep=np.empty((size, slots), np.bool_),
+            distance=np.empty((size, slots)),
+            position=np.empty((size, slots)),
+            lines=np.empty((size, 2, slots)),
+        )
 
     def points(
         self,
@@ -111,6 +133,7 @@ class Projector:
         start_s: F8,
         limits: RangeLimits | None = None,
         override: RangeCalibration | None = None,
+        rotations: F8 | None = None,
     ) -> PointBatch:
         """Return the points of a batch of packets.
 
@@ -123,55 +146,67 @@ class Projector:
         limits : RangeLimits, optional
         override : RangeCalibration, optional
             Replaces scale and bias of every packet.
+        rotations : ndarray, shape (P, 3, 3), float64, optional
+            From the cloud frame to that of the points, for each packet; where it is not known,
+            NaN, and the packet's points are left out. The cloud frame if not given.
 
         Returns
         -------
         PointBatch
             Points with a return whose range is within both the packet's and the user's limits.
         """
-        data = b"".join(payloads)
-        raw = np.frombuffer(data, self._layout)
-        octets = np.frombuffer(data, np.uint8).reshape(len(raw), self._layout.itemsize)
-        if len(raw) > self._work.capacity:
-            self._work = _Work(len(raw), self._slots)
-        for run in _runs(octets, self._limits):
-            head = octets[run.start]
-            constants = head[_CALIBRATION].tobytes() + head[self._limits].tobytes()
+        raw = np.frombuffer(b"".join(payloads), self._layout)
+        points = np.empty(len(raw) * self._slots, POINT)
+        counts = np.empty(len(raw), np.intp)
+        total = left_out = 0
+        first_s: float | None = None
+        for block, constants in self._blocks(raw):
+            packets, starts = raw[block], start_s[block]
             table = _table(constants, self._slots)
-            work = self._work.part(run)
-            _ranges(raw[run], table, limits or RangeLimits(), override, work)
-            if self._is_3d:
-                _place_3d(raw[run], table, work)
-            else:
-                _place_2d(table, work)
-        return _compress(raw, start_s, self._work.part(slice(0, len(raw))))
+            work = _Work._make(array[: len(packets)] for array in self._work)
+            _fill_ranges(packets, table, limits or RangeLimits(), override, work)
+            if rotations is not None:
+                left_out += _leave_out(np.isnan(rotations[block, 0, 0]), work.keep)
+            kept = np.flatnonzero(work.keep)
+            counts[block] = np.count_nonzero(work.keep, axis=1)
+            if not len(kept):
+                continue
+            place = _place_3d if self._is_3d else _place_2d
+            weights, basis = place(packets, table)
+            if rotations is not None:
+                weights = rotations[block] @ weights
+            _fill_positions(weights, basis, work)
+            increment = packets["time_increment"].astype(np.float64)
+            if first_s is None:
+                packet, slot = divmod(int(kept[0]), self._slots)
+                first_s = float(starts[packet] + slot * increment[packet])
+            _fill_times(starts - first_s, increment, work)
+            part = points[total : total + len(kept)]
+            work.grid.reshape(-1).take(kept, out=part, mode="clip")  # "raise" would copy twice
+            total += len(kept)
+        return PointBatch(points[:total], first_s or 0.0, counts, left_out)
+
+    def _blocks(self, raw: NDArray[np.void]) -> Iterator[tuple[slice, bytes]]:
+        """Yield packets that can be projected at once and their calibration and limits.
+
+        These are the same to the bit and the steps of the head's angle nearly so.
+        """
+        words = raw.view(np.uint32).reshape(len(raw), -1)[:, self._constants]
+        changed = (words[1:] != words[:-1]).any(axis=1)
+        for begin, end in pairwise([0, *(np.flatnonzero(changed) + 1).tolist(), len(raw)]):
+            constants = words[begin].tobytes()
+            for lo in range(begin, end, self._block):
+                block = slice(lo, min(lo + self._block, end))
+                if not self._is_3d or _is_even(raw["com_horizontal_angle_step"][block]):
+                    yield block, constants
+                else:
+                    yield from ((slice(i, i + 1), constants) for i in range(lo, block.stop))
 
 
-class _Work:
-    """Work arrays over (packets, slots)."""
-
-    def __init__(self, capacity: int, slots: int) -> None:
-        self.capacity = capacity
-        self.grid: NDArray[np.void] = np.empty((capacity, slots), POINT)
-        self.keep: NDArray[np.bool_] = np.empty((capacity, slots), np.bool_)
-        self.distance: F8 = np.empty((capacity, slots))
-        self.directions: F8 = np.empty((2, capacity, 2, slots))
-
-    def part(self, run: slice) -> _Work:
-        """Return views of some packets."""
-        view = _Work.__new__(_Work)
-        view.capacity = run.stop - run.start
-        view.grid, view.keep = self.grid[run], self.keep[run]
-        view.distance, view.directions = self.distance[run], self.directions[:, run]
-        return view
-
-
-def _runs(octets: NDArray[np.uint8], limits: slice) -> list[slice]:
-    """Return the runs of packets whose calibration and limits are the same to the bit."""
-    changed = (octets[1:, _CALIBRATION] != octets[:-1, _CALIBRATION]).any(axis=1)
-    changed |= (octets[1:, limits] != octets[:-1, limits]).any(axis=1)
-    edges = [0, *(np.flatnonzero(changed) + 1).tolist(), len(octets)]
-    return [slice(lo, hi) for lo, hi in pairwise(edges)]
+def _is_even(step: NDArray[np.float32]) -> bool:
+    """Tell whether the Taylor series of :func:`_place_3d` holds for these steps."""
+    spread = float(step.max()) - float(step.min())
+    return spread * wire.POINTS_PER_3D_PACKET / 2 <= _TAYLOR_LIMIT_RAD
 
 
 @lru_cache(maxsize=16)
@@ -201,7 +236,7 @@ def _table(constants: bytes, count: int) -> _Table:
     )
 
 
-def _ranges(
+def _fill_ranges(
     raw: NDArray[np.void],
     table: _Table,
     limits: RangeLimits,
@@ -210,90 +245,91 @@ def _ranges(
 ) -> None:
     """Fill the calibrated ranges, the intensities and which slots are kept."""
     scale, bias = override or (table.scale, table.bias)
-    counts = raw["ranges"]
-    np.multiply(counts, scale, out=work.distance)
-    work.distance += scale * bias
-    work.grid["range"] = work.distance
+    counts, used = raw["ranges"], raw["point_num"]
+    distance, keep = work.distance, work.keep
+    np.multiply(counts, scale, out=distance)
+    distance += scale * bias
+    work.grid["range"] = distance
     work.grid["intensity"] = raw["intensities"]
-    np.greater_equal(work.distance, max(table.lo, limits.lo), out=work.keep)
-    work.keep &= work.distance <= min(table.hi, limits.hi)
-    work.keep &= counts > 0
-    used = raw["point_num"]
+    np.greater_equal(distance, max(table.lo, limits.lo), out=keep)
+    keep &= distance <= min(table.hi, limits.hi)
+    keep &= counts > 0
     if (used < counts.shape[1]).any():
-        work.keep &= np.arange(counts.shape[1]) < used[:, None]
+        keep &= np.arange(counts.shape[1]) < used[:, None]
 
 
-def _place_2d(table: _Table, work: _Work) -> None:
-    work.grid["x"] = 0.0
-    work.grid["y"] = np.cos(table.alpha) * work.distance
-    work.grid["z"] = np.sin(table.alpha) * work.distance + table.a
+def _leave_out(unknown: NDArray[np.bool_], keep: NDArray[np.bool_]) -> int:
+    """Keep no point of some packets; return how many those were."""
+    if not unknown.any():
+        return 0
+    left_out = int(np.count_nonzero(keep[unknown]))
+    keep[unknown] = False
+    return left_out
 
 
-def _place_3d(raw: NDArray[np.void], table: _Table, work: _Work) -> None:
-    """Fill x, y, z of 3D packets.
+def _place_2d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
+    """Return weights and basis of 2D packets, see :func:`_fill_positions`."""
+    basis = np.zeros((2, 2, len(table.alpha)))
+    basis[0, 0] = np.cos(table.alpha)
+    basis[1, 0] = np.sin(table.alpha)
+    basis[1, 1] = table.a
+    weights = np.zeros((len(raw), 3, 2))
+    weights[:, 1, 0] = weights[:, 2, 1] = 1.0
+    return weights, basis
+
+
+def _place_3d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
+    """Return weights and basis of 3D packets, see :func:`_fill_positions`.
 
     The head angle of slot j is split into the packet's mid angle, j times the mean step of all
-    packets (a table) and j times what the packet's own step differs from it, whose sine and cosine
-    are a short Taylor series. All of that is one small matrix product per batch instead of a sine
-    per point.
+    packets (the basis) and j times what the packet's own step differs from it, whose rotation is a
+    short Taylor series. So there is no sine per point. Complex numbers stand for (x, y).
     """
     step = raw["com_horizontal_angle_step"].astype(np.float64)
     start = raw["com_horizontal_angle_start"].astype(np.float64) + table.theta_bias
     middle = (len(table.u) - 1) / 2
     j: F8 = np.arange(len(table.u), dtype=np.float64) - middle
-    mid = start + step * middle
     mean = float(step.mean())
     delta = step - mean
-    distance = work.distance
-    if np.abs(delta).max() * middle > _TAYLOR_LIMIT_RAD:
-        theta = mid[:, None] + step[:, None] * j
-        cos, sin = np.cos(theta), np.sin(theta)
-        radial, tangential = table.u * distance + table.b, table.v * distance
-        work.grid["x"] = cos * radial - sin * tangential
-        work.grid["y"] = sin * radial + cos * tangential
-    else:
-        _directions(table, mid, mean, delta, j, work.directions)
-        for axis, name in enumerate(("x", "y")):
-            position = work.directions[axis, :, 0]
-            position *= distance
-            position += work.directions[axis, :, 1]
-            work.grid[name] = position
-    distance *= table.w
-    distance += table.a
-    work.grid["z"] = distance
+
+    series = np.empty((3, 2, len(j)), np.complex128)
+    series[0, 1] = np.exp(1j * mean * j)
+    series[0, 0] = (table.u + 1j * table.v) * series[0, 1]
+    series[0, 1] *= table.b
+    np.multiply(series[0], j, out=series[1])
+    np.multiply(series[1], j, out=series[2])
+    basis = np.empty((7, 2, len(j)))
+    basis[:3], basis[3:6] = series.real, series.imag
+    basis[6, 0], basis[6, 1] = table.w, table.a
+
+    turn = np.empty((len(raw), 3), np.complex128)
+    turn[:, 0] = np.exp(1j * (start + step * middle))
+    turn[:, 1] = turn[:, 0] * (1j * delta)
+    turn[:, 2] = turn[:, 1] * (0.5j * delta)
+    weights = np.zeros((len(raw), 3, 7))
+    weights[:, 0, :3], weights[:, 0, 3:6] = turn.real, -turn.imag
+    weights[:, 1, :3], weights[:, 1, 3:6] = turn.imag, turn.real
+    weights[:, 2, 6] = 1.0
+    return weights, basis
 
 
-def _directions(table: _Table, mid: F8, mean: float, delta: F8, j: F8, out: F8) -> None:
-    """Fill d(x, y)/dD and the offset of (x, y): shape (axis, P, derivative or offset, n)."""
-    cos_j, sin_j = np.cos(j * mean), np.sin(j * mean)
-    basis = np.empty((6, 2, len(j)))
-    basis[0, 0] = table.u * cos_j - table.v * sin_j
-    basis[1, 0] = table.u * sin_j + table.v * cos_j
-    basis[0, 1] = table.b * cos_j
-    basis[1, 1] = table.b * sin_j
-    basis[2:4] = basis[0:2] * j
-    basis[4:6] = basis[2:4] * j
-    cos, sin, half = np.cos(mid), np.sin(mid), 0.5 * delta * delta
-    weights = (
-        (cos, -sin, -delta * sin, -delta * cos, -half * cos, half * sin),
-        (sin, cos, delta * cos, -delta * sin, -half * sin, -half * cos),
-    )
-    for axis in range(2):
-        rows = out[axis].reshape(len(mid), -1)
-        np.matmul(np.stack(weights[axis], axis=1), basis.reshape(6, -1), out=rows)
+def _fill_positions(weights: F8, basis: F8, work: _Work) -> None:
+    """Fill x, y and z.
+
+    Each is a line over the distance: its slopes and offsets over the slots, shape (2, n), are a
+    weighted sum of those in ``basis``, shape (K, 2, n). A packet has three rows of ``weights``,
+    shape (P, 3, K), one per axis; to rotate a packet is to rotate these.
+    """
+    basis = basis.reshape(len(basis), -1)
+    for axis, name in enumerate(("x", "y", "z")):
+        np.matmul(weights[:, axis], basis, out=work.lines.reshape(len(weights), -1))
+        np.multiply(work.lines[:, 0], work.distance, out=work.position)
+        np.add(work.position, work.lines[:, 1], out=work.position)
+        work.grid[name] = work.position
 
 
-def _compress(raw: NDArray[np.void], start_s: F8, work: _Work) -> PointBatch:
-    """Return the kept points, their times relative to the first of them."""
-    kept = np.flatnonzero(work.keep)
-    counts = np.count_nonzero(work.keep, axis=1)
-    if not len(kept):
-        return PointBatch(np.empty(0, POINT), 0.0, counts)
-    slots = work.grid.shape[1]
-    increment = raw["time_increment"].astype(np.float64)
-    packet, slot = divmod(int(kept[0]), slots)
-    first_s = float(start_s[packet] + slot * increment[packet])
-    time = np.multiply.outer(increment, np.arange(slots, dtype=np.float64), out=work.distance)
-    time += (start_s - first_s)[:, None]
-    work.grid["time"] = time
-    return PointBatch(work.grid.reshape(-1).take(kept), first_s, counts)
+def _fill_times(start_s: F8, increment: F8, work: _Work) -> None:
+    slots = np.arange(work.position.shape[1], dtype=np.float64)
+    np.multiply.outer(increment, slots, out=work.position)
+    np.add(work.position, start_s[:, None], out=work.position)
+    work.grid["time"] = work.position

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -14,7 +13,6 @@ from l2lidar_node import wire
 from l2lidar_node.assembler import MAX_GAP_NS, MAX_PACKETS, SweepAssembler
 from l2lidar_node.config import SweepConfig
 from l2lidar_node.framing import Frame
-from l2lidar_node.geometry import PointBatch
 from l2lidar_node.packets import PointPacket, decode
 from l2lidar_node.types import POINT, HostNs, Sweep
 from tests import build
@@ -311,18 +309,24 @@ def test_a_sweep_without_points_is_a_sweep():
     assert sweep.start == START
 
 
-def test_levelling_sees_every_packets_start():
+def test_levelling_sees_every_packets_start_and_turns_its_points():
     seen: list[list[int]] = []
 
-    def level(batch: PointBatch, starts: list[HostNs]) -> PointBatch:
+    def level(starts: list[HostNs]) -> np.ndarray:
         seen.append(list(starts))
-        return dataclasses.replace(batch, points=batch.points[:1])
+        upside_down = np.diag([1.0, -1.0, -1.0])
+        return np.array([np.eye(3), upside_down, np.full((3, 3), np.nan)])
 
-    assembler = SweepAssembler(SweepConfig(packets=2), level)
-    assembler.push(PLAIN, HostNs(START))
-    (sweep,) = assembler.push(PLAIN, HostNs(START + PERIOD))
-    assert seen == [[START, START + PERIOD]]
-    assert len(sweep.points) == 1
+    assembler = SweepAssembler(SweepConfig(packets=3), level)
+    sweeps: list[Sweep] = []
+    for number in range(3):
+        sweeps += assembler.push(PLAIN, HostNs(START + number * PERIOD))
+    points = sweeps[0].points
+    assert seen == [[START, START + PERIOD, START + 2 * PERIOD]]
+    assert len(points) == 600
+    assert assembler.unlevelled == 300
+    for name, sign in (("x", 1), ("y", -1), ("z", -1)):
+        np.testing.assert_array_equal(points[name][300:], sign * points[name][:300])
 
 
 @given(

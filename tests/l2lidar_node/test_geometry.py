@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from l2lidar_node import wire
 from l2lidar_node.geometry import PointBatch, Projector, RangeCalibration, RangeLimits
@@ -17,11 +18,17 @@ WIDE = RangeLimits(-1e9, 1e9)
 
 
 def project(
-    payloads, limits=WIDE, override=None, kind=PacketType.POINTS_3D, start_s=None, projector=None
+    payloads,
+    limits=WIDE,
+    override=None,
+    kind=PacketType.POINTS_3D,
+    start_s=None,
+    projector=None,
+    rotations=None,
 ) -> PointBatch:
     if start_s is None:
         start_s = np.arange(len(payloads)) * 0.005
-    return (projector or Projector(kind)).points(payloads, start_s, limits, override)
+    return (projector or Projector(kind)).points(payloads, start_s, limits, override, rotations)
 
 
 def xyz(points):
@@ -144,6 +151,46 @@ def test_calibrations_that_change_within_a_batch():
     rng = np.random.default_rng(5)
     units = [build.UNIT_A, build.UNIT_A, build.UNIT_B, build.UNIT_A, build.PLAIN, build.UNIT_B]
     compare([random_packet(rng, calibration=unit) for unit in units])
+
+
+def test_more_packets_than_are_projected_at_once():
+    rng = np.random.default_rng(11)
+    payloads = [random_packet(rng, calibration=build.UNIT_A) for _ in range(150)]
+    starts = 1.0 + np.arange(150) * 0.005
+    batch = compare(payloads, start_s=starts)
+    first = project(payloads[:1], start_s=starts)
+    assert batch.first_s == first.first_s
+    assert batch.counts.sum() == len(batch.points)
+    since = np.repeat(starts, batch.counts) - batch.first_s
+    within = batch.points["time"] - since
+    assert within.min() > -1e-6
+    assert within.max() < 300 * build.SLOT_NS * 1e-9
+
+
+def test_every_packet_is_turned_by_its_rotation():
+    """As exactly as it is placed without: there is one rounding to float32, at the end."""
+    rng = np.random.default_rng(12)
+    steps = [build.STEP_RAD, build.STEP_RAD * 1.2, -0.02] * 10
+    payloads = [random_packet(rng, calibration=build.UNIT_A, step=step) for step in steps]
+    turns = Rotation.random(30, rng)
+    batch = project(payloads, rotations=turns.as_matrix())
+    exact = [scalar_3d(payload)[:, :3] for payload in payloads]
+    expected = np.concatenate([turn.apply(part) for turn, part in zip(turns, exact, strict=True)])
+    error = np.abs(xyz(batch.points) - expected)
+    storage = np.spacing(np.abs(expected).astype(np.float32)) / 2
+    assert (error - storage).max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", [PacketType.POINTS_3D, PacketType.POINTS_2D])
+def test_packets_whose_rotation_is_not_known_are_left_out(kind):
+    maker = build.points_3d if kind == PacketType.POINTS_3D else build.points_2d
+    payloads = [maker(ranges=2000), maker(ranges=2500), maker(ranges=3000, count=100)]
+    level, unknown = np.eye(3), np.full((3, 3), np.nan)
+    batch = project(payloads, kind=kind, rotations=np.array([level, unknown, level]))
+    expected = project([payloads[0], payloads[2]], kind=kind, start_s=np.array([0.0, 0.01]))
+    np.testing.assert_array_equal(batch.points, expected.points)
+    assert batch.left_out == batch.counts[0]
+    assert batch.counts.tolist() == [expected.counts[0], 0, 100]
 
 
 def test_limits_and_angles_that_change_within_a_batch():
