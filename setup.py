@@ -72,11 +72,11 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "l2lidar_node = l2lidar_node.ros.driver_node:main",
-            "l2lidar_emulator = l2lidar_node.emulator.cli:main",
-            "deskew_node = l2lidar_proc.ros.deskew_node:main",
-            "odometry_node = l2lidar_proc.ros.odometry_node:main",
-            "l2lidar = l2lidar_node.cli.main:main",
+            "l2lidar_node = l2lidar_node.programs:l2lidar_node",
+            "l2lidar_emulator = l2lidar_node.programs:l2lidar_emulator",
+            "deskew_node = l2lidar_proc.programs:deskew_node",
+            "odometry_node = l2lidar_proc.programs:odometry_node",
+            "l2lidar = l2lidar_node.programs:l2lidar",
         ],
     },
 )

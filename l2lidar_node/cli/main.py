@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import os
 import sys
 from typing import Final
 
@@ -20,6 +20,7 @@ from l2lidar_node.cli.rotation import reset, start, stop
 from l2lidar_node.cli.status import info, monitor
 from l2lidar_node.cli.sync_check import sync_check
 from l2lidar_node.cli.view import view
+from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import SettingError
 from l2lidar_node.transport import TransportError
 
@@ -31,7 +32,8 @@ def app() -> typer.Typer:
     """Return the command line."""
     made = typer.Typer(
         help="Work with a Unitree L2 without ROS: find it, look at it, set it, record it.",
-        epilog="Exit codes: 0 done; 1 the unit, the network or a file stands in the way; 2 usage.",
+        epilog="Exit codes: 0 done; 1 the unit, the network or a file stands in the way; 2 usage; "
+        "130 interrupted.",
         add_completion=False,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -55,8 +57,8 @@ def app() -> typer.Typer:
 
 def demo(context: typer.Context) -> None:
     """Show everything with a virtual L2; all options go to the demo."""
-    command = [sys.executable, "-m", "l2lidar_node.demo", *context.args]
-    raise typer.Exit(subprocess.call(command))
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-m", "l2lidar_node.demo", *context.args])
 
 
 def main() -> int:
@@ -78,4 +80,4 @@ def _failed(message: str, code: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(interruptible(main))

@@ -28,6 +28,7 @@ def view(
     """Look at clouds raw and deskewed, path, map, IMU and health, in rerun. Needs ROS 2."""
     try:
         import rclpy
+        from rclpy.signals import SignalHandlerOptions
 
         from l2lidar_node.ros import topics, viewer
     except ImportError as error:
@@ -45,7 +46,7 @@ def view(
         "imu": topics.IMU,
         "odometry": topics.ODOMETRY,
     }
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         shown = viewer.view(
             sdk, {role: namespace.rstrip("/") + name for role, name in names.items()}, seconds

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import rclpy
+from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
 from l2lidar_node.demo.observer import Observer, TopicRecord
@@ -20,6 +21,7 @@ from l2lidar_node.demo.processes import (
 )
 from l2lidar_node.demo.recorder import TopicRecorder
 from l2lidar_node.demo.report import report
+from l2lidar_node.programs import INTERRUPTED, interruptible
 
 _WARM_UP_S = 3.0
 _START_TIMEOUT_S = 60.0
@@ -36,7 +38,7 @@ def main() -> int:
         f"A virtual L2 in a {options.world} ({options.motion}) streams over UDP to {chain}; "
         f"watching the topics for {options.duration:.0f} s ..."
     )
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C interrupts this one
     observer = Observer()
     try:
         with ExitStack() as stack:
@@ -55,7 +57,7 @@ def main() -> int:
         return 1
     except KeyboardInterrupt:
         console.print("interrupted")
-        return 130
+        return INTERRUPTED
     finally:
         observer.destroy_node()
         rclpy.try_shutdown()
@@ -144,4 +146,4 @@ def _tell(console: Console, observer: Observer) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(interruptible(main))

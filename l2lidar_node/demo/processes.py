@@ -11,6 +11,8 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Final
 
+from l2lidar_node.programs import held
+
 GRACE_S: Final = 10.0
 
 
@@ -82,9 +84,10 @@ class Programs:
 
     def start(self, module: str, arguments: list[str]) -> Program:
         """Start a program that is stopped with the others."""
-        program = Program(module, arguments)
-        self._running.append(program)
-        self._stack.callback(program.stop)
+        with held():
+            program = Program(module, arguments)
+            self._running.append(program)
+            self._stack.callback(program.stop)
         return program
 
     def check(self) -> None:

@@ -33,6 +33,7 @@ from l2lidar_node.emulator.results import write_ledger, write_whole
 from l2lidar_node.emulator.returns import RangeNoise
 from l2lidar_node.emulator.server import MAX_SPEED, Server
 from l2lidar_node.emulator.studio import Studio, StudioError
+from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import Setting, Value, settings_of, values_of
 
 _LEAD_NS: Final = 100_000_000  # from ready to power-on, so that the first packets are in time
@@ -221,15 +222,12 @@ def main() -> None:
     """Run the command line.
 
     Leaves with 0 at the end of the duration and when told to stop, 1 where the system refuses
-    a port or a file, 2 for a wrong option.
+    a port or a file, 2 for a wrong option, 130 when interrupted before it runs.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(with_options(emulate, _panels()))
     try:
         app(prog_name="l2lidar_emulator", standalone_mode=True)
-    except KeyboardInterrupt:  # before there was anything to end
-        sys.exit(0)
     except (PortError, StudioError, OSError) as error:
         typer.echo(f"l2lidar_emulator: {error}", err=True)
         sys.exit(1)
@@ -242,4 +240,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(interruptible(main))

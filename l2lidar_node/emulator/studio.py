@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
 from l2lidar_node.emulator.results import write_points, write_trajectory
+from l2lidar_node.programs import held
 from l2lidar_node.wire import WorkMode
 
 _AHEAD: Final = 4  # blocks
@@ -53,7 +55,10 @@ class Studio:
         self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _settle)
         self._futures: dict[_Key, Future[Block]] = {}
         try:
-            self._pool.submit(_prepare, config, truth).result()
+            resource_tracker.ensure_running()  # or starting it lets signals through
+            with held():
+                prepared = self._pool.submit(_prepare, config, truth)
+            prepared.result()
         except BrokenProcessPool:  # open3d's readers crash on some damaged files
             self.close()
             raise StudioError(

@@ -7,6 +7,7 @@ from pathlib import Path
 import rclpy
 import yaml
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 
@@ -17,6 +18,8 @@ class UsageError(ValueError):
 def start_rclpy(argv: list[str]) -> None:
     """Initialise rclpy with a node's command line, the program's name first.
 
+    Signals are left as they are.
+
     Raises
     ------
     UsageError
@@ -26,7 +29,7 @@ def start_rclpy(argv: list[str]) -> None:
     try:
         unknown = remove_ros_args(arguments)[1:]
         if not unknown:
-            rclpy.init(args=arguments)
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except UnknownROSArgsError as error:
         raise UsageError(f"ROS arguments not known: {error}") from None
     except RCLError as error:  # its own words are all there is to say

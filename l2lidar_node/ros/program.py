@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import gc
-import signal
 import sys
 from collections.abc import Callable
 
 import rclpy
-from rclpy._rclpy_pybind11 import RCLError
-from rclpy.exceptions import NameValidationException
+from rclpy.exceptions import NameValidationException, NotInitializedException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import install_signal_handlers
 
+from l2lidar_node.programs import end_by_signal, ignore_signals
 from l2lidar_node.ros.arguments import UsageError, start_rclpy
 from l2lidar_node.settings import SettingError
 
@@ -36,14 +36,16 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
     Returns
     -------
     int
-        0 after a signal; the node's ``exit_code`` where it has one and ended itself; 1 for a
-        :class:`StartError`; 2 for wrong arguments.
+        0 after a signal, which until rclpy is there ends the process; the node's ``exit_code``
+        where it has one and ended itself; 1 for a :class:`StartError`; 2 for wrong arguments.
     """
+    end_by_signal()
     node = None
     try:
         start_rclpy(sys.argv if args is None else args)
-        # Before the node: made after a signal, rclpy's executor leaves a trace when it goes.
+        # Before there are handlers: made after a signal, it leaves a trace when it goes.
         executor = SingleThreadedExecutor()
+        install_signal_handlers()  # from here on a signal shuts rclpy down and does nothing else
         node = make()
         executor.add_node(node)
         # Or every full collection walks all that was imported, and takes 20 ms on a slow core.
@@ -57,14 +59,14 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
     except StartError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
-    except RCLError:
+    except (RuntimeError, NotInitializedException):
         if rclpy.ok():
             raise
-        # A signal came while something was being made: rclpy has no better word for it.
+        # A signal came while something was being made or used: rclpy has no better word for it.
     finally:
-        # Ctrl-C under `ros2 launch` comes twice, from the terminal and from launch.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # Its handlers stay: a signal that comes again does nothing.
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        ignore_signals()
     return int(getattr(node, "exit_code", 0))

@@ -10,6 +10,7 @@ import rclpy
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
@@ -37,7 +38,7 @@ def observe(asked: Topics, needs_imu: bool, seconds: float) -> tuple[Observation
     SourceError
         If there are no such topics, or which to use is not plain.
     """
-    rclpy.init(args=[])
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = Node("l2lidar_check")
     try:
         return _observe(node, asked, needs_imu, seconds)

@@ -1,0 +1,15 @@
+"""Starts the nodes; see :mod:`l2lidar_node.programs`."""
+
+from __future__ import annotations
+
+from l2lidar_node.programs import run
+
+
+def deskew_node() -> int:
+    """Run the deskew node."""
+    return run("l2lidar_proc.ros.deskew_node")
+
+
+def odometry_node() -> int:
+    """Run the odometry node."""
+    return run("l2lidar_proc.ros.odometry_node")
