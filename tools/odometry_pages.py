@@ -54,7 +54,7 @@ def _table(rows: list[Row]) -> str:
         drift.append(_mm(np.nanmedian([row["rpe_m"] for row in mine])))
         count.append(str(len(mine)))
     lines.append("| RPE over 1 m, median [mm] | " + " | ".join(drift) + " |")
-    lines.append("| real-time factor, median | " + " | ".join(speed) + " |")
+    lines.append("| recording / processor time, median | " + " | ".join(speed) + " |")
     lines.append("| runs | " + " | ".join(count) + " |")
     return "\n".join(lines)
 

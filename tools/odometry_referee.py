@@ -11,12 +11,23 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-RINGS = 32
-COLUMNS = 1800
+LIO_SAM = Path("config") / "consumers" / "lio_sam" / "params.yaml"
+OPTICAL_CENTRE_M = 0.0445  # the rings are those of the `velodyne` layout: elevation from here
+CT_ICP = {
+    # evalio's defaults are for streets (42 mm in the room); these are finer, for 30 m and less
+    "init_sample_voxel_size": 0.5,
+    "sample_voxel_size": 0.5,
+    "voxel_size": 0.1,
+    "size_voxel_map": 0.5,
+    "min_distance_points": 0.05,
+    "num_iters_icp": 10,
+    "ls_num_threads": 1,
+}
 Poses = list[tuple[int, Any]]
 
 
@@ -101,60 +112,94 @@ def genz_lio(recording: Recording) -> Poses:
     return out
 
 
-def evalio(name: str, changes: dict[str, Any]) -> Callable[[Recording], Poses]:
-    """Return a run of one of evalio's pipelines."""
+def ct_icp(recording: Recording) -> Poses:
+    """CT-ICP through evalio; a pose is that of the sweep's first point."""
+    return _evalio(recording, "CTICP", CT_ICP, _lio_sam_parameters(), 0)
 
-    def run(recording: Recording) -> Poses:
-        from evalio import types
-        from evalio._cpp import pipelines
 
-        pipeline = getattr(pipelines, name)()
-        # some pipelines read their parameters when initialised, some only afterwards
-        settings = {**pipeline.default_params(), **changes}
-        pipeline.set_params(settings)
-        pipeline.initialize()
-        pipeline.set_params(settings)
-        pipeline.set_lidar_params(
-            types.LidarParams(
-                num_rows=RINGS, num_columns=COLUMNS, min_range=0.4, max_range=60.0, rate=4.4
-            )
+def lio_sam(recording: Recording) -> Poses:
+    """LIO-SAM through evalio, with the parameters that we ship for it.
+
+    It holds two sweeps back: what it says after a sweep is the pose at the start of the second
+    one before.
+    """
+    given = _lio_sam_parameters()
+    from evalio._cpp import pipelines
+
+    known = pipelines.LioSAM.default_params()
+    changes = {name: type(known[name])(given[name]) for name in known if name in given}
+    return _evalio(recording, "LioSAM", {**changes, "numberOfCores": 1}, given, 2)
+
+
+def _lio_sam_parameters() -> dict[str, Any]:
+    import yaml
+
+    found = yaml.safe_load(LIO_SAM.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    return dict(found)
+
+
+def _evalio(
+    recording: Recording, name: str, changes: dict[str, Any], given: dict[str, Any], latency: int
+) -> Poses:
+    """Run one of evalio's pipelines; the poses are ``latency`` sweeps behind."""
+    from evalio import types
+    from evalio._cpp import pipelines
+
+    pipeline = getattr(pipelines, name)()
+    pipeline.set_params({**pipeline.default_params(), **changes})
+    pipeline.set_imu_params(
+        types.ImuParams(
+            gyro=given["imuGyrNoise"],
+            accel=given["imuAccNoise"],
+            gyro_bias=given["imuGyrBiasN"],
+            accel_bias=given["imuAccBiasN"],
+            bias_init=1e-3,
+            gravity=np.array([0.0, 0.0, -given["imuGravity"]]),  # the vector, not what is felt
+            rate=250.0,
         )
-        pipeline.set_imu_params(
-            types.ImuParams(
-                gyro=2e-3, accel=4e-3, gyro_bias=1e-4, accel_bias=1e-3, bias_init=1e-3, rate=250.0
-            )
+    )
+    rings, columns = given["N_SCAN"], given["Horizon_SCAN"]
+    pipeline.set_lidar_params(
+        types.LidarParams(
+            num_rows=rings,
+            num_columns=columns,
+            min_range=given["lidarMinRange"],
+            max_range=given["lidarMaxRange"],
+            rate=4.4,
         )
-        pipeline.set_imu_T_lidar(types.SE3.from_mat(np.linalg.inv(recording.T_cloud_imu)))
-        out: Poses = []
-        last = -1
-        for start, end, points, times in recording:
-            for sample in recording.samples(last, end + 4_000_000):
-                pipeline.add_imu(
-                    types.ImuMeasurement(
-                        types.Stamp.from_nsec(int(sample["stamp"])),
-                        np.ascontiguousarray(sample["angular_velocity"]),
-                        np.ascontiguousarray(sample["linear_acceleration"]),
-                    )
+    )
+    T_imu_cloud = np.linalg.inv(recording.T_cloud_imu)
+    pipeline.set_imu_T_lidar(types.SE3.from_mat(T_imu_cloud))
+    pipeline.initialize()  # takes a copy of what it was told: nothing counts that is set later
+    out: Poses = []
+    starts: list[int] = []
+    last = -1
+    for start, end, points, times in recording:
+        starts.append(start)
+        for sample in recording.samples(last, end + 4_000_000):
+            pipeline.add_imu(
+                types.ImuMeasurement(
+                    types.Stamp.from_nsec(int(sample["stamp"])),
+                    np.ascontiguousarray(sample["angular_velocity"]),
+                    np.ascontiguousarray(sample["linear_acceleration"]),
                 )
-            last = end + 4_000_000
-            pipeline.add_lidar(_measurement(types, start, points, times))
-            # most pipelines say where the IMU is, in a frame of their own
-            out += [
-                (stamp.to_nsec(), pose.to_mat() @ np.linalg.inv(recording.T_cloud_imu))
-                for stamp, pose in pipeline.saved_estimates()
-            ]
-        return out
-
-    return run
+            )
+        last = end + 4_000_000
+        pipeline.add_lidar(_measurement(types, start, points, times, rings, columns))
+        # what is saved says where the IMU is
+        found = [pose.to_mat() @ T_imu_cloud for _, pose in pipeline.saved_estimates()]
+        if len(starts) > latency and found:
+            out.append((starts[-1 - latency], found[-1]))
+    return out
 
 
-def _measurement(types: Any, start: int, points: Any, times: Any) -> Any:
-    """Return a sweep with elevation rings, as LIO-SAM sorts points."""
+def _measurement(types: Any, start: int, points: Any, times: Any, rings: int, columns: int) -> Any:
+    """Return a sweep with the rings and columns of LIO-SAM's range image."""
     ranges = np.linalg.norm(points, axis=1)
-    elevation = np.arcsin(np.clip(points[:, 2] / np.maximum(ranges, 1e-6), 0.0, 1.0))
-    rows = np.minimum((elevation / (np.pi / 2) * RINGS).astype(int), RINGS - 1)
+    elevation = np.arctan2(points[:, 2] - OPTICAL_CENTRE_M, np.hypot(points[:, 0], points[:, 1]))
+    rows = np.clip(np.floor(elevation * (rings / (np.pi / 2))), 0, rings - 1).astype(int)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
-    columns = ((azimuth + np.pi) / (2 * np.pi) * COLUMNS).astype(int) % COLUMNS
+    around = ((azimuth + np.pi) / (2 * np.pi) * columns).astype(int) % columns
     made = [
         types.Point(x=x, y=y, z=z, t=types.Duration.from_nsec(t), range=r, row=row, col=column)
         for (x, y, z), t, r, row, column in zip(
@@ -162,7 +207,7 @@ def _measurement(types: Any, start: int, points: Any, times: Any) -> Any:
             np.round(times * 1e9).astype(int).tolist(),
             (ranges * 1e3).astype(int).tolist(),
             rows.tolist(),
-            columns.tolist(),
+            around.tolist(),
             strict=True,
         )
     ]
@@ -172,8 +217,8 @@ def _measurement(types: Any, start: int, points: Any, times: Any) -> Any:
 REFEREES: dict[str, Callable[[Recording], Poses]] = {
     "rko_lio": rko_lio,
     "genz_lio": genz_lio,
-    "ct_icp": evalio("CTICP", {"ls_num_threads": 2}),
-    "lio_sam": evalio("LioSAM", {"numberOfCores": 2}),
+    "ct_icp": ct_icp,
+    "lio_sam": lio_sam,
 }
 
 
@@ -181,9 +226,9 @@ def main() -> int:
     """Run from a command line; return the exit code."""
     name, source, target = sys.argv[1:4]
     recording = Recording(source)
-    begin = time.perf_counter()
+    begin = time.process_time()
     found = REFEREES[name](recording)
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     np.savez(
         target,
         stamps=np.array([stamp for stamp, _ in found], dtype=np.int64),
