@@ -20,12 +20,13 @@ from l2lidar_node.layouts import LAYOUTS
 from l2lidar_node.ros.conversions import CloudTemplate, from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_node.types import HostNs
 from l2lidar_proc import report
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.pipeline import Deskewed, Pipeline
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
+from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames
 from l2lidar_proc.velocity import carried_over
 
@@ -85,19 +86,7 @@ class DeskewNode(Node):
 
     def _imu(self, message: Imu) -> None:
         self._mount(message.header.frame_id)
-        q, rate, force = message.orientation, message.angular_velocity, message.linear_acceleration
-        sample = np.array(
-            [
-                (
-                    from_time(message.header.stamp),
-                    (q.w, q.x, q.y, q.z),
-                    (rate.x, rate.y, rate.z),
-                    (force.x, force.y, force.z),
-                )
-            ],
-            dtype=IMU_SAMPLE,
-        )
-        self._pipeline.imu(sample)
+        self._pipeline.imu(to_sample(message))
         if self._pipeline.is_waiting:
             self._hand_out()
 
