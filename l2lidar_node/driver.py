@@ -100,19 +100,19 @@ class Driver:
         arrival : HostNs
             When they reached this host, at best as the kernel noted it.
         """
-        self.counters.datagrams += 1
-        self.counters.octets += len(data)
-        events = self.settle(arrival)
+        counters = self.counters
+        counters.datagrams += 1
+        counters.octets += len(data)
+        events = self.settle(arrival) if self.is_overdue(arrival) else []
         for item in self._framer.feed(data):
             if isinstance(item, FrameError):
-                self.counters.faults[item.fault.value] += 1
-                self.counters.skipped_octets += item.skipped
+                counters.faults[item.fault.value] += 1
+                counters.skipped_octets += item.skipped
                 continue
             is_known = item.packet_type in wire.FRAME_SIZES
-            self.counters.frames[item.packet_type if is_known else 0] += 1
+            counters.frames[item.packet_type if is_known else 0] += 1
             events += self._handle(decode(item), arrival)
-        events += self._clock.events()
-        return events
+        return events + self._clock.events()
 
     def tick(self, now: HostNs, heard_until: HostNs | None = None) -> list[Event]:
         """Return what is due by now; to be called every few milliseconds.
@@ -144,7 +144,7 @@ class Driver:
 
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would do anything."""
-        return self._has_stalled(until) or self._intake.is_overdue(until)
+        return self._intake.is_overdue(until) or self._has_stalled(until)
 
     def outbox(self) -> list[Outgoing]:
         """Return the frames to send now, in order, once."""
@@ -225,13 +225,18 @@ class Driver:
 
     def _handle(self, packet: Packet, arrival: HostNs) -> list[Event]:
         if isinstance(packet, ImuPacket):
-            return self._order(Stream.IMU, packet, arrival)
+            self._watchdog.heard(Stream.IMU, arrival)
+            if self._intake.follows(Stream.IMU, packet, arrival):
+                return self._imu(packet, arrival)
+            return self._reordered(Stream.IMU, packet, arrival)
         if isinstance(packet, PointPacket):
+            self._watchdog.heard(Stream.POINTS, arrival)
             if (packet.packet_type == wire.PacketType.POINTS_3D) != self._config.sweep.frame3d:
                 self.counters.ignored_points += 1
-                self._watchdog.heard(Stream.POINTS, arrival)
                 return []
-            return self._order(Stream.POINTS, packet, arrival)
+            if self._intake.follows(Stream.POINTS, packet, arrival):
+                return self._points(packet, arrival)
+            return self._reordered(Stream.POINTS, packet, arrival)
         if isinstance(packet, Ack):
             return self._acknowledged(packet, arrival)
         if isinstance(packet, Version):
@@ -244,10 +249,9 @@ class Driver:
             self.counters.rejected[f"{packet.packet_type}.{packet.reason}"] += 1
         return []
 
-    def _order(
+    def _reordered(
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
     ) -> list[Event]:
-        self._watchdog.heard(stream, arrival)
         events: list[Event] = []
         if self._intake.begins_anew(stream, packet, arrival):
             events = self._released(self._intake.restart(stream))
@@ -256,12 +260,11 @@ class Driver:
 
     def _released(self, released: Released) -> list[Event]:
         events: list[Event] = []
-        for missing, timed in released:
-            packet = timed.packet
+        for missing, (packet, arrival) in released:
             if isinstance(packet, ImuPacket):
-                events += self._imu(packet, timed.arrival)
+                events += self._imu(packet, arrival)
             else:
-                events += self._points(packet, timed.arrival, missing)
+                events += self._points(packet, arrival, missing)
         return events
 
     def _imu(self, packet: ImuPacket, arrival: HostNs) -> list[Event]:
@@ -276,7 +279,7 @@ class Driver:
         self.gravity.add(sample)
         return [sample]
 
-    def _points(self, packet: PointPacket, arrival: HostNs, missing: int) -> list[Event]:
+    def _points(self, packet: PointPacket, arrival: HostNs, missing: int = 0) -> list[Event]:
         start = self._clock.observe(
             Stream.POINTS, packet.seq, packet.stamp, arrival, packet.duration_ns
         )
@@ -295,16 +298,13 @@ class Driver:
         self.counters.sweeps += 1
         self.counters.unlevelled = self._assembler.unlevelled
         self.counters.points += len(sweep.points)
-        self.counters.slots += sweep.packets * self._slots
+        is_3d = self._config.sweep.frame3d
+        slots = wire.POINTS_PER_3D_PACKET if is_3d else wire.POINTS_PER_2D_PACKET
+        self.counters.slots += sweep.packets * slots
         if not len(sweep.points):
             self.counters.empty_sweeps += 1
             return []
         return [sweep]
-
-    @property
-    def _slots(self) -> int:
-        is_3d = self._config.sweep.frame3d
-        return wire.POINTS_PER_3D_PACKET if is_3d else wire.POINTS_PER_2D_PACKET
 
     def _acknowledged(self, ack: Ack, now: HostNs) -> list[Event]:
         answer = self._requests.answer(ack, now)
@@ -319,8 +319,8 @@ class Driver:
         return [answer]
 
     def _has_stalled(self, until: HostNs) -> bool:
-        is_silent = self._intake.silence_ns(Stream.POINTS, until) > MAX_GAP_NS
-        return is_silent and self._assembler.is_collecting
+        silence_ns = self._intake.silence_ns(Stream.POINTS, until)
+        return silence_ns > MAX_GAP_NS and self._assembler.is_collecting
 
     def _send_due(self, now: HostNs) -> list[Event]:
         due: list[Command] = []

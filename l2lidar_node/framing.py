@@ -80,7 +80,11 @@ class Framer:
 
     def feed(self, data: bytes) -> list[FramingEvent]:
         """Return the frames and errors that these bytes complete, in order."""
-        if self._pending and data.startswith(wire.MAGIC):
+        if not self._pending:
+            frame = _whole(data)
+            if frame is not None:
+                return [frame]
+        elif data.startswith(wire.MAGIC):
             events, rest = _parse(data)
             if not rest:
                 return events
@@ -90,6 +94,21 @@ class Framer:
     def reset(self) -> None:
         """Forget an incomplete frame, for example when the sender restarted."""
         self._pending = b""
+
+
+def _whole(data: bytes) -> Frame | None:
+    """Return the frame that a datagram is, as nearly all are; None if it is anything else."""
+    size = len(data)
+    if size < wire.OVERHEAD:
+        return None
+    magic, packet_type, stated = wire.HEADER.unpack_from(data)
+    if stated != size or magic != wire.MAGIC or wire.FRAME_SIZES.get(packet_type) != size:
+        return None
+    payload = data[_HEADER_SIZE:-_TAIL_SIZE]
+    crc, _, _, end = wire.TAIL.unpack_from(data, size - _TAIL_SIZE)
+    if crc != zlib.crc32(payload) or end != wire.TAIL_END:
+        return None
+    return Frame(packet_type, payload)
 
 
 def _parse(data: bytes) -> tuple[list[FramingEvent], bytes]:

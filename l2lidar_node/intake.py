@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from l2lidar_node.packets import ImuPacket, PointPacket
@@ -26,6 +27,16 @@ Released = list[tuple[int, Timed]]
 """Packets in order, each with how many are missing just before it."""
 
 
+@dataclass(slots=True)
+class _Lane:
+    """What is known of one stream."""
+
+    order: SequenceOrder[Timed]
+    newest: PointPacket | ImuPacket | None = None
+    arrival: int = 0  # [ns] of the packet that came last
+    fallen: int = 0  # packets in a row whose stamps fell
+
+
 class Intake:
     """The packets of both streams on their way from arrival to use.
 
@@ -36,14 +47,31 @@ class Intake:
     """
 
     def __init__(self, window: int) -> None:
-        self._orders = {stream: SequenceOrder[Timed](window) for stream in Stream}
-        self._newest: dict[Stream, Timed] = {}
-        self._fallen = dict.fromkeys(Stream, 0)
+        self._lanes = {stream: _Lane(SequenceOrder(window)) for stream in Stream}
 
     @property
     def counts(self) -> dict[Stream, SequenceCounts]:
         """What the sequence numbers say, by stream; goes on counting."""
-        return {stream: order.counts for stream, order in self._orders.items()}
+        return {stream: lane.order.counts for stream, lane in self._lanes.items()}
+
+    def follows(self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs) -> bool:
+        """Take a packet that comes just after the one before, as nearly all do.
+
+        Returns whether it did. Others are for :meth:`begins_anew` and :meth:`push`, which would
+        treat this one alike.
+        """
+        lane = self._lanes[stream]
+        if (
+            lane.newest is None
+            or packet.stamp < lane.newest.stamp
+            or arrival - lane.arrival > SILENCE_NS
+            or not lane.order.follows(packet.seq)
+        ):
+            return False
+        lane.newest = packet
+        lane.arrival = arrival
+        lane.fallen = 0
+        return True
 
     def begins_anew(
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
@@ -55,68 +83,71 @@ class Intake:
         ones: after a pause nothing is late. An earlier number with a later stamp is not late
         either.
         """
-        newest = self._newest.get(stream)
+        lane = self._lanes[stream]
+        newest = lane.newest
         if newest is None:
             return False
-        fall = newest.packet.stamp - packet.stamp
+        fall = newest.stamp - packet.stamp
         if fall > RESTART_NS:
-            self._fallen[stream] += 1
-            is_alone = arrival - newest.arrival > REORDER_NS
-            is_many = self._fallen[stream] > _FEW
-            return is_alone or is_many or not self._is_earlier(stream, packet)
-        self._fallen[stream] = 0
-        if fall >= 0 or packet.seq > newest.packet.seq:
+            lane.fallen += 1
+            is_alone = arrival - lane.arrival > REORDER_NS
+            is_many = lane.fallen > _FEW
+            return is_alone or is_many or not lane.order.is_earlier(packet.seq, newest.seq)
+        lane.fallen = 0
+        if fall >= 0 or packet.seq > newest.seq:
             return False
-        return arrival - newest.arrival <= SILENCE_NS and self._is_earlier(stream, packet)
+        is_fresh = arrival - lane.arrival <= SILENCE_NS
+        return is_fresh and lane.order.is_earlier(packet.seq, newest.seq)
 
     def restart(self, stream: Stream) -> Released:
         """Return what waits; the next packet of the stream is in order, whatever its number."""
-        self._newest.pop(stream, None)
-        self._fallen[stream] = 0
-        return self._orders[stream].restart()
+        lane = self._lanes[stream]
+        lane.newest = None
+        lane.fallen = 0
+        return lane.order.restart()
 
     def push(self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs) -> Released:
         """Return what a packet releases."""
-        order = self._orders[stream]
-        newest = self._newest.get(stream)
+        lane = self._lanes[stream]
+        order, newest, pause = lane.order, lane.newest, arrival - lane.arrival
+        lane.arrival = arrival
+        if newest is None or lane.fallen == 0:
+            lane.newest = packet
         timed = Timed(packet, arrival)
-        if newest is None or self._fallen[stream] == 0:
-            self._newest[stream] = timed
-        else:
-            self._newest[stream] = newest._replace(arrival=arrival)
         if newest is None:
             return order.restart() + order.push(packet.seq, timed)
-        if arrival - newest.arrival > SILENCE_NS:
+        if pause > SILENCE_NS:
             return order.resume(packet.seq, timed)
         return order.push(packet.seq, timed)
 
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would release anything."""
-        return any(_overdue(order, until) for order in self._orders.values())
+        for lane in self._lanes.values():
+            if lane.order.waiting and _overdue(lane.order, until):
+                return True  # written out: every packet asks
+        return False
 
     def settle(self, until: HostNs) -> Released:
         """Return what has waited for :data:`REORDER_NS`, nothing more having arrived by then."""
         released: Released = []
-        for order in self._orders.values():
-            while _overdue(order, until):
-                released += order.give_up()
+        for lane in self._lanes.values():
+            while _overdue(lane.order, until):
+                released += lane.order.give_up()
         return released
 
     def silence_ns(self, stream: Stream, until: HostNs) -> int:
         """Return how long nothing of a stream arrived; 0 before there was anything."""
-        newest = self._newest.get(stream)
-        return 0 if newest is None else until - newest.arrival
+        lane = self._lanes[stream]
+        return 0 if lane.newest is None else until - lane.arrival
 
     def flush(self) -> Released:
         """Return everything that waits."""
-        return [item for order in self._orders.values() for item in order.flush()]
-
-    def _is_earlier(self, stream: Stream, packet: PointPacket | ImuPacket) -> bool:
-        return self._orders[stream].is_earlier(packet.seq, self._newest[stream].packet.seq)
+        return [item for lane in self._lanes.values() for item in lane.order.flush()]
 
     def forget(self) -> None:
         """Take the next packet of each stream for the first one."""
-        self._newest.clear()
+        for lane in self._lanes.values():
+            lane.newest = None
 
 
 def _overdue(order: SequenceOrder[Timed], until: HostNs) -> bool:

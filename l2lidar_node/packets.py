@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,8 +19,6 @@ NS: Final = 1_000_000_000
 
 # Measurements are decoded hundreds of times a second: one precompiled struct each instead of a
 # dtype view.
-_POINTS_3D = struct.Struct("<4I 36x 8f 8f I")
-_POINTS_2D = struct.Struct("<4I 36x 8f 6f I")
 _IMU = struct.Struct("<4I 4f 3f 3f")
 
 _MAX_FIELD: Final = 1e6  # in any unit: all real ones are below 1e4, and points must fit float32
@@ -141,64 +140,80 @@ def decode(frame: Frame) -> Packet:
     return decoder(frame.payload)
 
 
-def _points_3d(payload: bytes) -> PointPacket | DecodeError:
-    return _points(wire.PacketType.POINTS_3D, payload, _POINTS_3D, wire.POINTS_PER_3D_PACKET)
+class _PointLayout(NamedTuple):
+    """Where the numbers are in a packet of ranges."""
+
+    packet_type: int
+    size: int
+    capacity: int
+    fields: struct.Struct  # time increment and number of points are the last ones
+    head_angle: int | None  # place among the fields
 
 
-def _points_2d(payload: bytes) -> PointPacket | DecodeError:
-    return _points(wire.PacketType.POINTS_2D, payload, _POINTS_2D, wire.POINTS_PER_2D_PACKET)
+_POINTS_3D: Final = _PointLayout(
+    wire.PacketType.POINTS_3D,
+    wire.POINTS_3D_PAYLOAD.itemsize,
+    wire.POINTS_PER_3D_PACKET,
+    struct.Struct("<4I 36x 8f 8f I"),
+    12,
+)
+_POINTS_2D: Final = _PointLayout(
+    wire.PacketType.POINTS_2D,
+    wire.POINTS_2D_PAYLOAD.itemsize,
+    wire.POINTS_PER_2D_PACKET,
+    struct.Struct("<4I 36x 8f 6f I"),
+    None,
+)
 
 
-def _points(
-    packet_type: int, payload: bytes, layout: struct.Struct, capacity: int
-) -> PointPacket | DecodeError:
-    if len(payload) != wire.PAYLOADS[packet_type].itemsize:
+def _points(layout: _PointLayout, payload: bytes) -> PointPacket | DecodeError:
+    packet_type, size, capacity, numbers, head_angle = layout
+    if len(payload) != size:
         return DecodeError(packet_type, "length")
-    fields = layout.unpack_from(payload)
+    fields = numbers.unpack_from(payload)
     seq, _, sec, nsec = fields[:4]
     time_increment, count = fields[-2:]
     if count > capacity:
         return DecodeError(packet_type, "point_num")
     if nsec >= NS:
         return DecodeError(packet_type, "stamp")
-    size = math.hypot(*fields[4:-1])  # one NaN or infinity anywhere makes it one
-    if not math.isfinite(size):
-        return DecodeError(packet_type, "not_finite")
-    if size > _MAX_FIELD:
-        return DecodeError(packet_type, "implausible")
+    length = math.hypot(*fields[4:-1])  # one NaN or infinity anywhere makes it one
+    if not length <= _MAX_FIELD:
+        is_finite = math.isfinite(length)
+        return DecodeError(packet_type, "implausible" if is_finite else "not_finite")
     if not 0.0 < time_increment < _MAX_TIME_INCREMENT_S:
         return DecodeError(packet_type, "time_increment")
-    head_angle = fields[12] if packet_type == wire.PacketType.POINTS_3D else 0.0
     return PointPacket(
         packet_type,
         seq,
         DeviceNs(sec * NS + nsec),
         math.ceil(max(count - 1, 0) * time_increment * NS),
-        head_angle,
+        0.0 if head_angle is None else fields[head_angle],
         payload,
     )
 
 
 def _imu(payload: bytes) -> ImuPacket | DecodeError:
-    if len(payload) != wire.IMU_PAYLOAD.itemsize:
+    if len(payload) != _IMU.size:
         return DecodeError(wire.PacketType.IMU, "length")
-    seq, _, sec, nsec, w, x, y, z, *motion = _IMU.unpack(payload)
+    seq, _, sec, nsec, w, x, y, z, p, q, r, ax, ay, az = _IMU.unpack(payload)
     if nsec >= NS:
         return DecodeError(wire.PacketType.IMU, "stamp")
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not math.isfinite(norm + sum(motion)):
+    if not math.isfinite(norm + p + q + r + ax + ay + az):
         return DecodeError(wire.PacketType.IMU, "not_finite")
     if norm < _MIN_QUATERNION_NORM:
         return DecodeError(wire.PacketType.IMU, "quaternion_norm")
-    rate, acceleration = tuple(motion[:3]), tuple(motion[3:])
-    if max(map(abs, rate)) > _MAX_RATE or max(map(abs, acceleration)) > _MAX_ACCELERATION:
+    fastest = max(p, q, r, -p, -q, -r)
+    strongest = max(ax, ay, az, -ax, -ay, -az)
+    if fastest > _MAX_RATE or strongest > _MAX_ACCELERATION:
         return DecodeError(wire.PacketType.IMU, "implausible")
     return ImuPacket(
         seq,
         DeviceNs(sec * NS + nsec),
         (w / norm, x / norm, y / norm, z / norm),
-        rate,
-        acceleration,
+        (p, q, r),
+        (ax, ay, az),
     )
 
 
@@ -246,8 +261,8 @@ def _parameters(payload: bytes) -> Parameters | DecodeError:
 
 
 _DECODERS: Final[dict[int, Callable[[bytes], Packet]]] = {
-    wire.PacketType.POINTS_3D: _points_3d,
-    wire.PacketType.POINTS_2D: _points_2d,
+    wire.PacketType.POINTS_3D: partial(_points, _POINTS_3D),
+    wire.PacketType.POINTS_2D: partial(_points, _POINTS_2D),
     wire.PacketType.IMU: _imu,
     wire.PacketType.VERSION: _version,
     wire.PacketType.ACK: _ack,

@@ -49,6 +49,12 @@ class SequenceOrder(Generic[T]):
     window : int
         How many early packets may wait; 0 releases everything at once.
 
+    Attributes
+    ----------
+    counts : SequenceCounts
+    waiting : dict
+        What waits by its number, the longest first; only to be read.
+
     Notes
     -----
     Numbers wrap. The modulus is not documented (0..1024 has been seen), so it is learned: a number
@@ -62,24 +68,33 @@ class SequenceOrder(Generic[T]):
         self._reach = 2 * window + _LATE_REACH
         self._modulus = FIRST_MODULUS
         self._next: int | None = None
-        self._waiting: dict[int, T] = {}
+        self.waiting: dict[int, T] = {}
         self._given_up: set[int] = set()  # of the numbers within reach: tells late from duplicate
         self._last_wrap = _UNKNOWN
 
     @property
     def oldest(self) -> T | None:
         """What has been waiting the longest; None if nothing waits."""
-        return next(iter(self._waiting.values()), None)
+        return next(iter(self.waiting.values()), None)
 
     def is_earlier(self, seq: int, than: int) -> bool:
         """Tell whether a number comes a little before another one that came lately."""
         return self._next is not None and self._ahead(seq) < self._ahead(than)
 
+    def follows(self, seq: int) -> bool:
+        """Take the next number while nothing waits; return whether it was that.
+
+        It is as if it had been pushed and released at once.
+        """
+        if seq != self._next or self.waiting:
+            return False
+        self._next = seq + 1 if seq + 1 != self._modulus else 0
+        self._given_up.discard(seq)
+        return True
+
     def push(self, seq: int, item: T) -> list[tuple[int, T]]:
         """Return what can be released now, each with how many are missing just before it."""
-        if seq == self._next and not self._waiting:
-            self._next = self._after(seq)
-            self._given_up.discard(seq)
+        if self.follows(seq):
             return [(0, item)]
         self._unlearn(seq)
         if self._next is None:
@@ -89,14 +104,14 @@ class SequenceOrder(Generic[T]):
         if ahead < 0:
             self._count_behind(seq)
             return []
-        if seq in self._waiting:
+        if seq in self.waiting:
             self.counts.duplicates += 1
             return []
-        if any(self._ahead(other) > ahead for other in self._waiting):
+        if any(self._ahead(other) > ahead for other in self.waiting):
             self.counts.reordered += 1
-        self._waiting[seq] = item
+        self.waiting[seq] = item
         released = self._run(0)
-        while len(self._waiting) > self._window:
+        while len(self.waiting) > self._window:
             released += self.give_up()
         return released
 
@@ -116,9 +131,9 @@ class SequenceOrder(Generic[T]):
 
     def give_up(self) -> list[tuple[int, T]]:
         """Release the first packets that wait, counting the numbers before them as lost."""
-        if not self._waiting or self._next is None:
+        if not self.waiting or self._next is None:
             return []
-        first = min(self._waiting, key=self._ahead)
+        first = min(self.waiting, key=self._ahead)
         missing = self._ahead(first)
         if first < self._next:
             missing = self._wrapped(first, missing)
@@ -131,7 +146,7 @@ class SequenceOrder(Generic[T]):
     def flush(self) -> list[tuple[int, T]]:
         """Release everything that waits, counting the numbers in between as lost."""
         released: list[tuple[int, T]] = []
-        while self._waiting:
+        while self.waiting:
             released += self.give_up()
         return released
 
@@ -157,7 +172,7 @@ class SequenceOrder(Generic[T]):
         if seq >= self._next - self._reach:
             return seq - self._next
         # It wrapped, nobody knows where: after the largest number seen, as far as can be told.
-        largest = max((n for n in self._waiting if n >= self._next), default=self._next - 1)
+        largest = max((n for n in self.waiting if n >= self._next), default=self._next - 1)
         return largest + 1 - self._next + seq
 
     def _numbers_before(self, seq: int, count: int) -> set[int]:
@@ -175,9 +190,9 @@ class SequenceOrder(Generic[T]):
 
     def _run(self, missing: int) -> list[tuple[int, T]]:
         released: list[tuple[int, T]] = []
-        while self._next in self._waiting:
+        while self._next in self.waiting:
             seq = self._next
-            released.append((missing, self._waiting.pop(seq)))
+            released.append((missing, self.waiting.pop(seq)))
             self._given_up.discard(seq)
             missing = 0
             self._next = self._after(seq)

@@ -238,6 +238,8 @@ class DeviceClock:
 
     def events(self) -> list[ClockEvent]:
         """Return what happened since the last call, oldest first."""
+        if not self._events:
+            return []
         happened = list(self._events)
         self._events.clear()
         return happened

@@ -266,7 +266,7 @@ def test_any_numbers_are_taken(numbers, window):
     released = []
     for index, number in enumerate(numbers):
         released += order.push(number, index)
-        assert len(order._waiting) <= window
+        assert len(order.waiting) <= window
     released += order.flush()
     out = [index for _, index in released]
     assert len(out) == len(set(out))
