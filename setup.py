@@ -36,7 +36,7 @@ setup(
     author=MANIFEST.findtext("maintainer"),
     maintainer=MANIFEST.findtext("maintainer"),
     packages=find_packages(include=["l2lidar_node*", "l2lidar_proc*"]),
-    package_data={"": ["py.typed"]},
+    package_data={"": ["py.typed"], "l2lidar_node.ros": ["*.xml"]},
     data_files=shared_files(),
     zip_safe=False,
     python_requires=">=3.11,<3.13",

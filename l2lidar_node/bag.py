@@ -125,7 +125,7 @@ class BagWriter:
         reliable = topics.qos_reliability == "reliable"
         for topic, kind, depth in (
             (topics.point_cloud_topic_id, _CLOUD, 10),
-            (topics.imu_topic_id, _IMU, 200),
+            (topics.imu_topic_id, _IMU, 1000),
         ):
             self._file.connect(topic, kind, depth, reliable, latched=False)
         if self._config.frames.publish_tf:

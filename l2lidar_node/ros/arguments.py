@@ -10,6 +10,8 @@ from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from l2lidar_node.ros.middleware import make_room
+
 
 class UsageError(ValueError):
     """The command line is wrong; the message says what and what would be right."""
@@ -26,6 +28,7 @@ def start_rclpy(argv: list[str]) -> None:
         If anything on the command line is wrong.
     """
     arguments = ros_arguments(argv)
+    make_room()
     try:
         unknown = remove_ros_args(arguments)[1:]
         if not unknown:
