@@ -20,6 +20,7 @@ RUN_BY = {
     r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
     r"l2lidar (discover|info|set work-mode).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
+    r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/test_bag_readers.py",
     r"l2lidar check .*\.mcap .*": "tests/l2lidar_node/readiness/test_recordings.py",
     r"l2lidar check /.*": "tests/l2lidar_node/ros/test_topic_source.py",
     r"l2lidar view.*": "tests/l2lidar_node/ros/test_viewer.py",
@@ -38,6 +39,7 @@ NOT_RUN = {
     r"sudo .*": ADMIN,
     r"nmcli .*": ADMIN,
     r"ping .*": SENSOR,
+    r"(rko_lio|genz_lio_pipeline) .*": "heavy, one of them GPL: run by hand, and by the bench",
 }
 """Commands that no test runs, with the reason."""
 
