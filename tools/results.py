@@ -68,13 +68,19 @@ def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable
         console.print(
             f"{mark}[/] {target.name}: {_text(target.value)} (bound {_text(target.bound)})"
         )
+    path = keep(name, rows, targets)
+    console.print(f"written to {path}")
+    return path
+
+
+def keep(name: str, rows: list[dict[str, Any]], targets: Iterable[Target]) -> Path:
+    """Write ``out/bench/NAME.json`` alone; return its path."""
     path = FOLDER / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     content = {"machine": machine(), "rows": rows, "targets": [asdict(item) for item in targets]}
     part = path.with_suffix(".part")
     part.write_text(json.dumps(content, indent=1, default=float) + "\n")
     part.replace(path)
-    console.print(f"written to {path}")
     return path
 
 

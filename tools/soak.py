@@ -1,42 +1,149 @@
 """Runs the whole chain for long and watches for growth, loss, steps back and unclean ends.
 
-``make soak`` prints the table and writes ``out/bench/soak.json``.
+``make soak`` prints the table and writes ``out/bench/soak.json``, which says every half a minute
+how it stands: a run that is interrupted has its result as well.
 """
 
 from __future__ import annotations
 
 import argparse
-import random
+import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import rclpy
 from numpy.typing import NDArray
+from rclpy.signals import SignalHandlerOptions
 
 from l2lidar_node import wire
 from l2lidar_node.demo.processes import Program, Programs, isolate_ros
-from tools import chain
+from tools import chain, interrupts
 from tools.cpu import process_cpu_s, resident_mb
-from tools.results import Target, at_most, publish
+from tools.results import Target, at_most, keep, publish
 from tools.topic_watch import CLOUDS, DESKEWED, IMU, ODOMETRY, TopicWatch, backward_steps, missing
 
 _START_S: Final = 60.0
 _WARM_UP_S: Final = 20.0
-_SAMPLES: Final = 120
+_LOOK_S: Final = 30.0
 _MAX_GROWTH_MB: Final = 10.0
 _CLOUD_PACKETS: Final = 38
+_CLOUD_S: Final = _CLOUD_PACKETS * wire.MIRROR_PERIOD_S
 _PERIODS_S: Final = {
-    IMU: 1 / wire.IMU_RATE_HZ,
-    CLOUDS: _CLOUD_PACKETS * wire.MIRROR_PERIOD_S,
-    DESKEWED: _CLOUD_PACKETS * wire.MIRROR_PERIOD_S,
-    ODOMETRY: _CLOUD_PACKETS * wire.MIRROR_PERIOD_S,
-}
+    IMU: 1 / wire.IMU_RATE_HZ, CLOUDS: _CLOUD_S, DESKEWED: _CLOUD_S, ODOMETRY: _CLOUD_S,
+}  # fmt: skip
 _LINK: Final = ("points lost", "imu lost", "points late", "imu late", "kernel drops")
-_STOPS: Final = 8
+_ROUNDS: Final = 4  # of interruptions of every program
+
+
+@dataclass(slots=True)
+class Tally:
+    """What came on a topic, counted as it comes.
+
+    Attributes
+    ----------
+    messages, missing, steps_back : int
+    """
+
+    messages: int = 0
+    missing: int = 0
+    steps_back: int = 0
+    _last: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+
+    def add(self, seen: NDArray[np.int64], period_s: float) -> None:
+        """Count the messages that came since the last call."""
+        line = np.concatenate([self._last, seen])
+        self.messages += len(seen)
+        self.missing += missing(line, period_s)
+        self.steps_back += backward_steps(line)
+        self._last = line[-1:]
+
+
+class Soak:
+    """The chain at work, and what has been seen of it so far.
+
+    Parameters
+    ----------
+    running : dict of str to Program
+    watch, casual : TopicWatch
+        Who asks for reliable delivery, and who takes what comes.
+    """
+
+    def __init__(self, running: dict[str, Program], watch: TopicWatch, casual: TopicWatch) -> None:
+        self.running = running
+        self._watches = watch, casual
+        self._tallies = [{topic: Tally() for topic in _PERIODS_S} for _ in self._watches]
+        self._samples: dict[str, list[tuple[float, int, int]]] = {name: [] for name in running}
+        self._loads: list[float] = []
+        self._begun = time.monotonic()
+        self._cpu = {name: process_cpu_s(program.pid) for name, program in running.items()}
+        for item in self._watches:
+            item.forget()
+
+    @property
+    def minutes(self) -> float:
+        """How long it has been going."""
+        return (time.monotonic() - self._begun) / 60
+
+    def look(self) -> None:
+        """Count what came and measure every program."""
+        for item, tallies in zip(self._watches, self._tallies, strict=True):
+            for topic, tally in tallies.items():
+                tally.add(item.seen(topic), _PERIODS_S[topic])
+            item.forget()
+        for name, program in self.running.items():
+            self._samples[name].append(sample(program))
+        self._loads.append(os.getloadavg()[0])
+
+    def found(self) -> tuple[list[dict[str, Any]], list[Target]]:
+        """Return rows and targets as they stand."""
+        rows: list[dict[str, Any]] = []
+        targets: list[Target] = []
+        lows, highs = min(self._loads, default=0.0), max(self._loads, default=0.0)
+        rows.append(
+            _row("time", f"{self.minutes:.1f} min, load of the machine {lows:.1f} to {highs:.1f}")
+        )
+        reliable, casual = self._tallies
+        for topic, tally in reliable.items():
+            text = f"{tally.messages} messages, {tally.missing} missing"
+            rows.append(_row(topic, f"{text}, {tally.steps_back} steps back"))
+            targets += [
+                at_most(f"{topic}: missing", tally.missing, 0),
+                at_most(f"{topic}: steps back", tally.steps_back, 0),
+            ]
+        for topic, tally in casual.items():
+            text = f"{tally.messages} messages, {tally.missing} missing"
+            rows.append(_row(f"{topic}, to a best-effort subscriber", text))
+        link = self._watches[0].checks.get("link", {})
+        counted = {name: int(link[name]) for name in _LINK if name in link}
+        rows.append(_row("driver's own count since its start", str(counted or link)))
+        for name in self.running:
+            row, more = self._program(name)
+            rows.append(row)
+            targets += [] if name == "emulator" else more
+        return rows, targets
+
+    def _program(self, name: str) -> tuple[dict[str, Any], list[Target]]:
+        memory, threads, files = np.array(self._samples[name]).T
+        at = len(memory) // 4
+        try:
+            used = process_cpu_s(self.running[name].pid) - self._cpu[name]
+        except OSError:
+            return _row(name, "has ended"), [at_most(f"{name}: has ended", 1, 0)]
+        text = (
+            f"{memory[at]:.1f} -> {memory[-1]:.1f} MB, {threads[-1]:.0f} threads, "
+            f"{files[-1]:.0f} files, {100 * used / (60 * self.minutes):.1f} % CPU"
+        )
+        return _row(name, text), [
+            at_most(f"{name}: growth [MB]", growth_mb(memory), _MAX_GROWTH_MB),
+            at_most(f"{name}: more threads", int(threads[-1] - threads[at]), 0),
+            at_most(f"{name}: more files", int(files[-1] - files[at]), 0),
+        ]
 
 
 def sample(program: Program) -> tuple[float, int, int]:
@@ -53,126 +160,97 @@ def growth_mb(memory: NDArray[np.float64]) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the chain and then end drivers at random moments; return 1 if a target is missed."""
+    """Run the chain, end it and then every program at random moments; return 1 on a miss."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--world", default="room")
     parser.add_argument("--motion", default="walk")
+    parser.add_argument("--rounds", type=int, default=_ROUNDS, help="of interruptions")
     options = parser.parse_args(arguments)
     isolate_ros()
     unit = ["--boot-scale", "0.1", "--world", options.world]
     unit += ["--motion", options.motion] if options.world != "pattern" else []
-    rclpy.init()
-    # Reliable, so that what is missing was lost by a node and not on the way to this one.
-    watch = TopicWatch(list(_PERIODS_S), reliable=True)
-    try:
-        with Programs() as programs:
-            programs_by_name = chain.start(programs, unit, {"qos_reliability": "reliable"})
-            rows, targets = _soaked(watch, programs, programs_by_name, 60 * options.minutes)
-        targets += _stopped_anywhere(rows)
-    finally:
-        watch.destroy_node()
-        rclpy.try_shutdown()
-    publish("soak", f"The whole chain for {options.minutes:g} minutes", rows, targets)
+    title = f"The whole chain for {options.minutes:g} minutes"
+    with Programs() as programs, _watching() as (watch, casual):
+        running = chain.start(programs, unit, {"qos_reliability": "reliable"})
+        _wait_for_clouds(watch, programs, min(_WARM_UP_S, 15 * options.minutes))
+        soak = Soak(running, watch, casual)
+        trouble = _went_on(soak, programs, watch, options.minutes)
+        rows, targets = soak.found()
+        targets.append(at_most("ended before its time", int(bool(trouble)), 0))
+        if trouble:
+            rows.append(_row("ended before its time", trouble))
+        for name, program in running.items():
+            targets += _stopped(name, program, rows)
+    if options.rounds and not trouble:
+        targets.append(_interrupted(options.rounds, rows))
+    publish("soak", title, rows, targets)
     return int(not all(target.met for target in targets))
 
 
-def _soaked(
-    watch: TopicWatch, programs: Programs, running: dict[str, Program], seconds: float
-) -> tuple[list[dict[str, Any]], list[Target]]:
+@contextmanager
+def _watching() -> Iterator[tuple[TopicWatch, TopicWatch]]:
+    """Give who watches as reliable and as best-effort subscriber."""
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    with ExitStack() as stack:
+        stack.callback(rclpy.try_shutdown)
+        watch = TopicWatch(list(_PERIODS_S), reliable=True)
+        stack.callback(watch.destroy_node)
+        casual = TopicWatch(list(_PERIODS_S), name="casual_watch")
+        stack.callback(casual.destroy_node)
+        watch.spin_with(casual)
+        yield watch, casual
+
+
+def _wait_for_clouds(watch: TopicWatch, programs: Programs, warm_up_s: float) -> None:
     deadline = time.monotonic() + _START_S
     while not len(watch.seen(CLOUDS)):
         watch.watch(0.2)
         programs.check()
         if time.monotonic() > deadline:
             raise TimeoutError("no clouds")
-    watch.watch(min(_WARM_UP_S, seconds / 4))
-    watch.forget()
+    watch.watch(warm_up_s)
+
+
+def _went_on(soak: Soak, programs: Programs, watch: TopicWatch, minutes: float) -> str:
+    """Let it go on, noting how it stands; return what ended it before its time."""
+    try:
+        while (left := minutes - soak.minutes) > 0:
+            watch.watch(min(_LOOK_S, minutes * 60 / 8, left * 60))
+            soak.look()
+            programs.check()
+            keep("soak", *soak.found())
+    except KeyboardInterrupt:
+        soak.look()
+        return f"interrupted after {soak.minutes:.1f} min"
+    except RuntimeError as error:
+        return str(error)
+    return ""
+
+
+def _stopped(name: str, program: Program, rows: list[dict[str, Any]]) -> list[Target]:
     begin = time.monotonic()
-    cpu = {name: process_cpu_s(program.pid) for name, program in running.items()}
-    samples: dict[str, list[tuple[float, int, int]]] = {name: [] for name in running}
-    while time.monotonic() - begin < seconds:
-        for name, program in running.items():
-            samples[name].append(sample(program))
-        watch.watch(seconds / _SAMPLES)
-        programs.check()
-    lasted = time.monotonic() - begin
-    shares = {name: (process_cpu_s(p.pid) - cpu[name]) / lasted for name, p in running.items()}
-    return _reported(watch, running, samples, shares)
+    code, said = program.stop()
+    took = time.monotonic() - begin
+    words = f": {_last_words(said)}" if code else ""
+    rows.append(_row(f"{name}: SIGINT", f"exit code {code} after {took:.1f} s{words}"))
+    if name == "emulator":
+        rows.append(_row("emulator's own report", " | ".join(said.splitlines()[-6:])))
+    return [at_most(f"{name}: exit code after SIGINT", abs(code) + ("Traceback" in said), 0)]
 
 
-def _reported(
-    watch: TopicWatch,
-    running: dict[str, Program],
-    samples: dict[str, list[tuple[float, int, int]]],
-    shares: dict[str, float],
-) -> tuple[list[dict[str, Any]], list[Target]]:
-    rows: list[dict[str, Any]] = []
-    targets: list[Target] = []
-    for topic, period in _PERIODS_S.items():
-        seen = watch.seen(topic)
-        if not len(seen):
-            continue
-        gone, back = missing(seen, period), backward_steps(seen)
-        rows.append(_row(topic, f"{len(seen)} messages, {gone} missing, {back} steps back"))
-        targets += [
-            at_most(f"{topic}: missing", gone, 0),
-            at_most(f"{topic}: steps back", back, 0),
-        ]
-    link = watch.checks.get("link", {})
-    counted = {name: int(link.get(name, 0)) for name in _LINK if name in link}
-    rows.append(_row("driver's own count since its start", str(counted or link)))
-    for name, program in running.items():
-        values = np.array(samples[name])
-        memory, threads, files = values.T
-        grown = growth_mb(memory)
-        more = [int(line[-1] - line[len(line) // 4]) for line in (threads, files)]
-        begin = time.monotonic()
-        code, said = program.stop()
-        took = time.monotonic() - begin
-        at = len(memory) // 4
-        result = (
-            f"{memory[at]:.1f} -> {memory[-1]:.1f} MB, {threads[-1]:.0f} threads, "
-            f"{files[-1]:.0f} files, {100 * shares[name]:.1f} % CPU; "
-            f"SIGINT: exit code {code} after {took:.1f} s"
-        )
-        rows.append(_row(name, result + (f": {_last_words(said)}" if code else "")))
-        if name == "emulator":
-            rows.append(_row("emulator's own report", " | ".join(said.splitlines()[-6:])))
-            continue
-        targets += [
-            at_most(f"{name}: growth [MB]", grown, _MAX_GROWTH_MB),
-            at_most(f"{name}: more threads", more[0], 0),
-            at_most(f"{name}: more files", more[1], 0),
-            at_most(f"{name}: exit code after SIGINT", abs(code) + ("Traceback" in said), 0),
-        ]
-    return rows, targets
-
-
-def _stopped_anywhere(rows: list[dict[str, Any]]) -> list[Target]:
-    """End chains at random moments of their start and their work."""
-    rng = random.Random(3)
-    unclean: list[str] = []
-    early = 0
-    for _ in range(_STOPS):
-        with Programs() as programs:
-            running = chain.start(programs, ["--boot-scale", "0.05", "--world", "pattern"])
-            delay = rng.uniform(0.3, 10.0)
-            time.sleep(delay)
-            for name, program in running.items():
-                code, said = program.stop()
-                if code in (-2, 130):  # before there was a handler of signals
-                    early += 1
-                elif code or "Traceback" in said:
-                    unclean.append(f"{name} after {delay:.1f} s: {code} {_last_words(said)}")
-    remark = f"; {early} programs still imported and ended as Python does" if early else ""
-    rows.append(
-        _row(
-            f"{_STOPS} chains ended at random moments",
-            ("; ".join(unclean) or "all clean") + remark,
-        )
-    )
-    return [at_most("unclean ends at random moments", len(unclean), 0)]
+def _interrupted(rounds: int, rows: list[dict[str, Any]]) -> Target:
+    """Interrupt every program at random moments of its start and its work."""
+    ends = interrupts.run(list(interrupts.commands(Path())), rounds, seed=3)
+    ends += interrupts.run(["deskew_node", "odometry_node"], rounds, seed=4, is_fed=True)
+    unclean = [
+        f"{sent.program} after {sent.delay_s:.2f} s: {complaint}"
+        for sent, how in ends
+        if (complaint := how.complaint(sent))
+    ]
+    result = "; ".join(unclean) or "all clean"
+    rows.append(_row(f"{len(ends)} programs ended at random moments", result))
+    return at_most("unclean ends at random moments", len(unclean), 0)
 
 
 def _last_words(said: str) -> str:

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
@@ -35,10 +35,16 @@ class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no t
     topics : sequence of str
     reliable : bool
         Ask for reliable delivery: the publisher then has to offer it.
+    name : str
+        Of the node.
     """
 
-    def __init__(self, topics: Sequence[str], *, reliable: bool = False) -> None:
-        super().__init__("watch")
+    def __init__(
+        self, topics: Sequence[str], *, reliable: bool = False, name: str = "watch"
+    ) -> None:
+        super().__init__(name)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
         self.checks: dict[str, dict[str, str]] = {}
         self._seen: dict[str, list[tuple[int, int]]] = defaultdict(list)
         policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
@@ -56,7 +62,11 @@ class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no t
         """Handle what arrives for a while."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
-            rclpy.spin_once(self, timeout_sec=min(left, 0.1))
+            self._executor.spin_once(min(left, 0.1))
+
+    def spin_with(self, other: Node) -> None:
+        """Handle what arrives at another node, too."""
+        self._executor.add_node(other)
 
     def seen(self, topic: str) -> NDArray[np.int64]:
         """Return stamp and arrival of the messages so far [ns, host clock], shape (N, 2)."""
