@@ -62,6 +62,9 @@ class PlainOdometry:
             spread = np.ptp(times[inside]) > 0.0
             frame = self._kiss.register(xyz[inside], times[inside] if spread else times[:0])
             points = points[inside].copy()
+            if len(frame) != len(points):
+                # its deskew moved some across its range limits; it does not tell which
+                points = np.zeros(len(frame), points.dtype)
             for axis, column in zip("xyz", frame.T, strict=True):
                 points[axis] = column
         status = (Status.PREDICTED, Status.SPARSE) if few else ()
