@@ -11,6 +11,7 @@ import argparse
 import multiprocessing
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from typing import Any
 
@@ -64,7 +65,11 @@ def measure(run: Run, scene: str, motion: str, seed: int, cut: str, name: str) -
         "seconds": run.seconds,
         "method": name,
     }
-    found = methods.run_method(name, run, cut)
+    try:
+        found = methods.run_method(name, run, cut)
+    except Exception:  # counts as lost, and must not end the measurement
+        traceback.print_exc()
+        found = None
     if found is None or len(found.stamps) < 10:
         lost = float("inf")
         return {**row, "ate_m": lost, "max_m": lost, "rpe_m": lost, "real_time_factor": 0.0}
