@@ -8,13 +8,17 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TypeVar
+from typing import Final, TypeVar
+
+import numpy as np
 
 from l2lidar_node.driver import Driver, Event
 from l2lidar_node.transport import Transport
 from l2lidar_node.types import HostNs
 
 T = TypeVar("T")
+
+_LARGEST_SWEEP: Final = 4_000_000  # [8 B]
 
 
 class Loop(ABC):
@@ -48,6 +52,9 @@ class Loop(ABC):
 
     def start(self) -> None:
         """Start the loop."""
+        # glibc gives freed blocks back to the system, and has every page of the next sweep cleared
+        # again, unless one as large has been freed before.
+        np.empty(_LARGEST_SWEEP)
         self._thread.start()
 
     def stop(self) -> None:
@@ -111,8 +118,8 @@ class Loop(ABC):
         self._run_calls()
 
     def _run_calls(self) -> None:
-        with contextlib.suppress(queue.Empty):
-            while True:
+        while not self._calls.empty():
+            with contextlib.suppress(queue.Empty):  # at the end two threads may be here
                 self._calls.get_nowait()()
 
     def _hand_out(self, events: list[Event]) -> None:

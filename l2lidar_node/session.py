@@ -12,6 +12,7 @@ from l2lidar_node.transport import Transport
 from l2lidar_node.types import HostNs
 
 TICK_S: Final = 0.01
+_TICK_NS: Final = round(TICK_S * 1e9)
 
 
 class Tap(Protocol):
@@ -58,29 +59,29 @@ class Session(Loop):
         return HostNs(time.time_ns())
 
     def _work(self) -> None:
-        next_tick = 0.0
+        now = next_tick = self._now()
         while not self._stopping.is_set():
-            heard_until = self._now()
             batch = self.transport.receive(TICK_S)
             for data, arrival in batch:
                 if self._tap:
                     self._tap.received(data, arrival)
                 self._hand_out(self.driver.receive(data, arrival))
-            self._run_calls()
-            self._send()
-            now = time.monotonic()
-            if now >= next_tick:
-                next_tick = now + TICK_S
+            if not self._calls.empty():
+                self._run_calls()
+                self._send()
+            before, now = now, self._now()
+            if not 0 < next_tick - now <= _TICK_NS:  # the clock may have been set
+                next_tick = HostNs(now + _TICK_NS)
                 # More may wait in the socket than one batch holds.
-                self._tick(batch[-1].arrival if batch else heard_until)
+                self._tick(now, batch[-1].arrival if batch else before)
         self._run_calls()
         self._send()
         self._hand_out(self.driver.flush())
 
-    def _tick(self, heard_until: HostNs) -> None:
+    def _tick(self, now: HostNs, heard_until: HostNs) -> None:
         if self._tap and self.driver.is_overdue(heard_until):
             self._tap.waited(heard_until)
-        self._hand_out(self.driver.tick(self._now(), heard_until))
+        self._hand_out(self.driver.tick(now, heard_until))
         self._send()
 
     def _send(self) -> None:
