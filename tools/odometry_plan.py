@@ -66,11 +66,16 @@ class Plan:
     slow_seeds: int
 
     def tasks(self, done: Sequence[Row] = ()) -> list[Task]:
-        """Return what is to be done, without what is: all of a seed, slow ones last."""
+        """Return what is to be done, without what is.
+
+        First the first seed, then the other seeds without referees, then with them, slow ones
+        last: whenever it is cut, what is there can be compared.
+        """
         known = {tuple(row[name] for name in KEY) for row in done}
         found = []
         orders = [
-            *((rank, seed) for seed in range(self.seeds) for rank in (0, 1)),
+            *((rank, 0) for rank in (0, 1)),
+            *((rank, seed) for rank in (0, 1) for seed in range(1, self.seeds)),
             *((2, seed) for seed in range(self.seeds)),
         ]
         for (rank, seed), scene, motion in product(orders, self.scenes, self.motions):
@@ -102,9 +107,7 @@ class Plan:
             return 0
         if seed >= self.referee_seeds:
             return None
-        if name not in SLOW:
-            return 0
-        if cut == CUTS[0]:
+        if name not in SLOW or cut == CUTS[0]:
             return 1
         return 2 if seed < self.slow_seeds else None
 
