@@ -12,14 +12,12 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 
 import numpy as np
 
 from l2lidar_node import wire
 from l2lidar_node.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
-from l2lidar_node.cloud_fields import points_of
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event
 from l2lidar_node.framing import Frame, Framer
@@ -29,6 +27,7 @@ from l2lidar_node.recording import Recording
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import build
 from l2lidar_node.types import HostNs, ImuSample, Sweep
+from tools import fuzz_clouds as clouds
 from tools.fuzz_mutator import sealed
 
 Check = Callable[[bytes], None]
@@ -182,43 +181,6 @@ def _pcap() -> Check:
     return check
 
 
-_CLOUD: Final = struct.Struct("<4I2B")
-_FIELD: Final = struct.Struct("<sIBI")
-
-
-def _clouds() -> list[bytes]:
-    def cloud(height: int, width: int, fields: list[tuple[bytes, int, int, int]]) -> bytes:
-        head = _CLOUD.pack(height, width, 24, 24 * width, 0, len(fields))
-        return head + b"".join(_FIELD.pack(*item) for item in fields) + bytes(24 * width * height)
-
-    xyz = [(b"x", 0, 7, 1), (b"y", 4, 7, 1), (b"z", 8, 7, 1)]
-    return [cloud(1, 5, xyz), cloud(3, 2, [*xyz, (b"t", 12, 8, 1), (b"i", 20, 4, 2)])]
-
-
-def _cloud() -> Check:
-    def check(data: bytes) -> None:
-        if len(data) < _CLOUD.size:
-            return
-        height, width, step, row_step, order, count = _CLOUD.unpack_from(data)
-        end = min(_CLOUD.size + count * _FIELD.size, len(data))
-        end -= (end - _CLOUD.size) % _FIELD.size
-        fields = [
-            SimpleNamespace(name=name.decode("latin-1"), offset=at, datatype=kind, count=number)
-            for name, at, kind, number in _FIELD.iter_unpack(data[_CLOUD.size : end])
-        ]
-        message = SimpleNamespace(
-            height=height, width=width, point_step=step, row_step=row_step,
-            is_bigendian=bool(order & 1), fields=fields, data=data[end:],
-        )  # fmt: skip
-        try:
-            points = points_of(message)
-        except ValueError:
-            return
-        assert points.shape == (height * width,), "not as many points as the cloud says"
-
-    return check
-
-
 _YAML: Final = (
     b"l2lidar_node:\n  ros__parameters:\n    l2_ip: '127.0.0.1'\n    host_port: 6201\n"
     b"    yaw_covar: 10\n    a: {b: [1, 2.5e-7, true]}\n",
@@ -336,7 +298,8 @@ TARGETS: Final = {
         FuzzTarget("wire", _wire, _frames, _WORDS, 1_000_000),
         FuzzTarget("driver", _driver, _frames, _WORDS, 50_000),
         FuzzTarget("pcap", _pcap, _captures, (b"\x0a\x0d\x0d\x0a", b"\x08\x00\x45\x00"), 20_000),
-        FuzzTarget("cloud", _cloud, _clouds, (), 50_000),
+        FuzzTarget("cloud", clouds.fields, clouds.plain, (), 50_000),
+        FuzzTarget("message", clouds.message, clouds.timed, (b"t", b"\x07", b"\x08"), 20_000),
         FuzzTarget(
             "yaml", _parameters, lambda: list(_YAML),
             (b"ros__parameters:", b"*a", b"&a ", b"[[[[", b"{", b"!!int ", b"<<: ", b"2001-99-99",

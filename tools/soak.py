@@ -155,7 +155,9 @@ def sample(program: Program) -> tuple[float, int, int]:
 
 def growth_mb(memory: NDArray[np.float64]) -> float:
     """Return by how much memory grew, from the second to the last quarter of the samples [MB]."""
-    quarter = max(len(memory) // 4, 1)
+    if len(memory) < 4:
+        return float(memory[-1] - memory[0])
+    quarter = len(memory) // 4
     return float(np.median(memory[-quarter:]) - np.median(memory[quarter : 2 * quarter]))
 
 
