@@ -111,6 +111,23 @@ def test_a_score_is_the_distance_from_the_truth_after_an_alignment(run):
     assert 0.005 < relative < 0.03
 
 
+@pytest.mark.parametrize("answer", ["nothing", "too few", "an exception"])
+def test_a_method_that_fails_is_lost(run, monkeypatch, answer):
+    stamps = odometry_runs.EPOCH + np.arange(10) * 100_000_000
+
+    def method(*_):
+        if answer == "an exception":
+            raise ValueError(answer)
+        if answer == "nothing":
+            return None
+        return Found(stamps, np.tile(np.eye(4), (10, 1, 1)), 1.0)
+
+    monkeypatch.setattr(bench_odometry.methods, "run_method", method)
+    found = bench_odometry.measure(run, "room", "walk", 0, "turn", OURS)
+    assert found["ate_m"] == math.inf
+    assert found["real_time_factor"] == 0.0
+
+
 def test_targets_compare_the_same_runs_only():
     rows = [
         row(ate=0.001),

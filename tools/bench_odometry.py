@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from tools import odometry_methods as methods
 from tools import odometry_pages
 from tools.odometry_plan import Plan, Rows, Task
-from tools.odometry_runs import CUTS, Run, record, truth
+from tools.odometry_runs import CUTS, Run, count, record, truth
 from tools.results import Target, at_least, at_most, publish
 
-SCENES = ("room", "yard", "corridor")
+SCENES = ("room", "yard", "corridor", "box")
 MOTIONS = ("walk", "trot", "drone")
 LOCAL = (methods.OURS, methods.PLAIN, methods.DESKEWED)
 DIVERGED_M = 1.0
 RPE_M = 1.0
-FEWEST = 0.7  # of the poses that a recording has sweeps for
+FEWEST = 0.7  # poses for each sweep: with fewer it is lost
 
 Row = dict[str, Any]
 
@@ -70,7 +70,7 @@ def measure(run: Run, scene: str, motion: str, seed: int, cut: str, name: str) -
     except Exception:  # counts as lost, and must not end the measurement
         traceback.print_exc()
         found = None
-    if found is None or len(found.stamps) < 10:
+    if found is None or len(found.stamps) < FEWEST * count(run, cut):
         lost = float("inf")
         return {**row, "ate_m": lost, "max_m": lost, "rpe_m": lost, "real_time_factor": 0.0}
     ate, largest, relative = score(run, found)

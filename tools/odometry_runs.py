@@ -104,6 +104,11 @@ def sweeps(run: Run, cut: str) -> Iterator[Sweep]:
         yield Sweep(HostNs(start), HostNs(end), points, last - first, 0)
 
 
+def count(run: Run, cut: str) -> int:
+    """Return how many sweeps a recording has."""
+    return len(_bounds(run, cut)[0])
+
+
 def _bounds(run: Run, cut: str) -> tuple[list[int], list[int]]:
     if cut == "turn":
         edges = np.flatnonzero(np.abs(np.diff(run.heads)) > np.pi) + 1
