@@ -26,6 +26,11 @@ _NUMBERS: Final = {code: number for number, code in DATATYPES.items()}
 
 NS: Final = 1_000_000_000
 
+_STAMP_AT: Final = 4  # in a serialised message, after its encapsulation
+_STAMP: Final = struct.Struct("<iI")
+_QUATERNION: Final = struct.Struct("<4d")
+_VECTOR: Final = struct.Struct("<3d")
+
 
 def to_time(stamp: HostNs) -> Time:
     """Return a stamp as a message."""
@@ -96,30 +101,27 @@ class CloudTemplate:
     frame : str
     """
 
-    _HEAD = struct.Struct("<iI")
-
     def __init__(self, layout: np.dtype[np.void], frame: str) -> None:
         message = to_cloud(np.zeros(0, layout), HostNs(0), frame)
         message.width, message.row_step = 0x11111111, 0x22222222
         message.is_dense = True
         data = serialize_message(message)
-        self._layout = layout
-        self._before, rest = _split(data, struct.pack("<I", message.width))
+        before, rest = _split(data, struct.pack("<I", message.width))
         self._between, _ = _split(rest, struct.pack("<I", message.row_step))
+        self._encapsulation, self._before = before[:_STAMP_AT], before[_STAMP_AT + _STAMP.size :]
 
     def serialize(self, points: NDArray[np.void], stamp: HostNs) -> bytes:
         """Return the CDR message of finite points, shape (N,), of this template's layout."""
-        seconds, nanoseconds = divmod(stamp, NS)
         size = points.nbytes
         return b"".join(
             (
-                self._before[:4],
-                self._HEAD.pack(seconds, nanoseconds),
-                self._before[12:],
+                self._encapsulation,
+                _STAMP.pack(*divmod(stamp, NS)),
+                self._before,
                 struct.pack("<I", len(points)),
                 self._between,
                 struct.pack("<II", size, size),
-                points.tobytes(),
+                np.ascontiguousarray(points).view(np.uint8).data,  # copied once, here
                 b"\x01",  # is_dense
             )
         )
@@ -157,12 +159,12 @@ class ImuTemplate:
 
     def serialize(self, sample: ImuSample) -> bytes:
         """Return the CDR message of a sample."""
-        w, x, y, z = sample.orientation_wxyz
+        stamp, (w, x, y, z), rate, acceleration = sample
         data = self._data
-        struct.pack_into("<iI", data, 4, *divmod(sample.stamp, NS))
-        struct.pack_into("<4d", data, self._at[0], x, y, z, w)
-        struct.pack_into("<3d", data, self._at[1], *sample.angular_velocity)
-        struct.pack_into("<3d", data, self._at[2], *sample.linear_acceleration)
+        _STAMP.pack_into(data, _STAMP_AT, *divmod(stamp, NS))
+        _QUATERNION.pack_into(data, self._at[0], x, y, z, w)
+        _VECTOR.pack_into(data, self._at[1], *rate)
+        _VECTOR.pack_into(data, self._at[2], *acceleration)
         return bytes(data)
 
 

@@ -94,28 +94,25 @@ class DriverNode(Node):
 
     def _handle(self, event: Event) -> None:
         try:
-            self._hand_on(event)
+            if isinstance(event, ImuSample):
+                if self._imu_publisher is not None:
+                    self._imu_publisher.publish(self._imu_template.serialize(event))
+            elif isinstance(event, Sweep):
+                points = self._layout.convert(event.points, event.start)
+                self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
+            else:
+                self._report(event)
         except RCLError:
             # A signal ends rclpy while the session still hands out what it holds.
             if self.context.ok():
                 raise
 
-    def _hand_on(self, event: Event) -> None:
-        if isinstance(event, ImuSample):
-            if self._imu_publisher is not None:
-                self._imu_publisher.publish(self._imu_template.serialize(event))
-        elif isinstance(event, Sweep):
-            points = self._layout.convert(event.points, event.start)
-            self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
-        elif isinstance(event, Answer):
+    def _report(self, event: Answer | Silence | ClockEvent | Version | Parameters) -> None:
+        if isinstance(event, Answer):
             self._answered(event)
         elif isinstance(event, Silence):
             self._silent(event)
-        else:
-            self._report(event)
-
-    def _report(self, event: ClockEvent | Version | Parameters) -> None:
-        if isinstance(event, Version):
+        elif isinstance(event, Version):
             self.get_logger().info(
                 f"the device is {event.name}, firmware {event.firmware} ({event.date}), "
                 f"hardware {event.hardware}"
