@@ -57,6 +57,9 @@ class BagFile:
         self._path = path
         # rosbags writes folders: for a single file, what is in one is taken out at the end.
         self._folder = path.with_suffix(".unfinished") if path.suffix == ".mcap" else path
+        if self._folder.exists():
+            left = f"'{self._folder}' is left of one that was killed; remove it if it is of no use"
+            raise FileExistsError(errno.EEXIST, left, str(path))
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
         self.store = get_typestore(Stores.ROS2_JAZZY)

@@ -110,6 +110,8 @@ class BagWriter:
         self._path = path
         self._is_file = path.suffix == ".mcap"
         self._folder = path.with_suffix(".part") if self._is_file else path
+        if self._is_file:  # what a run that was killed left can be made again
+            shutil.rmtree(self._folder, ignore_errors=True)
         self._types = typestore
         self._connections: dict[tuple[str, str], Connection] = {}
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)

@@ -1,4 +1,4 @@
-"""Writes points as PLY or PCD."""
+"""Writes points as PLY or PCD; the file is complete or as it was before."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from l2lidar_node.files import whole
 
 
 def save(path: Path, points: NDArray[np.float64]) -> int:
@@ -19,6 +21,7 @@ def save(path: Path, points: NDArray[np.float64]) -> int:
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points)))
-    if not o3d.io.write_point_cloud(path, cloud):
-        raise OSError(f"{path} could not be written")
+    with whole(path) as part:
+        if not o3d.io.write_point_cloud(part, cloud):
+            raise OSError(f"{path} could not be written")
     return len(points)

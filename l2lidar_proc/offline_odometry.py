@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReaderError
 
+from l2lidar_node.files import whole, write_whole
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import Sweep
@@ -209,8 +210,8 @@ def write(run: OdometryRun, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     names = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
     paths = [folder / name for name in names]
-    paths[0].write_text(tum(run.poses), encoding="utf-8")
-    paths[1].write_text(kitti(run.poses), encoding="utf-8")
+    write_whole(paths[0], tum(run.poses))
+    write_whole(paths[1], kitti(run.poses))
     if len(run.map_points):
         map_file.save(paths[2], run.map_points)
     _plot(run, paths[3])
@@ -231,7 +232,8 @@ def _plot(run: OdometryRun, path: Path) -> None:
         way = np.array([item.pose[:2, 3] for item in run.poses])
         axes.plot(way[:, 0], way[:, 1], lw=1.5)
     FigureCanvasAgg(figure)
-    figure.savefig(path)
+    with whole(path) as part:
+        figure.savefig(part)
 
 
 def _chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:

@@ -26,8 +26,8 @@ FILE_MODULES = {
     "l2lidar_node.emulator.assembly": "reads what the virtual unit was configured to",
     "l2lidar_node.emulator.backlog": "asks the kernel how full the receiver's socket is",
     "l2lidar_node.emulator.results": "writes the truth of a run",
-    "l2lidar_node.emulator.truth": "writes the true trajectory",
     "l2lidar_node.emulator.tum": "reads trajectories",
+    "l2lidar_node.files": "writes files that are complete or as they were before",
     "l2lidar_proc.bag": "reads and writes bags",
 }
 

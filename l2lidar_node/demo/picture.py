@@ -10,6 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from l2lidar_node.files import whole
+
 _WALLS_M: Final = 1.5
 
 
@@ -40,7 +42,8 @@ def save_cloud(points: NDArray[np.void], path: Path, title: str) -> None:
     plan.set_aspect("equal")
     plan.set(xlabel="x [m]", ylabel="y [m]", title="from above")
     figure.colorbar(dots, ax=plan, label="range [m]")
-    figure.savefig(path)
+    with whole(path) as part:
+        figure.savefig(part)
 
 
 def save_comparison(raw: NDArray[np.void], deskewed: NDArray[np.void], path: Path) -> None:
@@ -68,7 +71,8 @@ def save_comparison(raw: NDArray[np.void], deskewed: NDArray[np.void], path: Pat
         plan.scatter(points["x"], points["y"], s=1.5, linewidths=0, **height)
         plan.set_aspect("equal")
         plan.set(xlabel="x [m]", ylabel="y [m]", title=title)
-    figure.savefig(path)
+    with whole(path) as part:
+        figure.savefig(part)
 
 
 def save_track(
@@ -97,4 +101,5 @@ def save_track(
     errors = figure.add_subplot(1, 2, 2)
     errors.plot(1e3 * np.linalg.norm(estimated - true, axis=1), "tab:red")
     errors.set(xlabel="sweep", ylabel="distance from the truth [mm]", ylim=(0, None))
-    figure.savefig(path)
+    with whole(path) as part:
+        figure.savefig(part)

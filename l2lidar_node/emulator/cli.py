@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import signal
@@ -29,10 +30,11 @@ from l2lidar_node.emulator.inertial import ImuNoise
 from l2lidar_node.emulator.options import group, with_options
 from l2lidar_node.emulator.physics import PhysicsConfig
 from l2lidar_node.emulator.port import PortError
-from l2lidar_node.emulator.results import write_ledger, write_whole
+from l2lidar_node.emulator.results import write_ledger
 from l2lidar_node.emulator.returns import RangeNoise
 from l2lidar_node.emulator.server import MAX_SPEED, Server
 from l2lidar_node.emulator.studio import Studio, StudioError
+from l2lidar_node.files import write_whole
 from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import Setting, Value, settings_of, values_of
 
@@ -138,6 +140,8 @@ def emulate(
     config = group(DeviceConfig, settings)
     physics = assembly.seen_from(config, group(PhysicsConfig, settings))
     stored = assembly.stored_settings(flash, config, serial is not None)
+    if truth is not None:
+        _make_folder(truth)  # or a run would end with the truth having nowhere to go
     with ExitStack() as stack:
         port = assembly.opened(stored, config, serial)
         stack.callback(port.close)
@@ -186,6 +190,12 @@ def _keep(path: Path | None, flash: Flash) -> None:
         write_whole(path, flash.to_json().encode())
 
 
+def _make_folder(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
+
+
 def _write_truth(
     folder: Path, device: VirtualL2, studio: Studio | None, values: dict[str, Value]
 ) -> None:
@@ -228,7 +238,11 @@ def main() -> None:
     app.command()(with_options(emulate, _panels()))
     try:
         app(prog_name="l2lidar_emulator", standalone_mode=True)
-    except (PortError, StudioError, OSError) as error:
+    except OSError as error:
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        typer.echo(f"l2lidar_emulator: {text}", err=True)
+        sys.exit(1)
+    except (PortError, StudioError) as error:
         typer.echo(f"l2lidar_emulator: {error}", err=True)
         sys.exit(1)
     except ImportError as error:

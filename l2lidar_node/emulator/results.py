@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -17,6 +16,7 @@ from l2lidar_node.emulator import tum
 from l2lidar_node.emulator.ledger import Fault, FaultEvent, Ledger
 from l2lidar_node.emulator.motion import Motion
 from l2lidar_node.emulator.scanner import Scan
+from l2lidar_node.files import write_whole
 from l2lidar_node.wire import WorkMode
 
 TRUE_POINT: Final = np.dtype([("hit", "<f4", (3,)), ("measured", "<f4", (3,))])
@@ -127,13 +127,6 @@ def write_points(folder: Path, mode: WorkMode, scan: Scan) -> None:
     path = folder / _points_name(mode, scan.first)
     path.parent.mkdir(parents=True, exist_ok=True)
     _write_array(path, points)
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is either complete or as it was before."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(content)
-    os.replace(part, path)
 
 
 def _write_array(path: Path, array: NDArray[np.void]) -> None:

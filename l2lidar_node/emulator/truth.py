@@ -11,6 +11,7 @@ from l2lidar_node.emulator import tum
 from l2lidar_node.emulator.motion import Motion
 from l2lidar_node.emulator.scanner import Scan
 from l2lidar_node.emulator.spline import rotation_matrices
+from l2lidar_node.files import write_whole
 
 
 def undistorted(
@@ -64,4 +65,4 @@ def write_tum(
     origin_ns : int
         Stamp of the motion's time 0 [ns].
     """
-    Path(path).write_text(tum.render(motion.trajectory(t_s, origin_ns)), encoding="utf-8")
+    write_whole(Path(path), tum.render(motion.trajectory(t_s, origin_ns)))

@@ -18,6 +18,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node.files import write_whole
 from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
@@ -239,8 +240,8 @@ class OdometryNode(Node):
             for item in self._pipeline.trajectory
         ]
         try:
-            path.write_text(trajectory.tum(poses), encoding="utf-8")
-            path.with_suffix(".kitti").write_text(trajectory.kitti(poses), encoding="utf-8")
+            write_whole(path, trajectory.tum(poses))
+            write_whole(path.with_suffix(".kitti"), trajectory.kitti(poses))
             response.success = True
             response.message = f"{len(poses)} poses in {path.absolute()} and beside it"
         except OSError as error:

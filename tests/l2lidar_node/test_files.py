@@ -1,0 +1,128 @@
+"""Writers and what they leave where they are ended in the middle."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2lidar_node.bag import BagFile
+from l2lidar_node.emulator import results, truth
+from l2lidar_node.emulator.ledger import Ledger
+from l2lidar_node.emulator.motion import from_tum
+from l2lidar_node.files import whole, write_whole
+from l2lidar_proc import map_file, offline_odometry
+
+ROOT = Path(__file__).parents[2]
+needs_open3d = pytest.mark.skipif(find_spec("open3d") is None, reason="needs open3d")
+POINTS = np.random.default_rng(1).random((200, 3))
+
+
+class PowerCutError(BaseException):
+    """Ends a program at a certain place."""
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_whole(path, "one\n")
+    write_whole(path, b"two\n")
+    assert path.read_bytes() == b"two\n"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fill_the_disk() -> None:
+        with whole(path) as part:
+            part.write_text("ne")
+            raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        fill_the_disk()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_name_to_write_to_tells_the_format(tmp_path: Path) -> None:
+    with whole(tmp_path / "a.ply") as part:
+        assert part.suffix == ".ply"
+        assert part.parent == tmp_path
+        part.touch()
+
+
+def _way(folder: Path) -> None:
+    run = offline_odometry.OdometryRun([], POINTS, 0, Counter(), Counter())
+    offline_odometry.write(run, folder)
+
+
+def _a_way(folder: Path) -> Path:
+    path = folder.parent / "way.tum"
+    path.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 1 1 0 0 0 0 1\n")
+    return path
+
+
+WRITERS = [
+    pytest.param(lambda folder: map_file.save(folder / "m.ply", POINTS), marks=needs_open3d),
+    pytest.param(lambda folder: map_file.save(folder / "m.pcd", POINTS), marks=needs_open3d),
+    pytest.param(_way, marks=needs_open3d),
+    lambda folder: truth.write_tum(
+        folder / "t.tum", from_tum(_a_way(folder)), np.linspace(0.0, 1.0, 5)
+    ),
+    lambda folder: results.write_ledger(folder, Ledger(), {}),
+]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_a_writer_that_is_ended_in_the_middle_leaves_the_old_file(
+    write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is not put in its place at the end was not written to that place either."""
+    write(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert before
+    for path in before:
+        path.write_bytes(b"old")
+
+    def cut(*_: object) -> None:
+        raise PowerCutError
+
+    monkeypatch.setattr("l2lidar_node.files.os.replace", cut)
+    with pytest.raises(PowerCutError):
+        write(tmp_path)
+    assert {path.read_bytes() for path in before} == {b"old"}
+
+
+@needs_open3d
+def test_a_map_is_whole_whenever_its_writer_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    code = (
+        "import sys, numpy as np; from pathlib import Path; from l2lidar_proc import map_file\n"
+        "points = np.random.default_rng(1).random((100_000, 3))\n"
+        "while True: map_file.save(Path(sys.argv[1]), points); print('.', flush=True)"
+    )
+    sizes = set()
+    for times in (1, 2, 3):
+        with subprocess.Popen(
+            [sys.executable, "-c", code, str(path)], cwd=ROOT, stdout=subprocess.PIPE
+        ) as process:
+            assert process.stdout is not None
+            for _ in range(times):
+                process.stdout.readline()
+            process.send_signal(signal.SIGKILL)
+        sizes.add(path.stat().st_size)
+    assert len(sizes) == 1
+
+
+def test_what_a_killed_recording_left_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run.unfinished").mkdir()
+    with pytest.raises(FileExistsError, match=r"run\.unfinished.*killed"):
+        BagFile(tmp_path / "run.mcap")
