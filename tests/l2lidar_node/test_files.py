@@ -66,7 +66,7 @@ def _way(folder: Path) -> None:
 
 def _a_way(folder: Path) -> Path:
     path = folder.parent / "way.tum"
-    path.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 1 1 0 0 0 0 1\n")
+    path.write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 1 1 0 0 0 0 1\n3 0 1 0 0 0 0 1\n")
     return path
 
 
