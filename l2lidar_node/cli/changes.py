@@ -41,7 +41,7 @@ class UsageError(ValueError):
     """A value that no unit can have; the message says which and why."""
 
 
-@app.command("work-mode")
+@app.command("work-mode", context_settings={"ignore_unknown_options": True})  # -imu_off is none
 @with_network
 def work_mode(
     network: NetworkConfig,
@@ -56,8 +56,7 @@ def work_mode(
 ) -> None:
     """Store a work mode. Field of view and IMU act at once, the rest after a restart.
 
-    Interrupted after the command has gone out, it stores the old mode again. Write changes that
-    begin with a minus after two dashes: l2lidar set work-mode -- -imu_off
+    Interrupted after the command has gone out, it stores the old mode again.
     """
     with Device(network) as device:
         before = device.read_parameters().work_mode

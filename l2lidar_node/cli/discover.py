@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import socket
 import time
 from collections import Counter
@@ -56,6 +57,17 @@ class Speaker:
                 self.work_mode = packet.work_mode
 
 
+def _addresses(given: list[str] | None) -> list[str] | None:
+    for text in given or []:
+        try:
+            ipaddress.IPv4Address(text)
+        except ipaddress.AddressValueError:
+            raise typer.BadParameter(
+                f"'{text}' is not an IPv4 address, expected one such as {wire.LIDAR_IP}"
+            ) from None
+    return given
+
+
 def discover(
     host_port: Annotated[
         int, typer.Option(min=1, max=65535, help="Port that units send to.")
@@ -65,7 +77,9 @@ def discover(
     ] = wire.LIDAR_PORT,
     probe: Annotated[
         list[str] | None,
-        typer.Option(metavar="ADDRESS", help=f"Also ask here, besides {wire.LIDAR_IP}."),
+        typer.Option(
+            metavar="ADDRESS", callback=_addresses, help=f"Also ask here, besides {wire.LIDAR_IP}."
+        ),
     ] = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=600.0, help="Seconds to listen.")] = 3.0,
     json_: JsonOption = False,

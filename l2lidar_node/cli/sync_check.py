@@ -17,7 +17,7 @@ from l2lidar_node.cli.options import JsonOption, with_network
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.clock.envelope import supporting_line
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver import Event
+from l2lidar_node.driver import Driver, Event
 from l2lidar_node.framing import Frame, Framer
 from l2lidar_node.packets import ImuPacket, PointPacket, decode
 from l2lidar_node.types import HostNs, Stream
@@ -71,7 +71,7 @@ def sync_check(
             happened[event.kind.value] += 1
 
     with Device(network, count, collector, enable_latency_measure=True) as device:
-        if device.wait_for(lambda driver: driver.counters.samples > 0, _HEAR_S) is None:
+        if device.wait_for(_is_measuring, _HEAR_S) is None:
             raise DeviceError(f"no measurements come from the L2; {device.advice()}")
         steps = range(round(duration * 10))
         for _ in steps if json_ else track(steps, "measuring", console=out, transient=True):
@@ -103,6 +103,11 @@ def sync_check(
         _show(result)
     if not status.locked:
         raise DeviceError("the arrivals are too irregular, or the clock is: no line fits them")
+
+
+def _is_measuring(driver: Driver) -> bool:
+    """Tell whether a stream has stamps: with the IMU off or in 2D mode there is only one."""
+    return driver.counters.samples > 0 or driver.last_points is not None
 
 
 def judged(seen: list[tuple[int, int]], ratio: float) -> dict[str, float]:

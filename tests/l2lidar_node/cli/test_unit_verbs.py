@@ -98,6 +98,7 @@ def test_silence_is_explained(run: Run, impatient: None) -> None:
         ["set", "mac"],
         ["sync-check", "--duration", "0"],
         ["replay", "no/such/file.pcap"],
+        ["discover", "--probe", "lidar", "--timeout", "0.1"],
     ],
     ids=" ".join,
 )
@@ -105,6 +106,11 @@ def test_wrong_usage_is_exit_code_2(run: Run, arguments: list[str]) -> None:
     outcome = run(*arguments)
     assert outcome.code == 2
     assert outcome.err
+
+
+def test_an_address_to_ask_that_is_none_is_named(run: Run) -> None:
+    outcome = run("discover", "--probe", "lidar", "--timeout", "0.1")
+    assert "'lidar' is not an IPv4 address" in " ".join(outcome.err.replace("│", " ").split())
 
 
 @pytest.mark.parametrize(
@@ -280,6 +286,13 @@ def test_work_mode_is_shown_asked_for_stored_and_read_back(run: Run, unit: Unit)
     assert "nothing to change" in outcome.out
     assert "restart" in run("set", "work-mode", "+mode_2d", *unit.options, "--yes").out
     assert unit.flash.work_mode == 6
+
+
+def test_a_change_may_begin_with_a_minus(run: Run, make_unit) -> None:
+    unit = make_unit(mode=int(WorkMode.IMU_OFF))
+    outcome = run("set", "work-mode", "-imu_off", *unit.options, "--yes")
+    assert outcome.code == 0, outcome.err
+    assert unit.flash.work_mode == 0
 
 
 @pytest.mark.parametrize("answer", ["", "n", "no"])
@@ -472,6 +485,13 @@ def test_a_unit_that_does_not_acknowledge_is_exit_code_1(run: Run, make_unit) ->
     outcome = run("set", "work-mode", "4", *unit.options, "--yes")
     assert outcome.code == 1
     assert unit.flash.work_mode == 0
+
+
+def test_sync_check_measures_a_unit_without_imu(run: Run, make_unit) -> None:
+    unit = make_unit(mode=int(WorkMode.IMU_OFF))
+    outcome = run("sync-check", *unit.options, "--duration", "2", "--json")
+    assert outcome.code == 0, outcome.err
+    assert list(json.loads(outcome.out)["streams"]) == ["points"]
 
 
 def test_sync_check_measures_the_clock_and_leaves_it_alone(run: Run, unit: Unit) -> None:
