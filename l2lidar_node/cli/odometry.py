@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from l2lidar_proc.offline_odometry import OdometryRun
 
 _CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
+_CAPTURES: Final = (".pcap", ".pcapng", ".cap")
 _STEP: Final = 1000  # entries between two looks at the progress
 
 
@@ -67,7 +68,7 @@ def odometry(
             def progress(share: float) -> None:
                 bar.update(task, completed=share)
 
-            if source.is_file() and is_capture(_start_of(source)):
+            if _is_capture(source):
                 with source.open("rb") as stream:
                     recording = Recording(stream, l2_ip)
                     taken = _events(recording, source.stat().st_size, progress)
@@ -76,14 +77,21 @@ def odometry(
                 run = offline_odometry.run_bag(source, config, progress)
             progress(1.0)
         files = offline_odometry.write(run, folder)
-    except (CaptureError, offline_odometry.RecordingError, OSError) as error:
+    except offline_odometry.RecordingError as error:
+        raise DeviceError(str(error)) from None
+    except CaptureError as error:
         raise DeviceError(f"{source}: {error}") from None
+    except OSError as error:
+        raise DeviceError(f"{error.filename or source}: {error.strerror}") from None
     _say(run, files)
 
 
-def _start_of(path: Path) -> bytes:
+def _is_capture(path: Path) -> bool:
+    """Tell whether a file is a capture, or is called one: then what it lacks is said."""
+    if not path.is_file():
+        return False
     with path.open("rb") as stream:
-        return stream.read(4)
+        return is_capture(stream.read(4)) or path.suffix in _CAPTURES
 
 
 def _events(recording: Recording, size: int, progress: Any) -> Iterator[tuple[int, Any]]:

@@ -280,7 +280,12 @@ def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
     outcome = run("odometry", str(tmp_path / "a.mcap"), str(tmp_path / "out"))
     assert outcome.code == 1
     assert "a.mcap" in outcome.err
+    assert outcome.err.count("a.mcap") == 1
     assert run("odometry", str(tmp_path / "no such")).code == 2
+    (tmp_path / "a.pcap").write_bytes(b"")
+    outcome = run("odometry", str(tmp_path / "a.pcap"), str(tmp_path / "out"))
+    assert outcome.code == 1
+    assert "a.pcap: this is no capture file" in outcome.err
     (tmp_path / "a.yaml").write_text("odometry_node: {ros__parameters: {mode: best}}")
     outcome = run("odometry", str(tmp_path / "a.mcap"), "--params-file", str(tmp_path / "a.yaml"))
     assert outcome.code == 2
