@@ -51,7 +51,7 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("sweep_cut:=circle", ("sweep_cut", "circle", "half_turn")),
         ("calRangeScale:=.nan", ("calRangeScale", "finite")),
         ("cloud_frame:=/abs", ("cloud_frame", "/abs")),
-        ("point_cloud_topic_id:=/a//b", ("/a//b",)),
+        ("point_cloud_topic_id:=/a//b", ("point_cloud_topic_id", "/a//b")),
     ],
 )
 def test_a_wrong_parameter_ends_the_start_with_one_message(
