@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +22,7 @@ from l2lidar_node.ros.conversions import from_cloud, from_time
 _ODOMETRY: Final = "world"
 _SENSOR: Final = f"{_ODOMETRY}/sensor"
 _MAX_RANGE_M: Final = 10.0  # end of the colour scale
+_DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _LEVELS: Final = {0: "INFO", 1: "WARN", 2: "ERROR", 3: "ERROR"}
 
 
@@ -147,11 +150,20 @@ def open_viewer(web: bool, save: Path | None) -> Any:
         address = rerun.serve_grpc(default_blueprint=layout)
         rerun.serve_web_viewer(connect_to=address, open_browser=False)
     else:
-        try:
-            rerun.spawn(default_blueprint=layout)
-        except RuntimeError as error:
-            raise ViewerError(f"cannot open a window ({error}); try --web") from None
+        _open_window(rerun, layout)
     return rerun
+
+
+def _open_window(rerun: Any, layout: Any) -> None:
+    if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)):
+        raise ViewerError("there is no display to open a window on; try --web or --save")
+    # Its program stands beside Python's, in a virtual environment that need not be activated.
+    folders = [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
+    os.environ["PATH"] = os.pathsep.join(folders)
+    try:
+        rerun.spawn(default_blueprint=layout)
+    except RuntimeError as error:
+        raise ViewerError(f"cannot open a window ({error}); try --web or --save") from None
 
 
 def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
