@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Final
 
@@ -42,7 +43,7 @@ def stored_settings(path: Path | None, config: DeviceConfig, serial: bool) -> Fl
     Raises
     ------
     FlashError
-        If the file is none that the emulator wrote.
+        If the file is none that the emulator wrote, or its folder cannot be written to.
     SettingError
         If an address or a version is not one.
     """
@@ -50,8 +51,12 @@ def stored_settings(path: Path | None, config: DeviceConfig, serial: bool) -> Fl
     if path is not None and path.exists():
         try:
             return Flash.from_json(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise FlashError(f"{path}: {error.strerror}") from None
+        except ValueError as error:
             raise FlashError(f"{path}: {error}") from None
+    if path is not None and not os.access(path.parent, os.W_OK):
+        raise FlashError(f"{path}: there is no folder '{path.parent}' that can be written to")
     flash = Flash.factory(config.addresses, config.identity)
     mode = flash.work_mode | (WorkMode.SERIAL if serial else 0)
     return dataclasses.replace(flash, work_mode=int(mode))

@@ -165,7 +165,7 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | f
     import open3d as o3d
 
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
+        raise ValueError(f"{path}: {'is no file' if path.exists() else 'there is no such file'}")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
             mesh = o3d.io.read_triangle_mesh(path)

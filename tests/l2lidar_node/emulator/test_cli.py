@@ -165,6 +165,9 @@ def test_a_killed_measuring_process_is_one_message(host):
         pytest.param(["--motion", "no/path.tum"], ["no/path.tum"], marks=needs_rays),
         (["--mount", "sideways"], ["'--mount'", "upside_down"]),
         (["--flash", "pyproject.toml"], ["pyproject.toml", "stored settings"]),
+        (["--flash", "tests"], ["tests: Is a directory"]),
+        (["--flash", "no/folder/flash.json"], ["flash.json", "no folder 'no/folder'"]),
+        pytest.param(["--world", "tests"], ["tests: is no file"], marks=needs_rays),
         (["--worlds", "room"], ["--worlds"]),
     ],
 )
@@ -204,10 +207,10 @@ def test_a_port_in_use_is_one_message(host):
 
 def test_a_folder_that_cannot_be_written_is_one_message(tmp_path):
     (tmp_path / "file").write_text("")
-    code, _, err = run(*QUICK, "--duration", "0.1", "--truth", str(tmp_path / "file" / "truth"))
-    assert code == 1
+    code, out, err = run(*QUICK, "--duration", "9", "--truth", str(tmp_path / "file" / "truth"))
+    assert (code, out) == (1, "")  # before it runs: afterwards the truth would be lost
     assert len(err.splitlines()) == 1
-    assert "truth" in err
+    assert "truth: Not a directory" in err
 
 
 def test_help_shows_every_setting_once():
