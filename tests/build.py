@@ -338,16 +338,29 @@ def sweeps(
 
 
 def digest(points: NDArray[np.void]) -> dict[str, str | int]:
-    """Return a hash of every field, of values rounded to what is the same on every machine.
+    """Return two hashes of every field: of its values rounded, and of its bits.
 
-    Lengths are rounded to 10 um, times to 10 ns, intensities are whole.
+    Lengths are rounded to 10 um, times to 10 ns, intensities are whole. Points are computed with
+    64 bits and have 32, so that the bits are the same on other machines, too, but for one value in
+    a hundred million.
     """
     unit = {"time": 1e-8, "intensity": 1.0}
     result: dict[str, str | int] = {"points": len(points)}
     for name in points.dtype.names or ():
         rounded = np.round(points[name].astype(np.float64) / unit.get(name, 1e-5)).astype("<i8")
         result[name] = hashlib.sha256(rounded.tobytes()).hexdigest()[:16]
+        result[f"{name}: bits"] = hashlib.sha256(points[name].tobytes()).hexdigest()[:16]
     return result
+
+
+def differences(
+    before: Sequence[Mapping[str, str | int]], after: Sequence[Mapping[str, str | int]]
+) -> list[str]:
+    """Return what differs between the digests of sweeps, by number and name of the field."""
+    found = [] if len(before) == len(after) else [f"{len(before)} sweeps are {len(after)} now"]
+    for number, (old, new) in enumerate(zip(before, after, strict=False)):
+        found += [f"sweep {number}: {name}" for name in old if old[name] != new.get(name)]
+    return found
 
 
 DIGESTED: dict[str, tuple[Mapping[str, float], Mapping[str, object]]] = {
