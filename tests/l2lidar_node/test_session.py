@@ -161,14 +161,31 @@ def test_a_device_that_answers_nothing_is_asked_again_and_given_up(running):
     assert answer.text == "start rotation: the device did not acknowledge it"
 
 
-def test_what_others_send_is_not_heard(running):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreigner:
-        foreigner.bind(("127.0.0.9", 0))
-        foreigner.sendto(build.frame(wire.PacketType.IMU, build.imu(500)), running.address)
+def test_others_cannot_inject_samples_points_or_answers(running):
+    """Everything is right about their packets but where they come from."""
+    ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(
+        PATIENCE_S
+    )
+    packet_type = running.received(commands.start())
+    fakes = [
+        build.frame(wire.PacketType.IMU, build.imu(500)),
+        *build.frames_3d(build.points_3d(seq, seq * 2_000_000) for seq in range(30)),
+        build.frame(wire.PacketType.ACK, build.ack(packet_type, 2, 0)),
+        build.frame(wire.PacketType.VERSION, build.version()),
+    ]
+    for address in ("127.0.0.9", HOST):  # another machine's, and another program's on this host
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreigner:
+            foreigner.bind((address, 0))
+            for fake in fakes:
+                foreigner.sendto(fake, running.address)
     running.send(build.frame(wire.PacketType.IMU, build.imu(0, acceleration=(1.0, 2.0, 3.0))))
     (sample,) = running.wait_for(ImuSample)
     assert sample.linear_acceleration == (1.0, 2.0, 3.0)
-    assert running.transport.foreign == 1
+    assert running.transport.foreign == 2 * len(fakes)
+    assert running.rest() == []
+    running.send(build.frame(wire.PacketType.ACK, build.ack(packet_type, 2, 0)))
+    (answer,) = running.wait_for(Answer)
+    assert (answer.ticket, answer.ok) == (ticket, True)
 
 
 def test_silence_comes_by_itself(device):
