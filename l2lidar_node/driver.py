@@ -37,6 +37,8 @@ from l2lidar_node.watchdog import DeviceState, Watchdog
 
 QUERY_NS: Final = 1_000_000_000  # interval of version, parameter and latency requests
 _ROUND_TRIPS: Final = 60  # the last minute's
+# Looking up a member of an Enum takes long.
+_IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +105,13 @@ class Driver:
         counters = self.counters
         counters.datagrams += 1
         counters.octets += len(data)
-        events = self.settle(arrival) if self.is_overdue(arrival) else []
+        events = [] if self._intake.is_flowing(arrival) else self.settle(arrival)
         for item in self._framer.feed(data):
             if isinstance(item, FrameError):
                 counters.faults[item.fault.value] += 1
                 counters.skipped_octets += item.skipped
                 continue
-            is_known = item.packet_type in wire.FRAME_SIZES
-            counters.frames[item.packet_type if is_known else 0] += 1
+            counters.frames[item.packet_type if item.packet_type in wire.FRAME_SIZES else 0] += 1
             events += self._handle(decode(item), arrival)
         return events + self._clock.events()
 
@@ -225,18 +226,18 @@ class Driver:
 
     def _handle(self, packet: Packet, arrival: HostNs) -> list[Event]:
         if isinstance(packet, ImuPacket):
-            self._watchdog.heard(Stream.IMU, arrival)
-            if self._intake.follows(Stream.IMU, packet, arrival):
+            self._watchdog.heard(_IMU, arrival)
+            if self._intake.follows(_IMU, packet, arrival):
                 return self._imu(packet, arrival)
-            return self._reordered(Stream.IMU, packet, arrival)
+            return self._reordered(_IMU, packet, arrival)
         if isinstance(packet, PointPacket):
-            self._watchdog.heard(Stream.POINTS, arrival)
-            if (packet.packet_type == wire.PacketType.POINTS_3D) != self._config.sweep.frame3d:
+            self._watchdog.heard(_POINTS, arrival)
+            if (packet.packet_type == _POINTS_3D) != self._config.sweep.frame3d:
                 self.counters.ignored_points += 1
                 return []
-            if self._intake.follows(Stream.POINTS, packet, arrival):
+            if self._intake.follows(_POINTS, packet, arrival):
                 return self._points(packet, arrival)
-            return self._reordered(Stream.POINTS, packet, arrival)
+            return self._reordered(_POINTS, packet, arrival)
         if isinstance(packet, Ack):
             return self._acknowledged(packet, arrival)
         if isinstance(packet, Version):
@@ -268,9 +269,9 @@ class Driver:
         return events
 
     def _imu(self, packet: ImuPacket, arrival: HostNs) -> list[Event]:
-        stamp = self._clock.observe(Stream.IMU, packet.seq, packet.stamp, arrival)
+        stamp = self._clock.observe(_IMU, packet.seq, packet.stamp, arrival)
         if stamp is None:
-            self.counters.unlocked[Stream.IMU] += 1
+            self.counters.unlocked[_IMU] += 1
             return []
         sample = ImuSample(stamp, *packet[2:])
         self.counters.samples += 1
@@ -280,11 +281,9 @@ class Driver:
         return [sample]
 
     def _points(self, packet: PointPacket, arrival: HostNs, missing: int = 0) -> list[Event]:
-        start = self._clock.observe(
-            Stream.POINTS, packet.seq, packet.stamp, arrival, packet.duration_ns
-        )
+        start = self._clock.observe(_POINTS, packet.seq, packet.stamp, arrival, packet.duration_ns)
         if start is None:
-            self.counters.unlocked[Stream.POINTS] += 1
+            self.counters.unlocked[_POINTS] += 1
             return []
         self.last_points = packet.payload
         events: list[Event] = []
@@ -319,8 +318,7 @@ class Driver:
         return [answer]
 
     def _has_stalled(self, until: HostNs) -> bool:
-        silence_ns = self._intake.silence_ns(Stream.POINTS, until)
-        return silence_ns > MAX_GAP_NS and self._assembler.is_collecting
+        return self._assembler.is_collecting and self._intake.pause_ns(until) > MAX_GAP_NS
 
     def _send_due(self, now: HostNs) -> list[Event]:
         due: list[Command] = []

@@ -14,6 +14,7 @@ split at any byte, damaged, or have garbage between them. The rules:
 
 from __future__ import annotations
 
+import struct
 import zlib
 from dataclasses import dataclass
 from enum import Enum
@@ -26,6 +27,10 @@ _TAIL_SIZE: Final = wire.TAIL.size
 _ELASTIC: Final = frozenset({int(wire.PacketType.PARAMETERS)})
 """Known types whose size differs between firmware versions."""
 _MAX_MISSES: Final = 8
+_WHOLE: Final = {
+    size: struct.Struct(f"<4sII{size - wire.OVERHEAD}sI6x2s") for size in wire.FRAME_SIZES.values()
+}
+"""A whole frame by its size: magic, packet type, size, payload, crc, end mark."""
 
 
 class Fault(Enum):
@@ -98,15 +103,17 @@ class Framer:
 
 def _whole(data: bytes) -> Frame | None:
     """Return the frame that a datagram is, as nearly all are; None if it is anything else."""
-    size = len(data)
-    if size < wire.OVERHEAD:
+    layout = _WHOLE.get(len(data))
+    if layout is None:
         return None
-    magic, packet_type, stated = wire.HEADER.unpack_from(data)
-    if stated != size or magic != wire.MAGIC or wire.FRAME_SIZES.get(packet_type) != size:
-        return None
-    payload = data[_HEADER_SIZE:-_TAIL_SIZE]
-    crc, _, _, end = wire.TAIL.unpack_from(data, size - _TAIL_SIZE)
-    if crc != zlib.crc32(payload) or end != wire.TAIL_END:
+    magic, packet_type, size, payload, crc, end = layout.unpack(data)
+    if (
+        magic != wire.MAGIC
+        or size != len(data)
+        or size != wire.FRAME_SIZES.get(packet_type)
+        or end != wire.TAIL_END
+        or crc != zlib.crc32(payload)
+    ):
         return None
     return Frame(packet_type, payload)
 

@@ -47,7 +47,9 @@ class Intake:
     """
 
     def __init__(self, window: int) -> None:
-        self._lanes = {stream: _Lane(SequenceOrder(window)) for stream in Stream}
+        self._points = _Lane(SequenceOrder(window))
+        self._imu = _Lane(SequenceOrder(window))
+        self._lanes = {Stream.POINTS: self._points, Stream.IMU: self._imu}
 
     @property
     def counts(self) -> dict[Stream, SequenceCounts]:
@@ -120,12 +122,17 @@ class Intake:
             return order.resume(packet.seq, timed)
         return order.push(packet.seq, timed)
 
+    def is_flowing(self, until: HostNs) -> bool:
+        """Tell whether points came a moment ago and nothing waits: so nothing can be overdue."""
+        return (
+            until - self._points.arrival <= REORDER_NS
+            and not self._points.order.waiting
+            and not self._imu.order.waiting
+        )
+
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would release anything."""
-        for lane in self._lanes.values():
-            if lane.order.waiting and _overdue(lane.order, until):
-                return True  # written out: every packet asks
-        return False
+        return any(_overdue(lane.order, until) for lane in self._lanes.values())
 
     def settle(self, until: HostNs) -> Released:
         """Return what has waited for :data:`REORDER_NS`, nothing more having arrived by then."""
@@ -135,10 +142,9 @@ class Intake:
                 released += lane.order.give_up()
         return released
 
-    def silence_ns(self, stream: Stream, until: HostNs) -> int:
-        """Return how long nothing of a stream arrived; 0 before there was anything."""
-        lane = self._lanes[stream]
-        return 0 if lane.newest is None else until - lane.arrival
+    def pause_ns(self, until: HostNs) -> int:
+        """Return how long no points arrived; 0 before there were any."""
+        return 0 if self._points.newest is None else until - self._points.arrival
 
     def flush(self) -> Released:
         """Return everything that waits."""

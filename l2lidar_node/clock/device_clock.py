@@ -92,6 +92,9 @@ class _Mode(Enum):
     SYSTEM = "system"
 
 
+_ESTIMATED, _SYSTEM = _Mode.ESTIMATED, _Mode.SYSTEM  # to look up a member of an Enum takes long
+
+
 class DeviceClock:
     """The device's clock as seen from the host.
 
@@ -180,7 +183,7 @@ class DeviceClock:
             if u >= host.due:
                 self._update(u, stamp, arrival)
         mode = self._mode
-        if mode is _Mode.ESTIMATED:
+        if mode is _ESTIMATED:
             if u is not None and host.ready:
                 result = host.at(u)
                 if result > left:
@@ -190,7 +193,7 @@ class DeviceClock:
             else:
                 self._unlocked += 1
                 return None
-        elif mode is _Mode.SYSTEM:
+        elif mode is _SYSTEM:
             result = max(arrival, self._last[stream] + 1)
         else:
             if not (self._schedule.in_force or self._config.publish_unlocked):
@@ -246,9 +249,9 @@ class DeviceClock:
 
     @property
     def _locked(self) -> bool:
-        if self._mode is _Mode.ESTIMATED:
+        if self._mode is _ESTIMATED:
             return self._host.ready
-        return self._mode is _Mode.SYSTEM or self._schedule.in_force
+        return self._mode is _SYSTEM or self._schedule.in_force
 
     def _update(self, u: int, stamp: int, arrival: int) -> None:
         """Do what need not be done for every packet."""

@@ -32,6 +32,7 @@ _BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that
 _BOOT_SEQ: Final = 16  # so can sequence numbers
 _KEEP: Final = 64  # packets, and epochs, that may still be on their way
 _SYNCS: Final = 128
+_IMU: Final = Stream.IMU  # to look up a member of an Enum takes long
 
 
 class Step(Enum):
@@ -140,7 +141,7 @@ class DeviceLine:
 
         Never raises, whatever the arguments; see :meth:`DeviceClock.observe`.
         """
-        track = self._imu if stream is Stream.IMU else self._points
+        track = self._imu if stream is _IMU else self._points
         epoch = track.epoch
         if epoch is None:
             return self._join(track, seq, stamp, arrival)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from l2lidar_node.framing import Frame
 from l2lidar_node.intake import REORDER_NS, Intake, Released
-from l2lidar_node.packets import ImuPacket, decode
-from l2lidar_node.types import HostNs, Stream
+from l2lidar_node.packets import ImuPacket, PointPacket, decode
+from l2lidar_node.types import DeviceNs, HostNs, Stream
 from l2lidar_node.wire import PacketType
 from tests import build
 
@@ -32,9 +34,11 @@ class Arriving:
         assert isinstance(packet, ImuPacket)
         return packet
 
-    def take(self, packet: ImuPacket) -> list[int]:
+    def take(self, packet: ImuPacket, by_the_long_way: bool = False) -> list[int]:
         """Return the numbers a packet releases."""
         self.now += PERIOD
+        if not by_the_long_way and self.intake.follows(IMU, packet, HostNs(self.now)):
+            return [packet.seq]
         released: Released = []
         if self.intake.begins_anew(IMU, packet, HostNs(self.now)):
             self.restarts += 1
@@ -50,6 +54,12 @@ class Arriving:
         return self.intake.counts[IMU]
 
 
+def points(seq: int) -> PointPacket:
+    packet = decode(Frame(PacketType.POINTS_3D, build.points_3d(seq, 1)))
+    assert isinstance(packet, PointPacket)
+    return packet
+
+
 def test_packets_keep_their_own_arrival():
     arriving = Arriving()
     arriving.run(0)
@@ -63,9 +73,9 @@ def test_packets_keep_their_own_arrival():
 def test_streams_do_not_disturb_each_other():
     arriving = Arriving()
     assert arriving.run(7) == [7]
-    points = decode(Frame(PacketType.POINTS_3D, build.points_3d(500, 1)))
-    assert not arriving.intake.begins_anew(Stream.POINTS, points, HostNs(arriving.now))
-    assert len(arriving.intake.push(Stream.POINTS, points, HostNs(arriving.now))) == 1
+    other = points(500)
+    assert not arriving.intake.begins_anew(Stream.POINTS, other, HostNs(arriving.now))
+    assert len(arriving.intake.push(Stream.POINTS, other, HostNs(arriving.now))) == 1
     assert arriving.run(8) == [8]
 
 
@@ -83,12 +93,51 @@ def test_what_waits_is_overdue_after_so_long():
     assert not arriving.intake.is_overdue(HostNs(second + S))
 
 
-def test_silence_is_measured_by_stream():
+def test_a_pause_is_one_of_the_points():
     arriving = Arriving()
-    assert arriving.intake.silence_ns(IMU, HostNs(arriving.now)) == 0
     arriving.run(0)
-    assert arriving.intake.silence_ns(IMU, HostNs(arriving.now + 5)) == 5
-    assert arriving.intake.silence_ns(Stream.POINTS, HostNs(arriving.now + 5)) == 0
+    assert arriving.intake.pause_ns(HostNs(arriving.now + 5)) == 0
+    arriving.intake.push(Stream.POINTS, points(500), HostNs(arriving.now + 2))
+    arriving.run(1)
+    assert arriving.intake.pause_ns(HostNs(arriving.now + 5)) == 3 + PERIOD
+
+
+def test_nothing_can_be_overdue_while_it_flows():
+    arriving = Arriving()
+    intake = arriving.intake
+    assert not intake.is_flowing(HostNs(arriving.now))
+    intake.push(Stream.POINTS, points(500), HostNs(arriving.now))
+    arriving.run(0, 1)
+    assert intake.is_flowing(HostNs(arriving.now))
+    assert not intake.is_flowing(HostNs(arriving.now + REORDER_NS))
+    arriving.run(3)
+    assert not intake.is_flowing(HostNs(arriving.now))
+    arriving.run(2)
+    assert intake.is_flowing(HostNs(arriving.now))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([1] * 12 + [0, 0, 2, 3, -1, -2, -40, 5, 1000]),
+            st.sampled_from([1] * 8 + [0, 2, -3, 600, -600]),
+            st.sampled_from([PERIOD] * 9 + [0, -PERIOD, 2 * REORDER_NS, 2 * S]),
+        ),
+        max_size=60,
+    )
+)
+def test_the_short_way_is_the_long_way(steps):
+    """What follows the packet before it is handled as if it had gone through everything."""
+    short, long = Arriving(), Arriving()
+    seq, stamp = 1000, 10 * S
+    for ahead, passed, gap in steps:
+        seq, stamp = max(seq + ahead, 0), max(stamp + passed * PERIOD, 0)
+        packet = short.packet(0)._replace(seq=seq % 1025, stamp=DeviceNs(stamp))
+        for arriving in (short, long):
+            arriving.now += gap - PERIOD
+        assert short.take(packet) == long.take(packet, by_the_long_way=True)
+    assert short.counts == long.counts
+    assert short.restarts == long.restarts
 
 
 @pytest.mark.parametrize("last", [5, 500, 1024])
