@@ -14,10 +14,11 @@ from typing import Any
 def main() -> None:
     """Fuzz until the fuzzer's options say that it is enough."""
     atheris: Any = importlib.import_module("atheris")  # not there unless asked for
-    with atheris.instrument_imports(include=["l2lidar_node"], enable_loader_override=False):
+    packages = ["l2lidar_node", "l2lidar_proc"]
+    with atheris.instrument_imports(include=packages, enable_loader_override=False):
         from tools.fuzz_targets import TARGETS
 
-    check: Any = TARGETS[sys.argv[1]].make()
+        check: Any = TARGETS[sys.argv[1]].make()  # it may import what it checks
     atheris.Setup([sys.argv[0], *sys.argv[2:]], check)
     atheris.Fuzz()
 
