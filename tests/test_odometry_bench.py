@@ -76,6 +76,8 @@ def test_rows_outlive_a_run_that_is_cut(tmp_path):
     some = [row(), row("ct_icp", math.inf)]
     for item in some:
         rows.append(item)
+    some[0] = row(ate=0.002)
+    rows.append(some[0])
     with rows.path.open("a") as file:
         file.write('{"scene": "ro')
     assert rows.read() == some

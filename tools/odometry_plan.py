@@ -137,8 +137,8 @@ class Rows:
         )
 
     def read(self) -> list[Row]:
-        """Return the rows; a line that was cut off while it was written does not count."""
-        return list(self._rows())
+        """Return the rows, the last of each run; a line that was cut off does not count."""
+        return list({tuple(row[name] for name in KEY): row for row in self._rows()}.values())
 
     def _rows(self) -> Iterator[Row]:
         if not self.path.exists():
