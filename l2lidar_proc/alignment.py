@@ -7,6 +7,7 @@ linearly in dt: so a sweep corrects the motion within itself as well as its plac
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,9 @@ F64 = NDArray[np.float64]
 
 _FIRST_REACH_M = 0.5  # farthest point from its plane in the first step; each step halves it
 _LAST_REACH_SCALES = 3.0  # down to this many outlier scales
+WEAK = 0.01  # share of points below which a direction counts as hardly observed
+_TILTED = 4  # one in so many matches stands for what is taken off for uncertain normals
+_SCATTER_SHARED = 3.0  # neighbours in a cell that is not flat err together
 _DONE = 2e-4  # a step below this, in radians and metres, is the last
 _FAR_NOISE = 0.00056  # range noise grows as this times range^1.25, measured on a real unit
 
@@ -114,28 +118,55 @@ def align(
         error = state.minus(prior)
         points = _redone(source, error, prior.rotation)
         places = points @ state.rotation.T + state.position
-        found = surfaces.match(places)
+        found = surfaces.match(places, narrow=True)
         reach = max(_FIRST_REACH_M * 0.5**step, _LAST_REACH_SCALES * config.outlier_scale)
-        near = np.abs(found.distances) < reach
+        spread = np.sqrt(config.outlier_scale**2 + found.scatter)
+        near = np.abs(found.distances) < np.maximum(reach, _LAST_REACH_SCALES * spread)
         if np.count_nonzero(near) < least:
             return result
         index, normals, distances = found.index[near], found.normals[near], found.distances[near]
-        weights = _trust(distances, config.outlier_scale) / (noise2[index] + found.variances[near])
+        spread = spread[near]
+        known2 = found.variances[near] + _SCATTER_SHARED * found.scatter[near]
+        weights = _trust(distances, spread) / (noise2[index] + known2)
         h = _derivatives(points[index], source.since[index], normals, state.rotation)
         weighted = h * weights[:, None]
         information = weighted.T @ h
+        some = np.flatnonzero(near)[::_TILTED]
+        at = found.index[some]
+        for axis in range(2):
+            tilted = _derivatives(
+                points[at], source.since[at], found.across[some, axis], state.rotation
+            )
+            tilts = _TILTED * weights[::_TILTED] * found.tilts[some, axis]
+            information -= (tilted * tilts[:, None]).T @ tilted
         state, posterior = corrected(
             prior, covariance, state, information, -(weighted.T @ distances)
         )
         residual = float(np.sqrt((weights * distances**2).sum() / weights.sum()))
-        agreement = np.count_nonzero(np.abs(distances) < 2.0 * config.outlier_scale) / len(near)
+        agreement = np.count_nonzero(np.abs(distances) < 2.0 * spread) / len(near)
         result = Alignment(
             state, posterior, information, len(index), agreement, residual, step + 1
         )
         change = state.minus(prior) - error
         if np.abs(change[:6]).max() < _DONE:
             break
-    return result
+    return None if result is None else _cautious(result, covariance)
+
+
+def _cautious(found: Alignment, before: F64) -> Alignment:
+    """Return an alignment that claims less in directions for which only few points speak.
+
+    The few that there are err together, and lie in parts of the map that were seen as seldom: what
+    they agree on is hardly news. So in these directions the covariance stays near that of before.
+    """
+    strength, directions = np.linalg.eigh(found.information[POSITION, POSITION])
+    share = strength / max(float(strength.sum()), 1e-12)
+    doubt = directions * np.sqrt(1.0 - np.clip(share / WEAK, 0.0, 1.0)) @ directions.T
+    kept = np.zeros((ERRORS, ERRORS))
+    kept[POSITION, POSITION] = kept[VELOCITY, VELOCITY] = kept[GRAVITY, GRAVITY] = doubt
+    kept[ACCEL_BIAS, ACCEL_BIAS] = found.state.rotation.T @ doubt @ found.state.rotation
+    covariance = found.covariance + kept @ (before - found.covariance) @ kept
+    return dataclasses.replace(found, covariance=covariance)
 
 
 def _redone(source: Source, error: F64, rotation: F64) -> F64:
@@ -148,7 +179,7 @@ def _redone(source: Source, error: F64, rotation: F64) -> F64:
     )
 
 
-def _trust(distances: F64, scale: float) -> F64:
+def _trust(distances: F64, scale: F64) -> F64:
     """Return the weights (N,) of Geman and McClure: 1 for no distance, a quarter at the scale."""
     return np.asarray(1.0 / (1.0 + (distances / scale) ** 2) ** 2)
 

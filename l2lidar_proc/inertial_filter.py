@@ -125,6 +125,11 @@ class Noise:
 BLIND_GYRO: Final = 0.5
 BLIND_ACCEL: Final = 1.0
 
+# a velocity less certain than the first is drawn towards rest, as if that were measured with an
+# error of the second once a second [m/s]
+SLOW_FROM: Final = 0.2
+SLOW_SPEED: Final = 1.0
+
 
 def predicted(
     state: InertialState,
@@ -224,6 +229,28 @@ def corrected(
     z = (directions[:, known].T @ pull) / root
     error, posterior = update(-at.minus(prior), covariance, z, np.eye(len(z)), h)
     return at.moved(np.asarray(error)), 0.5 * (posterior + posterior.T)
+
+
+def slowed(state: InertialState, covariance: F64, seconds: float) -> tuple[InertialState, F64]:
+    """Return state and covariance with the velocity, where hardly known, drawn towards rest.
+
+    Carriers are slow: it is as if a velocity of zero were measured all the time, but so coarsely
+    that it counts only where nothing else tells the velocity.
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    seconds : float
+        How much time has passed since this was done last.
+    """
+    if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < SLOW_FROM**2:
+        return state, covariance
+    information = np.zeros_like(covariance)
+    information[VELOCITY, VELOCITY] = seconds / SLOW_SPEED**2 * np.eye(3)
+    return corrected(
+        state, covariance, state, information, -information[:, VELOCITY] @ state.velocity
+    )
 
 
 def loosened(covariance: F64, errors: slice, sigma: float) -> F64:

@@ -60,7 +60,7 @@ class KissMatcher:
         """How far predictions have lately been off [m]."""
         return float(self._threshold.get_threshold())
 
-    def register(self, points: F64, guess: F64) -> F64 | None:
+    def register(self, points: F64, guess: F64, most: float = np.inf) -> F64 | None:
         """Return the pose (4, 4) that aligns points (N, 3) with the map, None without a map.
 
         Parameters
@@ -68,10 +68,12 @@ class KissMatcher:
         points : ndarray, shape (N, 3)
             Deskewed [m].
         guess : ndarray, shape (4, 4)
+        most : float
+            Largest threshold to use [m].
         """
         if self._map.empty() or len(points) < LEAST_POINTS:
             return None
-        sigma = self.threshold
+        sigma = min(self.threshold, most)
         source = voxel_down_sample(points, 1.5 * self._config.mapping.voxel_size)
         pose = self._registration.align_points_to_map(
             points=source,

@@ -19,6 +19,7 @@ from l2lidar_proc.inertial_filter import (
     InertialState,
     Noise,
     loosened,
+    slowed,
 )
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
@@ -30,13 +31,13 @@ F64 = NDArray[np.float64]
 
 _WINDOW_S: Final = 6.0
 _OPENING_NS: Final = 450_000_000  # the first sweeps are held for so long
+_OPENING_LONGEST_NS: Final = 3_000_000_000  # or, at rest, until they meet each other
+_OPENING_FELT_NS: Final = 1_000_000_000  # whose samples tell whether the sensor rests
 _OPENING_ROUNDS: Final = 6
 _OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the rounds
 _REST_SPEED: Final = 0.06  # [m/s] faster, the sensor did not rest, however quiet the IMU
 _WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
 _LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
-_COAST_NS: Final = 3_000_000_000  # an unconfirmed velocity is kept for so long,
-_COAST_S: Final = 1.0  # and then fades with this time constant
 _PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
 _LOST_SWEEPS: Final = 25
 _STEADY_SIGMA: Final = 0.5  # [rad/s] of the assumption that the rate stays, where there is no gyro
@@ -86,7 +87,6 @@ class Odometry:
         self._trusts_gravity = False
         self._steady: F64 = np.zeros(3)
         self._lost_sweeps = 0
-        self._aligned_at = HostNs(0)
         self._last: OdometryEstimate | None = None
 
     def imu(self, samples: Samples) -> None:
@@ -126,23 +126,23 @@ class Odometry:
         motion = self._predicted(sweep, self._state, self._covariance)
         status += gaps_in(motion)
         source = self.matcher.source(sweep, motion)
-        found = self.matcher.match(source, motion)
-        guess = motion.state
+        found, uncharted = self.matcher.match(source, motion)
+        guess, state, covariance = motion.state, motion.state, motion.covariance
         if found is None:
-            motion = self._coasted(motion)
             few = len(source.points) < self.config.min_points
             status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
             self._lost_sweeps += not few
         else:
-            motion = motion.corrected(found.state, found.covariance)
-            self._aligned_at = motion.state.stamp
+            state, covariance = found.state, found.covariance
             self._lost_sweeps = 0
+        lasted = (state.stamp - self._state.stamp) * 1e-9
+        motion = motion.corrected(*slowed(state, covariance, lasted))
         self._keep(motion)
         moved = motion.deskewed(sweep, self._lever)
         if self._lost_sweeps >= _LOST_SWEEPS:
             status.append(Status.LOST)
             self._forget_map()
-        if found is not None or Status.LOST in status:
+        if found is not None or uncharted or Status.LOST in status:
             self.matcher.extend(moved, motion, guess)
         quality = self.matcher.quality(len(source.points), found)
         return [self._estimate(motion, moved, status, quality)]
@@ -180,6 +180,8 @@ class Odometry:
         if seed == len(held) - 1 and most:
             return []
         motions = self._solved(held[seed:], held[0].start) if most > self.config.min_points else []
+        if motions is None:
+            return []
         if not motions:
             del held[0]
             return []
@@ -199,14 +201,17 @@ class Odometry:
 
     def _solved(
         self, sweeps: list[Sweep], since: HostNs, may_rest: bool = True
-    ) -> list[SweepMotion]:
+    ) -> list[SweepMotion] | None:
         """Begin the map with the first sweeps; return their motions, empty if they do not fit.
 
         As long as the velocity is not known the map's first sweep is smeared: what the following
-        ones say of the velocity then deskews it better, in a few rounds.
+        ones say of the velocity then deskews it better, in a few rounds. Where little comes back
+        it takes many sweeps at rest before one meets what others saw: None as long as that may
+        still happen.
         """
         reference = self._reference(sweeps[0])
-        samples = self._imu.between(HostNs(since - _OPENING_NS), sweeps[-1].end)
+        until = min(sweeps[-1].end, since + _OPENING_FELT_NS)
+        samples = self._imu.between(HostNs(since - _OPENING_NS), HostNs(until))
         opening = startup.opening(samples, reference, may_rest)
         self._trusts_gravity = opening.gravity_trusted
         # the odometry frame begins at the cloud frame's origin, the state is the IMU's
@@ -216,25 +221,27 @@ class Odometry:
             first = self._predicted(sweeps[0], start, opening.covariance, since)
             motions = [first]
             self.matcher.extend(first.deskewed(sweeps[0], self._lever), first, first.state)
+            met = False
             for sweep in sweeps[1:]:
                 motion = self._predicted(sweep, motions[-1].state, motions[-1].covariance)
                 source = self.matcher.source(sweep, motion)
-                found = self.matcher.match(source, motion, opening=True)
-                if found is None and opening.at_rest:
-                    return self._solved(sweeps, since, may_rest=False)
-                if found is None:
-                    return []
-                motion = motion.corrected(found.state, found.covariance)
+                found, uncharted = self.matcher.match(source, motion, opening=True)
+                if found is not None:
+                    motion = motion.corrected(found.state, found.covariance)
+                    met = True
+                elif not (uncharted and opening.at_rest):
+                    return self._solved(sweeps, since, may_rest=False) if opening.at_rest else []
                 motions.append(motion)
                 self.matcher.extend(motion.deskewed(sweep, self._lever), motion, motion.state)
             velocity = motions[1].state_at(reference).velocity
             if opening.at_rest and np.linalg.norm(velocity) > _REST_SPEED:
                 return self._solved(sweeps, since, may_rest=False)
+            if not met and sweeps[-1].end - since < _OPENING_LONGEST_NS:
+                return None
             if np.linalg.norm(velocity - start.velocity) < _OPENING_STEP:
                 break
             start = dataclasses.replace(start, velocity=velocity)
         self._keep(motions[-1])
-        self._aligned_at = motions[-1].state.stamp
         return motions
 
     def _restart(self, reference: HostNs) -> None:
@@ -245,15 +252,6 @@ class Odometry:
         )
         for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
             self._covariance = loosened(self._covariance, errors, sigma)
-
-    def _coasted(self, motion: SweepMotion) -> SweepMotion:
-        """Return a motion that slows down when nothing has confirmed the velocity for long."""
-        state = motion.state
-        if self._state is None or state.stamp - self._aligned_at < _COAST_NS:
-            return motion
-        kept = float(np.exp(-(state.stamp - self._state.stamp) * 1e-9 / _COAST_S))
-        state = dataclasses.replace(state, velocity=kept * state.velocity)
-        return motion.corrected(state, motion.covariance)
 
     def _forget_map(self) -> None:
         self.matcher.clear()
@@ -293,6 +291,8 @@ class Odometry:
             covariance = loosened(covariance, GYRO_BIAS, _STEADY_SIGMA)
         gap = reference - state.stamp
         if gap > _LONG_GAP_NS and len(samples) * _PERIOD_S * 1e9 < 0.5 * gap:
+            speed = float(np.linalg.norm(state.velocity))
+            covariance = loosened(covariance, VELOCITY, max(1.0, speed))
             state = dataclasses.replace(state, velocity=np.zeros(3))
         settings = self.config.inertial
         scale = float(np.sqrt(_PERIOD_S))

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_proc import rotations
+from l2lidar_proc.alignment import WEAK
 from l2lidar_proc.inertial_filter import GYRO_BIAS, POSITION, TURN, VELOCITY, InertialState
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
-
-_DEGENERATE: Final = 0.01  # share of points below which a direction counts as not observed
 
 
 def cloud_pose(state: InertialState, lever: F64) -> F64:
@@ -56,7 +53,7 @@ def estimate_of(
         Of an angular velocity [rad/s].
     """
     state, p = motion.state, motion.covariance
-    if quality.matched and quality.weakest < _DEGENERATE:
+    if quality.matched and quality.weakest < WEAK:
         status = (*status, Status.DEGENERATE)
     pose = np.zeros((6, 18))
     pose[:3, POSITION] = np.eye(3)

@@ -1,12 +1,14 @@
-"""Keeps the map of small flat surfaces: points binned into cells, a plane fitted to each cell.
+"""Keeps the map of small surfaces: points binned into cells, a plane fitted to each cell.
 
 A surface averages the range noise of every point that ever fell into its cell, which
 nearest-neighbour methods cannot do. Cells come in several sizes; the finest flat one speaks for a
-place.
+place. Where none is flat (foliage, rock, trunks, cables) a cell still tells where its points are
+across the directions in which they are few: less sharply, by their scatter.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -25,7 +27,10 @@ CELL: Final = np.dtype(
         ("mean", "<f8", (3,)),  # [m] map frame
         ("axes", "<f8", (3, 3)),  # rows: the normal, then the two axes of the surface; unit
         ("spread", "<f8", (3,)),  # [m^2] variance along each of the axes, ascending
+        ("sweeps", "<f8"),  # in which points came
+        ("fitted", "<f8"),  # count when mean, axes and spread were computed
         ("flat", "?"),
+        ("narrow", "<i1"),  # axes of a cell that is not flat along which its points lie close
     ],
     align=True,
 )
@@ -37,6 +42,12 @@ _MASK: Final = (1 << _BITS) - 1
 _HALF: Final = 1 << (_BITS - 1)
 _ELONGATED: Final = 9.0  # a surface is at least 3 times wider than it is thick
 _WIDTH: Final = 0.08  # and, in its shorter direction, this part of its cell (1 sigma)
+_NARROW: Final = (
+    0.16  # largest scatter that tells a place, by the cell's edge; evenly filled: 0.29
+)
+_NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is narrow as well
+_EDGES: Final = 0.4  # part of the points that may lack a flat surface where flat ones abound
+_GROWTH: Final = 1.12  # of the points before a cell is fitted again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +64,21 @@ class Matches:
         Of the point from the plane along the normal [m].
     variances : ndarray, shape (M,)
         Of the plane's place under the point [m^2].
+    scatter : ndarray, shape (M,)
+        Variance of the map's points about the plane where they are no flat surface, else 0 [m^2].
+    across : ndarray, shape (M, 2, 3)
+        The other two axes of the surface, unit, map frame.
+    tilts : ndarray, shape (M, 2)
+        Variance of the normal towards each of these, for the noise of the points [rad^2].
     """
 
     index: I64
     normals: F64
     distances: F64
     variances: F64
+    scatter: F64
+    across: F64
+    tilts: F64
 
 
 class SurfelMap:
@@ -101,24 +121,36 @@ class SurfelMap:
             for level in self._levels:
                 level.add(points)
 
-    def match(self, points: F64) -> Matches:
-        """Return the surface of every point (N, 3) [m] that has one: the finest at its place."""
-        found: list[tuple[I64, NDArray[np.void]]] = []
+    def match(self, points: F64, *, narrow: bool = False) -> Matches:
+        """Return the surface of every point that has one: the finest at its place.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            [m], map frame.
+        narrow : bool
+            Points without a flat surface get the narrow directions of the finest cell that has
+            any, one or two matches each; but not where most points have one: there the others are
+            edges, and scan lines of the map's first sweeps.
+        """
+        found: list[Matches] = []
         left = np.arange(len(points))
         for level in self._levels:
             cell = level.flat_at(points[left])
             known = cell >= 0
-            found.append((left[known], level.cells[cell[known]]))
+            found.append(_distances(points, left[known], level.cells[cell[known]], 0))
             left = left[~known]
-        index = np.concatenate([some for some, _ in found])
-        cells = np.concatenate([some for _, some in found])
-        offset = points[index] - cells["mean"]
-        along = np.einsum("nij,nj->ni", cells["axes"], offset)
-        spread = cells["spread"]
-        # a plane fitted to n points is worst known far from their middle
-        reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
-        variances = spread[:, 0] * reach / cells["count"]
-        return Matches(index, cells["axes"][:, 0], along[:, 0], variances)
+        narrow &= len(left) > _EDGES * len(points)
+        for level in self._levels if narrow else ():
+            cell = level.narrow_at(points[left])
+            known = cell >= 0
+            cells = level.cells[cell[known]]
+            found.append(_distances(points, left[known], cells, 0))
+            both = cells["narrow"] > 1
+            found.append(_distances(points, left[known][both], cells[both], 1))
+            left = left[~known]
+        columns = zip(*map(_columns, found), strict=True)
+        return Matches(*(np.concatenate(column) for column in columns))
 
     def forget(self, origin: F64, distance: float) -> None:
         """Drop the cells farther than a distance [m] from a place (3,)."""
@@ -128,6 +160,33 @@ class SurfelMap:
     def points(self) -> F64:
         """Return the middles of the finest level's surfaces [m], shape (N, 3), map frame."""
         return self._levels[0].points()
+
+
+def _distances(points: F64, index: I64, cells: NDArray[np.void], axis: int) -> Matches:
+    """Return how far some points are from the middles of their cells along an axis of these."""
+    offset = points[index] - cells["mean"]
+    along = np.einsum("nij,nj->ni", cells["axes"], offset)
+    spread = cells["spread"]
+    # a plane fitted to n points is worst known far from their middle
+    reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
+    scatter = np.where(cells["flat"], 0.0, spread[:, axis])
+    thin, others = spread[:, axis, None], spread[:, [1 - axis, 2]]
+    tilts = thin * others / (cells["count"][:, None] * (others - thin) ** 2 + 1e-12)
+    # the two axes across a line are one as good as the other
+    tilts[cells["narrow"] > 1, 0] = 0.0
+    return Matches(
+        index,
+        cells["axes"][:, axis],
+        along[:, axis],
+        spread[:, axis] * reach / cells["count"],
+        scatter,
+        cells["axes"][:, [1 - axis, 2]],
+        np.minimum(tilts, 1.0),
+    )
+
+
+def _columns(found: Matches) -> tuple[NDArray[np.generic], ...]:
+    return tuple(getattr(found, item.name) for item in dataclasses.fields(found))
 
 
 class _Level:
@@ -146,6 +205,7 @@ class _Level:
         self.cells: NDArray[np.void] = np.zeros(1, CELL)
         # by row, compact copies for look-ups
         self._flat: NDArray[np.bool_] = np.zeros(1, np.bool_)
+        self._narrow: NDArray[np.bool_] = np.zeros(1, np.bool_)
         self._count: I64 = np.zeros(1, np.int64)
 
     def __len__(self) -> int:
@@ -153,9 +213,16 @@ class _Level:
 
     def flat_at(self, points: F64) -> I64:
         """Return the row of the flat cell each point lies in, -1 where there is none."""
+        return self._rows_at(points, self._flat)
+
+    def narrow_at(self, points: F64) -> I64:
+        """Return the row of the narrow cell each point lies in, -1 where there is none."""
+        return self._rows_at(points, self._narrow)
+
+    def _rows_at(self, points: F64, wanted: NDArray[np.bool_]) -> I64:
         rows = self._find(self._key(points))
         known = rows >= 0
-        rows[known] = np.where(self._flat[rows[known]], rows[known], -1)
+        rows[known] = np.where(wanted[rows[known]], rows[known], -1)
         return rows
 
     def add(self, points: F64) -> None:
@@ -175,6 +242,7 @@ class _Level:
         )
         self._count[rows] += count
         self.cells["count"][rows] = self._count[rows]
+        self.cells["sweeps"][rows] += 1.0
         self.cells["sum"][rows] += total
         self.cells["products"][rows] += products
         self._fit(rows, middles)
@@ -186,7 +254,7 @@ class _Level:
         rows = self._rows[near]
         self._keys, self._rows = self._keys[near], np.arange(len(rows))
         self.cells, self._flat = self.cells[rows].copy(), self._flat[rows]
-        self._count = self._count[rows]
+        self._count, self._narrow = self._count[rows], self._narrow[rows]
         self._reserve(1)
 
     def points(self) -> F64:
@@ -194,7 +262,8 @@ class _Level:
         return np.asarray(used["mean"][used["flat"]])
 
     def _fit(self, rows: I64, middles: F64) -> None:
-        enough = self.cells["count"][rows] >= self._least
+        count = self._count[rows]
+        enough = (count >= self._least) & (count >= _GROWTH * self.cells["fitted"][rows])
         rows, middles = rows[enough], middles[enough]
         if not len(rows):
             return
@@ -214,6 +283,11 @@ class _Level:
         self.cells["spread"][rows] = spread
         self.cells["flat"][rows] = flat
         self._flat[rows] = flat
+        close = spread[:, :2] < (_NARROW * self._size) ** 2
+        close &= (self.cells["sweeps"][rows] >= _NARROW_SWEEPS)[:, None] & ~flat[:, None]
+        self.cells["narrow"][rows] = close.sum(axis=1)
+        self._narrow[rows] = close[:, 0]
+        self.cells["fitted"][rows] = count[:, 0]
 
     def _key(self, points: F64) -> I64:
         cell = np.floor(points * (1.0 / self._size)).astype(np.int64) + _HALF
@@ -247,4 +321,5 @@ class _Level:
             extra = max(count, 2 * len(self.cells)) - len(self.cells)
             self.cells = np.concatenate((self.cells, np.zeros(extra, CELL)))
             self._flat = np.concatenate((self._flat, np.zeros(extra, np.bool_)))
+            self._narrow = np.concatenate((self._narrow, np.zeros(extra, np.bool_)))
             self._count = np.concatenate((self._count, np.zeros(extra, np.int64)))

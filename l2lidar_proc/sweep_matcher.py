@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import Sweep
 from l2lidar_proc.alignment import Alignment, Source, align
-from l2lidar_proc.inertial_filter import POSITION, InertialState
+from l2lidar_proc.inertial_filter import POSITION, TURN, InertialState, corrected
 from l2lidar_proc.kiss import KissMatcher, thinned
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, weakest
@@ -23,7 +23,25 @@ F64 = NDArray[np.float64]
 _LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
 _AGREEMENT: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
 _OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
+_YOUNG: Final = 12  # sweeps in a map before a sweep without surfaces around is remarkable
+_PLACED: Final = (0.03, 0.15)  # [rad, m] what KISS-ICP's registration with few sweeps is worth
 _PRUNING: Final = 0.2  # the map is pruned whenever this part of its radius was travelled
+
+
+class Match(NamedTuple):
+    """What came of matching a sweep with the map.
+
+    Attributes
+    ----------
+    alignment : Alignment or None
+        The one that can be believed.
+    uncharted : bool
+        There is none because the map has only just begun and has no surfaces here yet; the
+        prediction is good enough to add the sweep where it is.
+    """
+
+    alignment: Alignment | None
+    uncharted: bool
 
 
 class SweepMatcher:
@@ -55,9 +73,11 @@ class SweepMatcher:
         )
         self.kiss = KissMatcher(config)
         self._pruned_at = np.zeros(3)
+        self._sweeps = 0
 
     def clear(self) -> None:
         """Forget the maps."""
+        self._sweeps = 0
         self.surfaces.clear()
         self.kiss.clear()
 
@@ -73,10 +93,8 @@ class SweepMatcher:
             np.linalg.norm(points[chosen], axis=1),
         )
 
-    def match(
-        self, source: Source, motion: SweepMotion, *, opening: bool = False
-    ) -> Alignment | None:
-        """Return the alignment that can be believed, None if there is none.
+    def match(self, source: Source, motion: SweepMotion, *, opening: bool = False) -> Match:
+        """Return the alignment that can be believed, if there is one.
 
         A prediction that may be a surface off is not the only one to begin from: KISS-ICP's
         registration and a search around it give others, and the result has to fit the map as
@@ -92,19 +110,25 @@ class SweepMatcher:
             later.
         """
         if len(source.points) < self.config.min_points or not len(self.surfaces):
-            return None
+            return Match(None, False)
         sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
         loose = sigma > _LOOSE_M
-        strict = loose and not opening
+        young = self._sweeps < _YOUNG
+        strict = loose and not opening and not young
         found = self._align(source, motion, motion.state)
         if not loose or (strict and _believable(found, source, strict)):
-            return found if _believable(found, source, strict) else None
+            if _believable(found, source, strict):
+                return Match(found, False)
+            return Match(None, young and not loose and found is None)
         starts = [self._registered(source, motion.state)]
         if strict:
             starts += likely_places(motion.state, motion.covariance, source, self.surfaces)
         others = [found, *(self._align(source, motion, start) for start in starts)]
         good = [other for other in others if other and _believable(other, source, strict)]
-        return max(good, key=lambda other: other.agreement * other.matched, default=None)
+        best = max(good, key=lambda other: other.agreement * other.matched, default=None)
+        if best is None and young and found is None:
+            best = self._placed(source, motion)
+        return Match(best, False)
 
     def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> None:
         """Add the deskewed points (N,) of a sweep to the maps.
@@ -118,6 +142,7 @@ class SweepMatcher:
             What was predicted: from it KISS-ICP learns how good predictions are.
         """
         state = motion.state
+        self._sweeps += 1
         points = xyz(moved) - self._lever
         self.surfaces.add(points @ state.rotation.T + state.position)
         self.kiss.update(points, _pose(state), _pose(guess))
@@ -153,9 +178,21 @@ class SweepMatcher:
             start,
         )
 
-    def _registered(self, source: Source, guess: InertialState) -> InertialState:
+    def _placed(self, source: Source, motion: SweepMotion) -> Alignment:
+        """Return what the place that KISS-ICP's registration finds is worth by itself."""
+        place = self._registered(source, motion.state, _PLACED[1])
+        information = np.zeros_like(motion.covariance)
+        information[TURN, TURN] = np.eye(3) / _PLACED[0] ** 2
+        information[POSITION, POSITION] = np.eye(3) / _PLACED[1] ** 2
+        still = np.zeros(len(information))
+        state, covariance = corrected(motion.state, motion.covariance, place, information, still)
+        return Alignment(state, covariance, information, 0, 0.0, 0.0, 1)
+
+    def _registered(
+        self, source: Source, guess: InertialState, most: float = np.inf
+    ) -> InertialState:
         """Return the guess with the pose that KISS-ICP's registration finds."""
-        better = self.kiss.register(source.points, _pose(guess))
+        better = self.kiss.register(source.points, _pose(guess), most)
         if better is None:
             return guess
         return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])

@@ -1,0 +1,101 @@
+"""The odometry where surfaces are few: open sky, foliage, a long blindness, a direction unseen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import HostNs
+from l2lidar_proc.alignment import Source, align
+from l2lidar_proc.inertial_filter import ERRORS, POSITION, TURN, InertialState
+from l2lidar_proc.odometry import Odometry
+from l2lidar_proc.odometry_config import OdometryConfig, SurfaceConfig
+from l2lidar_proc.surfels import SurfelMap
+from tests.l2lidar_proc.odometry_places import SEED, visited
+from tests.l2lidar_proc.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
+from tools.odometry_runs import sweeps
+
+
+@pytest.mark.parametrize(
+    ("place", "cut"), [("bushes", "turn"), ("poles", "turn"), ("poles", "38 packets")]
+)
+def test_foliage_and_poles_are_enough(place, cut):
+    run = visited(place)
+    estimates = drive(run, cut)
+    assert len(estimates) == len(list(sweeps(run, cut)))
+    found = errors(run, estimates)
+    assert np.sqrt((found**2).mean()) < 0.012
+    assert found.max() < 0.04
+    assert estimates[-1].is_aligned
+
+
+def test_in_foliage_it_can_start_in_motion():
+    run = visited("bushes")
+    moving = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.5e9]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, moving)
+    assert len(estimates) == len(moving)
+    assert all(item.is_aligned for item in estimates[5:])
+    assert errors(run, estimates[5:]).max() < 0.06
+
+
+def test_a_long_blindness_ends_where_the_sensor_is():
+    """Seconds without points, in which the sensor walks on: none of it may be taken for rest."""
+    run = recording("room", "walk", 9.0)
+    some = list(sweeps(run, "turn"))
+    some[17:18] = [dataclasses.replace(some[30], points=some[30].points[-120:])]
+    del some[18:31]
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some)
+    found = errors(run, [item for item in estimates if item.is_aligned])
+    assert found.max() < 0.02
+    blind = [item for item in estimates if not item.is_aligned]
+    assert blind
+    assert all(item.velocity @ item.velocity > 0.2 for item in blind)
+
+
+def _corridor(rng: np.random.Generator, count: int):
+    """Return points on the two walls, the floor and the ceiling of a corridor along x."""
+    points = rng.uniform((-6.0, -1.0, -1.2), (6.0, 1.0, 1.2), (count, 3))
+    side = rng.integers(0, 4, count)
+    points[side == 0, 1], points[side == 1, 1] = -1.0, 1.0
+    points[side == 2, 2], points[side == 3, 2] = -1.2, 1.2
+    return points + 0.011 * rng.standard_normal((count, 3))
+
+
+def test_noise_does_not_tell_the_place_along_a_corridor():
+    rng = np.random.default_rng(SEED)
+    surfaces = SurfelMap((0.15, 0.3, 0.6, 1.5))
+    for _ in range(12):
+        surfaces.add(_corridor(rng, 4000))
+    zero = np.zeros(3)
+    state = InertialState(
+        HostNs(0), np.eye(3), zero, zero, zero, zero, np.array([0.0, 0.0, -9.80665])
+    )
+    sigma = np.full(ERRORS, 0.01)
+    sigma[POSITION], sigma[TURN] = 0.1, 0.02
+    points = _corridor(rng, 1500)
+    source = Source(points, rng.uniform(-0.1, 0.1, len(points)), np.linalg.norm(points, axis=1))
+    found = align(state, np.diag(sigma**2), source, surfaces, SurfaceConfig(), 100)
+    across = np.sqrt(np.diag(found.covariance)[POSITION])
+    assert across[0] > 0.08
+    assert across[1:].max() < 0.01
+
+
+def test_a_pole_tells_two_directions_and_one_scan_line_none():
+    rng = np.random.default_rng(SEED)
+    surfaces = SurfelMap((0.3,))
+    angle, height = rng.uniform(0.0, 2.0 * np.pi, 120), rng.uniform(0.01, 0.29, 120)
+    pole = np.column_stack([0.15 + 0.03 * np.cos(angle), 0.15 + 0.03 * np.sin(angle), height])
+    for part in np.array_split(pole, 6):
+        surfaces.add(part)
+    line = np.column_stack([np.full(40, 1.05), np.full(40, 0.15), np.linspace(0.01, 0.29, 40)])
+    surfaces.add(line + 0.003 * rng.standard_normal(line.shape))
+    probe = np.array([[0.18, 0.15, 0.1], [1.06, 0.15, 0.1]])
+    assert not len(surfaces.match(probe).index)
+    found = surfaces.match(probe, narrow=True)
+    assert found.index.tolist() == [0, 0]
+    assert np.abs(found.normals[:, 2]).max() < 0.2
+    assert np.linalg.norm(found.distances) == pytest.approx(0.03, abs=0.008)
+    assert (found.scatter > 0.01**2).all()
