@@ -7,7 +7,7 @@ The companion package deskews properly and needs this off.
 
 from __future__ import annotations
 
-from collections import deque
+import struct
 from typing import Final
 
 import numpy as np
@@ -16,11 +16,16 @@ from numpy.typing import NDArray
 from l2lidar_node.types import HostNs, ImuSample
 
 MAX_AGE_NS: Final = 80_000_000  # upstream's tolerance between a packet and its orientation
-_HISTORY: Final = 8192  # samples, 32 s: more than the longest sweep
+_CAPACITY: Final = 16_384  # samples; half of it, 32 s, is more than the longest sweep
+
+_SAMPLE: Final = np.dtype([("stamp", "<i8"), ("wxyz", "<f8", (4,))])
+_PACKED: Final = struct.Struct("<q4d")  # the same
 
 
 class Levelling:
     """Remembers the latest orientations and makes rotations of them.
+
+    Its length is how many it remembers.
 
     Parameters
     ----------
@@ -30,15 +35,25 @@ class Levelling:
 
     def __init__(self, roll_pitch_only: bool) -> None:
         self.roll_pitch_only = roll_pitch_only
-        self._samples: deque[ImuSample] = deque(maxlen=_HISTORY)
+        self._samples: NDArray[np.void] = np.empty(_CAPACITY, _SAMPLE)
+        self._octets = self._samples.view(np.uint8).data  # to write one in a single call
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return self._count
 
     def add(self, sample: ImuSample) -> None:
         """Remember a sample; they come in ascending order."""
-        self._samples.append(sample)
+        if self._count == _CAPACITY:
+            self._forget(_CAPACITY // 2)
+        at = self._count * _PACKED.size
+        _PACKED.pack_into(self._octets, at, sample.stamp, *sample.orientation_wxyz)
+        self._count += 1
 
     def clear(self) -> None:
         """Forget all samples, for example because the time line began anew."""
-        self._samples.clear()
+        self._count = 0
 
     def __call__(self, starts: list[HostNs]) -> NDArray[np.float64]:
         """Return the rotations of packets from the cloud frame into the levelled frame.
@@ -46,7 +61,7 @@ class Levelling:
         Parameters
         ----------
         starts : list of HostNs, length P
-            When the packets began, ascending; what is older than the first is forgotten.
+            When the packets began, ascending; what is too old for the first is forgotten.
 
         Returns
         -------
@@ -54,22 +69,26 @@ class Levelling:
             By the orientation nearest to each start; NaN where none is within
             :data:`MAX_AGE_NS`.
         """
-        while self._samples and self._samples[0].stamp < starts[0] - MAX_AGE_NS:
-            self._samples.popleft()
-        if not self._samples:
+        stamps = self._samples["stamp"][: self._count]
+        self._forget(int(np.searchsorted(stamps, starts[0] - MAX_AGE_NS)))
+        if not self._count:
             return np.full((len(starts), 3, 3), np.nan)
+        stamps = self._samples["stamp"][: self._count]
         instants = np.array(starts, np.int64)
-        stamps = np.array([sample.stamp for sample in self._samples], np.int64)
-        after = np.searchsorted(stamps, instants).clip(max=len(stamps) - 1)
-        before = (after - 1).clip(min=0)
+        after = np.minimum(np.searchsorted(stamps, instants), self._count - 1)
+        before = np.maximum(after - 1, 0)
         is_before_nearer = instants - stamps[before] <= stamps[after] - instants
-        nearest = np.where(is_before_nearer, before, after)
-        wxyz = np.array([sample.orientation_wxyz for sample in self._samples])
-        rotations = _rotations(wxyz[nearest])
+        nearest = self._samples[np.where(is_before_nearer, before, after)]
+        rotations = _rotations(nearest["wxyz"])
         if self.roll_pitch_only:
             rotations = _without_yaw(rotations)
-        rotations[np.abs(stamps[nearest] - instants) > MAX_AGE_NS] = np.nan
+        rotations[np.abs(nearest["stamp"] - instants) > MAX_AGE_NS] = np.nan
         return rotations
+
+    def _forget(self, count: int) -> None:
+        """Forget so many of the oldest samples."""
+        self._count -= count
+        self._samples[: self._count] = self._samples[count : count + self._count]
 
 
 def _rotations(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -134,7 +134,7 @@ def test_old_samples_are_forgotten_and_clear_forgets_all():
         *(sample(START - n * 4_000_000, Rotation.identity()) for n in range(100, 0, -1))
     )
     level([HostNs(START)])
-    assert len(level._samples) == MAX_AGE_NS // 4_000_000
+    assert len(level) == MAX_AGE_NS // 4_000_000
     level.clear()
     assert np.isnan(level([HostNs(START)])).all()
 
@@ -142,6 +142,8 @@ def test_old_samples_are_forgotten_and_clear_forgets_all():
 def test_memory_is_bounded_while_nobody_asks():
     level = Levelling(False)
     item = sample(START, Rotation.identity())
-    for _ in range(20_000):
-        level.add(item)
-    assert len(level._samples) < 10_000
+    for number in range(40_000):
+        level.add(item._replace(stamp=HostNs(START + number * 4_000_000)))
+        assert len(level) < 20_000
+    longest_sweep = [HostNs(START + (40_000 - ago * 250) * 4_000_000) for ago in (20, 10, 1)]
+    np.testing.assert_array_equal(level(longest_sweep), [np.eye(3)] * 3)
