@@ -12,11 +12,10 @@ from typing import Final
 
 from l2lidar_node import wire
 from l2lidar_node.layouts import LAYOUTS
-from l2lidar_node.settings import SettingError, setting
+from l2lidar_node.settings import TOPIC, SettingError, setting
 
 MIN_CLOCK_RATIO: Final = 0.5
 MAX_CLOCK_RATIO: Final = 3.0
-_TOPIC: Final = re.compile(r"(~/|/)?[A-Za-z_{][\w{}]*(/[A-Za-z_{][\w{}]*)*", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,24 +203,14 @@ class FrameConfig:
 class TopicConfig:
     """What the topics are called and how they are sent."""
 
-    point_cloud_topic_id: str = setting("/points", "topic of the clouds")
-    imu_topic_id: str = setting("/imu/data", "topic of the IMU samples")
+    point_cloud_topic_id: str = setting("/points", "topic of the clouds", form=TOPIC)
+    imu_topic_id: str = setting("/imu/data", "topic of the IMU samples", form=TOPIC)
     qos_reliability: str = setting(
         "best_effort",
         "reliability of both topics; reliable reaches every subscriber, best_effort is upstream's",
         choices=("best_effort", "reliable"),
     )
     point_layout: str = setting("native", "fields of the clouds", choices=tuple(LAYOUTS))
-
-    def __post_init__(self) -> None:
-        """Check the names: rclpy would say what is wrong, but not with which parameter."""
-        for name in ("point_cloud_topic_id", "imu_topic_id"):
-            value = getattr(self, name)
-            if not _TOPIC.fullmatch(value):
-                raise SettingError(
-                    f"parameter '{name}': {value!r} is not a topic name, expected names such as "
-                    "/front/points, each of letters, digits and '_', beginning with no digit"
-                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

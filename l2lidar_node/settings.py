@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, Final, NamedTuple, TypeVar, get_type_hints
 
 _KEY = "l2lidar.setting"
 
@@ -23,6 +24,22 @@ G = TypeVar("G")
 
 class SettingError(ValueError):
     """A value that a setting cannot take; the message says which, and what would be right."""
+
+
+class Form(NamedTuple):
+    """What a text has to look like: a pattern for all of it, and both ends of the message."""
+
+    pattern: re.Pattern[str]
+    name: str
+    expected: str
+
+
+TOPIC: Final = Form(
+    re.compile(r"(~/|/)?[A-Za-z_{][\w{}]*(/[A-Za-z_{][\w{}]*)*", re.ASCII),
+    "a topic name",
+    "names such as /front/points, each of letters, digits and '_', beginning with no digit",
+)
+"""ROS says what is wrong with a name, but not which parameter holds it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +67,8 @@ class Setting:
         Whether a running node takes a new value.
     item : type or None
         Type of the elements of a tuple.
+    form : Form or None
+        Of a string; None for any.
     """
 
     name: str
@@ -63,6 +82,7 @@ class Setting:
     choices: tuple[str, ...] = ()
     live: bool = False
     item: Kind | None = None
+    form: Form | None = None
 
     @property
     def range_text(self) -> str:
@@ -81,7 +101,7 @@ class Setting:
         ------
         SettingError
             If the type is wrong, a number is not finite or out of range, or a string is not a
-            choice.
+            choice or has not its form.
         """
         if self.item is None:
             return self._check_scalar(value, self.type)
@@ -104,6 +124,8 @@ class Setting:
                 raise self._error(value, f"is out of range, expected {self.range_text}")
         if self.choices and value not in self.choices:
             raise self._error(value, f"is not known, expected one of {self.range_text}")
+        if self.form and not self.form.pattern.fullmatch(str(value)):
+            raise self._error(value, f"is not {self.form.name}, expected {self.form.expected}")
         checked: Scalar = kind(value)
         return checked
 
@@ -129,6 +151,7 @@ def setting(
     hi: float | None = None,
     choices: tuple[str, ...] = (),
     live: bool = False,
+    form: Form | None = None,
 ) -> Any:
     """Return a dataclass field that carries everything about one setting.
 
@@ -143,6 +166,7 @@ def setting(
         "hi": hi,
         "choices": choices,
         "live": live,
+        "form": form,
     }
     return field(default=default, metadata={_KEY: metadata})
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from l2lidar_node.layouts import LAYOUTS
-from l2lidar_node.settings import SettingError, setting
+from l2lidar_node.settings import TOPIC, SettingError, setting
 from l2lidar_proc import rotations
 from l2lidar_proc.rotations import F64
 
@@ -204,14 +204,16 @@ class ProcConfig:
 class DeskewTopics:
     """Where a deskew node listens and speaks."""
 
-    cloud_topic: str = setting("/points", "clouds with one time per point")
-    imu_topic: str = setting("/imu/data", "IMU samples")
-    velocity_topic: str = setting("odometry", "velocity of the sensor or of what carries it")
+    cloud_topic: str = setting("/points", "clouds with one time per point", form=TOPIC)
+    imu_topic: str = setting("/imu/data", "IMU samples", form=TOPIC)
+    velocity_topic: str = setting(
+        "odometry", "velocity of the sensor or of what carries it", form=TOPIC
+    )
     velocity_type: str = setting(
         "odometry", "what comes on velocity_topic: nav_msgs/Odometry, geometry_msgs/TwistStamped",
         choices=("odometry", "twist", "none"),
     )  # fmt: skip
-    output_topic: str = setting("points_deskewed", "deskewed clouds")
+    output_topic: str = setting("points_deskewed", "deskewed clouds", form=TOPIC)
     qos_reliability: str = setting(
         "reliable", "reliability of the output", choices=("best_effort", "reliable")
     )

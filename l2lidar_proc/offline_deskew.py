@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
 from rosbags.highlevel import AnyReaderError
 
+from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_proc import bag
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
@@ -149,6 +149,8 @@ def deskew_recording(
     FileExistsError
         If the target exists.
     """
+    if not source.exists():
+        raise RecordingError(f"{source}: there is no such file or folder")
     try:
         with bag.open_bag(source) as reader:
             kinds = {item.topic: item.msgtype for item in reader.connections}
@@ -164,7 +166,7 @@ def deskew_recording(
                         deskewer.take(connection.topic, connection.msgtype, message, recorded_ns)
                 deskewer.finish(_END_NS)
                 return deskewer.pipeline.counts, deskewer.refused
-    except (AnyReaderError, FileNotFoundError) as error:
+    except AnyReaderError as error:
         raise RecordingError(f"{source}: {error}") from None
 
 
@@ -195,24 +197,6 @@ def _chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> st
     raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
 
 
-def _parameters(path: Path) -> dict[str, Any]:
-    """Return what a ROS parameter file says to the deskew node.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read.
-    """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        values: dict[str, Any] = {}
-        for heading in ("/**", "deskew_node", "/deskew_node"):
-            values.update((content.get(heading) or {}).get("ros__parameters") or {})
-    except (OSError, yaml.YAMLError, AttributeError) as error:
-        raise RecordingError(f"parameter file '{path}': {error}") from None
-    return values
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run from a command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="l2lidar_proc.offline_deskew", description=__doc__)
@@ -221,11 +205,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--params-file", type=Path, help="parameter file, as for the node")
     given = parser.parse_args(arguments)
     try:
-        values = _parameters(given.params_file) if given.params_file is not None else {}
+        values = {}
+        if given.params_file is not None:
+            values = parameters_for(given.params_file, "deskew_node", "/deskew_node")
         config = build(DeskewNodeConfig, values)
         counts, refused = deskew_recording(given.source, given.target, config)
     except (SettingError, RecordingError, FileExistsError, ValueError) as error:
         print(error, file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"{error.filename or given.target}: {error.strerror}", file=sys.stderr)
         return 2
     print(
         f"{counts.sweeps} clouds: {counts.deskewed} deskewed, {counts.still} at rest, "

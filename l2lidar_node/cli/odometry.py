@@ -62,6 +62,7 @@ def odometry(
     except ValueError as error:
         raise UsageError(str(error)) from None
     try:
+        folder.mkdir(parents=True, exist_ok=True)  # or a long run would end with nowhere to write
         with Progress(console=out) as bar:
             task = bar.add_task("odometry", total=1.0)
 

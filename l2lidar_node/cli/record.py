@@ -113,7 +113,9 @@ def convert(
             with BagWriter(bag, config) as writer:
                 for event in events(recording, config):
                     writer.add(event)
-    except (OSError, CaptureError) as error:
+    except OSError as error:
+        raise DeviceError(f"{error.filename or capture}: {error.strerror}") from None
+    except CaptureError as error:
         raise DeviceError(f"{capture}: {error}") from None
     cut = "; the capture is cut off at its end" if recording.is_cut_off else ""
     say(f"{bag}: {writer.clouds} clouds, {writer.samples} IMU samples{cut}")

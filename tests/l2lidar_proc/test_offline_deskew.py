@@ -136,7 +136,17 @@ def test_the_command_line(recording, tmp_path, capsys):
     assert main([str(recording), str(target)]) == 2
     assert "exists" in capsys.readouterr().err
     assert main([str(tmp_path / "nothing"), str(tmp_path / "x")]) == 2
-    assert "nothing" in capsys.readouterr().err
+    assert "nothing: there is no such file" in capsys.readouterr().err
+    assert main([str(recording), str(parameters / "x.mcap")]) == 2
+    assert "Not a directory" in capsys.readouterr().err
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(tmp_path)]) == 2
+    assert f"parameter file '{tmp_path}': Is a directory" in capsys.readouterr().err
+    parameters.write_text("deskew_node:\n  ros__parameters:\n    cloud_topic: a b\n")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "parameter 'cloud_topic': 'a b' is not a topic name" in capsys.readouterr().err
+    parameters.write_text("hello")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "expected a node's name" in capsys.readouterr().err
     parameters.write_text("deskew_node:\n  ros__parameters:\n    range_mxa: 6.0\n")
     assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
     assert "range_max" in capsys.readouterr().err

@@ -286,6 +286,9 @@ def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
     outcome = run("odometry", str(tmp_path / "a.pcap"), str(tmp_path / "out"))
     assert outcome.code == 1
     assert "a.pcap: this is no capture file" in outcome.err
+    outcome = run("odometry", str(tmp_path / "a.mcap"), str(tmp_path / "a.pcap" / "out"))
+    assert outcome.code == 1
+    assert "out: Not a directory" in outcome.err  # said before the recording is looked at
     (tmp_path / "a.yaml").write_text("odometry_node: {ros__parameters: {mode: best}}")
     outcome = run("odometry", str(tmp_path / "a.mcap"), "--params-file", str(tmp_path / "a.yaml"))
     assert outcome.code == 2
