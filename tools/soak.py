@@ -23,6 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from l2lidar_node import wire
 from l2lidar_node.demo.processes import Program, Programs, isolate_ros
+from l2lidar_node.programs import interruptible
 from tools import chain, interrupts
 from tools.cpu import process_cpu_s, resident_mb
 from tools.results import Target, at_most, keep, publish
@@ -264,4 +265,4 @@ def _row(what: str, result: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(interruptible(main))

@@ -26,6 +26,8 @@ DESKEWED: Final = "/points_deskewed"
 ODOMETRY: Final = "/odometry"
 _KINDS: Final = {CLOUDS: PointCloud2, IMU: Imu, DESKEWED: PointCloud2, ODOMETRY: Odometry}
 
+_DEPTHS: Final = {IMU: 10_000}  # 40 s: what is to be seen is not what the watch itself loses
+
 
 class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no types
     """Subscribes to topics and keeps what arrives, stamps and times alone.
@@ -53,7 +55,7 @@ class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no t
                 _KINDS[topic],
                 topic,
                 lambda data, topic=topic: self._note(topic, data),
-                QoSProfile(depth=500, reliability=policy),
+                QoSProfile(depth=_DEPTHS.get(topic, 500), reliability=policy),
                 raw=True,
             )
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)

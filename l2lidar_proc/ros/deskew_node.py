@@ -28,6 +28,7 @@ from l2lidar_proc.pipeline import Deskewed, Pipeline
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames
+from l2lidar_proc.ros.waiting import waiting
 from l2lidar_proc.velocity import carried_over
 
 _IMU_DEPTH = 500
@@ -74,7 +75,7 @@ class DeskewNode(Node):
         listening = QoSProfile(depth=10, reliability=asked)
         often = QoSProfile(depth=_IMU_DEPTH, reliability=asked)
         self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
-        self.create_subscription(Imu, topics.imu_topic, self._imu, often)
+        self._imu_input = self.create_subscription(Imu, topics.imu_topic, self._imu, often)
         velocities = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
             self.create_subscription(Odometry, topics.velocity_topic, self._odometry, velocities)
@@ -85,10 +86,13 @@ class DeskewNode(Node):
         self._pipeline.configure(config.proc)
 
     def _imu(self, message: Imu) -> None:
-        self._mount(message.header.frame_id)
-        self._pipeline.imu(to_sample(message))
+        self._take(message)
         if self._pipeline.is_waiting:
             self._hand_out()
+
+    def _take(self, message: Imu) -> None:
+        self._mount(message.header.frame_id)
+        self._pipeline.imu(to_sample(message))
 
     def _mount(self, imu_frame: str) -> None:
         """Take the place of the IMU from TF as soon as both frames are in it."""
@@ -153,6 +157,8 @@ class DeskewNode(Node):
 
     def _hand_out(self) -> None:
         """Publish what is finished, and come back in time for what still waits."""
+        for message in waiting(self._imu_input, _IMU_DEPTH):
+            self._take(message)
         for item in self._pipeline.poll(time.monotonic_ns()):
             self._publish(item)
         due = self._pipeline.due_ns

@@ -32,6 +32,7 @@ from l2lidar_proc.odometry_pipeline import OdometryPipeline
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames
+from l2lidar_proc.ros.waiting import waiting
 
 _IMU_DEPTH = 500
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
@@ -86,7 +87,7 @@ class OdometryNode(Node):
         listening = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         often = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
-        self.create_subscription(Imu, topics.imu_topic, self._imu, often)
+        self._imu_input = self.create_subscription(Imu, topics.imu_topic, self._imu, often)
         self.create_service(Trigger, "~/reset", self._reset)
         self.create_service(Trigger, "~/save_map", self._save_map)
         self.create_service(Trigger, "~/save_trajectory", self._save_trajectory)
@@ -95,10 +96,13 @@ class OdometryNode(Node):
         self._pipeline.configure(config.odometry)
 
     def _imu(self, message: Imu) -> None:
-        self._imu_frame = message.header.frame_id
-        self._pipeline.imu(to_sample(message))
+        self._take(message)
         if self._pipeline.due_ns is not None:
             self._hand_out()
+
+    def _take(self, message: Imu) -> None:
+        self._imu_frame = message.header.frame_id
+        self._pipeline.imu(to_sample(message))
 
     def _cloud(self, message: PointCloud2) -> None:
         self._cloud_frame = message.header.frame_id
@@ -134,6 +138,8 @@ class OdometryNode(Node):
 
     def _hand_out(self) -> None:
         """Publish what is finished, and come back in time for what still waits."""
+        for message in waiting(self._imu_input, _IMU_DEPTH):
+            self._take(message)
         for estimate in self._pipeline.poll(time.monotonic_ns()):
             self._publish(estimate)
         due = self._pipeline.due_ns
