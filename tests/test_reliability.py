@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
 
 from l2lidar_node.emulator.physics import PhysicsConfig
 from l2lidar_node.emulator.studio import Studio, StudioError
-from tools import fault_world, faults, load_scale
+from tools import fault_world, faults, interrupts, load_scale
 from tools.fault_runs import SINGLE, FaultCase, random_case, run
 from tools.fuzz_campaign import campaign
 
@@ -82,6 +83,33 @@ def test_hostile_input_is_survived(name: str) -> None:
 def test_the_world_outside(case) -> None:
     finding = fault_world.run(case)
     assert finding.good, finding
+
+
+def test_programs_interrupted_at_random_moments_end_well() -> None:
+    pytest.importorskip("rclpy")
+    programs = list(interrupts.commands(Path()))
+    unclean = [
+        f"{sent}: {complaint}\n{how.said}"
+        for sent, how in interrupts.run(programs, rounds=1, seed=7)
+        if (complaint := how.complaint(sent))
+    ]
+    assert "\n".join(unclean) == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "left", "words"),
+    [
+        (1, "", 0, "exit code 1"),
+        (0, "Traceback ...\n", 0, "'Traceback'"),
+        (-11, "", 0, "exit code -11"),
+        (0, "", 1, "1 processes left behind"),
+        (130, "", 0, ""),
+        (-2, "interrupted", 0, ""),
+    ],
+)
+def test_an_unclean_end_is_seen(code: int, said: str, left: int, words: str) -> None:
+    sent = interrupts.Interruption("deskew_node", (signal.SIGINT,), 1.0)
+    assert interrupts.End(code, 0.1, said, left).complaint(sent) == words
 
 
 def test_a_mesh_that_crashes_its_reader_is_refused_with_a_sentence(tmp_path: Path) -> None:
