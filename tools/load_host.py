@@ -13,12 +13,13 @@ import sys
 import threading
 import time
 
+from l2lidar_node import health
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event
 from l2lidar_node.session import Session
 from l2lidar_node.settings import build
 from l2lidar_node.transport import UdpTransport
-from l2lidar_node.types import Sweep
+from l2lidar_node.types import HostNs, Sweep
 from tools.cpu import process_cpu_s
 from tools.load_sender import address
 
@@ -46,10 +47,16 @@ def main() -> int:
     for session in sessions:
         session.start()
     begin = process_cpu_s(os.getpid())
+    before = [health.observe(one.driver, one.transport, _now()) for one in sessions]
     print("listening", flush=True)
     stopping.wait()
     for session in sessions:
         session.stop()
+    complaints = set()
+    for one, since in zip(sessions, before, strict=True):
+        after = health.observe(one.driver, one.transport, _now())
+        link = next(c for c in health.judge(one.driver, since, after) if c.name == "link")
+        complaints |= {link.message} if link.level else set()
     counts = [session.driver.counters for session in sessions]
     found = {
         "received": sum(one.datagrams for one in counts),
@@ -59,10 +66,15 @@ def main() -> int:
         "sweeps": sum(one.sweeps for one in counts),
         "cpu_s": process_cpu_s(os.getpid()) - begin,
         "failures": [repr(session.failure) for session in sessions if session.failure],
+        "complaints": sorted(complaints),
         "latencies_ms": latencies,
     }
     print(json.dumps(found))
     return 0
+
+
+def _now() -> HostNs:
+    return HostNs(time.time_ns())
 
 
 if __name__ == "__main__":

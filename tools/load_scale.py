@@ -24,7 +24,7 @@ from l2lidar_node.types import HostNs
 LENGTHS: Final = (1, 10, 50, 200, 1000, 4000)
 CROWDS: Final = ((1, 1), (4, 1), (8, 1), (16, 1), (8, 2), (8, 4))
 """Sensors, and processes that they are shared among."""
-RATES: Final = (1, 5, 10, 20, 50)
+RATES: Final = (1, 5, 10, 20, 50, 100, 200)
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
 
 
@@ -56,7 +56,9 @@ def crowd(sensors: int, processes: int, rate: float, seconds: float) -> dict[str
     dict
         ``sent``, ``received``, ``lost`` (by their numbers), ``kernel_drops``, ``late``,
         ``cpu`` (cores), ``p99_ms`` (last slot measured to sweep made), ``latest_ms`` (of the
-        sender), ``unsaid`` (lost datagrams that no counter knows).
+        sender), ``rate`` (at which it sent in the end, in units of a real sensor's),
+        ``unsaid`` (lost datagrams that no counter knows), ``complaints`` (what the driver says of
+        its link).
     """
     ports = free_udp_ports(sensors)
     share = sensors // processes
@@ -94,7 +96,8 @@ def crowd(sensors: int, processes: int, rate: float, seconds: float) -> dict[str
     latencies = [value for result in results for value in result["latencies_ms"]]
     found["sent"] = told["sent"] * sensors
     found["latest_ms"] = told["latest_ms"]
-    found["pace"] = seconds / told["seconds"]
+    found["rate"] = rate * seconds / told["seconds"]
+    found["complaints"] = sorted({text for result in results for text in result["complaints"]})
     found["cpu"] = sum(result["cpu_s"] for result in results) / told["seconds"]
     found["p99_ms"] = float(np.percentile(latencies, 99)) if latencies else float("nan")
     found["unsaid"] = found["sent"] - found["received"] - found["kernel_drops"]
