@@ -1,5 +1,7 @@
 """Plays a capture of raw packets through the driver, deskew and odometry."""
 
+from pathlib import Path
+
 from launch import LaunchDescription
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
@@ -18,10 +20,16 @@ def _needs(given):
             "loop:=true takes the sensor back to where the recording began, "
             "which no odometry can follow; add deskew_odometry:=false"
         )
+    try:
+        rate = float(given["rate"])
+    except ValueError:
+        raise ValueError(f"rate:={given['rate']} is not a number") from None
+    if not Path(given["file"]).expanduser().is_file():
+        raise ValueError(f"file:={given['file']}: there is no such file")
     return {
         **(for_deskew() if is_followed else {}),
         "replay_file": given["file"],
-        "replay_rate": float(given["rate"]),
+        "replay_rate": rate,
         "replay_loop": is_loop,
     }
 

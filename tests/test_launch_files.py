@@ -44,7 +44,7 @@ STARTS = {
     "l2_top_mount_example": ["robot_state_publisher", "l2lidar_node", "rviz2"],
     "l2_forward_mount_example": ["robot_state_publisher", "l2lidar_node", "rviz2"],
 }
-NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": "recording.pcap"}}
+NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": str(ROOT / "README.md")}}
 
 # The folder launch/ of this repository looks like an empty package: ask for more of the real one.
 try:
@@ -65,7 +65,7 @@ def strings(path):
 
 
 def executables():
-    return set(re.findall(r'"(\w+) = l2lidar_\w+\.[\w.]+:main"', (ROOT / "setup.py").read_text()))
+    return set(re.findall(r'"(\w+) = l2lidar_\w+\.[\w.]+:\w+"', (ROOT / "setup.py").read_text()))
 
 
 def consumer_driver(name):
@@ -281,6 +281,42 @@ def test_wrong_port_and_missing_file_are_refused(launched):
         launched("l2lidar", l2_port="abc")
     with pytest.raises(ValueError, match=r"absent\.yaml"):
         launched("l2lidar", params_file="absent.yaml")
+    with pytest.raises(ValueError, match=r"file:=absent\.pcap: there is no such file"):
+        launched("replay", file="absent.pcap")
+    with pytest.raises(ValueError, match="rate:=fast is not a number"):
+        launched("replay", rate="fast")
+    with pytest.raises(ValueError, match="emulator_options:='open: "):
+        launched("l2lidar", emulator="true", emulator_options="'open")
+
+
+@needs_launch
+def test_what_the_driver_would_refuse_is_not_started_again_and_again(launched, tmp_path):
+    with pytest.raises(ValueError, match="parameter 'l2_port': 99999 is out of range"):
+        launched("l2lidar", l2_port="99999")
+    file = tmp_path / "mine.yaml"
+    file.write_text("l2lidar_node: {ros__parameters: {robot_x: 0.1, watchdog_action: nap}}")
+    with pytest.raises(ValueError, match="parameter 'watchdog_action': 'nap' is not known"):
+        launched("l2lidar", params_file=str(file))
+
+
+@needs_launch
+def test_a_virtual_l2_that_fails_fails_the_launch():
+    from launch import LaunchContext
+    from launch.actions import Shutdown
+    from launch.events.process import ProcessExited
+
+    from l2lidar_node.ros.bringup import _emulated
+
+    def ended(code):
+        event = ProcessExited(
+            action=None, name="", cmd=[], cwd=None, env=None, pid=1, returncode=code
+        )
+        return _emulated(event, LaunchContext())
+
+    assert isinstance(ended(0), Shutdown)
+    assert isinstance(ended(-2), Shutdown)
+    with pytest.raises(RuntimeError, match="exit code 2"):
+        ended(2)
 
 
 @needs_launch
@@ -323,7 +359,7 @@ def test_consumer_goes_over_the_parameter_file(launched, consumer):
 def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched):
     made = launched("replay", rate="2", rviz="true")
     values = made.parameters("l2lidar_node")
-    assert (values["replay_file"], values["replay_rate"]) == ("recording.pcap", 2.0)
+    assert (values["replay_file"], values["replay_rate"]) == (NEEDED["replay"]["file"], 2.0)
     assert values["replay_loop"] is False
     assert values["imu_adjust"] is False
     assert "use_sim_time" not in values, "the driver makes that time"

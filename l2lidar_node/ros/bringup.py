@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from launch.actions import ExecuteProcess, OpaqueFunction, Shutdown
 from launch.conditions import IfCondition
+from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.logging import launch_config
 from launch.substitutions import LaunchConfiguration
@@ -17,9 +18,11 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
 from l2lidar_node import wire
+from l2lidar_node.config import DriverConfig
 from l2lidar_node.ros.launch_arguments import ARGUMENTS, PACKAGE, share
 from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
 from l2lidar_node.ros.topics import DRIVER_TOPICS, SHOWN_TOPICS
+from l2lidar_node.settings import build, settings_of
 
 Given = Mapping[str, str]
 """Value of every launch argument, as text."""
@@ -50,7 +53,12 @@ def driver(
         if given["l2_name"]:
             values["l2_name"] = given["l2_name"]
         node = _node(
-            "l2lidar_node", given["name"], given, [given["params_file"], *files(given)], values
+            "l2lidar_node",
+            given["name"],
+            given,
+            [given["params_file"], *files(given)],
+            values,
+            DriverConfig,
         )
         return [*_emulator(given, values), node]
 
@@ -112,14 +120,28 @@ def rviz(values: Parameters | None = None) -> OpaqueFunction:
 
 
 def _node(
-    executable: str, name: str, given: Given, files: Sequence[str], values: Parameters
+    executable: str,
+    name: str,
+    given: Given,
+    files: Sequence[str],
+    values: Parameters,
+    settings: type | None = None,
 ) -> Node:
-    """Return a node of ours; the parameters it starts with are kept beside the launch's log."""
+    """Return a node of ours; the parameters it starts with are kept beside the launch's log.
+
+    Raises
+    ------
+    SettingError
+        If a parameter cannot have its value; started, the node would end, and be started again.
+    """
     full_name = "/".join(["", *filter(None, given["namespace"].split("/")), name])
     merged: dict[str, Any] = {}
     for path in files:
         merged.update(parameters_for(Path(path), executable, full_name))
     merged.update(values)
+    if settings is not None:
+        known = {item.name for item in settings_of(settings)}
+        build(settings, {item: value for item, value in merged.items() if item in known})
     kept = Path(launch_config.get_log_file_path(f"{full_name[1:].replace('/', '.')}.yaml"))
     kept.write_text(parameter_file(merged), encoding="utf-8")
     return Node(
@@ -162,14 +184,32 @@ def _addresses(given: Given) -> dict[str, str | int]:
 def _emulator(given: Given, values: Parameters) -> list[ExecuteProcess]:
     if given["emulator"] != "true":
         return []
+    try:
+        options = shlex.split(given["emulator_options"])
+    except ValueError as error:
+        raise ValueError(f"emulator_options:={given['emulator_options']}: {error}") from None
     command: list[Any] = [
         ExecutableInPackage("l2lidar_emulator", PACKAGE),
         *("--lidar-port", str(values["l2_port"])),
         *("--host-port", str(values["host_port"])),
-        *shlex.split(given["emulator_options"]),
+        *options,
     ]
-    ended = Shutdown(reason="the virtual L2 has ended")
-    return [ExecuteProcess(cmd=command, name="l2lidar_emulator", output="screen", on_exit=ended)]
+    return [
+        ExecuteProcess(cmd=command, name="l2lidar_emulator", output="screen", on_exit=_emulated)
+    ]
+
+
+def _emulated(event: ProcessExited, context: LaunchContext) -> Shutdown:
+    """Return what ends the launch with the virtual L2.
+
+    Raises
+    ------
+    RuntimeError
+        If it failed: that ends the launch as well, with an exit code that says so.
+    """
+    if event.returncode > 0 and not context.is_shutdown:
+        raise RuntimeError(f"the virtual L2 ended with exit code {event.returncode}")
+    return Shutdown(reason="the virtual L2 has ended")
 
 
 def _relative(topics: Iterable[str]) -> list[tuple[str, str]]:
