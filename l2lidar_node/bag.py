@@ -58,10 +58,11 @@ class BagFile:
         # rosbags writes folders: for a single file, what is in one is taken out at the end.
         self._folder = path.with_suffix(".unfinished") if path.suffix == ".mcap" else path
         if self._folder.exists():
-            left = f"'{self._folder}' is left of one that was killed; remove it if it is of no use"
+            left = f"'{self._folder}' was cut off; remove it if it is of no use"
             raise FileExistsError(errno.EEXIST, left, str(path))
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
+        self._is_used = False
         self.store = get_typestore(Stores.ROS2_JAZZY)
 
     def __enter__(self) -> BagFile:
@@ -75,9 +76,12 @@ class BagFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish the file."""
+        """Finish the file; after an exception it does not get its name, or goes if empty."""
         self._writer.close()
-        if self._folder != self._path:
+        if kind is not None:
+            if not self._is_used:
+                shutil.rmtree(self._folder)
+        elif self._folder != self._path:
             (content,) = self._folder.glob("*.mcap")
             content.replace(self._path)
             shutil.rmtree(self._folder)
@@ -93,6 +97,7 @@ class BagFile:
 
     def write(self, topic: str, now: int, data: bytes | memoryview) -> None:
         """Append a serialised (CDR) message that was received at an instant [ns]."""
+        self._is_used = True
         self._writer.write(self._connections[topic], now, data)
 
 

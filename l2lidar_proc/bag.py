@@ -127,9 +127,11 @@ class BagWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the bag; of a single file the folder around it goes."""
+        """Close the bag; of a single file the folder around it goes, after an exception all."""
         self._writer.close()
-        if self._is_file:
+        if kind is not None:
+            shutil.rmtree(self._folder)
+        elif self._is_file:
             (content,) = self._folder.glob("*.mcap")
             content.replace(self._path)
             shutil.rmtree(self._folder)

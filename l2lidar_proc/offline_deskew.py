@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from rosbags.highlevel import AnyReaderError
 
+from l2lidar_node.programs import interruptible
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_proc import bag
@@ -226,4 +227,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(interruptible(main))

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.files import whole, write_whole
+from l2lidar_node.programs import interruptible
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import Sweep
@@ -279,4 +280,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(interruptible(main))

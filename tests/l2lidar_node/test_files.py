@@ -124,5 +124,21 @@ def test_a_map_is_whole_whenever_its_writer_is_killed(tmp_path: Path) -> None:
 
 def test_what_a_killed_recording_left_is_named(tmp_path: Path) -> None:
     (tmp_path / "run.unfinished").mkdir()
-    with pytest.raises(FileExistsError, match=r"run\.unfinished.*killed"):
+    with pytest.raises(FileExistsError, match=r"run\.unfinished.*cut off"):
         BagFile(tmp_path / "run.mcap")
+
+
+def test_a_bag_that_is_cut_off_does_not_get_its_name(tmp_path: Path) -> None:
+    def cut_off(path: Path, data: bytes) -> None:
+        with BagFile(path) as bag:
+            bag.connect("/numbers", "std_msgs/msg/Header", 1, reliable=True, latched=False)
+            if data:
+                bag.write("/numbers", 1, data)
+            raise PowerCutError
+
+    with pytest.raises(PowerCutError):
+        cut_off(tmp_path / "empty.mcap", b"")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(PowerCutError):
+        cut_off(tmp_path / "half.mcap", bytes(16))
+    assert [path.name for path in tmp_path.iterdir()] == ["half.unfinished"]
