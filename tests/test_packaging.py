@@ -86,6 +86,24 @@ def test_every_python_package_imported_is_declared() -> None:
     assert {DISTRIBUTIONS.get(name, name) for name in used} - declared - optional == set()
 
 
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("module", "allowed"),
+    [
+        ("l2lidar_node.ros.driver_node", {"dpkt"}),
+        ("l2lidar_proc.ros.deskew_node", {"dpkt", "scipy", "filterpy"}),
+        ("l2lidar_proc.ros.odometry_node", {"dpkt", "scipy", "filterpy", "kiss_icp"}),
+    ],
+)
+def test_a_node_needs_what_the_page_on_installing_says(module: str, allowed: set[str]) -> None:
+    seen = subprocess.run(
+        [sys.executable, "-c", f"import sys, {module}; print(*sys.modules)"],
+        capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    heavy = {"dpkt", "scipy", "filterpy", "kiss_icp", "open3d", "rosbags", "typer", "matplotlib"}
+    assert heavy & set(seen) <= allowed
+
+
 @pytest.mark.parametrize(
     "entry", importlib.metadata.distribution(NAME).entry_points, ids=lambda entry: entry.name
 )
