@@ -33,8 +33,13 @@ REFEREES = ("rko_lio", "genz_lio", "ct_icp", "lio_sam")
 PACKAGES = ("numpy", "rko_lio", "genz-lio", "evalio")
 FOLDER = Path("out") / "referees"
 _LIMIT_S = 600  # of processor time
-# LIO-SAM as evalio builds it reads memory that it has not set: this sets it to 0 (glibc)
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MALLOC_PERTURB_": "255"}
+# LIO-SAM as evalio builds it reads elements that it has not set, and some before the beginning of
+# an array. This sets them to 0, and lets no array have a mapping of its own with nothing before it.
+_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "MALLOC_PERTURB_": "255",
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
