@@ -124,6 +124,9 @@ class Noise:
 # where nothing is measured a carrier may turn and speed up like this: per sqrt(Hz), as densities
 BLIND_GYRO: Final = 0.5
 BLIND_ACCEL: Final = 1.0
+BLIND_TURN: Final = (
+    0.6  # [sqrt(s)] and by this part of the rate that is held: what shakes turns back
+)
 
 # a velocity less certain than the first is drawn towards rest, as if that were measured with an
 # error of the second once a second [m/s]
@@ -162,7 +165,8 @@ def predicted(
         dt = float(seen.stamps[last] - seen.stamps[first]) * 1e-9
         spans = np.diff(felt.stamps[first : last + 1])
         blind = float(spans[felt.missing[first:last]].sum()) / float(spans.sum())
-        gyro2 = (1.0 - blind) * noise.gyro**2 + blind * BLIND_GYRO**2
+        held = float(np.abs(seen.rates[first : last + 1]).max())
+        gyro2 = (1.0 - blind) * noise.gyro**2 + blind * (BLIND_GYRO**2 + (BLIND_TURN * held) ** 2)
         blind = 1.0 if blind_forces else blind
         accel2 = (1.0 - blind) * noise.accel**2 + blind * BLIND_ACCEL**2
         turn = rotations.matrices(seen.rotations_wxyz[[first, last]])

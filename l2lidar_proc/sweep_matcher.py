@@ -14,7 +14,7 @@ from l2lidar_proc.inertial_filter import POSITION, TURN, InertialState, correcte
 from l2lidar_proc.kiss import KissMatcher, thinned
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, weakest
-from l2lidar_proc.relocation import likely_places
+from l2lidar_proc.relocation import is_turned, likely_places
 from l2lidar_proc.surfels import SurfelMap
 from l2lidar_proc.sweep_motion import SweepMotion
 
@@ -112,7 +112,7 @@ class SweepMatcher:
         if len(source.points) < self.config.min_points or not len(self.surfaces):
             return Match(None, False)
         sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
-        loose = sigma > _LOOSE_M
+        loose = sigma > _LOOSE_M or is_turned(motion.covariance)
         young = self._sweeps < _YOUNG
         strict = loose and not opening and not young
         found = self._align(source, motion, motion.state)

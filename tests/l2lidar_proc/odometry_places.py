@@ -10,7 +10,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator import shapes, tum
+from l2lidar_node.emulator import scenes, shapes, tum
 from l2lidar_node.emulator.motion import rpy_quaternions
 from tools.odometry_runs import Run, record
 
@@ -54,6 +54,25 @@ def ring(seconds: float, speed: float = 0.7, radius: float = 1.4) -> NDArray[np.
         [0.04 * np.sin(2.0 * t), 0.05 * np.sin(1.5 * t), angle + np.pi / 2 + 0.2 * np.sin(t)]
     )
     return tum.pose_array(np.round(t * 1e9).astype(np.int64), place, rpy_quaternions(rpy))
+
+
+def shaking(seconds: float) -> NDArray[np.void]:
+    """Return a sensor shaken about one spot of the room, at up to 3 rad/s."""
+    t = np.arange(0.0, seconds, 0.01)
+    x, y = scenes.make("room").spot
+    swing = np.sin(2.0 * np.pi * 0.8 * t)
+    place = np.column_stack([x + 0.1 * np.sin(2.0 * t), y + 0.02 * swing, 1.1 + 0.03 * swing])
+    rpy = np.column_stack([0.15 * np.sin(7.0 * t), 0.1 * np.sin(9.0 * t), 0.6 * swing])
+    return tum.pose_array(np.round(t * 1e9).astype(np.int64), place, rpy_quaternions(rpy))
+
+
+@lru_cache(maxsize=2)
+def shaken(seconds: float = 8.0) -> Run:
+    """Return a recording of 2 s of rest and then shaking in the built-in room."""
+    with tempfile.TemporaryDirectory() as folder:
+        motion = Path(folder) / "motion.tum"
+        motion.write_text(tum.render(shaking(seconds)), encoding="utf-8")
+        return record("room", str(motion), 1, seconds)
 
 
 @lru_cache(maxsize=4)

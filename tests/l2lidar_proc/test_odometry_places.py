@@ -13,7 +13,7 @@ from l2lidar_proc.inertial_filter import ERRORS, POSITION, TURN, InertialState
 from l2lidar_proc.odometry import Odometry
 from l2lidar_proc.odometry_config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.surfels import SurfelMap
-from tests.l2lidar_proc.odometry_places import SEED, visited
+from tests.l2lidar_proc.odometry_places import SEED, shaken, visited
 from tests.l2lidar_proc.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
 from tools.odometry_runs import sweeps
 
@@ -38,6 +38,17 @@ def test_in_foliage_it_can_start_in_motion():
     assert len(estimates) == len(moving)
     assert all(item.is_aligned for item in estimates[5:])
     assert errors(run, estimates[5:]).max() < 0.06
+
+
+def test_a_turn_that_nobody_measured_is_found_again():
+    """Shaken, the rate at the beginning of a gap says nothing about its end."""
+    run = shaken()
+    seconds = (run.imu["stamp"] - run.imu["stamp"][0]) * 1e-9
+    estimates = drive(run, imu=run.imu[(seconds < 5.0) | (seconds > 5.3)])
+    after = [item for item in estimates if item.stamp > run.imu["stamp"][0] + 6_000_000_000]
+    assert all(item.is_aligned for item in after)
+    before = [item for item in estimates if item.stamp < run.imu["stamp"][0] + 5_000_000_000]
+    assert errors(run, before + after).max() < 0.02
 
 
 def test_a_long_blindness_ends_where_the_sensor_is():
