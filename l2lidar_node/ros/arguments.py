@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import rclpy
 import yaml
@@ -12,9 +13,20 @@ from rclpy.utilities import remove_ros_args
 
 from l2lidar_node.ros.middleware import make_room
 
+USAGE: Final = """usage: {name} [--params-file FILE] [--ros-args ...]
+
+A ROS 2 node. After --ros-args: -p NAME:=VALUE for a parameter, -r OLD:=NEW for a name.
+Its parameters are in the README and, while it runs, in `ros2 param describe /{name} NAME`."""
+
 
 class UsageError(ValueError):
     """The command line is wrong; the message says what and what would be right."""
+
+
+def wants_help(argv: list[str]) -> bool:
+    """Tell whether a command line, the program's name first, asks what it may be."""
+    own = argv[1 : argv.index("--ros-args")] if "--ros-args" in argv else argv[1:]
+    return "--help" in own or "-h" in own
 
 
 def start_rclpy(argv: list[str]) -> None:

@@ -17,6 +17,7 @@ from l2lidar_node.driver import Driver
 from l2lidar_node.loop import Loop
 from l2lidar_node.metadata import metadata
 from l2lidar_node.ros.conversions import to_time
+from l2lidar_node.ros.program import StartError
 from l2lidar_node.types import HostNs
 
 PERIOD_S = 1.0
@@ -49,7 +50,7 @@ class HealthPublisher:
     ----------
     node : Node
     session : Loop
-        Whose thread is asked for the figures.
+        Whose thread is asked for the figures; should it have failed, the program is ended.
     """
 
     def __init__(self, node: Node, session: Loop) -> None:
@@ -66,7 +67,8 @@ class HealthPublisher:
     def _publish(self) -> None:
         try:
             checks, about, now = self._session.call(self._look).result()
-        except CancelledError:  # the session has ended
+        except CancelledError:
+            self._ended()
             return
         config = self._session.driver.config
         if checks:
@@ -76,6 +78,11 @@ class HealthPublisher:
         if text != self._metadata:
             self._metadata = text
             self._about.publish(String(data=text))
+
+    def _ended(self) -> None:
+        """End the program if the session failed: nothing would ever come again."""
+        if self._session.failure is not None and self._node.context.ok():
+            raise StartError(f"the receiving thread failed: {self._session.failure!r}")
 
     def _look(
         self, driver: Driver, now: HostNs

@@ -13,12 +13,12 @@ from rclpy.node import Node
 from rclpy.signals import install_signal_handlers
 
 from l2lidar_node.programs import end_by_signal, ignore_signals
-from l2lidar_node.ros.arguments import UsageError, start_rclpy
+from l2lidar_node.ros.arguments import USAGE, UsageError, start_rclpy, wants_help
 from l2lidar_node.settings import SettingError
 
 
 class StartError(RuntimeError):
-    """What a node needs is not to be had; the message says what to do."""
+    """What a node needs is not to be had, or no longer; the message says what."""
 
 
 def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> int:
@@ -36,13 +36,18 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
     Returns
     -------
     int
-        0 after a signal, which until rclpy is there ends the process; the node's ``exit_code``
-        where it has one and ended itself; 1 for a :class:`StartError`; 2 for wrong arguments.
+        0 after ``--help`` and after a signal, which until rclpy is there ends the process; the
+        node's ``exit_code`` where it has one and ended itself; 1 for a :class:`StartError`; 2 for
+        wrong arguments.
     """
     end_by_signal()
+    argv = sys.argv if args is None else args
+    if wants_help(argv):
+        print(USAGE.format(name=name))
+        return 0
     node = None
     try:
-        start_rclpy(sys.argv if args is None else args)
+        start_rclpy(argv)
         # Before there are handlers: made after a signal, it leaves a trace when it goes.
         executor = SingleThreadedExecutor()
         install_signal_handlers()  # from here on a signal shuts rclpy down and does nothing else

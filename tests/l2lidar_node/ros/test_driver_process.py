@@ -64,6 +64,13 @@ def test_a_wrong_parameter_ends_the_start_with_one_message(
         assert word in result.stderr
 
 
+def test_help_is_given() -> None:
+    result = _run("--help")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "usage: l2lidar_node" in result.stdout
+    assert _run("--ros-args", "--help").returncode == 2
+
+
 def test_a_missing_or_broken_parameter_file_is_named(tmp_path: Path) -> None:
     missing = _run("--params-file", str(tmp_path / "nowhere.yaml"))
     assert missing.returncode == 2
@@ -215,3 +222,19 @@ def test_a_real_recording_comes_out_at_its_recorded_points(rig: Rig) -> None:
     error = np.linalg.norm(xyz - recorded, axis=1)
     assert np.median(error) < 1e-4
     assert error.max() < 2.5e-3
+
+
+def test_a_driver_whose_receiving_thread_fails_ends_and_says_why(rig: Rig) -> None:
+    code = (
+        "import sys; from l2lidar_node.driver import Driver\n"
+        "from l2lidar_node.ros import driver_node\n"
+        "def fail(self, *arguments): raise RuntimeError('no idea')\n"
+        "Driver.tick = fail\n"
+        "sys.exit(driver_node.main([sys.argv[0], *sys.argv[1:]]))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code, *rig.arguments()],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 1
+    assert "receiving thread failed: RuntimeError('no idea')" in result.stderr
