@@ -1,6 +1,6 @@
 """Runs another odometry over a recording; a program of its own, in that odometry's own Python.
 
-``python odometry_referee.py NAME RECORDING OUT``: RECORDING is a file of
+``python odometry_referee.py NAME RECORDING OUT SKIPPED``: RECORDING is a file of
 :mod:`tools.odometry_runs`, OUT gets the arrays ``stamps`` [ns] and ``poses`` (N, 4, 4), cloud
 frame to the odometry's own, and ``seconds``. Nothing of this project is imported here, and
 nothing here is imported by it: one of the referees is GPL.
@@ -32,16 +32,17 @@ Poses = list[tuple[int, Any]]
 
 
 class Recording:
-    """Sweeps and IMU samples as the file has them."""
+    """Sweeps and IMU samples as the file has them, without so many sweeps at the beginning."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, skipped: int = 0) -> None:
+        self._skipped = skipped
         self._file = dict(np.load(path))
         self.imu = self._file["imu"]
         self.T_cloud_imu = self._file["T_cloud_imu"]
 
     def __iter__(self) -> Iterator[tuple[int, int, Any, Any]]:
         """Yield start [ns], end [ns], points (N, 3) [m] and times (N,) [s] after the start."""
-        edges, spans = self._file["edges"], self._file["spans"]
+        edges, spans = self._file["edges"][self._skipped :], self._file["spans"][self._skipped :]
         for first, last, (start, end) in zip(edges[:-1], edges[1:], spans, strict=True):
             points = self._file["points"][first:last].astype(np.float64)
             yield int(start), int(end), points, self._file["times"][first:last].astype(np.float64)
@@ -224,8 +225,8 @@ REFEREES: dict[str, Callable[[Recording], Poses]] = {
 
 def main() -> int:
     """Run from a command line; return the exit code."""
-    name, source, target = sys.argv[1:4]
-    recording = Recording(source)
+    name, source, target, skipped = sys.argv[1:5]
+    recording = Recording(source, int(skipped))
     begin = time.process_time()
     found = REFEREES[name](recording)
     seconds = time.process_time() - begin
