@@ -113,7 +113,9 @@ class Driver:
                 continue
             counters.frames[item.packet_type if item.packet_type in wire.FRAME_SIZES else 0] += 1
             events += self._handle(decode(item), arrival)
-        return events + self._clock.events()
+        if self._clock.happened:
+            events += self._clock.events()
+        return events
 
     def tick(self, now: HostNs, heard_until: HostNs | None = None) -> list[Event]:
         """Return what is due by now; to be called every few milliseconds.

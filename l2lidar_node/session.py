@@ -65,7 +65,9 @@ class Session(Loop):
             for data, arrival in batch:
                 if self._tap:
                     self._tap.received(data, arrival)
-                self._hand_out(self.driver.receive(data, arrival))
+                events = self.driver.receive(data, arrival)
+                if events:
+                    self._hand_out(events)
             if not self._calls.empty():
                 self._run_calls()
                 self._send()

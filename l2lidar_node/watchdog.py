@@ -13,6 +13,8 @@ RUN_OUT_NS: Final = 5_000_000_000  # points that come so long after a stop say i
 MAX_STEP_NS: Final = 5_000_000_000  # time does not pass in larger steps between two questions
 SPIN_UP_NS: Final = 21_000_000_000  # from the first IMU packet to the first points, at power-on
 
+_POINTS: Final = Stream.POINTS  # to look up a member of an Enum takes long
+
 
 class DeviceState(Enum):
     """What the device is doing, as far as the host can tell."""
@@ -46,7 +48,7 @@ class Watchdog:
     def heard(self, stream: Stream, now: HostNs) -> None:
         """Note a measurement of a stream."""
         last = self._last.get(stream)
-        if stream is Stream.POINTS:
+        if stream is _POINTS:
             self._points_seen = True
             since = self._standby_since
             if since is not None and now - since > RUN_OUT_NS:

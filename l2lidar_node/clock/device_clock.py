@@ -105,6 +105,11 @@ class DeviceClock:
     ----------
     config : ClockConfig
 
+    Attributes
+    ----------
+    happened : deque of ClockEvent
+        What :meth:`events` will return; only to be read.
+
     Notes
     -----
     Stamps of a stream never go backwards and are never after the packet's arrival. Where both
@@ -115,7 +120,7 @@ class DeviceClock:
     def __init__(self, config: ClockConfig) -> None:
         self._guess = config.time_scale_num / config.time_scale_denom
         self._schedule = SyncSchedule(config)
-        self._events: deque[ClockEvent] = deque(maxlen=_EVENTS)
+        self.happened: deque[ClockEvent] = deque(maxlen=_EVENTS)
         self._counts: Counter[ClockEventKind] = Counter()
         self._held = 0
         self._unlocked = 0
@@ -241,10 +246,8 @@ class DeviceClock:
 
     def events(self) -> list[ClockEvent]:
         """Return what happened since the last call, oldest first."""
-        if not self._events:
-            return []
-        happened = list(self._events)
-        self._events.clear()
+        happened = list(self.happened)
+        self.happened.clear()
         return happened
 
     @property
@@ -300,4 +303,4 @@ class DeviceClock:
 
     def _report(self, kind: ClockEventKind, text: str) -> None:
         self._counts[kind] += 1
-        self._events.append(ClockEvent(kind, text))
+        self.happened.append(ClockEvent(kind, text))
