@@ -17,18 +17,20 @@ class Metadata:
     Attributes
     ----------
     hardware, firmware, name, date : str
+    product : str
+        What stands behind the date in the version packet; many units leave it empty.
     work_mode : int or None
         Bits of :class:`wire.WorkMode`.
     work_mode_names : list of str
     calibration : dict
         Names and units as in :data:`wire.CALIBRATION`.
-    slots : int
+    slots : int or None
         Slots in a packet.
-    angle_min_rad, angle_increment_rad : float
+    angle_min_rad, angle_increment_rad : float or None
         Of the slots along the arc.
-    time_increment_s : float
+    time_increment_s : float or None
         Between slots.
-    range_min_m, range_max_m : float
+    range_min_m, range_max_m : float or None
     imu_position_m : tuple
         In the cloud frame.
     cloud_frame, imu_frame : str
@@ -38,15 +40,16 @@ class Metadata:
     firmware: str
     name: str
     date: str
+    product: str
     work_mode: int | None
     work_mode_names: list[str]
     calibration: dict[str, float]
-    slots: int
-    angle_min_rad: float
-    angle_increment_rad: float
-    time_increment_s: float
-    range_min_m: float
-    range_max_m: float
+    slots: int | None
+    angle_min_rad: float | None
+    angle_increment_rad: float | None
+    time_increment_s: float | None
+    range_min_m: float | None
+    range_max_m: float | None
     imu_position_m: tuple[float, float, float]
     cloud_frame: str
     imu_frame: str
@@ -56,26 +59,33 @@ def metadata(driver: Driver) -> Metadata:
     """Return what a driver knows about its device."""
     version, parameters = driver.version, driver.parameters
     mode = None if parameters is None else parameters.work_mode
-    layout = wire.POINTS_3D_PAYLOAD if driver.config.sweep.frame3d else wire.POINTS_2D_PAYLOAD
-    payload = driver.last_points
-    packet = np.zeros(1, layout)[0] if payload is None else np.frombuffer(payload, layout)[0]
-    calibration = packet["calibration"]
+    packet = None
+    if driver.last_points is not None:
+        layout = wire.POINTS_3D_PAYLOAD if driver.config.sweep.frame3d else wire.POINTS_2D_PAYLOAD
+        packet = np.frombuffer(driver.last_points, layout)[0]
+
+    def told(name: str) -> float | None:
+        return None if packet is None else float(packet[name])
+
     return Metadata(
         hardware=version.hardware if version else "",
         firmware=version.firmware if version else "",
         name=version.name if version else "",
         date=version.date if version else "",
+        product=version.reserve if version else "",
         work_mode=mode,
         work_mode_names=[]
         if mode is None
         else [bit.name or "" for bit in wire.WorkMode if bit & mode],
-        calibration={name: float(calibration[name]) for name in wire.CALIBRATION.names or ()},
-        slots=int(packet["point_num"]),
-        angle_min_rad=float(packet["angle_min"]),
-        angle_increment_rad=float(packet["angle_increment"]),
-        time_increment_s=float(packet["time_increment"]),
-        range_min_m=float(packet["range_min"]),
-        range_max_m=float(packet["range_max"]),
+        calibration={}
+        if packet is None
+        else {name: float(packet["calibration"][name]) for name in wire.CALIBRATION.names or ()},
+        slots=None if packet is None else int(packet["point_num"]),
+        angle_min_rad=told("angle_min"),
+        angle_increment_rad=told("angle_increment"),
+        time_increment_s=told("time_increment"),
+        range_min_m=told("range_min"),
+        range_max_m=told("range_max"),
         imu_position_m=wire.IMU_POSITION_M,
         cloud_frame=driver.config.frames.cloud,
         imu_frame=driver.config.frames.imu,

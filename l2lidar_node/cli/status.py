@@ -22,14 +22,6 @@ from l2lidar_node.driver import Driver
 from l2lidar_node.metadata import metadata
 
 _WAIT_S = 3.0
-_TOLD_BY_POINTS = (
-    "slots",
-    "angle_min_rad",
-    "angle_increment_rad",
-    "time_increment_s",
-    "range_min_m",
-    "range_max_m",
-)
 
 
 @with_network
@@ -46,9 +38,7 @@ def info(network: NetworkConfig, json_: JsonOption = False) -> None:
     if json_:
         print_json({**about, "health": as_data(checks)})
         return
-    calibration = about.pop("calibration") if about["slots"] else {}
-    if not calibration:
-        about |= dict.fromkeys(_TOLD_BY_POINTS)
+    calibration = about.pop("calibration")
     del about["work_mode_names"]
     mode = about["work_mode"]
     about["work_mode"] = None if mode is None else work_mode_text(mode)

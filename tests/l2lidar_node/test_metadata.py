@@ -20,7 +20,9 @@ def test_a_device_that_said_nothing_yet():
         None,
         [],
     )
-    assert facts.slots == 0
+    assert (facts.calibration, facts.slots, facts.angle_min_rad, facts.range_max_m) == (
+        {}, None, None, None,
+    )  # fmt: skip
     assert (facts.cloud_frame, facts.imu_frame) == ("l2lidar_link", "l2lidar_imu")
     assert facts.imu_position_m == (-0.007698, -0.014655, 0.00667)
 
