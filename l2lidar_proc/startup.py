@@ -38,6 +38,7 @@ _STILL_CHANGE: Final = (
     0.06,
     0.25,
 )  # [rad/s, m/s^2] by which means over a few samples may differ at rest
+_STILL_NOISE: Final = 5.0  # sigma of their noise by which such means may differ besides
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,10 +120,18 @@ def _at_rest(samples: Samples) -> bool:
     parts = np.array_split(samples, _BLOCKS)
     rates = np.array([part["angular_velocity"].mean(axis=0) for part in parts])
     forces = np.array([part["linear_acceleration"].mean(axis=0) for part in parts])
+    # units differ tenfold in what their motors shake into the samples; means still differ by that
+    noise = np.array(
+        [white_noise(samples[name]) for name in ("angular_velocity", "linear_acceleration")]
+    )
+    allowed = np.hypot(
+        (2.0 * _STILL_CHANGE[0], _STILL_CHANGE[1]),
+        _STILL_NOISE * noise / np.sqrt(len(samples) / _BLOCKS),
+    )
     return bool(
         np.abs(rates.mean(axis=0)).max() < _STILL_RATE
-        and np.ptp(rates, axis=0).max() < 2.0 * _STILL_CHANGE[0]
-        and np.ptp(forces, axis=0).max() < _STILL_CHANGE[1]
+        and np.ptp(rates, axis=0).max() < allowed[0]
+        and np.ptp(forces, axis=0).max() < allowed[1]
     )
 
 

@@ -12,6 +12,7 @@ from l2lidar_proc.alignment import Source, align
 from l2lidar_proc.inertial_filter import ERRORS, POSITION, TURN, InertialState
 from l2lidar_proc.odometry import Odometry
 from l2lidar_proc.odometry_config import OdometryConfig, SurfaceConfig
+from l2lidar_proc.startup import opening
 from l2lidar_proc.surfels import SurfelMap
 from tests.l2lidar_proc.odometry_places import SEED, shaken, visited
 from tests.l2lidar_proc.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
@@ -110,3 +111,19 @@ def test_a_pole_tells_two_directions_and_one_scan_line_none():
     assert np.abs(found.normals[:, 2]).max() < 0.2
     assert np.linalg.norm(found.distances) == pytest.approx(0.03, abs=0.008)
     assert (found.scatter > 0.01**2).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("noise", [0.03, 0.25])
+def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise, seed):
+    """Units at rest were measured from 0.03 to 0.35 rad/s."""
+    rng = np.random.default_rng(seed)
+    run = recording("room", "walk")
+    some = run.imu[:230].copy()
+    some["angular_velocity"] += noise * rng.standard_normal((230, 3))
+    some["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
+    assert opening(some, HostNs(int(some["stamp"][100]))).at_rest
+    moving = run.imu[900:1130].copy()
+    moving["angular_velocity"] += noise * rng.standard_normal((230, 3))
+    moving["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
+    assert not opening(moving, HostNs(int(moving["stamp"][100]))).at_rest
