@@ -6,13 +6,12 @@ Names and defaults that upstream has are upstream's, so its YAML file works unch
 from __future__ import annotations
 
 import ipaddress
-import re
 from dataclasses import dataclass, field
 from typing import Final
 
 from l2lidar_node import wire
 from l2lidar_node.layouts import LAYOUTS
-from l2lidar_node.settings import TOPIC, SettingError, setting
+from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 
 MIN_CLOCK_RATIO: Final = 0.5
 MAX_CLOCK_RATIO: Final = 3.0
@@ -174,19 +173,9 @@ class ImuConfig:
 class FrameConfig:
     """Frame names and the one transform the driver owns."""
 
-    l2_name: str = setting("l2lidar", "prefix of the default frame names")
-    cloud_frame: str = setting("", "frame of the clouds; empty means <l2_name>_link")
+    l2_name: str = setting("l2lidar", "prefix of the default frame names", form=FRAME)
+    cloud_frame: str = setting("", "frame of the clouds; empty means <l2_name>_link", form=FRAME)
     publish_tf: bool = setting(True, "publish the static transform from cloud to IMU frame")
-
-    def __post_init__(self) -> None:
-        """Check the names."""
-        for name in ("l2_name", "cloud_frame"):
-            value = getattr(self, name)
-            if value.startswith("/") or not re.fullmatch(r"[\w/.~-]*", value):
-                raise SettingError(
-                    f"parameter '{name}': {value!r} is not a frame name, expected letters, "
-                    "digits, '_', '-', '.' and '/', not starting with '/'"
-                )
 
     @property
     def cloud(self) -> str:

@@ -41,6 +41,12 @@ TOPIC: Final = Form(
 )
 """ROS says what is wrong with a name, but not which parameter holds it."""
 
+FRAME: Final = Form(
+    re.compile(r"(?!/)[\w/.~-]*"),
+    "a frame name",
+    "letters, digits, '_', '-', '.' and '/', not starting with '/'",
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.settings import SettingError, setting
+from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,6 +94,15 @@ class SurfaceConfig:
         5, "largest number of steps of the alignment", lo=1, hi=50, live=True
     )
 
+    def __post_init__(self) -> None:
+        """Check the levels of the map."""
+        sizes = self.surface_sizes
+        if not sizes or any(fine >= coarse for fine, coarse in pairwise(sizes)):
+            raise SettingError(
+                f"parameter 'surface_sizes': {list(sizes)} cannot be it, expected at least one "
+                "edge, each larger than the one before"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KissConfig:
@@ -153,26 +163,42 @@ class OdometryConfig:
     surfaces: SurfaceConfig = field(default_factory=SurfaceConfig)
     kiss: KissConfig = field(default_factory=KissConfig)
 
+    def __post_init__(self) -> None:
+        """Check the two ranges against each other."""
+        if self.min_range >= self.max_range:
+            raise SettingError(
+                f"parameter 'min_range': {self.min_range} is out of range, "
+                f"expected less than max_range ({self.max_range})"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryTopics:
     """Where an odometry node listens and speaks, and which frames it names."""
 
-    cloud_topic: str = setting("/points", "clouds with one time per point, not deskewed")
-    imu_topic: str = setting("/imu/data", "IMU samples")
-    odometry_topic: str = setting("odometry", "pose and twist of base_frame, once per sweep")
-    fast_odometry_topic: str = setting(
-        "odometry_imu", "pose and twist carried on by the IMU, see imu_rate"
+    cloud_topic: str = setting(
+        "/points", "clouds with one time per point, not deskewed", form=TOPIC
     )
-    path_topic: str = setting("path", "where base_frame has been")
-    map_topic: str = setting("local_map", "local map in odom_frame")
-    registered_topic: str = setting("registered_points", "deskewed cloud in odom_frame")
+    imu_topic: str = setting("/imu/data", "IMU samples", form=TOPIC)
+    odometry_topic: str = setting(
+        "odometry", "pose and twist of base_frame, once per sweep", form=TOPIC
+    )
+    fast_odometry_topic: str = setting(
+        "odometry_imu", "pose and twist carried on by the IMU, see imu_rate", form=TOPIC
+    )
+    path_topic: str = setting("path", "where base_frame has been", form=TOPIC)
+    map_topic: str = setting("local_map", "local map in odom_frame", form=TOPIC)
+    registered_topic: str = setting(
+        "registered_points", "deskewed cloud in odom_frame", form=TOPIC
+    )
     qos_reliability: str = setting(
         "reliable", "reliability of what is published", choices=("best_effort", "reliable")
     )
-    odom_frame: str = setting("odom", "frame in which poses are given")
+    odom_frame: str = setting("odom", "frame in which poses are given", form=FRAME)
     base_frame: str = setting(
-        "", "frame whose pose is given, tied to the cloud frame by /tf_static; empty = cloud frame"
+        "",
+        "frame whose pose is given, tied to the cloud frame by /tf_static; empty = cloud frame",
+        form=FRAME,
     )
     publish_tf: bool = setting(True, "publish the transform between odom_frame and base_frame")
     invert_tf: bool = setting(
@@ -211,6 +237,11 @@ class OdometryTopics:
         """Check what a single setting cannot."""
         if len(self.imu_xyz) != 3:
             raise SettingError(f"parameter 'imu_xyz': {self.imu_xyz!r} has not three numbers")
+        if self.odom_frame in ("", self.base_frame):
+            raise SettingError(
+                f"parameter 'odom_frame': {self.odom_frame!r} cannot be it, expected a frame name "
+                "other than base_frame's"
+            )
         if not self.map_file.endswith((".ply", ".pcd")):
             raise SettingError(f"parameter 'map_file': '{self.map_file}' is not a .ply or .pcd")
 

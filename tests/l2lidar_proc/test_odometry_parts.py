@@ -165,6 +165,23 @@ def test_plain_mode_leaves_out_points_with_their_times():
     assert len(estimate.points) == np.isfinite(points["y"]).sum()
 
 
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [
+        ({"surface_sizes": ()}, "surface_sizes"),
+        ({"surface_sizes": (1.0, 0.2)}, "surface_sizes"),
+        ({"min_range": 5.0, "max_range": 1.0}, "min_range"),
+        ({"base_frame": "/base link"}, "base_frame"),
+        ({"odom_frame": ""}, "odom_frame"),
+        ({"base_frame": "odom"}, "odom_frame"),
+        ({"odometry_topic": "my odometry"}, "odometry_topic"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_by_name(values, name):
+    with pytest.raises(SettingError, match=f"parameter '{name}': .*expected"):
+        build(OdometryNodeConfig, values)
+
+
 def test_settings_refuse_what_cannot_be():
     with pytest.raises(SettingError, match="map_file"):
         build(OdometryNodeConfig, {"map_file": "map.txt"})
