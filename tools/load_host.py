@@ -50,6 +50,7 @@ def main() -> int:
     before = [health.observe(one.driver, one.transport, _now()) for one in sessions]
     print("listening", flush=True)
     stopping.wait()
+    _until_silent(sessions)
     for session in sessions:
         session.stop()
     complaints = set()
@@ -71,6 +72,14 @@ def main() -> int:
     }
     print(json.dumps(found))
     return 0
+
+
+def _until_silent(sessions: list[Session]) -> None:
+    """Wait until the sessions have taken what their sockets hold, however slow this machine is."""
+    before = -1
+    while (heard := sum(one.driver.counters.datagrams for one in sessions)) != before:
+        before = heard
+        time.sleep(0.3)
 
 
 def _now() -> HostNs:

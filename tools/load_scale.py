@@ -79,7 +79,6 @@ def crowd(sensors: int, processes: int, rate: float, seconds: float) -> dict[str
              *map(str, ports)],
             capture_output=True, text=True, check=True,
         )  # fmt: skip
-        time.sleep(0.5)
         for host in hosts:
             host.send_signal(signal.SIGINT)
         results = [json.loads(host.communicate(timeout=30)[0]) for host in hosts]
