@@ -31,7 +31,7 @@ _FIRST: Final = (
     "l2lidar_node/__init__.py", "l2lidar_node/programs.py", "l2lidar_proc/__init__.py",
     "__editable___l2lidar_node_0_1_0_finder.py",
 )  # fmt: skip
-_NOTHING_HEARD: Final = ("l2lidar monitor", "l2lidar record")  # say so with exit code 1
+_NOTHING_HEARD: Final = ("l2lidar monitor", "l2lidar record", "l2lidar discover")  # exit code 1
 _UNCLEAN_WORDS: Final = (
     "Traceback", "Exception ignored", "Fatal", "terminate called", "core dumped", "rcl_shutdown",
 )  # fmt: skip
