@@ -176,12 +176,11 @@ def _link(before: Period, after: Period) -> Check:
     received = sum(_measured(before, after).values())
     drops = after.kernel_drops - before.kernel_drops
     foreign = after.foreign - before.foreign
-    if lost > _LOSS_ERROR * (received + lost):
-        return Check("link", Level.ERROR, f"{lost} packets lost in {received + lost}", values)
+    is_grave = lost > _LOSS_ERROR * (received + lost)
     troubles = [
         text
         for number, text in (
-            (lost, f"{lost} packets lost"),
+            (lost, f"{lost} packets lost" + (f" in {received + lost}" if is_grave else "")),
             (damaged, f"{damaged} damaged or impossible packets"),
             (drops, f"{drops} datagrams dropped by the kernel; raise receive_buffer_bytes"),
             (foreign, f"{foreign} datagrams of other senders refused"),
@@ -189,7 +188,8 @@ def _link(before: Period, after: Period) -> Check:
         if number > 0
     ]
     if troubles:
-        return Check("link", Level.WARN, "; ".join(troubles), values)
+        level = Level.ERROR if is_grave else Level.WARN
+        return Check("link", level, "; ".join(troubles), values)
     return Check("link", Level.OK, "no loss", values)
 
 

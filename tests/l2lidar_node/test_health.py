@@ -145,6 +145,15 @@ def test_a_little_loss_is_a_warning_and_much_is_an_error():
     assert "packets lost in" in message
 
 
+def test_much_loss_names_its_cause_where_it_is_known():
+    watched = streaming(keep=lambda item: item.arrival_ns // 1_000 % 7)
+    watched.link.kernel_drops = 9
+    level, message = watched.verdict("link")
+    assert level is Level.ERROR
+    assert "packets lost in" in message
+    assert "9 datagrams dropped by the kernel" in message
+
+
 def test_damage_drops_and_foreigners_are_named():
     watched = streaming(1.5)
     watched.run.hear(PacketType.POINTS_3D, build.points_3d(count=999))
