@@ -29,6 +29,37 @@ TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 _NUMBERS: Final = {code: number for number, code in cloud_fields.DATATYPES.items()}
 
 
+class RecordingError(ValueError):
+    """A recording that cannot be used; the message says which and why."""
+
+
+def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:
+    """Return the topic that was asked for, or the only one of its kind.
+
+    Parameters
+    ----------
+    kinds : dict
+        Types of the recording's topics, by name.
+    wanted : str
+    kind : str
+        Type to look for.
+    parameter : str
+        What ``wanted`` is the value of, for the message.
+
+    Raises
+    ------
+    RecordingError
+        If there is none, or more than one and none of that name.
+    """
+    found = [topic for topic, its in kinds.items() if its == kind]
+    if wanted in found:
+        return wanted
+    if len(found) == 1:
+        return found[0]
+    listed = ", ".join(found) or "none"
+    raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
+
+
 def open_bag(path: Path) -> AnyReader:
     """Return a reader of a rosbag2 folder or an MCAP file; use it in a ``with``."""
     return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))

@@ -19,6 +19,7 @@ from l2lidar_node.programs import interruptible
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_proc import bag
+from l2lidar_proc.bag import RecordingError
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig
 from l2lidar_proc.frames import FrameTree
@@ -28,10 +29,6 @@ from l2lidar_proc.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.velocity import carried_over
 
 _END_NS: Final = 2**62
-
-
-class RecordingError(ValueError):
-    """A file that cannot be used; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,20 +179,10 @@ def _topics(config: DeskewNodeConfig, kinds: dict[str, str]) -> Topics:
         ]
         velocity = named[0] if named else found[0] if len(found) == 1 else ""
     return Topics(
-        _chosen(kinds, wanted.cloud_topic, bag.CLOUD, "cloud_topic"),
-        _chosen(kinds, wanted.imu_topic, bag.IMU, "imu_topic"),
+        bag.chosen(kinds, wanted.cloud_topic, bag.CLOUD, "cloud_topic"),
+        bag.chosen(kinds, wanted.imu_topic, bag.IMU, "imu_topic"),
         velocity,
     )
-
-
-def _chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:
-    found = [topic for topic, its in kinds.items() if its == kind]
-    if wanted in found:
-        return wanted
-    if len(found) == 1:
-        return found[0]
-    listed = ", ".join(found) or "none"
-    raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
 
 
 def main(arguments: list[str] | None = None) -> int:

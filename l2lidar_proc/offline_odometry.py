@@ -26,6 +26,7 @@ from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import Sweep
 from l2lidar_proc import bag, map_file
+from l2lidar_proc.bag import RecordingError
 from l2lidar_proc.base_frame import BaseFrame
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.frames import FrameTree
@@ -39,10 +40,6 @@ _END_NS: Final = 2**62
 
 Progress = Callable[[float], None]
 """Told the share of the recording that is done, 0 to 1."""
-
-
-class RecordingError(ValueError):
-    """A recording that cannot be used; the message says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,10 +135,10 @@ def run_bag(
     try:
         with bag.open_bag(source) as reader:
             kinds = {item.topic: item.msgtype for item in reader.connections}
-            cloud = _chosen(kinds, config.topics.cloud_topic, bag.CLOUD, "cloud_topic")
+            cloud = bag.chosen(kinds, config.topics.cloud_topic, bag.CLOUD, "cloud_topic")
             imu = ""
             if config.odometry.mode == "inertial":
-                imu = _chosen(kinds, config.topics.imu_topic, bag.IMU, "imu_topic")
+                imu = bag.chosen(kinds, config.topics.imu_topic, bag.IMU, "imu_topic")
             listener = _Listener(OdometryRunner(config), config, cloud, imu)
             span = max(reader.end_time - reader.start_time, 1)
             for connection, now, data in bag.messages(reader):
@@ -235,16 +232,6 @@ def _plot(run: OdometryRun, path: Path) -> None:
     FigureCanvasAgg(figure)
     with whole(path) as part:
         figure.savefig(part)
-
-
-def _chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:
-    found = [topic for topic, its in kinds.items() if its == kind]
-    if wanted in found:
-        return wanted
-    if len(found) == 1:
-        return found[0]
-    listed = ", ".join(found) or "none"
-    raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
 
 
 def main(arguments: list[str] | None = None) -> int:

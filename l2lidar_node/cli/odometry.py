@@ -50,6 +50,7 @@ def odometry(
     """
     from l2lidar_node.ros.parameter_files import parameters_for
     from l2lidar_proc import offline_odometry
+    from l2lidar_proc.bag import RecordingError
     from l2lidar_proc.odometry_config import OdometryNodeConfig
 
     try:
@@ -78,7 +79,7 @@ def odometry(
                 run = offline_odometry.run_bag(source, config, progress)
             progress(1.0)
         files = offline_odometry.write(run, folder)
-    except offline_odometry.RecordingError as error:
+    except RecordingError as error:
         raise DeviceError(str(error)) from None
     except CaptureError as error:
         raise DeviceError(f"{source}: {error}") from None

@@ -12,8 +12,9 @@ from rosbags.typesys import Stores, get_typestore
 from l2lidar_node.settings import build
 from l2lidar_node.types import POINT
 from l2lidar_proc import bag
+from l2lidar_proc.bag import RecordingError
 from l2lidar_proc.config import DeskewNodeConfig
-from l2lidar_proc.offline_deskew import RecordingError, deskew_recording, main
+from l2lidar_proc.offline_deskew import deskew_recording, main
 from tests.l2lidar_proc.analytic import Motion, at, rms, seen, xyz
 from tools.deskew_scenarios import Scenario, record
 

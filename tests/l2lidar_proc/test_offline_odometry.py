@@ -10,8 +10,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.types import Sweep
 from l2lidar_proc import bag
+from l2lidar_proc.bag import RecordingError
 from l2lidar_proc.odometry_config import OdometryNodeConfig
-from l2lidar_proc.offline_odometry import RecordingError, main, run_bag, run_events
+from l2lidar_proc.offline_odometry import main, run_bag, run_events
 from tests.l2lidar_proc.odometry_world import recording
 from tools.odometry_runs import sweeps, truth
 
