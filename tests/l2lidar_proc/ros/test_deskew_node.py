@@ -2,87 +2,52 @@
 
 from __future__ import annotations
 
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402  after importorskip
 from geometry_msgs.msg import TransformStamped, TwistStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud, to_time  # noqa: E402
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_time  # noqa: E402
 from l2lidar_node.settings import SettingError  # noqa: E402
+from l2lidar_proc.ros import deskew_node  # noqa: E402
 from l2lidar_proc.ros.deskew_node import DeskewNode  # noqa: E402
 from tests.l2lidar_proc.analytic import Motion, at, rms, seen, xyz  # noqa: E402
+from tests.l2lidar_proc.ros.bench import FRAME, IMU_FRAME, Bench  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
 WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
-TIMEOUT_S = 20.0
-FRAME = "l2lidar_link"
 
 
-class Bench:
-    """A deskew node and, in another node, everything it talks to."""
+class DeskewBench(Bench):
+    """A deskew node on the bench."""
 
     def __init__(self, *overrides: str) -> None:
-        rclpy.init(args=["test", "--ros-args", *(w for o in overrides for w in ("-p", o))])
-        self.node = DeskewNode()
-        self.peer = rclpy.create_node("peer")
+        super().__init__(DeskewNode, overrides)
         self.clouds: list[PointCloud2] = []
-        self.diagnostics: list[DiagnosticStatus] = []
         self.statistics: list[DiagnosticStatus] = []
-        self.peer.create_subscription(PointCloud2, "points_deskewed", self.clouds.append, 10)
-        self.peer.create_subscription(
-            DiagnosticArray, "/diagnostics", lambda m: self.diagnostics.extend(m.status), 10
-        )
-        self.peer.create_subscription(
-            DiagnosticStatus, "deskew_node/statistics", self.statistics.append, 10
-        )
-        self.cloud_publisher = self.peer.create_publisher(PointCloud2, "/points", 10)
-        self.imu_publisher = self.peer.create_publisher(Imu, "/imu/data", 500)
-        self.odometry_publisher = self.peer.create_publisher(Odometry, "odometry", 10)
-        self.twist_publisher = self.peer.create_publisher(TwistStamped, "twist", 10)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.tf_publisher = self.peer.create_publisher(TFMessage, "/tf_static", latched)
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.peer)
-        self.until(lambda: self.cloud_publisher.get_subscription_count())
-        self.until(lambda: self.imu_publisher.get_subscription_count())
-        self.until(lambda: self.node._output.get_subscription_count())
-        self.until(lambda: self.node._statistics.get_subscription_count())
+        self.hear(PointCloud2, "points_deskewed", self.clouds.append)
+        self.hear(DiagnosticStatus, "deskew_node/statistics", self.statistics.append)
+        self.odometry_out = self.peer.create_publisher(Odometry, "odometry", 10)
+        self.twist_out = self.peer.create_publisher(TwistStamped, "twist", 10)
+        self.until(self.clouds_out.get_subscription_count)
+        self.until(self.imu_out.get_subscription_count)
+        self.until(self.node._output.get_subscription_count)
+        self.until(self.node._statistics.get_subscription_count)
 
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.peer.destroy_node()
-        self.node.destroy_node()
-        rclpy.shutdown()
-
-    def until(self, condition) -> None:
-        deadline = time.monotonic() + TIMEOUT_S
-        while not condition():
-            assert time.monotonic() < deadline, "nothing came in time"
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def send_imu(self, samples, frame: str = "l2lidar_imu") -> None:
+    def send_imu(self, samples, frame: str = IMU_FRAME) -> None:
         window = self.node._pipeline.tracker.window
         for sample in samples:
-            message = Imu()
-            message.header.stamp = to_time(int(sample["stamp"]))
-            message.header.frame_id = frame
-            rate, force = message.angular_velocity, message.linear_acceleration
-            rate.x, rate.y, rate.z = sample["angular_velocity"].tolist()
-            force.x, force.y, force.z = sample["linear_acceleration"].tolist()
-            self.imu_publisher.publish(message)
+            self.send_sample(sample, frame)
             last = int(sample["stamp"])
             self.until(lambda last=last: window.newest is not None and window.newest >= last)
 
@@ -91,11 +56,8 @@ class Bench:
         message.header.stamp = to_time(at(seconds))
         linear = message.twist.twist.linear
         linear.x, linear.y, linear.z = (float(v) for v in velocity)
-        self.until(lambda: self.odometry_publisher.get_subscription_count())
-        self.odometry_publisher.publish(message)
-
-    def send_cloud(self, points, seconds: float) -> None:
-        self.cloud_publisher.publish(to_cloud(points, at(seconds), FRAME))
+        self.until(self.odometry_out.get_subscription_count)
+        self.odometry_out.publish(message)
 
     def known(self, seconds: float) -> bool:
         return self.node._pipeline.tracker.velocities.newest == at(seconds)
@@ -103,27 +65,33 @@ class Bench:
 
 @pytest.fixture
 def bench(request):
-    made = Bench(*getattr(request, "param", ()))
+    made = DeskewBench(*getattr(request, "param", ()))
     yield made
     made.close()
 
 
-def prime(bench: Bench, seconds: float) -> None:
+def prime(bench: DeskewBench, seconds: float) -> None:
     """Give the node its cloud frame and IMU samples up to an instant."""
-    bench.send_cloud(seen(WALK, 0, 0.23, 0)[0], 0.0)
+    bench.send_cloud(seen(WALK, 0, 0.23, 0)[0], at(0.0))
     bench.until(lambda: bench.clouds and bench.statistics)
     bench.clouds.clear()
     bench.statistics.clear()
     bench.send_imu(WALK.imu(0, seconds))
 
 
+def stop_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the node wait for samples however long they take."""
+    monkeypatch.setattr(deskew_node, "time", SimpleNamespace(monotonic_ns=lambda: 0))
+
+
 @pytest.mark.parametrize("bench", [("imu_wait_ms:=1000",)], indirect=True)
-def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(bench):
+def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(bench, monkeypatch):
     prime(bench, 2.1)
+    stop_time(monkeypatch)
     bench.send_odometry(2.0, WALK.velocity(np.array([2.0]))[0])
     bench.until(lambda: bench.known(2.0))
     points, truth = seen(WALK, 2.0, 2.23, 2.0, count=3000)
-    bench.send_cloud(points, 2.0)
+    bench.send_cloud(points, at(2.0))
     bench.send_imu(WALK.imu(2.104, 2.232))
     bench.until(lambda: bench.clouds)
     (cloud,) = bench.clouds
@@ -140,7 +108,7 @@ def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(bench):
 
 def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench):
     points, _ = seen(WALK, 0, 0.23, 0)
-    bench.send_cloud(points, 0.0)
+    bench.send_cloud(points, at(0.0))
     bench.until(lambda: bench.clouds)
     assert (from_cloud(bench.clouds[0])["x"] == points["x"]).all()
     bench.until(lambda: any("no IMU samples" in s.message for s in bench.diagnostics))
@@ -150,10 +118,11 @@ def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench):
 
 
 @pytest.mark.parametrize("bench", [("imu_wait_ms:=1000", "point_layout:=velodyne")], indirect=True)
-def test_the_output_has_the_layout_asked_for_without_a_time(bench):
+def test_the_output_has_the_layout_asked_for_without_a_time(bench, monkeypatch):
     prime(bench, 2.1)
+    stop_time(monkeypatch)
     points, _ = seen(WALK, 2.0, 2.23, 2.0, count=3000)
-    bench.send_cloud(points, 2.0)
+    bench.send_cloud(points, at(2.0))
     bench.send_imu(WALK.imu(2.104, 2.232))
     bench.until(lambda: bench.clouds)
     deskewed = from_cloud(bench.clouds[0])
@@ -164,7 +133,7 @@ def test_the_output_has_the_layout_asked_for_without_a_time(bench):
 def test_a_cloud_without_plain_times_passes_with_the_reason(bench):
     points, _ = seen(WALK, 0, 0.23, 0)
     points["time"] = 0.05
-    bench.send_cloud(points, 0.0)
+    bench.send_cloud(points, at(0.0))
     bench.until(lambda: bench.clouds)
     assert from_cloud(bench.clouds[0]).dtype.names == ("x", "y", "z", "intensity", "range")
     bench.until(
@@ -173,7 +142,7 @@ def test_a_cloud_without_plain_times_passes_with_the_reason(bench):
 
 
 def test_mounts_come_from_tf(bench):
-    bench.send_cloud(seen(WALK, 0, 0.23, 0)[0], 0.0)
+    bench.send_cloud(seen(WALK, 0, 0.23, 0)[0], at(0.0))
     bench.until(lambda: bench.clouds)
     mount = TransformStamped(child_frame_id="some_imu")
     mount.header.frame_id = FRAME
@@ -182,7 +151,7 @@ def test_mounts_come_from_tf(bench):
     base.header.frame_id = "base_link"
     base.transform.translation.x = 0.5
     base.transform.rotation.w = 1.0
-    bench.tf_publisher.publish(TFMessage(transforms=[mount, base]))
+    bench.tf_out.publish(TFMessage(transforms=[mount, base]))
     bench.until(lambda: bench.node._frames.version)
     bench.send_imu(WALK.imu(0, 0.1), frame="some_imu")
     np.testing.assert_allclose(
@@ -205,8 +174,8 @@ def test_velocity_from_a_twist(bench):
     message.header.frame_id = FRAME
     message.header.stamp = to_time(at(1.5))
     message.twist.linear.x = 0.7
-    bench.until(lambda: bench.twist_publisher.get_subscription_count())
-    bench.twist_publisher.publish(message)
+    bench.until(bench.twist_out.get_subscription_count)
+    bench.twist_out.publish(message)
     bench.until(lambda: bench.known(1.5))
     assert bench.node._pipeline.tracker.velocities.source == "twist"
 
@@ -218,14 +187,14 @@ def test_velocity_from_a_twist(bench):
 )
 def test_filters_and_parameters_live(bench):
     points, _ = seen(WALK, 0, 0.23, 0)
-    bench.send_cloud(points, 0.0)
+    bench.send_cloud(points, at(0.0))
     bench.until(lambda: bench.clouds)
     first = from_cloud(bench.clouds.pop())
     assert len(first) == (points["range"] <= 8).sum()
     assert first["time"][0] == 0.0
     (result,) = bench.node.set_parameters([Parameter("filters_before", value=["range", "voxel"])])
     assert result.successful, result.reason
-    bench.send_cloud(points, 0.3)
+    bench.send_cloud(points, at(0.3))
     bench.until(lambda: bench.clouds)
     assert len(from_cloud(bench.clouds.pop())) < len(first)
     for wrong in (Parameter("filters_before", value=["rnage"]), Parameter("range_min", value=9.0)):

@@ -2,78 +2,48 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
-from geometry_msgs.msg import TransformStamped  # noqa: E402
+from geometry_msgs.msg import TransformStamped  # noqa: E402  after importorskip
 from nav_msgs.msg import Odometry, Path  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud, to_time  # noqa: E402
+from l2lidar_node.ros.conversions import from_cloud, from_time  # noqa: E402
 from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
 from tests.l2lidar_proc.odometry_world import recording  # noqa: E402
+from tests.l2lidar_proc.ros.bench import FRAME, LATCHED, Bench  # noqa: E402
 from tools.odometry_runs import sweeps, truth  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
-TIMEOUT_S = 40.0
-FRAME = "l2lidar_link"
-LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-
-class Bench:
-    """An odometry node and, in another node, everything it talks to."""
+class OdometryBench(Bench):
+    """An odometry node on the bench."""
 
     def __init__(self, *overrides: str) -> None:
-        rclpy.init(args=["test", "--ros-args", *(w for o in overrides for w in ("-p", o))])
-        self.node = OdometryNode()
-        self.peer = rclpy.create_node("peer")
+        super().__init__(OdometryNode, overrides)
         self.poses: list[Odometry] = []
         self.fast: list[Odometry] = []
         self.paths: list[Path] = []
         self.maps: list[PointCloud2] = []
         self.registered: list[PointCloud2] = []
         self.transforms: list[TransformStamped] = []
-        self.diagnostics: list[DiagnosticStatus] = []
-        listen = self.peer.create_subscription
-        listen(Odometry, "odometry", self.poses.append, 50)
-        listen(Odometry, "odometry_imu", self.fast.append, 50)
-        listen(Path, "path", self.paths.append, LATCHED)
-        listen(PointCloud2, "local_map", self.maps.append, LATCHED)
-        listen(PointCloud2, "registered_points", self.registered.append, 50)
-        listen(TFMessage, "/tf", lambda m: self.transforms.extend(m.transforms), 50)
-        listen(DiagnosticArray, "/diagnostics", lambda m: self.diagnostics.extend(m.status), 10)
-        self.clouds = self.peer.create_publisher(PointCloud2, "/points", 10)
-        self.imu = self.peer.create_publisher(Imu, "/imu/data", 500)
-        self.static = self.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.peer)
-        self.until(lambda: self.clouds.get_subscription_count())
-        self.until(lambda: self.imu.get_subscription_count())
-        self.until(lambda: self.node._odometry.get_subscription_count())
-        self.until(lambda: self.node._registered.get_subscription_count())
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.peer.destroy_node()
-        self.node.destroy_node()
-        rclpy.shutdown()
-
-    def until(self, condition) -> None:
-        deadline = time.monotonic() + TIMEOUT_S
-        while not condition():
-            assert time.monotonic() < deadline, "nothing came in time"
-            self.executor.spin_once(timeout_sec=0.05)
+        self.hear(Odometry, "odometry", self.poses.append)
+        self.hear(Odometry, "odometry_imu", self.fast.append)
+        self.hear(Path, "path", self.paths.append, LATCHED)
+        self.hear(PointCloud2, "local_map", self.maps.append, LATCHED)
+        self.hear(PointCloud2, "registered_points", self.registered.append)
+        self.hear(TFMessage, "/tf", lambda m: self.transforms.extend(m.transforms))
+        self.until(self.clouds_out.get_subscription_count)
+        self.until(self.imu_out.get_subscription_count)
+        self.until(self.node._odometry.get_subscription_count)
+        self.until(self.node._registered.get_subscription_count)
+        self.until(self.node._tf.get_subscription_count)
 
     def send(self, run, some) -> None:
         """Send sweeps, each after the samples that cover it."""
@@ -82,19 +52,13 @@ class Bench:
         for sweep in some:
             last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
             for sample in run.imu[first:last]:
-                message = Imu()
-                message.header.stamp = to_time(int(sample["stamp"]))
-                message.header.frame_id = "l2lidar_imu"
-                rate, force = message.angular_velocity, message.linear_acceleration
-                rate.x, rate.y, rate.z = sample["angular_velocity"].tolist()
-                force.x, force.y, force.z = sample["linear_acceleration"].tolist()
-                self.imu.publish(message)
+                self.send_sample(sample)
                 self.executor.spin_once(timeout_sec=0.0)
             first = last
             newest = int(run.imu["stamp"][last - 1])
             self.until(lambda newest=newest: (pipeline.newest_imu or 0) >= newest)
             before = pipeline.sweeps
-            self.clouds.publish(to_cloud(sweep.points, sweep.start, FRAME))
+            self.send_cloud(sweep.points, sweep.start)
             self.until(lambda before=before: pipeline.sweeps > before)
 
     def call(self, name: str) -> Trigger.Response:
@@ -107,7 +71,7 @@ class Bench:
 
 @pytest.fixture
 def bench(request):
-    made = Bench(*getattr(request, "param", ()))
+    made = OdometryBench(*getattr(request, "param", ()))
     yield made
     made.close()
 
@@ -163,7 +127,7 @@ def test_base_frame_from_tf_with_the_transform_inverted(bench):
     mount.header.frame_id = "base_link"
     mount.transform.translation.z = 1.0
     mount.transform.rotation.w = 1.0
-    bench.static.publish(TFMessage(transforms=[mount]))
+    bench.tf_out.publish(TFMessage(transforms=[mount]))
     bench.until(lambda: bench.node._frames.version)
     bench.send(run, list(sweeps(run, "turn"))[:8])
     bench.until(lambda: len(bench.poses) == 8 and len(bench.transforms) == 8)
@@ -186,7 +150,7 @@ def test_a_cloud_that_cannot_be_used_is_told_of(bench):
     run = recording("room", "still", 3.0)
     points = next(sweeps(run, "turn")).points.copy()
     points["time"] = 0.0
-    bench.clouds.publish(to_cloud(points, 10**18, FRAME))
+    bench.send_cloud(points, 10**18)
     bench.until(
         lambda: any("times are equal" in v.key for s in bench.diagnostics for v in s.values)
     )
