@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from itertools import cycle
+from pathlib import Path
 from types import TracebackType
 from typing import Final
 
 from l2lidar_node.programs import held
 
-GRACE_S: Final = 10.0
+GRACE_S: Final = 30.0  # for a program that ends; only one that hangs takes so long
+_HANDED_OUT: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+_USUAL_LAST: Final = 60_999
+_LAST: Final = 65_535
 
 
 class ProgramError(RuntimeError):
@@ -103,11 +109,43 @@ def isolate_ros() -> None:
 
 
 def free_udp_ports(count: int) -> list[int]:
-    """Return UDP ports of the loopback interface that nobody uses right now."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    for sock in sockets:
-        sock.bind(("127.0.0.1", 0))
-    ports = [int(sock.getsockname()[1]) for sock in sockets]
-    for sock in sockets:
-        sock.close()
+    """Return UDP ports of the loopback interface that nobody uses right now.
+
+    They lie beyond those that the system hands out to whoever asks for any port, as DDS does many
+    times at every start: nobody takes them before they are used. No port is returned twice until
+    all have been.
+
+    Raises
+    ------
+    OSError
+        If there are not so many.
+    """
+    found: list[int] = []
+    for _ in range(_LAST - _beyond() + 1):
+        if len(found) == count:
+            break
+        port = next(_ports)
+        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", port))
+            found.append(port)
+    if len(found) < count:
+        raise OSError(f"of {count} UDP ports, {len(found)} are free")
+    return found
+
+
+def _beyond() -> int:
+    """Return the first port after those that the system hands out, some before the last one."""
+    try:
+        last = int(_HANDED_OUT.read_text().split()[1])
+    except OSError:
+        last = _USUAL_LAST
+    return last + 1 if last < _LAST - 1000 else _USUAL_LAST + 1
+
+
+def _shuffled() -> list[int]:
+    ports = list(range(_beyond(), _LAST + 1))
+    random.shuffle(ports)
     return ports
+
+
+_ports = cycle(_shuffled())
