@@ -29,7 +29,7 @@ from l2lidar_proc.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
 
-_WINDOW_S: Final = 6.0
+_WINDOW_S: Final = 12.0  # more than a held-up node has waiting
 _OPENING_NS: Final = 450_000_000  # the first sweeps are held for so long
 _OPENING_LONGEST_NS: Final = 3_000_000_000  # or, at rest, until they meet each other
 _OPENING_FELT_NS: Final = 1_000_000_000  # whose samples tell whether the sensor rests

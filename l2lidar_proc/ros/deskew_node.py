@@ -28,10 +28,9 @@ from l2lidar_proc.pipeline import Deskewed, Pipeline
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames
-from l2lidar_proc.ros.waiting import waiting
+from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
 from l2lidar_proc.velocity import carried_over
 
-_IMU_DEPTH = 500
 _RELIABILITY = {
     "best_effort": ReliabilityPolicy.BEST_EFFORT,
     "reliable": ReliabilityPolicy.RELIABLE,
@@ -72,11 +71,11 @@ class DeskewNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._statistics = self.create_publisher(DiagnosticStatus, "~/statistics", 10)
         asked = _RELIABILITY[topics.input_reliability]
-        listening = QoSProfile(depth=10, reliability=asked)
-        often = QoSProfile(depth=_IMU_DEPTH, reliability=asked)
+        listening = QoSProfile(depth=CLOUD_DEPTH, reliability=asked)
+        often = QoSProfile(depth=IMU_DEPTH, reliability=asked)
         self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
         self._imu_input = self.create_subscription(Imu, topics.imu_topic, self._imu, often)
-        velocities = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        velocities = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
             self.create_subscription(Odometry, topics.velocity_topic, self._odometry, velocities)
         elif topics.velocity_type == "twist":
@@ -157,7 +156,7 @@ class DeskewNode(Node):
 
     def _hand_out(self) -> None:
         """Publish what is finished, and come back in time for what still waits."""
-        for message in waiting(self._imu_input, _IMU_DEPTH):
+        for message in waiting(self._imu_input, IMU_DEPTH):
             self._take(message)
         for item in self._pipeline.poll(time.monotonic_ns()):
             self._publish(item)

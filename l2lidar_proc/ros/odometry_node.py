@@ -32,9 +32,8 @@ from l2lidar_proc.odometry_pipeline import OdometryPipeline
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames
-from l2lidar_proc.ros.waiting import waiting
+from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
 
-_IMU_DEPTH = 500
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
 
 
@@ -84,8 +83,8 @@ class OdometryNode(Node):
         self._registered = self.create_publisher(PointCloud2, topics.registered_topic, out)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        listening = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        often = QoSProfile(depth=_IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        listening = QoSProfile(depth=CLOUD_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        often = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
         self._imu_input = self.create_subscription(Imu, topics.imu_topic, self._imu, often)
         self.create_service(Trigger, "~/reset", self._reset)
@@ -138,7 +137,7 @@ class OdometryNode(Node):
 
     def _hand_out(self) -> None:
         """Publish what is finished, and come back in time for what still waits."""
-        for message in waiting(self._imu_input, _IMU_DEPTH):
+        for message in waiting(self._imu_input, IMU_DEPTH):
             self._take(message)
         for estimate in self._pipeline.poll(time.monotonic_ns()):
             self._publish(estimate)

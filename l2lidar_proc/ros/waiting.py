@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 from rclpy.subscription import Subscription
+
+# A node that is held up for some seconds catches up at once: better late than a hole in the map.
+CLOUD_DEPTH: Final = 30
+IMU_DEPTH: Final = 2000
 
 
 def waiting(subscription: Subscription, limit: int) -> Iterator[Any]:
