@@ -27,7 +27,7 @@ from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 
-_ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 0.5
+_ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 5.0  # however busy the machine is
 _NO_DEVICE = "a recording is replayed, there is no device to command"
 _CLOUD_DEPTH = 10
 _IMU_DEPTH = 1000  # 4 s, for reliable subscribers that are held up

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,7 +15,8 @@ from rclpy.node import Node
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.demo.processes import Program, Programs, free_udp_ports
 
-TIMEOUT_S = 40.0  # generous: only a failure waits that long
+TIMEOUT_S = 120.0  # generous: only a failure waits that long
+_ASK_AGAIN_S = 10.0
 
 
 @dataclass
@@ -58,13 +60,36 @@ class Rig:
             assert time.monotonic() < deadline, f"waited in vain for {what}"
 
     def call(self, kind: type, name: str, request: Any) -> Any:
-        """Call a service of the driver and return its response."""
+        """Call a service of the driver and return its response.
+
+        A server that has not heard of a client after 100 ms throws its answer away: it is asked
+        again.
+        """
         client = self.observer.create_client(kind, name)
         self.wait_for(client.service_is_ready, name)
-        future = client.call_async(request)
-        self.wait_for(future.done, f"an answer of {name}")
+        futures: list[Any] = []
+        asked = -math.inf
+
+        def is_answered() -> bool:
+            nonlocal asked
+            if time.monotonic() - asked > _ASK_AGAIN_S:
+                futures.append(client.call_async(request))
+                asked = time.monotonic()
+            return any(future.done() for future in futures)
+
+        self.wait_for(is_answered, f"an answer of {name}")
         self.observer.destroy_client(client)
-        return future.result()
+        return next(future.result() for future in futures if future.done())
+
+    def insist(self, kind: type, name: str, request: Any) -> None:
+        """Call a service until the device has acknowledged.
+
+        One that is not given the processor for a second acknowledges nothing in time.
+        """
+        deadline = time.monotonic() + TIMEOUT_S
+        while not (response := self.call(kind, name, request)).success:
+            assert "did not acknowledge" in response.message
+            assert time.monotonic() < deadline, response.message
 
 
 def assignments(values: Mapping[str, object]) -> list[str]:

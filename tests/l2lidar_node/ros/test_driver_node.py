@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -34,20 +35,28 @@ def rig() -> Iterator[Rig]:
 
 
 def test_topics_have_the_rates_fields_frames_and_stamps_that_users_rely_on(rig: Rig) -> None:
-    rig.observer.clouds, rig.observer.imu = TopicRecord(), TopicRecord()
-    rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= 12, "clouds")
-    clouds, imu, cloud = rig.observer.clouds, rig.observer.imu, rig.observer.cloud
+    clouds, imu = rig.observer.clouds, rig.observer.imu = TopicRecord(), TopicRecord()
+
+    def flow() -> bool:
+        """Judge the latest clouds by stamp; a pause of this machine cuts one short."""
+        cloud = rig.observer.cloud
+        return bool(
+            len(clouds.stamps) >= 12
+            and np.allclose(clouds.intervals_ms[-5:], 38 * 4.639, rtol=0.01)
+            and np.median(imu.intervals_ms[-200:]) == pytest.approx(4.0, abs=0.01)
+            and cloud is not None
+            and 0.16 < cloud["time"][-1] < 0.18
+        )
+
+    rig.wait_for(flow, "clouds and IMU samples at their rates")
     assert rig.observer.fields == ["x", "y", "z", "intensity", "range", "time"]
     assert (clouds.frame, imu.frame) == ("l2lidar_link", "l2lidar_imu")
     assert clouds.backward_steps == 0
     assert imu.backward_steps == 0
-    # By stamp, so that a slow machine does not matter.
-    assert np.median(clouds.intervals_ms) == pytest.approx(38 * 4.639, rel=0.01)
-    assert np.median(imu.intervals_ms) == pytest.approx(4.0, abs=0.01)
+    cloud = rig.observer.cloud
     assert cloud is not None
     assert cloud["time"][0] == 0.0
     assert (np.diff(cloud["time"]) >= 0).all()
-    assert 0.16 < cloud["time"][-1] < 0.18
     norms = np.sqrt(cloud["x"] ** 2 + cloud["y"] ** 2 + cloud["z"] ** 2)
     assert np.abs(norms - cloud["range"]).max() < 0.06  # the axis is 45 mm above the origin
     assert min(clouds.ages_s) > 0.16  # stamped at the first point, received after the last
@@ -55,6 +64,7 @@ def test_topics_have_the_rates_fields_frames_and_stamps_that_users_rely_on(rig: 
 
 def test_qos_is_upstreams(rig: Rig) -> None:
     for topic in ("/points", "/imu/data"):
+        rig.wait_for(lambda topic=topic: publishers(rig.observer, topic), topic)
         (info,) = publishers(rig.observer, topic)
         assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
 
@@ -187,15 +197,17 @@ def test_an_atomic_change_with_one_wrong_value_changes_nothing(rig: Rig) -> None
     result = rig.call(SetParametersAtomically, name, request).result
     assert not result.successful
     assert "sweep_duration_ms" in result.reason
-    seen = len(rig.observer.clouds.stamps)
-    rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= seen + 3, "clouds")
-    assert rig.observer.cloud is not None
-    assert rig.observer.cloud["time"][-1] > 0.16
+    now = time.time_ns()
+
+    def is_long() -> bool:
+        cloud, stamps = rig.observer.cloud, rig.observer.clouds.stamps
+        return cloud is not None and stamps[-1] > now and cloud["time"][-1] > 0.16
+
+    rig.wait_for(is_long, "a cloud of 38 packets")
 
 
 def test_enable_stops_and_starts_the_device(rig: Rig) -> None:
-    response = rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=False))
-    assert response.success, response.message
+    rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=False))
     rig.wait_for(
         lambda: (
             rig.observer.diagnostics
@@ -204,8 +216,7 @@ def test_enable_stops_and_starts_the_device(rig: Rig) -> None:
         "standby",
     )
     seen = len(rig.observer.clouds.stamps)
-    response = rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
-    assert response.success, response.message
+    rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
     rig.wait_for(lambda: len(rig.observer.clouds.stamps) > seen + 2, "clouds after the start")
     assert rig.observer.clouds.backward_steps == 0
 

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from std_srvs.srv import SetBool
 
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.ros.conversions import from_cloud
-from tests.build import REAL_L2, real_capture
+from tests.build import NS, REAL_L2, frames_3d, points_3d, real_capture
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, assignments, open_rig
 
 pytestmark = pytest.mark.ros
@@ -105,7 +106,9 @@ def test_a_signal_ends_it_cleanly(number: signal.Signals) -> None:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     assert process.stdout is not None
-    assert "listening" in process.stdout.readline()
+    for line in process.stdout:
+        if "listening" in line:
+            break
     process.send_signal(number)
     said, _ = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 0, said
@@ -194,26 +197,41 @@ def test_an_upstream_parameter_file_works_unchanged(rig: Rig, tmp_path: Path) ->
 @pytest.mark.skipif(not REAL_L2.exists(), reason="the recordings are not here")
 def test_a_real_recording_comes_out_at_its_recorded_points(rig: Rig) -> None:
     capture = real_capture(1)
+    probes: list[np.ndarray] = []
     clouds: list[np.ndarray] = []
 
-    rig.observer.create_subscription(
-        PointCloud2,
-        "/points",
-        lambda m: clouds.append(from_cloud(m).copy()),
-        QoSProfile(depth=500),
-    )
+    def keep(message: PointCloud2) -> None:
+        (probes if message.width == 1 else clouds).append(from_cloud(message).copy())
+
+    rig.observer.create_subscription(PointCloud2, "/points", keep, QoSProfile(depth=500))
     rig.driver(
         UseSystemTimeTS=True, aggregateNframes=0, qos_reliability="reliable",
         enable_l2_host_sync=False,
     )  # fmt: skip
     rig.wait_for(lambda: rig.observer.diagnostics, "the driver")
+    driver = ("127.0.0.1", rig.host_port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         device.bind(("127.0.0.1", rig.lidar_port))
+
+        # What is published before the driver has heard of the subscription never comes.
+        payloads = (points_3d(500 + k, k * NS, ranges=[3000], count=1) for k in range(500))
+        knocks = iter(frames_3d(payloads))
+        knocked = 0.0
+
+        def is_heard() -> bool:
+            nonlocal knocked
+            if time.monotonic() - knocked > 0.2:
+                device.sendto(next(knocks), driver)
+                knocked = time.monotonic()
+            return bool(probes)
+
+        rig.wait_for(is_heard, "a cloud of one point")
         datagrams = capture.datagrams()
-        for at in range(0, len(datagrams), 40):
-            for datagram in datagrams[at : at + 40]:
-                device.sendto(datagram.data, ("127.0.0.1", rig.host_port))
-            wanted = min(at + 40, len(datagrams))
+        few = 10  # fewer than the driver keeps for a subscriber that is held up
+        for at in range(0, len(datagrams), few):
+            for datagram in datagrams[at : at + few]:
+                device.sendto(datagram.data, driver)
+            wanted = min(at + few, len(datagrams))
             rig.wait_for(lambda wanted=wanted: len(clouds) >= wanted, f"cloud {wanted}")
     points = np.concatenate(clouds)
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -23,7 +24,7 @@ NAMES = (
 COUNT = 6
 
 SPEAKER = f"""
-import sys, time
+import sys
 from l2lidar_node.ros.arguments import start_rclpy
 start_rclpy(["speaker"])
 from rclpy.node import Node
@@ -32,10 +33,9 @@ from std_msgs.msg import UInt8MultiArray
 node = Node("speaker")
 qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 publisher = node.create_publisher(UInt8MultiArray, "clouds", qos)
-while not publisher.get_subscription_count():
-    time.sleep(0.01)
-print("heard of", flush=True)
-sys.stdin.readline()
+while sys.stdin.readline() == "knock\\n":
+    publisher.publish(UInt8MultiArray())
+    print("knocked", flush=True)
 for number in range({COUNT}):
     publisher.publish(UInt8MultiArray(data=bytes(365_000)))
 print("sent", flush=True)
@@ -49,14 +49,17 @@ from std_msgs.msg import UInt8MultiArray
 rclpy.init()
 node = rclpy.create_node("listener")
 qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-heard = []
-node.create_subscription(UInt8MultiArray, "clouds", heard.append, qos)
-print("listening", flush=True)
-sys.stdin.readline()
-until = time.monotonic() + 5.0
-while len(heard) < {COUNT} and time.monotonic() < until:
+knocks, clouds = [], []
+def hear(message):
+    (clouds if message.data else knocks).append(message)
+node.create_subscription(UInt8MultiArray, "clouds", hear, qos)
+while sys.stdin.readline() == "knock\\n":
+    rclpy.spin_once(node, timeout_sec=0.2)
+    print(len(knocks), flush=True)
+until = time.monotonic() + {LIMIT_S}
+while len(clouds) < {COUNT} and time.monotonic() < until:
     rclpy.spin_once(node, timeout_sec=0.1)
-print(len(heard), flush=True)
+print(len(clouds), flush=True)
 """
 
 
@@ -72,29 +75,45 @@ def next_line(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline().strip()
 
 
-def go_on(process: subprocess.Popen[str]) -> None:
+def tell(process: subprocess.Popen[str], word: str) -> None:
     assert process.stdin is not None
-    process.stdin.write("\n")
+    process.stdin.write(f"{word}\n")
     process.stdin.flush()
+
+
+def introduce(speaker: subprocess.Popen[str], listener: subprocess.Popen[str]) -> None:
+    """Have one hear the other: what is published before both know of each other is lost."""
+    heard = 0
+    deadline = time.monotonic() + LIMIT_S
+    while not heard:
+        assert time.monotonic() < deadline
+        tell(speaker, "knock")
+        assert next_line(speaker) == "knocked"
+        tell(listener, "knock")
+        heard = int(next_line(listener))
+    before = 0
+    while heard != before:  # until none waits
+        before = heard
+        tell(listener, "knock")
+        heard = int(next_line(listener))
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /dev/shm")
 def test_a_listener_that_is_held_up_loses_no_cloud(tmp_path: Path) -> None:
     domain = {
-        "ROS_DOMAIN_ID": str(100 + os.getpid() % 100),
+        "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 100),  # not that of this test run
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
     environment = {name: value for name, value in os.environ.items() if name not in NAMES}
     listener = started(LISTENER, environment | domain)
     speaker = started(SPEAKER, environment | domain)
     try:
-        assert next_line(listener) == "listening"
-        assert next_line(speaker) == "heard of"
+        introduce(speaker, listener)
         listener.send_signal(signal.SIGSTOP)
-        go_on(speaker)
+        tell(speaker, "go on")
         assert next_line(speaker) == "sent"
         listener.send_signal(signal.SIGCONT)
-        go_on(listener)
+        tell(listener, "go on")
         assert int(next_line(listener)) == COUNT
     finally:
         for process in (listener, speaker):
