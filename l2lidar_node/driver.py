@@ -1,8 +1,9 @@
 """Composes the driver's parts: bytes with their arrival in, sweeps and samples out; no socket.
 
 Every method takes the time as an argument and returns what happened. What comes out depends on
-the calls of :meth:`Driver.receive`, :meth:`Driver.sent` and :meth:`Driver.settle`, their order and
-their arguments alone, so a recording of those gives what the live sensor gave, bit for bit.
+the calls of :meth:`Driver.receive`, :meth:`Driver.sent`, :meth:`Driver.settle` and
+:meth:`Driver.host_stepped`, their order and their arguments alone, so a recording of those gives
+what the live sensor gave, bit for bit.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from l2lidar_node.packets import (
     Version,
     decode,
 )
+from l2lidar_node.queries import Queries
 from l2lidar_node.requests import Answer, Requests
 from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep
 from l2lidar_node.watchdog import DeviceState, Watchdog
 
-QUERY_NS: Final = 1_000_000_000  # interval of version, parameter and latency requests
 _ROUND_TRIPS: Final = 60  # the last minute's
 # Looking up a member of an Enum takes long.
 _IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
@@ -84,8 +85,7 @@ class Driver:
         self._requests = Requests()
         self._watchdog = Watchdog(config.watchdog)
         self._outbox: list[Outgoing] = []
-        self._next_query = HostNs(0)
-        self._latency_id = 100
+        self._queries = Queries(config.clock.enable_latency_measure)
 
     @property
     def config(self) -> DriverConfig:
@@ -144,6 +144,14 @@ class Driver:
         if self._has_stalled(until):
             events += self._finished(self._assembler.flush())
         return events
+
+    def host_stepped(self, by_ns: int, at: HostNs) -> list[Event]:
+        """Take note that the clock of arrivals was set and shows ``at``; return what that makes.
+
+        A step of 0 says that steps will be told. Where nobody tells they are inferred.
+        """
+        self._clock.host_stepped(by_ns, at)
+        return [*self._clock.events()]
 
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would do anything."""
@@ -323,18 +331,10 @@ class Driver:
         return self._assembler.is_collecting and self._intake.pause_ns(until) > MAX_GAP_NS
 
     def _send_due(self, now: HostNs) -> list[Event]:
-        due: list[Command] = []
-        if self._clock.sync_due(now):
-            due.append(commands.sync_time(now))
-        if not 0 <= self._next_query - now <= QUERY_NS:
-            self._next_query = HostNs(now + QUERY_NS)
-            if self.version is None:
-                due.append(commands.request_version())
-            if self.parameters is None:
-                due.append(commands.request_parameters())
-            if self._config.clock.enable_latency_measure:
-                self._latency_id += 1
-                due.append(commands.latency(self._latency_id))
+        due = [commands.sync_time(now)] if self._clock.sync_due(now) else []
+        due += self._queries.due(
+            now, version=self.version is not None, parameters=self.parameters is not None
+        )
         repeats, given_up = self._requests.expire(now)
         events: list[Event] = []
         for command in due + repeats:

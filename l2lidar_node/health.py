@@ -35,6 +35,7 @@ _CLOCK_TROUBLES: Final = {
     ClockEventKind.REBOOT: "the device restarted",
     ClockEventKind.FOREIGN_SYNC: "somebody else sets the device's clock",
     ClockEventKind.HOST_STEP: "this host's clock was stepped",
+    ClockEventKind.EARLIER: "packets come earlier than before",
     ClockEventKind.SILENCE: "the device was silent",
     ClockEventKind.LOST: "the device's clock had been lost track of",
 }

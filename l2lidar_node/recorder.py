@@ -67,6 +67,10 @@ class Recorder:
         """Write that the driver gave up waiting."""
         self._write(lambda: self._writer.waited(until), until)
 
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Write that the driver was told that the host's clock was set."""
+        self._write(lambda: self._writer.stepped(by_ns, at), at)
+
     def close(self) -> None:
         """Write what is left and close the file; may be called more than once."""
         if self._is_open:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
@@ -16,6 +17,11 @@ from l2lidar_node.types import HostNs
 
 WAITED: Final = b"l2lidar_node: nothing that was due is waited for from here on"
 """Content of the datagram, from the host to itself, that stands for :class:`Waited`."""
+
+STEPPED: Final = b"l2lidar_node: the host's clock was set by %+d ns"
+"""Likewise for :class:`Stepped`."""
+
+_STEP: Final = re.compile(re.escape(STEPPED).replace(re.escape(b"%+d"), rb"([+-][0-9]{1,18})"))
 
 _FROM_DEVICE: Final = frozenset(
     int(kind)
@@ -52,7 +58,14 @@ class Waited(NamedTuple):
     time: HostNs
 
 
-Entry = Received | Sent | Waited
+class Stepped(NamedTuple):
+    """By how much the host's clock was set [ns], and the instant at which the driver was told."""
+
+    by_ns: int
+    time: HostNs
+
+
+Entry = Received | Sent | Waited | Stepped
 
 
 class Recording:
@@ -119,8 +132,10 @@ class Recording:
                 is_device = datagram.source.ip == self.device.ip
                 if is_device and is_for_host and not datagram.outgoing:
                     yield Received(datagram.data, datagram.time)
-            elif is_for_host and datagram.data == WAITED:
-                yield Waited(datagram.time)
+            elif is_for_host:
+                note = _noted(datagram.data, datagram.time)
+                if note is not None:
+                    yield note
             elif datagram.destination == self.device and datagram.outgoing is not False:
                 for item in framer.feed(datagram.data):
                     if isinstance(item, Frame):
@@ -158,6 +173,18 @@ class RecordingWriter:
     def waited(self, until: HostNs) -> None:
         """Append that the driver gave up waiting."""
         self._capture.write(UdpDatagram(until, self._host, self._host, WAITED))
+
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Append that the driver was told that the host's clock was set."""
+        self._capture.write(UdpDatagram(at, self._host, self._host, STEPPED % by_ns))
+
+
+def _noted(data: bytes, time: HostNs) -> Waited | Stepped | None:
+    """Return what a datagram from the host to itself stands for."""
+    if data == WAITED:
+        return Waited(time)
+    step = _STEP.fullmatch(data)
+    return None if step is None else Stepped(int(step[1]), time)
 
 
 def _sent(frame: Frame, time: HostNs) -> Iterator[Sent]:

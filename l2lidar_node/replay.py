@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event
-from l2lidar_node.recording import Entry, Received, Recording, Sent
+from l2lidar_node.recording import Entry, Received, Recording, Sent, Stepped
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 
 
@@ -17,6 +17,8 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
         return driver.receive(entry.data, entry.time)
     if isinstance(entry, Sent):
         return driver.sent(entry.command, entry.time)
+    if isinstance(entry, Stepped):
+        return driver.host_stepped(entry.by_ns, entry.time)
     return driver.settle(entry.time)
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
 from l2lidar_node.driver import Driver, Event
+from l2lidar_node.host_clock import HostClock
 from l2lidar_node.loop import Loop
 from l2lidar_node.transport import Transport
 from l2lidar_node.types import HostNs
@@ -27,6 +27,9 @@ class Tap(Protocol):
     def waited(self, until: HostNs) -> None:
         """Take note that the driver is told to wait no longer for what was due until then."""
 
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Take note that the driver is told that the host's clock was set."""
+
     def close(self) -> None:
         """Take note that this was all."""
 
@@ -43,6 +46,8 @@ class Session(Loop):
         Called in the loop's thread with everything that happens, in order.
     tap : Tap, optional
         Told everything in the loop's thread; closed when the session ends.
+    clock : HostClock, optional
+        The clock that the transport tells arrivals in.
     """
 
     def __init__(
@@ -51,15 +56,18 @@ class Session(Loop):
         transport: Transport,
         on_event: Callable[[Event], None],
         tap: Tap | None = None,
+        clock: HostClock | None = None,
     ) -> None:
         super().__init__(driver, transport, on_event)
         self._tap = tap
+        self._clock = clock or HostClock()
 
     def _now(self) -> HostNs:
-        return HostNs(time.time_ns())
+        return self._clock.now()
 
     def _work(self) -> None:
         now = next_tick = self._now()
+        self._stepped(0, now)
         while not self._stopping.is_set():
             batch = self.transport.receive(TICK_S)
             for data, arrival in batch:
@@ -73,6 +81,10 @@ class Session(Loop):
                 self._send()
             before, now = now, self._now()
             if not 0 < next_tick - now <= _TICK_NS:  # the clock may have been set
+                step = self._clock.step_ns()
+                if step:
+                    now = self._now()
+                    self._stepped(step, now)
                 next_tick = HostNs(now + _TICK_NS)
                 # More may wait in the socket than one batch holds.
                 self._tick(now, batch[-1].arrival if batch else before)
@@ -85,6 +97,11 @@ class Session(Loop):
             self._tap.waited(heard_until)
         self._hand_out(self.driver.tick(now, heard_until))
         self._send()
+
+    def _stepped(self, by_ns: int, at: HostNs) -> None:
+        if self._tap:
+            self._tap.stepped(by_ns, at)
+        self._hand_out(self.driver.host_stepped(by_ns, at))
 
     def _send(self) -> None:
         for frame, at in self.driver.outbox():

@@ -127,6 +127,7 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
     driver = Driver(build(DriverConfig, values))
     clock = RecordingClock(driver.config.clock)
     driver._clock = clock
+    driver.host_stepped(0, HostNs(EPOCH_NS))  # nobody sets the host's clock, as a session knows
     rng = np.random.default_rng([seed, 106])
     commands: list[tuple[int, int, bytes]] = []
     count = 0

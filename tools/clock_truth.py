@@ -16,10 +16,10 @@ from l2lidar_node.types import Stream
 
 EVENT: Final = np.dtype(
     [
-        ("kind", "u1"),  # IMU, POINTS or SYNC
+        ("kind", "u1"),  # IMU, POINTS, SYNC or STEP
         ("seq", "<i8"),
-        ("stamp", "<i8"),  # [ns] device clock; of a SYNC: the value sent
-        ("arrival", "<i8"),  # [ns] host clock; of a SYNC: the instant it was sent
+        ("stamp", "<i8"),  # [ns] device clock; of a SYNC: the value sent; of a STEP: its size
+        ("arrival", "<i8"),  # [ns] host clock; of a SYNC: when it was sent; a STEP: was noticed
         ("duration", "<i8"),  # [ns] from the stamped instant to the last measurement
         ("truth", "<i8"),  # [ns] host clock at the stamped instant
     ]
@@ -29,6 +29,7 @@ EVENT: Final = np.dtype(
 IMU: Final = 0
 POINTS: Final = 1
 SYNC: Final = 2
+STEP: Final = 3
 STREAMS: Final = {IMU: Stream.IMU, POINTS: Stream.POINTS}
 
 _MS: Final = 1_000_000
@@ -66,6 +67,11 @@ class Scenario:
         When the device restarts (for ``reboot_s``), or another host sets its clock.
     host_steps : tuple of (float, float)
         When the host's clock is set, and by how many seconds.
+    notice_ms : float
+        How long it takes until the host notices that its clock was set, which it then tells, as
+        it does that it will; negative: it never does.
+    delays : tuple of (float, float, float)
+        From when to when, and by how many seconds, packets leave later; they keep their order.
     silences : tuple of (float, float)
         From when to when nothing arrives, and what is sent is lost.
     imu_noise_us : float
@@ -100,6 +106,8 @@ class Scenario:
     foreign_at: tuple[float, ...] = ()
     foreign_error: float = 5.0
     host_steps: tuple[tuple[float, float], ...] = ()
+    notice_ms: float = -1.0
+    delays: tuple[tuple[float, float, float], ...] = ()
     silences: tuple[tuple[float, float], ...] = ()
     imu: bool = True
     imu_noise_us: float = 0.0
@@ -128,9 +136,21 @@ def simulate(scenario: Scenario, seed: int) -> NDArray[np.void]:
         parts.append(_packets(scenario, POINTS, instants, _SWEEP, clock))
     syncs, packets = parts[0], np.concatenate(parts[1:])
     packets = _travel(scenario, packets[np.argsort(packets["arrival"], kind="stable")], rng)
-    events = np.concatenate([syncs, packets])
+    events = np.concatenate([_told(scenario), syncs, packets])
     events = events[np.argsort(events["arrival"], kind="stable")]
     return _on_host_clock(scenario, events)
+
+
+def _told(scenario: Scenario) -> NDArray[np.void]:
+    """Return what the host says of its clock; times still on the ideal line that starts at 0."""
+    if scenario.notice_ms < 0.0:
+        return np.zeros(0, EVENT)
+    events = np.zeros(1 + len(scenario.host_steps), EVENT)
+    events["kind"] = STEP
+    for event, (at, by) in zip(events[1:], scenario.host_steps, strict=True):
+        event["arrival"] = round(at * 1e9 + scenario.notice_ms * _MS)
+        event["stamp"] = round(by * 1e9)
+    return events
 
 
 def _sent(scenario: Scenario) -> NDArray[np.void]:
@@ -226,7 +246,10 @@ def _travel(
         phase = np.mod(arrival, scenario.burst_every * 1e9)
         held = phase < scenario.burst_ms * _MS
         arrival[held] += scenario.burst_ms * _MS - phase[held]
-    if scenario.fifo:
+    for start, stop, by in scenario.delays:
+        held = (arrival >= start * 1e9) & (arrival < stop * 1e9)
+        arrival[held] += by * 1e9
+    if scenario.fifo or scenario.delays:
         arrival = np.maximum.accumulate(arrival)
     late = rng.random(count) < scenario.reorder
     arrival[late] += scenario.reorder_ms * _MS

@@ -48,6 +48,9 @@ class _Collector:
     def waited(self, until: HostNs) -> None:
         """Ignore it."""
 
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Ignore it."""
+
     def close(self) -> None:
         """Do nothing."""
 

@@ -145,6 +145,11 @@ class Cadence:
         """Return the device time from the last packet to one some numbers later [ns]."""
         return round(gap * self._period + self._lag)
 
+    @property
+    def lap_ns(self) -> float:
+        """Time from a number to its next use [ns device]; 0 while unknown."""
+        return self._modulus * self._period
+
     def ascends(self, seq: int) -> bool:
         """Whether a number is above the last one, so neither wrapped nor restarted since."""
         return seq > self._seq

@@ -31,6 +31,7 @@ class ClockEventKind(Enum):
     REBOOT = "reboot"
     FOREIGN_SYNC = "foreign sync"
     HOST_STEP = "host step"
+    EARLIER = "earlier arrivals"
     SILENCE = "silence"
     LOST = "lost"
 
@@ -216,6 +217,22 @@ class DeviceClock:
         self._schedule.sent(value, sent)
         self._device.synced(value, sent)
 
+    def host_stepped(self, by_ns: int, at: HostNs) -> None:
+        """Take note that the host's clock was set.
+
+        Parameters
+        ----------
+        by_ns : int
+            0 says that steps are told from here on: then none is inferred from arrivals.
+        at : HostNs
+            What it showed when that was noticed.
+        """
+        if by_ns:
+            self._schedule.host_stepped(by_ns)
+            self._device.host_stepped(by_ns, at)
+            self._report_step(by_ns)
+        self._host.stepped(by_ns, at)
+
     def sync_due(self, now: HostNs) -> bool:
         """Return whether a time-sync command should be sent now."""
         return self._schedule.due(now)
@@ -274,10 +291,11 @@ class DeviceClock:
         self._last_u = u
         while host.steps:
             step = host.steps.popleft()
-            hold = f", stamps are held for {-step * 1e-9:.3f} s" if step < 0 else ""
-            self._report(
-                ClockEventKind.HOST_STEP, f"host clock stepped by {step * 1e-9:+.3f} s{hold}"
-            )
+            if host.is_told:
+                text = f"packets come {-step * 1e-9:.3f} s earlier than before{_hold(step)}"
+                self._report(ClockEventKind.EARLIER, text)
+            else:
+                self._report_step(step)
         self._notice()
 
     def _notice(self) -> None:
@@ -301,6 +319,14 @@ class DeviceClock:
             self._host.reset()
             self._last_u = None
 
+    def _report_step(self, step: int) -> None:
+        text = f"host clock stepped by {step * 1e-9:+.3f} s{_hold(step)}"
+        self._report(ClockEventKind.HOST_STEP, text)
+
     def _report(self, kind: ClockEventKind, text: str) -> None:
         self._counts[kind] += 1
         self.happened.append(ClockEvent(kind, text))
+
+
+def _hold(step: int) -> str:
+    return f", stamps are held for {-step * 1e-9:.3f} s" if step < 0 else ""

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
-from typing import Final, NamedTuple
+from typing import Final
 
 from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.types import DeviceNs, HostNs, Stream
@@ -43,15 +44,15 @@ class Step(Enum):
     LOST = "lost"
 
 
-class _Sync(NamedTuple):
-    """A sync of this host; ``number`` tells those of the same value apart."""
+@dataclass(slots=True, eq=False)
+class _Sync:
+    """A sync of this host; equal only to itself."""
 
-    number: int
     value: int
     sent: int
 
 
-_NO_SYNC: Final = _Sync(0, 1 << 80, 0)  # its value is after every stamp
+_NO_SYNC: Final = _Sync(1 << 80, 0)  # its value is after every stamp
 
 
 class _Epoch:
@@ -114,7 +115,6 @@ class DeviceLine:
         self.is_firm = True
         self._lateness = lateness
         self._syncs: deque[_Sync] = deque(maxlen=_SYNCS)
-        self._sync_count = 0
         self._epochs: deque[_Epoch] = deque(maxlen=_KEEP)
         self._newest = _NO_SYNC  # the latest that is known to have taken effect
         self._imu = _Track(_IMU_GAIN)
@@ -122,8 +122,16 @@ class DeviceLine:
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Take note of a sync that left this host; whether it arrives is not known."""
-        self._sync_count += 1
-        self._syncs.append(_Sync(self._sync_count, value, sent))
+        self._syncs.append(_Sync(value, sent))
+
+    def host_stepped(self, by_ns: int, at: int) -> None:
+        """Take note that the host's clock was set: what was before is told in its new time."""
+        for track in (self._imu, self._points):
+            # The last packets may have come after it was set, but before that was noticed.
+            if track.arrival + by_ns <= at if by_ns > 0 else track.arrival > at:
+                track.arrival += by_ns
+        for sync in self._syncs:
+            sync.sent += by_ns
 
     def restart(self) -> None:
         """Forget everything but how sequence numbers wrap."""
@@ -167,9 +175,7 @@ class DeviceLine:
         gap = cadence.gap(seq, u - track.u)
         advance = cadence.advance(gap)
         expected = track.u + advance
-        waited = arrival - track.arrival
-        reach = _SILENT_NS if cadence.ascends(seq) else _REACH_NS
-        counted = gap > 0 and abs(advance * self.ratio - waited) < reach
+        counted = gap > 0 and self._agrees(track, seq, advance, arrival)
         if counted:
             slip = cadence.slip(gap)
             begun = self._begun(track, epoch, stamp, expected, cadence.noise(gap))
@@ -182,6 +188,17 @@ class DeviceLine:
         if late and self._possible(track, u, arrival):
             return self._accept(track, epoch, seq, stamp, arrival)
         return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)
+
+    def _agrees(self, track: _Track, seq: int, advance: int, arrival: int) -> bool:
+        """Whether arrivals agree with how far a packet should be after the last one.
+
+        It may have waited on its way, but not for so long that numbers can have wrapped meanwhile.
+        """
+        late = arrival - track.arrival - advance * self.ratio
+        if not track.cadence.ascends(seq):
+            return abs(late) < _REACH_NS
+        lap = track.cadence.lap_ns * self.ratio
+        return -_SILENT_NS < late < max(lap - _SILENT_NS, _SILENT_NS)
 
     def _is_late(self, track: _Track, seq: int, stamp: int) -> bool:
         """Whether a packet is from before the last one, or is the last one again."""

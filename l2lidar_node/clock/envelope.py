@@ -159,6 +159,11 @@ class Envelope:
         self._reach = SHORT_BLOCKS
         self._shift(lows)
 
+    def host_stepped(self, by_ns: int) -> None:
+        """Move everything to another host time."""
+        self.line = self.line._replace(host=self.line.host + by_ns)
+        self._blocks = deque(((u, host + by_ns) for u, host in self._blocks), maxlen=LONG_BLOCKS)
+
     def _shift(self, packets: list[tuple[int, int]]) -> None:
         line = self.line
         lowest = min(host - line.at(u) for u, host in packets)

@@ -31,6 +31,7 @@ _SPREADS: Final = 10.0  # these margins grow by that many times the usual delay
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
 _BACKWARD_BLOCKS: Final = 2  # early ones cannot
 _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
+_PATIENCE_BLOCKS: Final = 600  # who is so long late, and the clock was not set, is so for good
 
 
 class HostLine:
@@ -43,7 +44,10 @@ class HostLine:
     due : int
         Place on the device line at which :meth:`update` wants to be called.
     steps : deque of int
-        Steps of the host's clock [ns]; whoever reads it takes it out.
+        Steps of what is published that arrivals made necessary [ns]: the host's clock was set, or
+        if that ``is_told``, packets come earlier than thought; whoever reads it takes it out.
+    is_told : bool
+        Whether somebody tells when the host's clock is set; else that is inferred.
     advance_ns : int
         How much earlier than the envelope stamps shall be: the constant part of the path delay.
     line : Line
@@ -59,7 +63,9 @@ class HostLine:
 
     __slots__ = (
         "_envelope",
+        "_from",
         "_host",
+        "_late_blocks",
         "_low",
         "_low_at",
         "_packets",
@@ -69,6 +75,7 @@ class HostLine:
         "_u",
         "advance_ns",
         "due",
+        "is_told",
         "line",
         "ready",
         "steps",
@@ -77,6 +84,8 @@ class HostLine:
     def __init__(self, ratio: float) -> None:
         self.line = Line(0, 0, ratio, 0.0)
         self.advance_ns = 0
+        self.is_told = False
+        self._from = 0  # arrivals before may be told in a time before the clock was set
         self.steps: deque[int] = deque(maxlen=64)
         self.reset()
 
@@ -86,6 +95,7 @@ class HostLine:
         self._envelope: Envelope | None = None
         self._packets: list[tuple[int, int]] = []
         self._suspects: list[tuple[int, int]] = []
+        self._late_blocks = 0
         self._segments: deque[tuple[int, int, float]] = deque(maxlen=_SEGMENTS)
         self._u = self._host = 0
         self._slope = self.line.ratio
@@ -95,6 +105,8 @@ class HostLine:
 
     def add(self, u: int, arrival: int) -> None:
         """Take one packet: its place on the device line, and when it could leave at the latest."""
+        if arrival < self._from:
+            return
         if not self.ready:
             self._packets.append((u, arrival))
             if len(self._packets) > _MOST:
@@ -105,6 +117,24 @@ class HostLine:
         if low is None or height < low:
             self._low = height
             self._low_at = (u, arrival)
+
+    def stepped(self, by_ns: int, at: int) -> None:
+        """Take note that the host's clock was set, and shows ``at``; 0: that this will be told.
+
+        A packet is stamped in the time that was shown when it was measured, whenever it comes.
+        """
+        self.is_told = True
+        if not by_ns:
+            return
+        self._from = at
+        self._suspects.clear()
+        self._low = None
+        if self._envelope is None:
+            self._packets.clear()
+            return
+        self._envelope.host_stepped(by_ns)
+        u = self._u + max(int((at - by_ns - self._host) / self._slope), 0)
+        self._go(u, self.at(u) + by_ns, self._slope)
 
     def at(self, u: int) -> int:
         """Return the host time [ns] of a place on the device line; needs ``ready``."""
@@ -124,7 +154,7 @@ class HostLine:
         """Fit again; to be called when a packet at or after ``due`` was added."""
         if self._envelope is None:
             self._acquire(u)
-        else:
+        elif u >= self._u:  # else it was measured before the host's clock was set
             self._follow(self._envelope, u)
         self.due = u + int(BLOCK_NS / self._slope)
 
@@ -169,7 +199,10 @@ class HostLine:
         suspects = self._suspects
         if -_EARLY_NS - spread <= off <= _STEP_NS + spread:
             suspects.clear()
+            self._late_blocks = 0
             return False
+        if off > 0 and self.is_told:
+            return self._is_late(envelope)
         if suspects and (suspects[-1][1] < line.at(suspects[-1][0])) != (off < 0):
             suspects.clear()
         suspects.append(self._low_at)
@@ -179,13 +212,22 @@ class HostLine:
         if last[1] - first[1] < _FLOWING * (last[0] - first[0]) * line.ratio:
             del suspects[0]
             return True
-        before = line.at(u)
+        before = self.at(u) + self.advance_ns if self.is_told else line.at(u)
         envelope.move(suspects)
         suspects.clear()
         step = envelope.line.at(u) - before
-        if abs(step) > _STEP_NS:
+        if step < -_STEP_NS or (step > _STEP_NS and not self.is_told):
             self.steps.append(step)
             self._go(u, envelope.line.at(u) - self.advance_ns, envelope.line.ratio)
+        return True
+
+    def _is_late(self, envelope: Envelope) -> bool:
+        """Count a late block; after many, lay the fit below it, on which stamps then close in."""
+        self._suspects.clear()
+        self._late_blocks += 1
+        if self._late_blocks >= _PATIENCE_BLOCKS:
+            self._late_blocks = 0
+            envelope.move([self._low_at])
         return True
 
     def _go(self, u: int, host: int, slope: float) -> None:

@@ -47,6 +47,11 @@ class SyncSchedule:
         self._value = value
         self._sent = sent
 
+    def host_stepped(self, by_ns: int) -> None:
+        """Take note that the host's clock was set."""
+        if self._sent is not None:
+            self._sent = HostNs(self._sent + by_ns)
+
     def seen(self, stamp: int, arrival: int) -> None:
         """Look at a stamp: a sync is in force when it counts from the value that was sent."""
         if self.in_force or self._sent is None:

@@ -11,7 +11,7 @@ from l2lidar_node.clock import ClockEvent, ClockEventKind, DeviceClock
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.sequence import SequenceOrder
 from l2lidar_node.types import DeviceNs, HostNs, Stream
-from tools.clock_truth import EVENT, IMU, POINTS, STREAMS, SYNC, Scenario, simulate
+from tools.clock_truth import EVENT, IMU, POINTS, STEP, STREAMS, SYNC, Scenario, simulate
 
 STAMPED = np.dtype([*EVENT.descr, ("published", "<i8")])
 Packet = tuple[int, int, int, int, int, int]
@@ -84,6 +84,9 @@ class Replay:
             kind, seq, stamp, arrival, _, _ = event
             if kind == SYNC:
                 self.clock.synced(HostNs(stamp), HostNs(arrival))
+                continue
+            if kind == STEP:
+                self.clock.host_stepped(stamp, HostNs(arrival))
                 continue
             if seq < 40 and arrival - boots[kind] > 400_000_000:
                 yield from (item for _, item in orders[kind].restart())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from l2lidar_node.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
 from l2lidar_node.pcap import CaptureError, PacketReader, PacketWriter
-from l2lidar_node.recording import Received, Recording, Sent
+from l2lidar_node.recording import STEPPED, WAITED, Received, Recording, Sent, Stepped, Waited
 from l2lidar_node.types import HostNs
 from tests import build
 from tests.build import SHARED_DATA
@@ -292,6 +292,16 @@ def test_a_recording_takes_what_its_host_and_device_said():
     first, *_ = recording
     assert isinstance(first, Sent)
     assert first.command.time == first.time == TIME  # as the driver counted it
+
+
+def test_only_exact_notes_of_the_host_to_itself_count():
+    wrong = [b"", STEPPED, STEPPED % 10**30, STEPPED % 5 + b"!", WAITED[:-1]]
+    notes = [STEPPED % 0, STEPPED % -3_600_000_000_000, WAITED]
+    packets = [udp_packet(data, HOST, HOST) for data in wrong + notes]
+    packets = [(1.0, bytes(packet)) for packet in [udp_packet(IMU), *packets]]
+    items = list(Recording(tcpdump(packets, 101)))
+    assert [type(item) for item in items] == [Received, Stepped, Stepped, Waited]
+    assert [item.by_ns for item in items[1:3]] == [0, -3_600_000_000_000]
 
 
 def test_cooked_captures_of_the_loopback_interface_show_everything_once():

@@ -199,6 +199,99 @@ def test_after_a_backward_step_stamps_wait_for_the_host_clock(step: float) -> No
 
 
 @pytest.mark.parametrize("sync", ["off", "once", "periodic"])
+@pytest.mark.parametrize("step", [0.05, 1.0, 3600.0, -0.05, -1.0, -3600.0])
+def test_a_step_that_is_told_is_followed_at_once(step: float, sync: str) -> None:
+    steps = ((6.0, step),)
+    told = Scenario(seconds=9.0, sync=sync, host_steps=steps, notice_ms=0.0, jitter="uniform")
+    replay = Replay(told, seed=3)
+
+    replay.check_promises()
+    assert replay.kinds == [ClockEventKind.LOCKED, ClockEventKind.HOST_STEP]
+    assert f"stepped by {step:+.3f} s" in replay.events[1].text
+    # The constant 0.2 ms of the path cannot be seen: one packet may be on the wrong side.
+    assert np.sum(replay.spread_ms > 0.05) <= 1
+    assert replay.clock.status().held == pytest.approx(min(max(-step, 0.0), 3.0) * 466, abs=10)
+
+
+def test_a_step_that_is_noticed_late_costs_no_more_than_until_then() -> None:
+    told = Scenario(seconds=9.0, host_steps=((6.0, 0.5),), notice_ms=300.0, jitter="uniform")
+    replay = Replay(told, seed=3)
+
+    replay.check_promises()
+    assert replay.kinds == [ClockEventKind.LOCKED, ClockEventKind.HOST_STEP]
+    assert np.sum(replay.spread_ms > 0.05) == pytest.approx(0.3 * 466, abs=5)
+    assert replay.clock.status().held == 0
+
+
+def test_a_clock_that_is_set_before_it_is_known_begins_anew() -> None:
+    told = Scenario(seconds=4.0, host_steps=((0.2, 1.0),), notice_ms=10.0)
+    replay = Replay(told, seed=3)
+
+    assert replay.kinds == [ClockEventKind.HOST_STEP, ClockEventKind.LOCKED]
+    assert replay.spread_ms.max() < 0.05
+    assert replay.lock_s < 2.0 + 1.0  # the step itself
+
+
+@pytest.mark.parametrize(
+    ("late", "sync"),  # numbers wrap after 4.1 s: nothing tells then how often it was synced
+    [
+        (1.0, "off"),
+        (1.0, "periodic"),
+        (2.0, "once"),
+        (2.0, "periodic"),
+        (5.0, "off"),
+        (5.0, "once"),
+    ],
+)
+def test_packets_that_stay_late_are_no_step_where_steps_are_told(late: float, sync: str) -> None:
+    delays = ((4.0, 7.0, late), (13.0, 14.0, late))
+    told = Scenario(
+        seconds=20.0, sync=sync, delays=delays, notice_ms=10.0, jitter="heavy", loss=0.05
+    )
+    replay = Replay(told, seed=3)
+
+    replay.check_promises()
+    assert replay.kinds == [ClockEventKind.LOCKED]
+    assert replay.spread_ms.max() < 0.1
+    status = replay.clock.status()
+    assert (status.held, len(replay.stamped)) == (0, len(replay.packets) - status.unlocked)
+
+
+@pytest.mark.parametrize("step", [1.0, -1.0])
+def test_a_step_is_told_from_lateness_at_the_same_time(step: float) -> None:
+    told = Scenario(
+        seconds=16.0, delays=((5.0, 9.0, 3.0),), host_steps=((7.0, step),), notice_ms=10.0
+    )
+    replay = Replay(told, seed=3)
+
+    replay.check_promises()
+    assert replay.kinds == [ClockEventKind.LOCKED, ClockEventKind.HOST_STEP]
+    assert np.sum(replay.spread_ms > 0.05) < 10  # measured until it was noticed
+    assert replay.clock.status().held == pytest.approx(max(-step, 0.0) * 466, abs=10)
+
+
+def test_who_was_late_while_the_clock_locked_is_earlier_later() -> None:
+    replay = Replay(Scenario(seconds=9.0, delays=((0.0, 3.0, 1.5),), notice_ms=10.0), seed=3)
+
+    replay.check_promises()
+    assert replay.kinds == [ClockEventKind.LOCKED, ClockEventKind.EARLIER]
+    assert "1.500 s earlier than before, stamps are held for 1.500 s" in replay.events[1].text
+    assert replay.spread_ms[-1000:].max() < 0.05
+
+
+def test_lateness_that_never_ends_is_closed_in_on_without_a_jump() -> None:
+    replay = Replay(Scenario(seconds=75.0, delays=((5.0, 80.0, 2.0),), notice_ms=10.0), seed=3)
+    imu = replay.of(IMU)
+
+    replay.check_promises()
+    assert replay.kinds == [ClockEventKind.LOCKED]
+    off = np.diff(imu["published"]) / np.diff(imu["truth"]) - 1.0
+    assert 0.0015 < off.max() < 0.0025
+    during = (imu["truth"] - imu["truth"][0]) * 1e-9
+    assert np.abs(off[during[1:] < 64.0]).max() < 1e-5
+
+
+@pytest.mark.parametrize("sync", ["off", "once", "periodic"])
 def test_a_silence_is_reported_and_does_not_spoil_stamps(sync: str) -> None:
     replay = Replay(Scenario(seconds=15.0, sync=sync, silences=((5.0, 8.0),)), seed=3)
 

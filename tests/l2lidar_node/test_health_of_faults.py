@@ -18,9 +18,7 @@ OK, WARN, ERROR = Level.OK, Level.WARN, Level.ERROR
 PLAIN = {"imu_adjust": False}
 
 
-def judged(
-    monkeypatch: pytest.MonkeyPatch, begin: float = 2.5, end: float = 3.5, **run: object
-) -> dict[str, Check]:
+def judged(begin: float = 2.5, end: float = 3.5, **run: object) -> dict[str, Check]:
     """Return how a driver judges a stretch of a run."""
     periods: list[Period] = []
     found: list[Check] = []
@@ -33,12 +31,12 @@ def judged(
 
     calls = [(begin, look), (end, look), *run.pop("calls", ())]
     run.setdefault("settings", PLAIN)
-    live_run(monkeypatch, end + 0.1, calls=sorted(calls, key=lambda call: call[0]), **run)
+    live_run(end + 0.1, calls=sorted(calls, key=lambda call: call[0]), **run)
     return {check.name: check for check in found}
 
 
-def test_without_a_fault_everything_is_ok(monkeypatch):
-    checks = judged(monkeypatch)
+def test_without_a_fault_everything_is_ok():
+    checks = judged()
     assert {name: check.level for name, check in checks.items()} == dict.fromkeys(
         ("device", "link", "clock", "points", "hardware", "imu"), OK
     )
@@ -61,32 +59,32 @@ def test_without_a_fault_everything_is_ok(monkeypatch):
     ],
     ids=str,
 )
-def test_a_fault_is_named(monkeypatch, faults, name, level, message):
-    check = judged(monkeypatch, end=4.5, faults=faults)[name]
+def test_a_fault_is_named(faults, name, level, message):
+    check = judged(end=4.5, faults=faults)[name]
     assert check.level is level
     assert re.search(message, check.message)
 
 
-def test_spinning_up_counts_down(monkeypatch):
-    checks = judged(monkeypatch, 9.0, 10.0, power=PowerConfig())
+def test_spinning_up_counts_down():
+    checks = judged(9.0, 10.0, power=PowerConfig())
     assert checks["device"].level is WARN
     assert checks["device"].message == "spinning up, points in about 15 s"
     assert checks["clock"].level is OK
 
 
-def test_a_clock_that_has_not_locked_yet(monkeypatch):
+def test_a_clock_that_has_not_locked_yet():
     faults = {"jitter": "heavy", "jitter_ms": 50.0}
-    assert judged(monkeypatch, 0.1, 0.3, faults=faults)["clock"].level is WARN
+    assert judged(0.1, 0.3, faults=faults)["clock"].level is WARN
 
 
-def test_a_unit_told_to_stop_is_as_asked(monkeypatch):
+def test_a_unit_told_to_stop_is_as_asked():
     calls = [(1.0, lambda driver, now: driver.stop_rotation(now))]
-    check = judged(monkeypatch, calls=calls)["device"]
+    check = judged(calls=calls)["device"]
     assert (check.level, check.message) == (OK, "in standby as asked")
 
 
-def test_a_covered_sensor(monkeypatch):
-    assert judged(monkeypatch, empty=True)["points"].level is WARN
+def test_a_covered_sensor():
+    assert judged(empty=True)["points"].level is WARN
 
 
 @pytest.mark.parametrize(
@@ -97,12 +95,12 @@ def test_a_covered_sensor(monkeypatch):
         (WorkMode.WAIT_FOR_START, ERROR, "nothing heard"),
     ],
 )
-def test_work_modes_that_do_not_fit(monkeypatch, mode, level, message):
-    check = judged(monkeypatch, mode=mode)["device"]
+def test_work_modes_that_do_not_fit(mode, level, message):
+    check = judged(mode=mode)["device"]
     assert check.level is level
     assert message in check.message
 
 
-def test_levelling_without_imu(monkeypatch):
-    checks = judged(monkeypatch, mode=WorkMode.IMU_OFF, settings={"imu_adjust": True})
+def test_levelling_without_imu():
+    checks = judged(mode=WorkMode.IMU_OFF, settings={"imu_adjust": True})
     assert checks["points"].level is WARN

@@ -43,8 +43,8 @@ class Played:
 
 
 @pytest.fixture
-def recorded(monkeypatch):
-    config, events, tap = live_run(monkeypatch, 2.5, faults={"loss": 0.01, "reorder": 0.02})
+def recorded():
+    config, events, tap = live_run(2.5, faults={"loss": 0.01, "reorder": 0.02})
     return config, events, tap.stream
 
 

@@ -276,6 +276,7 @@ class Notes:
     def __init__(self) -> None:
         self.received_data: list[bytes] = []
         self.sent_frames: list[bytes] = []
+        self.steps: list[int] = []
         self.closed = 0
 
     def received(self, data: bytes, arrival: HostNs) -> None:
@@ -286,6 +287,9 @@ class Notes:
 
     def waited(self, until: HostNs) -> None:
         pass
+
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        self.steps.append(by_ns)
 
     def close(self) -> None:
         self.closed += 1
@@ -304,5 +308,6 @@ def test_a_tap_hears_everything_in_both_directions():
     assert notes.received_data == [item.data for item in datagrams]
     assert notes.sent_frames == transport.sent
     assert commands.start().encode() in transport.sent
+    assert notes.steps == [0]  # the clock is watched, and nobody set it
     assert (notes.closed, transport.closed) == (1, 1)
     assert sum(isinstance(event, ImuSample) for event in events) == 50
