@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, Final
 
 import rclpy
 from rcl_interfaces.srv import GetParameters
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -19,6 +21,8 @@ from l2lidar_node.readiness.topics import SourceError, Topics, choose
 
 _DISCOVERY_S: Final = 6.0
 _LOOK_S: Final = 0.1
+_ASK_AGAIN_S: Final = 1.0
+_IDLE: Final = 50  # turns of the executor without a message of before
 _LEVELLING: Final = "imu_adjust"  # the driver's parameter, and upstream's
 
 
@@ -53,9 +57,9 @@ def _observe(
     asked = Topics(*(node.resolve_topic_name(topic) if topic else "" for topic in asked))
     topics = _found(node, asked, needs_imu)
     gathering = Gathering()
-    _listen(node, topics, gathering)
+    ear = _Ear(node, topics, gathering)
     levelling = _Levelling(node, topics.cloud)
-    _spin(node, seconds)
+    ear.listen(seconds)
     return (
         gathering.observation(
             cloud_qos=_offers(node, topics.cloud),
@@ -87,24 +91,47 @@ def _found(node: Node, asked: Topics, needs_imu: bool) -> Topics:
         rclpy.spin_once(node, timeout_sec=_LOOK_S)
 
 
-def _listen(node: Node, topics: Topics, gathering: Gathering) -> None:
-    def timed(take: Callable[[Any, int], None]) -> Callable[[Any], None]:
-        return lambda message: take(message, time.time_ns())
+class _Ear:
+    """Hears topics and notes when each message came, however late this program gets to it."""
 
-    # Best effort takes from every publisher, and deep queues lose nothing of what comes.
-    deep = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
-    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(PointCloud2, topics.cloud, timed(gathering.cloud), deep)
-    if topics.imu:
-        node.create_subscription(Imu, topics.imu, timed(gathering.imu), deep)
-    node.create_subscription(TFMessage, "/tf", gathering.transforms, deep)
-    node.create_subscription(TFMessage, "/tf_static", gathering.transforms, latched)
+    def __init__(self, node: Node, topics: Topics, gathering: Gathering) -> None:
+        # Best effort takes from every publisher, and deep queues lose nothing of what comes.
+        deep = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        listen = node.create_subscription
+        listen(PointCloud2, topics.cloud, self._timed(gathering.cloud), deep)
+        if topics.imu:
+            listen(Imu, topics.imu, self._timed(gathering.imu), deep)
+        listen(TFMessage, "/tf", gathering.transforms, deep)
+        listen(TFMessage, "/tf_static", gathering.transforms, latched)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._end_ns = sys.maxsize
+        self._handled = 0
 
+    def listen(self, seconds: float) -> None:
+        """Take what comes within some seconds; while this machine pauses they do not pass."""
+        left = seconds
+        while left > 0:
+            begun = time.monotonic()
+            self._executor.spin_once(timeout_sec=min(left, _LOOK_S))
+            left -= min(time.monotonic() - begun, 2 * _LOOK_S)
+        # What came by now still waits where this program is slow, more samples than clouds.
+        self._end_ns = time.time_ns()
+        idle = 0
+        while idle < _IDLE:
+            before = self._handled
+            self._executor.spin_once(timeout_sec=0.0)
+            idle = 0 if self._handled > before else idle + 1
 
-def _spin(node: Node, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
-        rclpy.spin_once(node, timeout_sec=min(left, _LOOK_S))
+    def _timed(self, take: Callable[[Any, int], None]) -> Callable[[Any, Any], None]:
+        def hear(message: Any, info: Any) -> None:
+            arrival = int(info["received_timestamp"]) or time.time_ns()
+            if arrival <= self._end_ns:
+                self._handled += 1
+                take(message, arrival)
+
+        return hear
 
 
 def _offers(node: Node, topic: str) -> tuple[Qos, ...]:
@@ -131,25 +158,29 @@ class _Levelling:
 
     def __init__(self, node: Node, topic: str) -> None:
         self.answer: bool | None = None
-        self._asked: set[str] = set()
         self._node = node
         self._topic = topic
-        self._clients: list[Any] = []
+        self._clients: dict[str, Any] = {}
+        self._answered_by: set[str] = set()
+        self._next_s = 0.0
         self._timer = node.create_timer(_LOOK_S, self._ask)
 
     def _ask(self) -> None:
         for info in self._node.get_publishers_info_by_topic(self._topic):
             name = f"{info.node_namespace.rstrip('/')}/{info.node_name}/get_parameters"
-            if name not in self._asked:
-                self._asked.add(name)
-                self._clients.append(self._node.create_client(GetParameters, name))
-        for client in list(self._clients):
-            if client.service_is_ready():
-                self._clients.remove(client)
+            if name not in self._clients:
+                self._clients[name] = self._node.create_client(GetParameters, name)
+        if time.monotonic() < self._next_s:
+            return
+        for name, client in self._clients.items():
+            if name not in self._answered_by and client.service_is_ready():
+                # Again until it answers: who has not heard of this node yet cannot.
+                self._next_s = time.monotonic() + _ASK_AGAIN_S
                 future = client.call_async(GetParameters.Request(names=[_LEVELLING]))
-                future.add_done_callback(self._answered)
+                future.add_done_callback(lambda done, name=name: self._answered(name, done))
 
-    def _answered(self, future: Any) -> None:
+    def _answered(self, name: str, future: Any) -> None:
+        self._answered_by.add(name)
         response = future.result()
         for value in response.values if response else ():
             if value.type:  # 0 where a node has no such parameter

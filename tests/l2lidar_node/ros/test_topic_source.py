@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.l2lidar_node.ros.rig import Rig, open_rig
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
 
 pytestmark = pytest.mark.ros
 
@@ -36,7 +36,7 @@ def results(rig: Rig) -> dict[str, tuple[int, dict[str, Any]]]:
     }
     results = {}
     for consumer, process in running.items():
-        said, error = process.communicate(timeout=60)
+        said, error = process.communicate(timeout=TIMEOUT_S)
         assert process.returncode in (0, 1), error
         results[consumer] = (process.returncode, json.loads(said))
     return results
@@ -76,7 +76,7 @@ def test_levelled_clouds_are_right_for_nav2(results) -> None:
 
 def test_a_topic_that_is_not_there_is_a_usage_error(rig: Rig) -> None:
     process = check("/nothing", "--for", "lio_sam")
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 2
     assert (
         "there is no topic '/nothing'; topics of type sensor_msgs/msg/PointCloud2 are: " in error
