@@ -4,7 +4,7 @@ from launch import LaunchDescription
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 
-from l2lidar_node.ros.bringup import companion, driver, for_deskew, rviz
+from l2lidar_node.ros.bringup import driver, for_deskew, rviz
 from l2lidar_node.ros.launch_arguments import (
     BOOL,
     CUTS,
@@ -13,6 +13,7 @@ from l2lidar_node.ros.launch_arguments import (
     Argument,
     arguments,
 )
+from l2lidar_proc.ros.bringup import deskew, odometry
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -24,8 +25,8 @@ def generate_launch_description() -> LaunchDescription:
             Argument("turn", "where a cloud ends", CUTS).declare("sweep_cut"),
             Argument("true", "whether to start the odometry node", BOOL).declare("odometry"),
             driver(lambda given: for_deskew(given["sweep_cut"])),
-            companion("deskew_node"),
-            companion("odometry_node", condition=IfCondition(LaunchConfiguration("odometry"))),
+            deskew(),
+            odometry(IfCondition(LaunchConfiguration("odometry"))),
             rviz(),
         ]
     )

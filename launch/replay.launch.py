@@ -6,8 +6,9 @@ from launch import LaunchDescription
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 
-from l2lidar_node.ros.bringup import companion, driver, for_deskew, rviz
+from l2lidar_node.ros.bringup import driver, for_deskew, rviz
 from l2lidar_node.ros.launch_arguments import BOOL, RVIZ_ARGUMENTS, Argument, arguments
+from l2lidar_proc.ros.bringup import deskew, odometry
 
 # The driver gives the recording's time on /clock.
 RECORDED_TIME = {"use_sim_time": True}
@@ -51,8 +52,8 @@ def generate_launch_description() -> LaunchDescription:
             *arguments("params_file", "proc_params_file"),
             *arguments(*RVIZ_ARGUMENTS, rviz_config="rviz/slam.rviz"),
             driver(_needs),
-            companion("deskew_node", wanted, RECORDED_TIME),
-            companion("odometry_node", wanted, RECORDED_TIME),
+            deskew(wanted, RECORDED_TIME),
+            odometry(wanted, RECORDED_TIME),
             rviz(RECORDED_TIME),
         ]
     )

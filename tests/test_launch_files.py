@@ -16,7 +16,11 @@ from l2lidar_node.settings import build
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.py"))
-PARTS = [ROOT / "l2lidar_node" / "ros" / name for name in ("bringup.py", "launch_arguments.py")]
+PARTS = [
+    ROOT / "l2lidar_node" / "ros" / "bringup.py",
+    ROOT / "l2lidar_node" / "ros" / "launch_arguments.py",
+    ROOT / "l2lidar_proc" / "ros" / "bringup.py",
+]
 CONSUMERS = ROOT / "config" / "consumers"
 NETWORK = {"l2_ip", "l2_port", "host_ip", "host_port"}
 DRIVER = NETWORK | {
@@ -297,6 +301,44 @@ def test_what_the_driver_would_refuse_is_not_started_again_and_again(launched, t
     file.write_text("l2lidar_node: {ros__parameters: {robot_x: 0.1, watchdog_action: nap}}")
     with pytest.raises(ValueError, match="parameter 'watchdog_action': 'nap' is not known"):
         launched("l2lidar", params_file=str(file))
+
+
+@needs_launch
+@pytest.mark.parametrize("name", ["deskew_odometry", "replay"])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("deskew_node: {ros__parameters: {voxel_size: -1.0}}",
+         "/a/deskew_node: parameter 'voxel_size': -1.0 is out of range"),
+        ("odometry_node: {ros__parameters: {mode: magic}}",
+         "/a/odometry_node: parameter 'mode': 'magic' is not known"),
+        ("/**: {ros__parameters: {imu_xyz: 3}}",
+         "/a/deskew_node: parameter 'imu_xyz': 3 is of type int, expected list"),
+    ],
+)  # fmt: skip
+def test_what_a_companion_would_refuse_is_not_started(launched, tmp_path, name, text, message):
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        launched(name, proc_params_file=str(file), namespace="a")
+
+
+@needs_launch
+def test_a_node_that_calls_its_arguments_wrong_ends_the_launch():
+    from launch import LaunchContext
+    from launch.events.process import ProcessExited
+
+    from l2lidar_node.ros.bringup import _ended
+
+    def ended(code):
+        event = ProcessExited(
+            action=None, name="deskew_node-2", cmd=[], cwd=None, env=None, pid=1, returncode=code
+        )
+        return _ended(event, LaunchContext())
+
+    assert ended(0) is ended(1) is ended(-9) is None
+    with pytest.raises(RuntimeError, match="deskew_node-2 cannot be started like that"):
+        ended(2)
 
 
 @needs_launch

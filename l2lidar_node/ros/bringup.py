@@ -22,7 +22,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.ros.launch_arguments import ARGUMENTS, PACKAGE, share
 from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
 from l2lidar_node.ros.topics import DRIVER_TOPICS, SHOWN_TOPICS
-from l2lidar_node.settings import build, settings_of
+from l2lidar_node.settings import SettingError, build, settings_of
 
 Given = Mapping[str, str]
 """Value of every launch argument, as text."""
@@ -31,6 +31,7 @@ Parameters = Mapping[str, bool | int | float | str]
 
 LOOPBACK: Final = "127.0.0.1"
 RESPAWN_DELAY_S: Final = 2.0
+_WRONG_USE: Final = 2  # exit code of a node that was given what it cannot take
 
 
 def driver(
@@ -71,13 +72,28 @@ def for_deskew(sweep_cut: str = "turn") -> Parameters:
 
 
 def companion(
-    executable: str, condition: IfCondition | None = None, values: Parameters | None = None
+    executable: str,
+    settings: type,
+    condition: IfCondition | None = None,
+    values: Parameters | None = None,
 ) -> OpaqueFunction:
-    """Return a node of ``l2lidar_proc``, named like its executable."""
+    """Return a node that goes with the driver, named like its executable.
+
+    Parameters
+    ----------
+    executable : str
+    settings : type
+        What it takes as parameters.
+    condition : IfCondition, optional
+        When to start it.
+    values : mapping, optional
+        Parameters that hold whatever the parameter file says.
+    """
 
     def actions(context: LaunchContext) -> list[Any]:
         given = _given(context)
-        return [_node(executable, executable, given, [given["proc_params_file"]], values or {})]
+        files = [given["proc_params_file"]]
+        return [_node(executable, executable, given, files, values or {}, settings)]
 
     return OpaqueFunction(function=actions, condition=condition)
 
@@ -125,23 +141,25 @@ def _node(
     given: Given,
     files: Sequence[str],
     values: Parameters,
-    settings: type | None = None,
+    settings: type,
 ) -> Node:
     """Return a node of ours; the parameters it starts with are kept beside the launch's log.
 
     Raises
     ------
     SettingError
-        If a parameter cannot have its value; started, the node would end, and be started again.
+        If a parameter cannot have its value.
     """
     full_name = "/".join(["", *filter(None, given["namespace"].split("/")), name])
     merged: dict[str, Any] = {}
     for path in files:
         merged.update(parameters_for(Path(path), executable, full_name))
     merged.update(values)
-    if settings is not None:
-        known = {item.name for item in settings_of(settings)}
+    known = {item.name for item in settings_of(settings)}
+    try:
         build(settings, {item: value for item, value in merged.items() if item in known})
+    except SettingError as error:
+        raise SettingError(f"{full_name}: {error}") from None
     kept = Path(launch_config.get_log_file_path(f"{full_name[1:].replace('/', '.')}.yaml"))
     kept.write_text(parameter_file(merged), encoding="utf-8")
     return Node(
@@ -153,10 +171,23 @@ def _node(
         remappings=_relative(DRIVER_TOPICS),
         ros_arguments=["--log-level", given["log_level"]],
         output="screen",
+        on_exit=_ended,
         # A replay that ended would begin again.
         respawn=given["respawn"] == "true" and not merged.get("replay_file"),
         respawn_delay=RESPAWN_DELAY_S,
     )
+
+
+def _ended(event: ProcessExited, context: LaunchContext) -> None:
+    """Let a node be started again, unless it would only end again.
+
+    Raises
+    ------
+    RuntimeError
+        If what it was given is wrong: that ends the launch, with an exit code that says so.
+    """
+    if event.returncode == _WRONG_USE and not context.is_shutdown:
+        raise RuntimeError(f"{event.process_name} cannot be started like that, see its message")
 
 
 def _given(context: LaunchContext) -> Given:

@@ -7,7 +7,11 @@ import sys
 from collections.abc import Callable
 
 import rclpy
-from rclpy.exceptions import NameValidationException, NotInitializedException
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    NameValidationException,
+    NotInitializedException,
+)
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import install_signal_handlers
@@ -58,7 +62,12 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (SettingError, UsageError, NameValidationException) as error:
+    except (
+        SettingError,
+        UsageError,
+        NameValidationException,
+        InvalidParameterTypeException,  # use_sim_time, which every node has
+    ) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     except StartError as error:

@@ -53,6 +53,7 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("calRangeScale:=.nan", ("calRangeScale", "finite")),
         ("cloud_frame:=/abs", ("cloud_frame", "/abs")),
         ("point_cloud_topic_id:=/a//b", ("point_cloud_topic_id", "/a//b")),
+        ("use_sim_time:=maybe", ("use_sim_time", "maybe", "BOOL")),
     ],
 )
 def test_a_wrong_parameter_ends_the_start_with_one_message(
