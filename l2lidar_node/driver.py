@@ -251,8 +251,8 @@ class Driver:
         if isinstance(packet, Ack):
             return self._acknowledged(packet, arrival)
         if isinstance(packet, Version):
-            self.version = packet
-            return [packet]
+            known, self.version = self.version, packet
+            return [] if packet == known else [packet]  # asked twice, it answers twice
         if isinstance(packet, Parameters):
             self.parameters = packet
             return [packet]

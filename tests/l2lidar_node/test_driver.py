@@ -476,6 +476,7 @@ def test_version_and_parameters_are_asked_for_until_they_come():
     (event,) = run.hear(PacketType.VERSION, build.version())
     assert isinstance(event, Version)
     assert run.driver.version == event
+    assert run.hear(PacketType.VERSION, build.version()) == []  # an answer to an earlier question
     run.sent.clear()
     run.wait(2)
     assert run.sent == [parameters] * 2
