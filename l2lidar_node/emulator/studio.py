@@ -10,6 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
+from multiprocessing.connection import wait
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -23,6 +24,7 @@ from l2lidar_node.programs import held
 from l2lidar_node.wire import WorkMode
 
 _AHEAD: Final = 4  # blocks
+_GRACE_S: Final = 0.3  # for a block that is being measured; to prepare a world takes seconds
 _IMU: Final = "imu"
 
 Block = tuple[NDArray[np.void], NDArray[np.float64]]
@@ -60,13 +62,13 @@ class Studio:
                 prepared = self._pool.submit(_prepare, config, truth)
             prepared.result()
         except BrokenProcessPool:  # open3d's readers crash on some damaged files
-            self.close()
+            self._end()
             raise StudioError(
                 f"world '{config.world}': the process that reads it crashed; a mesh file that is "
                 "damaged or cut off does that"
             ) from None
         except BaseException:
-            self.close()
+            self._end()
             raise
 
     def __enter__(self) -> Studio:
@@ -83,8 +85,16 @@ class Studio:
         self.close()
 
     def close(self) -> None:
-        """End the process; what it has not begun is dropped."""
-        self._pool.shutdown(cancel_futures=True)
+        """End the process; what it has not begun is dropped, and what takes it long as well."""
+        self._end(_GRACE_S)
+
+    def _end(self, grace_s: float = 0.0) -> None:
+        workers = [*(self._pool._processes or {}).values()]  # nobody else tells which they are
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        if len(wait([worker.sentinel for worker in workers], grace_s)) < len(workers):
+            for worker in workers:
+                worker.kill()
+        self._pool.shutdown()
 
     def points(self, mode: WorkMode) -> StudioScanner:
         """Return the source of point packets in a work mode (field of view, 2D or 3D)."""
@@ -143,13 +153,13 @@ def _settle() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
-    def wait() -> None:
+    def follow() -> None:
         parent = multiprocessing.parent_process()
         if parent is not None:
             parent.join()
             os._exit(0)
 
-    threading.Thread(target=wait, daemon=True).start()
+    threading.Thread(target=follow, daemon=True).start()
 
 
 def _prepare(config: PhysicsConfig, truth: Path | None) -> None:

@@ -129,16 +129,38 @@ def test_it_ends_cleanly_when_told_to(host, number, world):
     assert "heard: 1 COMMAND" in out
 
 
+def measuring(process):
+    """Return the number of the measuring process, once there is one."""
+    while True:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        for child in children:
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return int(child)
+        assert process.poll() is None
+
+
+@needs_rays
+@pytest.mark.parametrize("is_ready", [False, True])
+def test_it_does_not_wait_for_a_measuring_process_that_is_held_up(host, is_ready):
+    process = started(
+        "--world", "box", "--boot-scale", "10", "--lidar-port", "0", "--host-port", port_of(host)
+    )
+    if is_ready:
+        lidar_of(process)
+    os.kill(measuring(process), signal.SIGSTOP)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, err) == (0 if is_ready else 130, "")
+    assert bool(out) == is_ready
+
+
 @needs_rays
 def test_a_killed_measuring_process_is_one_message(host):
     process = started(
         "--world", "box", "--ready", "--lidar-port", "0", "--host-port", port_of(host)
     )
     host.recv(2000)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    for child in children:
-        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-            os.kill(int(child), signal.SIGKILL)
+    os.kill(measuring(process), signal.SIGKILL)
     _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1
     assert err == "l2lidar_emulator: the measuring process has come to an end\n"
