@@ -5,10 +5,15 @@ Names are unique over all groups: the command line makes one option of each.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
+from typing import Final
 
 from l2lidar_node import wire
-from l2lidar_node.settings import setting
+from l2lidar_node.settings import Form, setting
+
+_PRODUCT: Final = Form(re.compile(r"[ -~]{1,23}"), "a product name", "1 to 23 ASCII characters")
+_DATE: Final = Form(re.compile(r"[0-9]{6}"), "a date", "six digits such as 250715")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +65,8 @@ class IdentityConfig:
 
     hardware: str = setting("2.2.1.1", "hardware version, four numbers")
     firmware: str = setting("2.8.11.1", "firmware version, four numbers")
-    product: str = setting("YS-L2", "product name, up to 23 characters")
-    firmware_date: str = setting("250715", "firmware date as yymmdd")
+    product: str = setting("YS-L2", "product name, 1 to 23 ASCII characters", form=_PRODUCT)
+    firmware_date: str = setting("250715", "firmware date as yymmdd", form=_DATE)
     mac: str = setting("4c:32:01:00:00:62", "hardware address the unit leaves the factory with")
     work_mode: int = setting(
         0,
