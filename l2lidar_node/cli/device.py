@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswerError
@@ -11,6 +10,7 @@ from typing import Final, TypeVar
 
 from l2lidar_node import commands, health, source
 from l2lidar_node.cli.addresses import local_addresses
+from l2lidar_node.cli.patience import Patience
 from l2lidar_node.commands import Command
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver import Driver, Event
@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 ANSWER_S: Final = TRIES * REPEAT_NS / 1e9 + 0.5
 _LOOK_S: Final = 0.02
+_BUSY_S: Final = 10.0  # that the thread which gives up after ANSWER_S may be late
 
 
 class DeviceError(RuntimeError):
@@ -91,14 +92,14 @@ class Device:
 
     def wait_for(self, question: Callable[[Driver], T | None], timeout_s: float) -> T | None:
         """Ask until the answer is neither None nor False; None if that takes too long."""
-        deadline = time.monotonic() + timeout_s
+        patience = Patience(timeout_s)
         while True:
             answer = self.ask(question)
             if answer is not None and answer is not False:
                 return answer
-            if time.monotonic() > deadline:
+            if patience.is_over:
                 return None
-            time.sleep(_LOOK_S)
+            patience.pause(_LOOK_S)
 
     def command(self, start: Callable[[Driver, HostNs], int]) -> Answer:
         """Send what ``start`` queues, wait for its answer and return it.
@@ -115,7 +116,7 @@ class Device:
 
         self._session.call(begin).result()
         try:
-            answer = future.result(ANSWER_S)
+            answer = future.result(ANSWER_S + _BUSY_S)
         except NoAnswerError:
             raise DeviceError("the device did not answer") from None
         if not answer.ok:

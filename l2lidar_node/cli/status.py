@@ -16,6 +16,7 @@ from l2lidar_node import health
 from l2lidar_node.cli.console import as_data, facts, judgement, out, print_json
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import JsonOption, with_network
+from l2lidar_node.cli.patience import Patience
 from l2lidar_node.cli.stored import work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver import Driver
@@ -80,10 +81,10 @@ def monitor(
 
 
 def _seconds(device: Device, duration: float) -> Iterator[list[health.Check]]:
-    end = time.monotonic() + duration
+    patience = Patience(duration)
     before = device.period()
-    while time.monotonic() < end:
-        time.sleep(min(1.0, max(end - time.monotonic(), 0.0)))
+    while not patience.is_over:
+        patience.pause(1.0)
         checks, before = device.checks(before)
         yield checks
 

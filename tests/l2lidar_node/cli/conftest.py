@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import socket
 import sys
 import threading
 import time
@@ -13,6 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from l2lidar_node.cli.main import main
+from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.config import (
     AddressConfig,
     DeviceConfig,
@@ -26,13 +26,11 @@ from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
 from l2lidar_node.emulator.port import UdpPort
 from l2lidar_node.emulator.server import Server
 
-LIMIT_S = 20.0
+LIMIT_S = 120.0  # generous: only a failure waits that long
 
 
 def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as item:
-        item.bind(("127.0.0.1", 0))
-        return int(item.getsockname()[1])
+    return free_udp_ports(1)[0]
 
 
 class Unit:
