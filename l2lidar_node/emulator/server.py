@@ -7,7 +7,6 @@ import select
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Final
 
 from l2lidar_node.emulator.device import VirtualL2
@@ -99,18 +98,19 @@ class Server:
             wait_s = _LONGEST_WAIT_S
             if due_ns is not None:
                 wait_s = min(max((due_ns - now()) / speed * 1e-9, 0.0), wait_s)
-            if select.select([self._port], [], [], wait_s)[0]:
-                self._listen(now)
+            is_spoken_to = bool(select.select([self._port], [], [], wait_s)[0])
             until_ns = min(now(), end_ns)
             for time_ns, data in self._device.advance(until_ns):
                 self.unsent += not self._port.send(data)
                 self.lateness.add(now() - time_ns)
+            if is_spoken_to:  # what was due before goes out as it was, if late
+                self._listen(until_ns)
 
     def _race(self, power_on_ns: int, end_ns: int) -> None:
         now_ns = power_on_ns
         while not self._is_stopped and now_ns < end_ns:
             if select.select([self._port], [], [], 0.0)[0]:
-                self._listen(partial(int, now_ns))
+                self._listen(now_ns)
             next_ns = self._device.next_ns
             if next_ns is None:
                 select.select([self._port], [], [], _CHUNK_NS * 1e-9)
@@ -120,9 +120,9 @@ class Server:
                     pass
                 self.unsent += not self._port.send(data)
 
-    def _listen(self, now: Callable[[], int]) -> None:
+    def _listen(self, now_ns: int) -> None:
         for data in self._port.receive():
-            self._device.command(data, now())
+            self._device.command(data, now_ns)
         if self._device.flash != self._flash:
             self._flash = self._device.flash
             if self._on_flash:
