@@ -159,7 +159,7 @@ def live_run(
         for at, function in calls
     ]
     session.start()
-    session._thread.join(60)
+    session._thread.join(600)
     assert session.failure is None
     return config, events, tap
 

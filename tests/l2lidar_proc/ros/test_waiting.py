@@ -14,7 +14,7 @@ from std_msgs.msg import Int32
 from l2lidar_proc.ros.waiting import waiting
 
 pytestmark = pytest.mark.ros
-LIMIT_S = 30.0
+LIMIT_S = 120.0
 
 
 @pytest.fixture
