@@ -16,8 +16,8 @@ from typing import Any, Final
 from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.programs import interruptible
-from l2lidar_node.ros.parameter_files import parameters_for
-from l2lidar_node.settings import SettingError, build
+from l2lidar_node.ros.parameter_files import settings_for
+from l2lidar_node.settings import SettingError
 from l2lidar_proc import bag
 from l2lidar_proc.bag import RecordingError
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
@@ -193,10 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--params-file", type=Path, help="parameter file, as for the node")
     given = parser.parse_args(arguments)
     try:
-        values = {}
-        if given.params_file is not None:
-            values = parameters_for(given.params_file, "deskew_node", "/deskew_node")
-        config = build(DeskewNodeConfig, values)
+        config = settings_for(given.params_file, "deskew_node", DeskewNodeConfig)
         counts, refused = deskew_recording(given.source, given.target, config)
     except (SettingError, RecordingError, FileExistsError, ValueError) as error:
         print(error, file=sys.stderr)

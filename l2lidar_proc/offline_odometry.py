@@ -22,8 +22,7 @@ from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.programs import interruptible
-from l2lidar_node.ros.parameter_files import parameters_for
-from l2lidar_node.settings import SettingError, build
+from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.types import Sweep
 from l2lidar_proc import bag, map_file
 from l2lidar_proc.bag import RecordingError
@@ -64,6 +63,15 @@ class OdometryRun:
     sweeps: int
     counts: Counter[Status]
     refused: Counter[str]
+
+    @property
+    def report(self) -> list[str]:
+        """Lines that tell a person what was found."""
+        return [
+            f"{len(self.poses)} poses from {self.sweeps} sweeps",
+            *(f"{count} sweeps: {status.value}" for status, count in self.counts.items()),
+            *(f"{count} clouds not used: {reason}" for reason, count in self.refused.items()),
+        ]
 
 
 Event = tuple[int, Sweep | NDArray[np.void]]
@@ -244,25 +252,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--params-file", type=Path, help="parameter file, as for the node")
     given = parser.parse_args(arguments)
     try:
-        values = {}
-        if given.params_file is not None:
-            values = parameters_for(given.params_file, "odometry_node", "/odometry_node")
-        config = build(OdometryNodeConfig, values)
+        config = settings_for(given.params_file, "odometry_node", OdometryNodeConfig)
         with Bar() as bar:
             task = bar.add_task("odometry", total=1.0)
             run = run_bag(given.source, config, lambda share: bar.update(task, completed=share))
             bar.update(task, completed=1.0)
         files = write(run, given.target)
-    except (SettingError, ValueError, OSError) as error:
+    except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
-    print(f"{len(run.poses)} poses from {run.sweeps} sweeps")
-    for status, count in run.counts.items():
-        print(f"{count} sweeps: {status.value}")
-    for reason, count in run.refused.items():
-        print(f"{count} clouds not used: {reason}")
-    for path in files:
-        print(f"wrote {path}")
+    print(*run.report, *(f"wrote {path}" for path in files), sep="\n")
     return 0
 
 

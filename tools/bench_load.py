@@ -19,7 +19,7 @@ import rclpy
 from l2lidar_node import wire
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.demo.observer import Observer
-from l2lidar_node.demo.processes import Programs, free_udp_ports, isolate_ros
+from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
 from l2lidar_node.driver import Driver
 from l2lidar_node.emulator.pattern import PatternScanner
 from l2lidar_node.framing import Frame, Framer
@@ -132,12 +132,11 @@ def node_share(seconds: float) -> dict[str, float]:
         "host_ip": "127.0.0.1", "host_port": host_port,
         "enable_IMU_publishing": "true",
     }  # fmt: skip
-    assignments = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
     rclpy.init()
     observer = Observer()
     try:
         with Programs() as programs:
-            node = programs.start("l2lidar_node.ros.driver_node", ["--ros-args", *assignments])
+            node = programs.start("l2lidar_node.ros.driver_node", assigned(parameters))
             programs.start(
                 "l2lidar_node.emulator",
                 ["--ready", "--world", "pattern",

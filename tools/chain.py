@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from typing import Final
 
-from l2lidar_node.demo.processes import Program, Programs, free_udp_ports
+from l2lidar_node.demo.processes import Program, Programs, assigned, free_udp_ports
 
 EMULATOR: Final = "l2lidar_node.emulator"
 DRIVER: Final = "l2lidar_node.ros.driver_node"
@@ -38,12 +38,9 @@ def start(
         "host_port": host_port, "enable_IMU_publishing": "true", "imu_adjust": "false",
         **(values or {}),
     }  # fmt: skip
-    assignments = [
-        part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")
-    ]
     started = {
         module.rpartition(".")[2]: programs.start(
-            module, ["--ros-args", *assignments] if module == DRIVER else []
+            module, assigned(parameters) if module == DRIVER else []
         )
         for module in nodes
         if find_spec(module)

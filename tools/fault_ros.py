@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -16,14 +15,13 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Imu, PointCloud2
 
 from l2lidar_node import wire
-from l2lidar_node.demo.processes import Program, Programs, free_udp_ports, isolate_ros
+from l2lidar_node.demo.processes import Program, Programs, assigned, free_udp_ports, isolate_ros
 from tools.cpu import resident_mb
 from tools.fault_world import Finding
 from tools.topic_watch import CLOUDS, IMU, TopicWatch, backward_steps, missing
 
 _MODULE: Final = "tools.fault_ros"
 _TURN_S: Final = 0.229769  # of the head
-_START_S: Final = 30.0
 
 
 def run() -> list[Finding]:
@@ -35,24 +33,22 @@ def run() -> list[Finding]:
         "host_port": host_port, "enable_IMU_publishing": "true", "imu_adjust": "false",
         "sweep_cut": "turn", "qos_reliability": "reliable",
     }  # fmt: skip
-    assignments = [part for key, value in values.items() for part in ("-p", f"{key}:={value}")]
     rclpy.init()
     watch = TopicWatch([CLOUDS, IMU], reliable=True)
     try:
         with Programs() as programs:
-            driver = programs.start("l2lidar_node.ros.driver_node", ["--ros-args", *assignments])
+            driver = programs.start("l2lidar_node.ros.driver_node", assigned(values))
             programs.start(
                 "l2lidar_node.emulator",
                 ["--ready", "--world", "pattern",
                  "--host-port", str(host_port), "--lidar-port", str(lidar_port)],
             )  # fmt: skip
             slow = programs.start(_MODULE, [])
-            deadline = time.monotonic() + _START_S
-            while len(watch.seen(CLOUDS)) < 10 or watch.count_subscribers(CLOUDS) < 2:
-                watch.watch(0.2)
-                programs.check()
-                if time.monotonic() > deadline:
-                    raise TimeoutError("no clouds, or no second subscriber")
+            watch.until(
+                lambda: len(watch.seen(CLOUDS)) >= 10 and watch.count_subscribers(CLOUDS) >= 2,
+                programs,
+                "no clouds, or no second subscriber",
+            )
             return [
                 _watched(watch, driver, "two reliable subscribers", lambda: None),
                 _watched(

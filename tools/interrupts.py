@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from l2lidar_node.demo.processes import Programs, free_udp_ports, isolate_ros
+from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
 from tools import chain
 
 GRACE_S: Final = 15.0
@@ -116,10 +116,9 @@ def commands(folder: Path) -> dict[str, list[str]]:
         "l2_ip": "127.0.0.1", "l2_port": lidar_port, "host_ip": "127.0.0.1",
         "host_port": host_port, "enable_IMU_publishing": "true", "watchdog_action": "wait",
     }  # fmt: skip
-    parameters = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
     name = f"{host_port}"
     modules = {
-        "driver_node": ["l2lidar_node.ros.driver_node", "--ros-args", *parameters],
+        "driver_node": ["l2lidar_node.ros.driver_node", *assigned(values)],
         "deskew_node": ["l2lidar_proc.ros.deskew_node"],
         "odometry_node": ["l2lidar_proc.ros.odometry_node"],
         "emulator": ["l2lidar_node.emulator", "--ready", *ends],

@@ -23,7 +23,6 @@ _SWEEP_NS: Final = round(
     ((_PACKETS - 1) * wire.MIRROR_PERIOD_S + wire.MIRROR_PERIOD_S / 2 + _DELAY_S) * 1e9
 )
 """From a cloud's stamp to the instant at which the unit sends its last packet."""
-_START_S: Final = 60.0
 _WARM_UP_S: Final = 8.0
 
 
@@ -56,12 +55,7 @@ def measured(seconds: float, world: str) -> ChainCost:
     try:
         with Programs() as programs:
             running = chain.start(programs, ["--ready", "--world", world])
-            deadline = time.monotonic() + _START_S
-            while not len(watch.seen(CLOUDS)):
-                watch.watch(0.2)
-                programs.check()
-                if time.monotonic() > deadline:
-                    raise TimeoutError("no clouds")
+            watch.until(lambda: len(watch.seen(CLOUDS)) > 0, programs, "no clouds")
             watch.watch(_WARM_UP_S)
             watch.forget()
             begin = time.monotonic()

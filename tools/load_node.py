@@ -14,7 +14,7 @@ import rclpy
 from numpy.typing import NDArray
 
 from l2lidar_node import wire
-from l2lidar_node.demo.processes import Programs, free_udp_ports, isolate_ros
+from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
 from tools.chain import DRIVER
 from tools.cpu import process_cpu_s
 from tools.load_sender import address
@@ -24,7 +24,6 @@ _PACKETS: Final = 38  # in a cloud
 _PERIOD_NS: Final = round(wire.MIRROR_PERIOD_S * 1e9)
 _TO_SENT_NS: Final = round(_PERIOD_NS / 2) + 150_000  # from a packet's first slot, at the unit
 _WARM_UP_S: Final = 5.0  # the clock locks and settles
-_START_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +53,14 @@ def measured(seconds: float) -> NodeCost:
         "l2_ip": address(0), "host_ip": "127.0.0.1", "host_port": port,
         "enable_IMU_publishing": "true", "enable_l2_host_sync": "false",
     }  # fmt: skip
-    assignments = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
     rclpy.init()
     watch = TopicWatch([CLOUDS, IMU])
     try:
         with Programs() as programs:
-            node = programs.start(DRIVER, ["--ros-args", *assignments])
-            deadline = time.monotonic() + _START_S
-            while not watch.count_publishers(CLOUDS):
-                watch.watch(0.2)
-                programs.check()
-                if time.monotonic() > deadline:
-                    raise TimeoutError("the driver does not start")
+            node = programs.start(DRIVER, assigned(parameters))
+            watch.until(
+                lambda: watch.count_publishers(CLOUDS) > 0, programs, "the driver does not start"
+            )
             with subprocess.Popen(
                 [sys.executable, "-m", "tools.load_sender", "1", str(seconds + _WARM_UP_S + 1.0),
                  str(port), "--instants"],

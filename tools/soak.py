@@ -29,7 +29,6 @@ from tools.cpu import process_cpu_s, resident_mb
 from tools.results import Target, at_most, keep, publish
 from tools.topic_watch import CLOUDS, DESKEWED, IMU, ODOMETRY, TopicWatch, backward_steps, missing
 
-_START_S: Final = 60.0
 _WARM_UP_S: Final = 20.0
 _LOOK_S: Final = 30.0
 _MAX_GROWTH_MB: Final = 10.0
@@ -176,7 +175,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     title = f"The whole chain for {options.minutes:g} minutes"
     with Programs() as programs, _watching() as (watch, casual):
         running = chain.start(programs, unit, {"qos_reliability": "reliable"})
-        _wait_for_clouds(watch, programs, min(_WARM_UP_S, 15 * options.minutes))
+        watch.until(lambda: len(watch.seen(CLOUDS)) > 0, programs, "no clouds")
+        watch.watch(min(_WARM_UP_S, 15 * options.minutes))
         soak = Soak(running, watch, casual)
         trouble = _went_on(soak, programs, watch, options.minutes)
         rows, targets = soak.found()
@@ -203,16 +203,6 @@ def _watching() -> Iterator[tuple[TopicWatch, TopicWatch]]:
         stack.callback(casual.destroy_node)
         watch.spin_with(casual)
         yield watch, casual
-
-
-def _wait_for_clouds(watch: TopicWatch, programs: Programs, warm_up_s: float) -> None:
-    deadline = time.monotonic() + _START_S
-    while not len(watch.seen(CLOUDS)):
-        watch.watch(0.2)
-        programs.check()
-        if time.monotonic() > deadline:
-            raise TimeoutError("no clouds")
-    watch.watch(warm_up_s)
 
 
 def _went_on(soak: Soak, programs: Programs, watch: TopicWatch, minutes: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
+from l2lidar_node.demo.processes import Programs
+
+_START_S: Final = 60.0  # until programs are at work, on a busy machine
 _STAMP: Final = struct.Struct("<iI")
 _ENCAPSULATION: Final = 4  # bytes before a serialised message, which begins with its stamp
 
@@ -65,6 +68,23 @@ class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no t
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             self._executor.spin_once(min(left, 0.1))
+
+    def until(self, condition: Callable[[], bool], programs: Programs, otherwise: str) -> None:
+        """Handle what arrives until a condition holds, while programs run.
+
+        Raises
+        ------
+        TimeoutError
+            With the text ``otherwise``, if that takes too long.
+        ProgramError
+            If one of them ends.
+        """
+        deadline = time.monotonic() + _START_S
+        while not condition():
+            self.watch(0.2)
+            programs.check()
+            if time.monotonic() > deadline:
+                raise TimeoutError(otherwise)
 
     def spin_with(self, other: Node) -> None:
         """Handle what arrives at another node, too."""

@@ -48,18 +48,13 @@ def odometry(
 
     The trajectory in TUM format is what evo reads. Of a capture, sweeps of a full turn are used.
     """
-    from l2lidar_node.ros.parameter_files import parameters_for
+    from l2lidar_node.ros.parameter_files import settings_for
     from l2lidar_proc import offline_odometry
     from l2lidar_proc.bag import RecordingError
     from l2lidar_proc.odometry_config import OdometryNodeConfig
 
     try:
-        values = (
-            {}
-            if params_file is None
-            else parameters_for(params_file, "odometry_node", "/odometry_node")
-        )
-        config = build(OdometryNodeConfig, values)
+        config = settings_for(params_file, "odometry_node", OdometryNodeConfig)
     except ValueError as error:
         raise UsageError(str(error)) from None
     try:
@@ -117,12 +112,7 @@ def _taken(now: int, events: list[Event]) -> Iterator[tuple[int, Any]]:
 
 
 def _say(run: OdometryRun, files: list[Path]) -> None:
-    say(f"{len(run.poses)} poses from {run.sweeps} sweeps")
-    for status, count in run.counts.items():
-        say(f"{count} sweeps: {status.value}")
-    for reason, count in run.refused.items():
-        say(f"{count} clouds not used: {reason}")
-    for path in files:
-        say(f"wrote {path}")
+    for line in [*run.report, *(f"wrote {path}" for path in files)]:
+        say(line)
     if not run.poses:
         raise DeviceError("no way was found: are there clouds with times, and IMU samples?")

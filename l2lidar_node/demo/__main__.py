@@ -16,6 +16,7 @@ from l2lidar_node.demo.observer import Observer, TopicRecord
 from l2lidar_node.demo.processes import (
     ProgramError,
     Programs,
+    assigned,
     free_udp_ports,
     isolate_ros,
 )
@@ -103,8 +104,7 @@ def _start(programs: Programs, options: argparse.Namespace) -> None:
         "imu_adjust": "false",
         "sweep_cut": "turn",
     }
-    assignments = [part for key, value in driver.items() for part in ("-p", f"{key}:={value}")]
-    programs.start("l2lidar_node.ros.driver_node", ["--ros-args", *assignments])
+    programs.start("l2lidar_node.ros.driver_node", assigned(driver))
     if not options.driver_only:
         programs.start("l2lidar_proc.ros.deskew_node", [])
         programs.start("l2lidar_proc.ros.odometry_node", [])

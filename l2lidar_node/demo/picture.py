@@ -26,9 +26,7 @@ def save_cloud(points: NDArray[np.void], path: Path, title: str) -> None:
         PNG file; missing folders are made.
     title : str
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure = Figure(figsize=(13, 6), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure(path)
     figure.suptitle(title)
     colour: dict[str, Any] = {"c": points["range"], "cmap": "turbo", "vmin": 0.0, "linewidths": 0}
     colour["vmax"] = float(np.percentile(points["range"], 99))
@@ -56,9 +54,7 @@ def save_comparison(raw: NDArray[np.void], deskewed: NDArray[np.void], path: Pat
     path : Path
         PNG file; missing folders are made.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure = Figure(figsize=(13, 6.5), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure(path, height=6.5)
     for column, (title, points) in enumerate((("as measured", raw), ("deskewed", deskewed))):
         plan = figure.add_subplot(1, 2, column + 1)
         points = points[points["z"] < _WALLS_M]  # a ceiling would hide the walls
@@ -88,9 +84,7 @@ def save_track(
         PNG file; missing folders are made.
     title : str
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure = Figure(figsize=(13, 6), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure(path)
     figure.suptitle(title)
     plan = figure.add_subplot(1, 2, 1)
     plan.plot(true[:, 0], true[:, 1], color="0.6", linewidth=4, label="truth")
@@ -103,3 +97,11 @@ def save_track(
     errors.set(xlabel="sweep", ylabel="distance from the truth [mm]", ylim=(0, None))
     with whole(path) as part:
         figure.savefig(part)
+
+
+def _figure(path: Path, height: float = 6.0) -> Figure:
+    """Return an empty figure, the folder of whose file is there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(13, height), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure

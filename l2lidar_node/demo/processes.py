@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from itertools import cycle
 from pathlib import Path
@@ -100,6 +101,15 @@ class Programs:
         """Raise :class:`ProgramError` if any of them has ended."""
         for program in self._running:
             program.check()
+
+
+def assigned(values: Mapping[str, object]) -> list[str]:
+    """Return the arguments that give a node its parameters: ``--ros-args -p NAME:=VALUE ...``."""
+    texts = {
+        name: str(value).lower() if isinstance(value, bool) else value
+        for name, value in values.items()
+    }
+    return ["--ros-args", *(a for name, text in texts.items() for a in ("-p", f"{name}:={text}"))]
 
 
 def isolate_ros() -> None:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
+
+from l2lidar_node.settings import build
+
+G = TypeVar("G")
 
 
 class _Loader(yaml.SafeLoader):
@@ -62,6 +66,27 @@ def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any
         if heading == f"/{stock_name}" or _pattern(heading).fullmatch(full_name):
             values.update(_flat(section))
     return values
+
+
+def settings_for(path: Path | None, name: str, group: type[G]) -> G:
+    """Return the settings that a parameter file gives to a node of that name, without ROS.
+
+    Parameters
+    ----------
+    path : Path or None
+        None leaves all at their defaults.
+    name : str
+    group : type
+        Frozen dataclass of settings.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, or something in it is wrong.
+    """
+    values = {} if path is None else parameters_for(path, name, f"/{name}")
+    values.pop("use_sim_time", None)  # a recording tells its time, with and without it
+    return build(group, values)
 
 
 def parameter_file(values: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ import rclpy
 from rclpy.node import Node
 
 from l2lidar_node.demo.observer import Observer
-from l2lidar_node.demo.processes import Program, Programs, free_udp_ports
+from l2lidar_node.demo.processes import Program, Programs, assigned, free_udp_ports
 
 TIMEOUT_S = 120.0  # generous: only a failure waits that long
 _ASK_AGAIN_S = 10.0
@@ -49,7 +49,7 @@ class Rig:
             "imu_adjust": False,
             **parameters,
         }
-        return ["--ros-args", *assignments(values)]
+        return assigned(values)
 
     def wait_for(self, condition: Callable[[], Any], what: str) -> None:
         """Spin until a condition holds; fail if a program ends or it takes too long."""
@@ -90,15 +90,6 @@ class Rig:
         while not (response := self.call(kind, name, request)).success:
             assert "did not acknowledge" in response.message
             assert time.monotonic() < deadline, response.message
-
-
-def assignments(values: Mapping[str, object]) -> list[str]:
-    """Return ``-p name:=value`` for each value."""
-    return [
-        part
-        for name, value in values.items()
-        for part in ("-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}")
-    ]
 
 
 @contextmanager

@@ -16,10 +16,10 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 
-from l2lidar_node.demo.processes import free_udp_ports
+from l2lidar_node.demo.processes import assigned, free_udp_ports
 from l2lidar_node.ros.conversions import from_cloud
 from tests.build import NS, REAL_L2, frames_3d, points_3d, real_capture
-from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, assignments, open_rig
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
 
 pytestmark = pytest.mark.ros
 
@@ -89,10 +89,10 @@ def test_a_port_in_use_and_a_foreign_address_are_explained() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        busy = _run("--ros-args", *assignments({**LOOPBACK, "host_port": port}))
+        busy = _run(*assigned({**LOOPBACK, "host_port": port}))
     assert busy.returncode == 1
     assert f"host_port {port} is in use" in busy.stderr
-    foreign = _run("--ros-args", *assignments({**LOOPBACK, "host_ip": "203.0.113.9"}))
+    foreign = _run(*assigned({**LOOPBACK, "host_ip": "203.0.113.9"}))
     assert foreign.returncode == 1
     assert "203.0.113.9" in foreign.stderr
     assert "no address of this machine" in foreign.stderr
@@ -102,8 +102,8 @@ def test_a_port_in_use_and_a_foreign_address_are_explained() -> None:
 def test_a_signal_ends_it_cleanly(number: signal.Signals) -> None:
     (port,) = free_udp_ports(1)
     process = subprocess.Popen(
-        [sys.executable, "-m", "l2lidar_node.ros.driver_node", "--ros-args",
-         *assignments({**LOOPBACK, "host_port": port})],
+        [sys.executable, "-m", "l2lidar_node.ros.driver_node",
+         *assigned({**LOOPBACK, "host_port": port})],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     assert process.stdout is not None
@@ -119,7 +119,7 @@ def test_a_signal_ends_it_cleanly(number: signal.Signals) -> None:
 def test_the_watchdog_ends_a_driver_without_device() -> None:
     (port,) = free_udp_ports(1)
     values = {**LOOPBACK, "host_port": port, "watchdog_timeout_ms": 300}
-    result = _run("--ros-args", *assignments(values))
+    result = _run(*assigned(values))
     assert result.returncode == 1
     assert "no data from the L2 at 127.0.0.1" in result.stdout + result.stderr
     assert "Traceback" not in result.stderr

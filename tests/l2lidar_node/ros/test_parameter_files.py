@@ -1,7 +1,9 @@
 import pytest
 import yaml
 
-from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
+from l2lidar_node.ros.parameter_files import parameter_file, parameters_for, settings_for
+from l2lidar_node.settings import SettingError
+from l2lidar_proc.odometry_config import OdometryTopics
 
 FILE = """
 /**:
@@ -112,3 +114,13 @@ def test_written_file_applies_to_every_node_and_keeps_types(tmp_path):
     assert again == values
     assert [type(value) for value in again.values()] == [type(value) for value in values.values()]
     assert yaml.safe_load(file.read_text()).keys() == {"/**"}
+
+
+def test_a_file_for_a_node_serves_without_ros(tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text("odometry_node: {ros__parameters: {use_sim_time: true, map_period_s: 5}}")
+    assert settings_for(file, "odometry_node", OdometryTopics).map_period_s == 5.0
+    assert settings_for(None, "odometry_node", OdometryTopics).map_period_s == 2.0
+    file.write_text("odometry_node: {ros__parameters: {map_perod_s: 5.0}}")
+    with pytest.raises(SettingError, match="did you mean 'map_period_s'"):
+        settings_for(file, "odometry_node", OdometryTopics)

@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from l2lidar_node.demo.processes import Program
+from l2lidar_node.demo.processes import Program, assigned
 from l2lidar_node.recording import Recording
 from l2lidar_node.ros.conversions import from_time
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
@@ -149,9 +149,8 @@ def test_a_loop_goes_on_in_time_and_obeys_nobody(rig: Rig, tmp_path: Path) -> No
     ids=str,
 )
 def test_what_cannot_be_opened_ends_the_start(parameters: dict[str, str], words: str) -> None:
-    arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
     done = subprocess.run(
-        [sys.executable, "-m", "l2lidar_node.ros.driver_node", "--ros-args", *arguments],
+        [sys.executable, "-m", "l2lidar_node.ros.driver_node", *assigned(parameters)],
         capture_output=True,
         text=True,
         timeout=TIMEOUT_S,
