@@ -1,7 +1,7 @@
 """A driver without ROS in a process of its own, which writes down what it made of every packet.
 
 ``python -m tools.fault_host OUT [name=value ...]`` runs until it is interrupted and then writes
-``OUT.npy`` (see :data:`NOTE`) and ``OUT.json``.
+``OUT.npy`` (see :data:`NOTE`) and ``OUT.json``. Until then ``OUT.now`` says how far it is.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import yaml
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event, Silence
+from l2lidar_node.files import write_whole
 from l2lidar_node.recorder import Recorder
 from l2lidar_node.session import Session
 from l2lidar_node.settings import build
@@ -72,7 +73,8 @@ def main() -> int:
     session.start()
     print("listening", flush=True)
     while not stopping.wait(0.2) and not session.failure:
-        pass
+        now = {"foreign": transport.foreign, "samples": driver.counters.samples, "said": said}
+        write_whole(out.with_suffix(".now"), json.dumps(now).encode())
     session.stop()
     notes = [(kind, seq, stamp, at, answer) for kind, seq, stamp, at, _, _, answer in clock.notes]
     np.save(out.with_suffix(".npy"), np.array(notes, NOTE))

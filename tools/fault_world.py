@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.results import Results
 
-_DEADLINE_S: Final = 30.0
+_DEADLINE_S: Final = 120.0  # for the end of a program
+_LIMIT_S: Final = 60.0
 _PRIVILEGED_PORT: Final = 81
 _FREE_PORTS: Final = Path("/proc/sys/net/ipv4/ip_unprivileged_port_start")
 _PR_CAPBSET_DROP: Final = 24  # of Linux's sys/prctl.h
@@ -131,6 +132,24 @@ class World:
             process.send_signal(signal.SIGCONT)
             process.send_signal(signal.SIGINT)
         process.communicate(timeout=_DEADLINE_S)
+
+    def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Wait until a driver that runs is so far, however slow this machine is; return how far.
+
+        Raises
+        ------
+        TimeoutError
+            If it does not come so far.
+        """
+        path = self.folder / "host.now"
+        deadline = time.monotonic() + _LIMIT_S
+        while time.monotonic() < deadline:
+            if path.exists():
+                now: dict[str, Any] = json.loads(path.read_text())
+                if condition(now):
+                    return now
+            time.sleep(0.05)
+        raise TimeoutError(f"the driver is not so far after {_LIMIT_S:.0f} s")
 
     def close(self) -> None:
         """End everything."""
@@ -274,7 +293,7 @@ def crowd(world: World) -> Finding:
 def stranger(world: World) -> Finding:
     """Tell the driver a wrong address of the sensor."""
     host, _ = world.host(l2_ip="127.0.0.9"), world.unit()
-    _pause(3.0)
+    world.until(lambda now: now["foreign"] > 500 and "silence" in now["said"])
     world.end(host)
     facts = world.facts()
     finding = Finding("wrong l2_ip", published=facts["sweeps"], remark="nothing published")
@@ -303,7 +322,8 @@ def disk(world: World) -> Finding:
     """Fill the disk while recording."""
     path = world.folder / "flight.pcap"
     host, _ = world.host(limit=600_000, record_file=path), world.unit()
-    _pause(6.0)
+    full = world.until(lambda now: any("recording" in text for text in now["said"]))
+    world.until(lambda now: now["samples"] > full["samples"] + 300)
     finding = _ended(world, host, "disk full while recording")
     said = [text for text in world.facts()["said"] if "recording" in text]
     finding.good &= len(said) == 1 and path.stat().st_size <= 600_000

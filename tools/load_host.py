@@ -12,10 +12,13 @@ import signal
 import sys
 import threading
 import time
+from concurrent.futures import CancelledError
+from contextlib import suppress
 
 from l2lidar_node import health
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import Driver, Event
+from l2lidar_node.emulator import backlog
 from l2lidar_node.session import Session
 from l2lidar_node.settings import build
 from l2lidar_node.transport import UdpTransport
@@ -50,7 +53,7 @@ def main() -> int:
     before = [health.observe(one.driver, one.transport, _now()) for one in sessions]
     print("listening", flush=True)
     stopping.wait()
-    _until_silent(sessions)
+    _take_what_waits(sessions)
     for session in sessions:
         session.stop()
     complaints = set()
@@ -74,12 +77,15 @@ def main() -> int:
     return 0
 
 
-def _until_silent(sessions: list[Session]) -> None:
+def _take_what_waits(sessions: list[Session]) -> None:
     """Wait until the sessions have taken what their sockets hold, however slow this machine is."""
-    before = -1
-    while (heard := sum(one.driver.counters.datagrams for one in sessions)) != before:
-        before = heard
-        time.sleep(0.3)
+    for one in sessions:
+        network = one.driver.config.network
+        while backlog.unread(network.host_ip, network.host_port) and not one.failure:
+            time.sleep(0.05)
+    for one in sessions:  # its thread answers when it is through with what it took
+        with suppress(CancelledError):
+            one.call(lambda driver, now: None).result()
 
 
 def _now() -> HostNs:

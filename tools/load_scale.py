@@ -81,7 +81,7 @@ def crowd(sensors: int, processes: int, rate: float, seconds: float) -> dict[str
         )  # fmt: skip
         for host in hosts:
             host.send_signal(signal.SIGINT)
-        results = [json.loads(host.communicate(timeout=30)[0]) for host in hosts]
+        results = [json.loads(host.communicate(timeout=300)[0]) for host in hosts]
     finally:
         for host in hosts:
             if host.poll() is None:

@@ -20,6 +20,7 @@ from operator import itemgetter
 from typing import Final
 
 from l2lidar_node import wire
+from l2lidar_node.emulator import backlog
 from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
 from l2lidar_node.wire import PacketType
 
@@ -30,6 +31,7 @@ _STAMP: Final = struct.Struct("<I4xII")
 _LAST_SLOT_NS: Final = 150_000  # after the last slot a packet leaves
 _UPTIME_NS: Final = 10_000_000_000  # of the unit at its first packet
 _NS: Final = 1_000_000_000
+_ROOM_S: Final = 60.0  # longest wait for room in a socket
 
 
 def address(number: int) -> str:
@@ -84,8 +86,10 @@ def main() -> int:
         for sock, end in ends:
             sock.sendto(data, end)
     lasted = (time.time_ns() - begin) / 1e9
-    time.sleep(0.5)
     for sock, end in ends:  # the kernel says with the next datagram what it dropped before
+        until = time.monotonic() + _ROOM_S
+        while backlog.unread(*end) and time.monotonic() < until:
+            time.sleep(0.05)
         sock.sendto(last[1], end)
     told: dict[str, object] = {
         "sent": len(packets) + 1, "seconds": lasted, "latest_ms": late / 1e6
