@@ -25,8 +25,9 @@ from typing import Final
 from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
 from tools import chain
 
-GRACE_S: Final = 15.0
+GRACE_S: Final = 60.0
 _LATEST_S: Final = 5.0
+_LEFT_S: Final = 20.0
 _FIRST: Final = (
     "l2lidar_node/__init__.py", "l2lidar_node/programs.py", "l2lidar_proc/__init__.py",
     "__editable___l2lidar_node_0_1_0_finder.py",
@@ -160,8 +161,8 @@ def end(command: Sequence[str], sent: Interruption) -> End:
 
 
 def _left(group: int) -> int:
-    """Return whether a process group still lives a moment after its leader's end, and end it."""
-    until = time.monotonic() + 2.0
+    """Return whether a process group still lives long after its leader's end, and end it."""
+    until = time.monotonic() + _LEFT_S
     while time.monotonic() < until:
         try:
             os.killpg(group, 0)
