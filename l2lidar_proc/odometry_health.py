@@ -22,6 +22,7 @@ def judged(
     since: int,
     counts: Counter[Status],
     refused: Counter[str],
+    untied: str = "",
 ) -> tuple[int, str, dict[str, str]]:
     """Return level, message and figures for a diagnostic status.
 
@@ -37,6 +38,8 @@ def judged(
         How often what was reported.
     refused : Counter of str
         Clouds that could not be used, by reason.
+    untied : str
+        Why the poses are not those of the base frame; empty if they are.
     """
     values = {"sweeps": str(sweeps)}
     values |= {f"{status.name.lower()} [sweeps]": str(count) for status, count in counts.items()}
@@ -61,5 +64,6 @@ def judged(
     }
     if not since:
         return WARN, "no clouds", values
-    level = ERROR if _SERIOUS & set(last.status) else WARN if last.status else OK
-    return level, "; ".join(status.value for status in last.status) or "aligned", values
+    level = ERROR if untied or _SERIOUS & set(last.status) else WARN if last.status else OK
+    text = "; ".join(status.value for status in last.status) or "aligned"
+    return level, f"{text}; {untied}" if untied else text, values

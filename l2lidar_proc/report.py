@@ -68,6 +68,7 @@ def of_period(
     refused: dict[str, int],
     *,
     is_levelled: bool,
+    untied: str = "",
 ) -> Report:
     """Return what there is to say about the time between two looks.
 
@@ -82,6 +83,8 @@ def of_period(
         Clouds that could not be used, by reason.
     is_levelled : bool
         Whether the clouds come levelled, which they must not.
+    untied : str
+        Why velocities that came are not used; empty if they are.
     """
     sweeps = after.sweeps - before.sweeps
     values = {
@@ -107,6 +110,9 @@ def of_period(
         return Report(Level.ERROR, text, values)
     if not sweeps:
         return Report(Level.WARN, "no clouds", values)
-    if last is None:
-        return Report(Level.OK, f"{sweeps} sweeps", values)
-    return Report(last.level, f"{sweeps} sweeps, the last one: {last.message}", values)
+    level, text = Level.OK, f"{sweeps} sweeps"
+    if last is not None:
+        level, text = last.level, f"{text}, the last one: {last.message}"
+    if untied:
+        level, text = max(level, Level.WARN), f"{text}; velocity not used: {untied}"
+    return Report(level, text, values)

@@ -27,7 +27,7 @@ from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.pipeline import Deskewed, Pipeline
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
-from l2lidar_proc.ros.static_frames import StaticFrames
+from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
 from l2lidar_proc.velocity import carried_over
 
@@ -56,6 +56,7 @@ class DeskewNode(Node):
         self._cloud_frame = ""
         self._template: tuple[tuple[np.dtype[np.void], str], CloudTemplate] | None = None
         self._refused: Counter[str] = Counter()
+        self._untied = ""
         self._last: report.Report | None = None
         self._before = self._pipeline.counts
         self._open(config)
@@ -138,17 +139,14 @@ class DeskewNode(Node):
     ) -> None:
         if not self._cloud_frame:
             return
-        T_cloud_body = np.eye(4)
-        if frame != self._cloud_frame:
-            found = self._frames.find(self._cloud_frame, frame) if self._frames else None
-            if found is None:
-                self.get_logger().warning(
-                    f"velocity of frame '{frame}' not used: how '{self._cloud_frame}' is mounted "
-                    "on it is not on /tf_static",
-                    throttle_duration_sec=5.0,
-                )
-                return
-            T_cloud_body = found
+        self._untied = untied(self._frames, self._cloud_frame, frame)
+        if self._untied:
+            text = f"velocity not used: {self._untied}"
+            self.get_logger().warning(text, throttle_duration_sec=5.0)
+            return
+        T_cloud_body = self._frames.find(self._cloud_frame, frame) if self._frames else None
+        if T_cloud_body is None:
+            T_cloud_body = np.eye(4)
         velocity = carried_over(
             (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), T_cloud_body
         )
@@ -196,6 +194,7 @@ class DeskewNode(Node):
             tracker.attitude.latest,
             self._refused,
             is_levelled=self._levelling.is_levelled,
+            untied=self._untied,
         )
         self._before = self._pipeline.counts
         message = DiagnosticArray()

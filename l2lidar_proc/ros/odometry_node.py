@@ -31,7 +31,7 @@ from l2lidar_proc.odometry_estimate import OdometryEstimate
 from l2lidar_proc.odometry_pipeline import OdometryPipeline
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.samples import to_sample
-from l2lidar_proc.ros.static_frames import StaticFrames
+from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
@@ -253,6 +253,16 @@ class OdometryNode(Node):
             response.success, response.message = False, f"{path}: {error}"
         return response
 
+    def _untied(self) -> str:
+        """Return what is wrong where the poses cannot be those of the base frame."""
+        base = self._settings.value.topics.base_frame
+        reason = untied(self._frames, self._cloud_frame, base) if base else ""
+        if not reason or not self._cloud_frame:
+            return ""
+        text = f"poses are those of '{self._cloud_frame}': {reason}"
+        self.get_logger().warning(text, throttle_duration_sec=10.0)
+        return text
+
     def _diagnose(self) -> None:
         since = self._pipeline.sweeps - self._looked_at
         self._looked_at = self._pipeline.sweeps
@@ -262,6 +272,7 @@ class OdometryNode(Node):
             since,
             self._pipeline.counts,
             self._refused,
+            self._untied(),
         )
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()

@@ -42,3 +42,17 @@ class StaticFrames:
                 item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/"), T_parent_child
             )
         self.version += 1
+
+
+def untied(frames: StaticFrames | None, target: str, source: str) -> str:
+    """Return in words why a transform is not known, without frames as well; empty if it is."""
+    if target == source:
+        return ""
+    if frames is None:
+        return f"use_tf is false, so nothing tells how '{source}' is mounted"
+    if frames.find(target, source) is not None:
+        return ""
+    return (
+        f"'{source}' is not tied to '{target}' on /tf_static; what comes on /tf alone does not "
+        "count, since it may move: give a mount as a fixed joint or by static_transform_publisher"
+    )

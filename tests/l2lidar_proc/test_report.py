@@ -37,10 +37,12 @@ def test_a_sweep(flags, level):
     assert told.values["waited for the IMU [ms]"] == "7.0"
 
 
-def period(before: int, after: int, last, *, is_levelled: bool = False) -> report.Report:
+def period(
+    before: int, after: int, last, *, is_levelled: bool = False, untied: str = ""
+) -> report.Report:
     return report.of_period(
         PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, WindowCounts(), None,
-        {"no time field": 3}, is_levelled=is_levelled,
+        {"no time field": 3}, is_levelled=is_levelled, untied=untied,
     )  # fmt: skip
 
 
@@ -54,6 +56,13 @@ def test_a_period():
     assert told.values["last: at rest"] == "true"
     assert period(8, 8, last).level == Level.WARN
     assert period(3, 8, None).level == Level.OK
+
+
+def test_a_velocity_that_cannot_be_used_is_told_unless_worse_is():
+    told = period(3, 8, report.of_sweep(quality(), 0), untied="'base' is not tied")
+    assert told.level == Level.WARN
+    assert told.message.endswith("velocity not used: 'base' is not tied")
+    assert period(3, 8, report.of_sweep(quality(Flag.NO_IMU), 0), untied="x").level == Level.ERROR
 
 
 def test_levelled_clouds_are_an_error_whatever_else():

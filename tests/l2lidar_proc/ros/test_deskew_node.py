@@ -160,9 +160,12 @@ def test_mounts_come_from_tf(bench):
     bench.send_odometry(1.0, (1.0, 0.0, 0.0), frame="base_link")
     bench.until(lambda: bench.known(1.0))
     bench.send_odometry(2.0, (1.0, 0.0, 0.0), frame="nowhere")
+    bench.until(lambda: bench.node._untied)
+    assert "'nowhere' is not tied" in bench.node._untied
     bench.send_odometry(3.0, (1.0, 0.0, 0.0), frame="base_link")
     bench.until(lambda: bench.known(3.0))
     assert len(bench.node._pipeline.tracker.velocities._stamps) == 2
+    assert not bench.node._untied
 
 
 @pytest.mark.parametrize(

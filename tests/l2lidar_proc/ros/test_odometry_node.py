@@ -7,7 +7,8 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from geometry_msgs.msg import TransformStamped  # noqa: E402  after importorskip
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402  after importorskip
+from geometry_msgs.msg import TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry, Path  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -119,6 +120,22 @@ def test_everything_that_is_published(bench, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("bench", "words"),
+    [
+        (("base_frame:=base_link",), "'base_link' is not tied to 'l2lidar_link' on /tf_static"),
+        (("base_frame:=base_link", "use_tf:=false"), "use_tf is false"),
+    ],
+    indirect=["bench"],
+)
+def test_a_base_that_is_not_on_tf_is_an_error_that_says_so(bench, words):
+    bench.send(recording("room", "walk"), list(sweeps(recording("room", "walk"), "turn"))[:3])
+    bench.until(lambda: any(words in status.message for status in bench.diagnostics))
+    (first, *_) = [status for status in bench.diagnostics if words in status.message]
+    assert first.level == DiagnosticStatus.ERROR
+    assert "poses are those of 'l2lidar_link'" in first.message
+
+
+@pytest.mark.parametrize(
     "bench", [("base_frame:=base_link", "invert_tf:=true", "odom_frame:=map")], indirect=True
 )
 def test_base_frame_from_tf_with_the_transform_inverted(bench):
@@ -136,6 +153,7 @@ def test_base_frame_from_tf_with_the_transform_inverted(bench):
     assert (tf.header.frame_id, tf.child_frame_id) == ("base_link", "map")
     assert abs(bench.poses[0].pose.pose.position.z) < 1e-6
     assert abs(bench.poses[-1].pose.pose.position.z) < 0.05
+    assert not bench.node._untied()
 
 
 @pytest.mark.parametrize("bench", [("mode:=plain",)], indirect=True)
