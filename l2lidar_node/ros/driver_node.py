@@ -29,8 +29,9 @@ from l2lidar_node.types import HostNs, ImuSample, Sweep
 
 _ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 5.0  # however busy the machine is
 _NO_DEVICE = "a recording is replayed, there is no device to command"
-_CLOUD_DEPTH = 10
-_IMU_DEPTH = 1000  # 4 s, for reliable subscribers that are held up
+# 4 s, of half turns, for reliable subscribers that are held up.
+_CLOUD_DEPTH = 40
+_IMU_DEPTH = 1000
 
 
 class DriverNode(Node):

@@ -70,6 +70,22 @@ def end_of(program: Program, rig: Rig) -> int:
     return int(program._process.returncode)
 
 
+def heard_again(rig: Rig, path: Path, **settings: object) -> Ear:
+    """Replay a recording, slowly where this machine has not found the publishers by its end."""
+    for rate in (1.0, 0.3, 0.1):
+        ear = Ear(rig)
+        arguments = rig.arguments(**settings, replay_file=path, replay_rate=rate)
+        program = Program("l2lidar_node.ros.driver_node", arguments)
+        try:
+            assert end_of(program, rig) == 0
+        finally:
+            program.stop()
+        ear.close()
+        if len(ear.clouds) > 15:
+            break
+    return ear
+
+
 def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Path) -> None:
     path = tmp_path / "run.pcap"
     ear = Ear(rig)
@@ -84,12 +100,7 @@ def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Pat
     assert not ear.times
     ear.close()
 
-    again = Ear(rig)
-    program = Program("l2lidar_node.ros.driver_node", rig.arguments(**SETTINGS, replay_file=path))
-    try:
-        assert end_of(program, rig) == 0
-    finally:
-        program.stop()
+    again = heard_again(rig, path, **SETTINGS)
     for live, replayed, few in (
         (ear.clouds, again.clouds, 10),
         (ear.samples, again.samples, 100),
@@ -107,7 +118,6 @@ def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Pat
     with path.open("rb") as stream:
         recorded = [entry.time for entry in Recording(stream)]
     assert min(recorded) <= again.times[0] < again.times[-1] <= max(recorded)
-    again.close()
 
 
 def test_a_loop_goes_on_in_time_and_obeys_nobody(rig: Rig, tmp_path: Path) -> None:
