@@ -289,6 +289,10 @@ def test_wrong_port_and_missing_file_are_refused(launched):
         launched("replay", file="absent.pcap")
     with pytest.raises(ValueError, match="rate:=fast is not a number"):
         launched("replay", rate="fast")
+    with pytest.raises(ValueError, match="rviz_config:=absent: there is no such file"):
+        launched("l2lidar_with_rviz", rviz_config="absent")
+    with pytest.raises(ValueError, match="l2_port and host_port are both 6101"):
+        launched("l2lidar", emulator="true", host_port="6101")
     with pytest.raises(ValueError, match="emulator_options:='open: "):
         launched("l2lidar", emulator="true", emulator_options="'open")
 
@@ -324,21 +328,24 @@ def test_what_a_companion_would_refuse_is_not_started(launched, tmp_path, name, 
 
 
 @needs_launch
-def test_a_node_that_calls_its_arguments_wrong_ends_the_launch():
+def test_a_node_that_is_not_to_be_started_again_ends_the_launch():
     from launch import LaunchContext
     from launch.events.process import ProcessExited
 
     from l2lidar_node.ros.bringup import _ended
 
-    def ended(code):
+    def ended(is_respawned, code):
         event = ProcessExited(
             action=None, name="deskew_node-2", cmd=[], cwd=None, env=None, pid=1, returncode=code
         )
-        return _ended(event, LaunchContext())
+        _ended(is_respawned, event, LaunchContext())
 
-    assert ended(0) is ended(1) is ended(-9) is None
-    with pytest.raises(RuntimeError, match="deskew_node-2 cannot be started like that"):
-        ended(2)
+    for code in (0, 1, -9):
+        ended(True, code)
+    ended(False, 0)
+    for is_respawned, code in ((True, 2), (False, 2), (False, 1), (False, -11)):
+        with pytest.raises(RuntimeError, match=f"deskew_node-2 ended with exit code {code}"):
+            ended(is_respawned, code)
 
 
 @needs_launch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -116,6 +117,8 @@ def rviz(values: Parameters | None = None) -> OpaqueFunction:
     def actions(context: LaunchContext) -> list[Any]:
         given = _given(context)
         layout = given["rviz_config"]
+        if not Path(layout).is_file():
+            raise ValueError(f"rviz_config:={layout}: there is no such file")
         # The layout for the sensor alone is fixed to its frame, whose name follows l2_name.
         renamed = given["l2_name"] and Path(layout).name == "rvizl2lidar.rviz"
         frame = ["-f", f"{given['l2_name']}_link"] if renamed else []
@@ -160,6 +163,8 @@ def _node(
         build(settings, {item: value for item, value in merged.items() if item in known})
     except SettingError as error:
         raise SettingError(f"{full_name}: {error}") from None
+    # A replay that ended would begin again.
+    is_respawned = given["respawn"] == "true" and not merged.get("replay_file")
     kept = Path(launch_config.get_log_file_path(f"{full_name[1:].replace('/', '.')}.yaml"))
     kept.write_text(parameter_file(merged), encoding="utf-8")
     return Node(
@@ -171,23 +176,24 @@ def _node(
         remappings=_relative(DRIVER_TOPICS),
         ros_arguments=["--log-level", given["log_level"]],
         output="screen",
-        on_exit=_ended,
-        # A replay that ended would begin again.
-        respawn=given["respawn"] == "true" and not merged.get("replay_file"),
+        on_exit=partial(_ended, is_respawned),
+        respawn=is_respawned,
         respawn_delay=RESPAWN_DELAY_S,
     )
 
 
-def _ended(event: ProcessExited, context: LaunchContext) -> None:
+def _ended(is_respawned: bool, event: ProcessExited, context: LaunchContext) -> None:
     """Let a node be started again, unless it would only end again.
 
     Raises
     ------
     RuntimeError
-        If what it was given is wrong: that ends the launch, with an exit code that says so.
+        If what it was given is wrong, or it failed and is not started again: that ends the
+        launch, with an exit code that says so.
     """
-    if event.returncode == _WRONG_USE and not context.is_shutdown:
-        raise RuntimeError(f"{event.process_name} cannot be started like that, see its message")
+    is_final = event.returncode == _WRONG_USE or (event.returncode and not is_respawned)
+    if is_final and not context.is_shutdown:
+        raise RuntimeError(f"{event.process_name} ended with exit code {event.returncode}")
 
 
 def _given(context: LaunchContext) -> Given:
@@ -208,7 +214,9 @@ def _addresses(given: Given) -> dict[str, str | int]:
             values[name] = int(given[name])
     if given["emulator"] == "true":
         stock = {"l2_port": wire.LIDAR_PORT, "host_port": wire.HOST_PORT}
-        return {**stock, **values, "l2_ip": LOOPBACK, "host_ip": LOOPBACK}
+        values = {**stock, **values, "l2_ip": LOOPBACK, "host_ip": LOOPBACK}
+        if values["l2_port"] == values["host_port"]:
+            raise ValueError(f"l2_port and host_port are both {values['l2_port']} on this host")
     return values
 
 

@@ -60,7 +60,9 @@ ARGUMENTS: Final[Mapping[str, Argument]] = {
     "host_port": Argument("", f"UDP port of this host{_AS_IN_FILE}"),
     "emulator": Argument("false", "whether to start a virtual L2 and listen to it", BOOL),
     "emulator_options": Argument("", "command line options of the virtual L2, in one string"),
-    "respawn": Argument("true", "whether a node that died is started again", BOOL),
+    "respawn": Argument(
+        "true", "whether a node that died is started again; else its failure ends the launch", BOOL
+    ),
     "log_level": Argument(
         "info", "least severe message to print", ("debug", "info", "warn", "error", "fatal")
     ),

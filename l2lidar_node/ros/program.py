@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+import warnings
 from collections.abc import Callable
 
 import rclpy
@@ -50,6 +51,8 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
         print(USAGE.format(name=name))
         return 0
     node = None
+    # What rclpy says of a node that a signal interrupts while it is being made.
+    warnings.filterwarnings("ignore", "Failed to fini", RuntimeWarning)
     try:
         start_rclpy(argv)
         # Before there are handlers: made after a signal, it leaves a trace when it goes.
