@@ -1,15 +1,31 @@
-"""Time limits in which the pauses of this machine do not count."""
+"""Waiting on a machine that now and then gives this program no processor, or sleeps."""
 
 from __future__ import annotations
 
 import time
+from typing import Final
+
+_PAUSE_S: Final = 0.3  # nobody oversleeps by that much without one
+_MOMENT_S: Final = 0.2  # in which what came during a pause is taken
+
+
+def rest(seconds: float) -> None:
+    """Sleep; where the machine paused meanwhile, a moment longer.
+
+    Or what came during the pause would not have been taken yet, and looks as if it were missing.
+    """
+    while True:
+        begun = time.monotonic()
+        time.sleep(seconds)
+        if time.monotonic() - begun < seconds + _PAUSE_S:
+            return
+        seconds = _MOMENT_S
 
 
 class Patience:
     """Seconds to wait for something.
 
-    A machine that sleeps, or gives this program no processor for a while, hears nothing meanwhile:
-    so a pause counts for twice what was asked for at the most.
+    While the machine pauses nothing is heard: that counts for twice what was asked at the most.
 
     Parameters
     ----------
@@ -25,8 +41,8 @@ class Patience:
         return self._left_s <= 0.0
 
     def pause(self, seconds: float) -> None:
-        """Sleep, but not beyond the end."""
+        """Rest, but not beyond the end."""
         asked = max(min(seconds, self._left_s), 0.0)
         begun = time.monotonic()
-        time.sleep(asked)
+        rest(asked)
         self._left_s -= max(min(time.monotonic() - begun, 2.0 * asked), asked)

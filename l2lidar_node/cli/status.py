@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import time
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -16,7 +15,7 @@ from l2lidar_node import health
 from l2lidar_node.cli.console import as_data, facts, judgement, out, print_json
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import JsonOption, with_network
-from l2lidar_node.cli.patience import Patience
+from l2lidar_node.cli.patience import Patience, rest
 from l2lidar_node.cli.stored import work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver import Driver
@@ -33,7 +32,7 @@ def info(network: NetworkConfig, json_: JsonOption = False) -> None:
             raise DeviceError(f"nothing heard from the L2; {device.advice()}")
         device.wait_for(_is_known, _WAIT_S)
         before = device.period()
-        time.sleep(1.0)
+        rest(1.0)
         checks, _ = device.checks(before)
         about: dict[str, Any] = dataclasses.asdict(device.ask(metadata))
     if json_:
