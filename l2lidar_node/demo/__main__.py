@@ -25,7 +25,7 @@ from l2lidar_node.demo.report import report
 from l2lidar_node.programs import INTERRUPTED, interruptible
 
 _WARM_UP_S = 3.0
-_START_TIMEOUT_S = 60.0
+_START_TIMEOUT_S = 180.0  # on a slow machine
 _BOOT_SCALE = 0.05  # a real unit takes 25 s
 
 
@@ -103,6 +103,7 @@ def _start(programs: Programs, options: argparse.Namespace) -> None:
         "enable_latency_measure": "true",
         "imu_adjust": "false",
         "sweep_cut": "turn",
+        "watchdog_action": "wait",  # until the world is there
     }
     programs.start("l2lidar_node.ros.driver_node", assigned(driver))
     if not options.driver_only:

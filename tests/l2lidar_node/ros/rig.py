@@ -47,6 +47,7 @@ class Rig:
             "host_port": self.host_port,
             "enable_IMU_publishing": True,
             "imu_adjust": False,
+            "watchdog_timeout_ms": 600_000,  # the virtual L2 may take its time to start
             **parameters,
         }
         return assigned(values)
