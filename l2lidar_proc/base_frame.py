@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from l2lidar_proc import rotations
 from l2lidar_proc.inertial_filter import skew
 from l2lidar_proc.odometry_estimate import OdometryEstimate
-from l2lidar_proc.trajectory import levelled_start
+from l2lidar_proc.trajectory import StampedPoses, levelled_start
 
 F64 = NDArray[np.float64]
 
@@ -64,8 +64,16 @@ class BaseFrame:
         return self._T_odom_map
 
     def pose(self, T_map_lidar: F64) -> F64:
-        """Return the pose (4, 4) of the base frame for one of the cloud frame."""
+        """Return the pose (..., 4, 4) of the base frame for one of the cloud frame."""
         return np.asarray(self.odom_from_map(T_map_lidar) @ T_map_lidar @ self.T_lidar_base)
+
+    def poses(self, of_lidar: StampedPoses) -> StampedPoses:
+        """Return the poses (N,) of the base frame for those of the cloud frame, oldest first."""
+        found = of_lidar.copy()
+        if len(found):
+            self.odom_from_map(of_lidar["pose"][0])
+            found["pose"] = self.pose(of_lidar["pose"])
+        return found
 
     def motion(self, estimate: OdometryEstimate) -> BaseMotion:
         """Return an estimate as one of the base frame."""

@@ -15,7 +15,7 @@ from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import OdometryEstimate, Status
 from l2lidar_proc.plain_odometry import PlainOdometry
 from l2lidar_proc.sequencer import Sequencer
-from l2lidar_proc.trajectory import StampedPose
+from l2lidar_proc.trajectory import Trajectory
 
 _MS: Final = 1_000_000
 
@@ -35,7 +35,7 @@ class OdometryPipeline:
     Attributes
     ----------
     odometry : Odometry or PlainOdometry
-    trajectory : list of StampedPose
+    trajectory : Trajectory
         Of the cloud frame.
     sweeps : int
         Sweeps that came in.
@@ -73,7 +73,7 @@ class OdometryPipeline:
 
     def _begin(self) -> None:
         self._sequencer = Sequencer(self._wait_ns)
-        self.trajectory: list[StampedPose] = []
+        self.trajectory = Trajectory()
         self.sweeps = 0
         self.counts: Counter[Status] = Counter()
         self.last: OdometryEstimate | None = None
@@ -108,6 +108,6 @@ class OdometryPipeline:
                 if Status.REFUSED in estimate.status:
                     continue
                 self.last = estimate
-                self.trajectory.append(StampedPose(estimate.stamp, estimate.T_odom_lidar))
+                self.trajectory.append(estimate.stamp, estimate.T_odom_lidar)
                 estimates.append(estimate)
         return estimates

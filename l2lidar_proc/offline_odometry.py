@@ -33,7 +33,7 @@ from l2lidar_proc.odometry import Odometry
 from l2lidar_proc.odometry_config import OdometryNodeConfig
 from l2lidar_proc.odometry_estimate import Status
 from l2lidar_proc.odometry_pipeline import OdometryPipeline
-from l2lidar_proc.trajectory import StampedPose, kitti, tum
+from l2lidar_proc.trajectory import StampedPoses, kitti, tum
 
 _END_NS: Final = 2**62
 
@@ -47,7 +47,7 @@ class OdometryRun:
 
     Attributes
     ----------
-    poses : list of StampedPose
+    poses : ndarray of STAMPED_POSE, shape (N,)
         Of the base frame in the odometry frame.
     map_points : ndarray, shape (N, 3)
         Local map at the end [m], odometry frame.
@@ -58,7 +58,7 @@ class OdometryRun:
         Clouds that could not be used, by reason.
     """
 
-    poses: list[StampedPose]
+    poses: StampedPoses
     map_points: NDArray[np.float64]
     sweeps: int
     counts: Counter[Status]
@@ -104,11 +104,11 @@ class OdometryRunner:
     def finish(self) -> OdometryRun:
         """Return what was found."""
         self.pipeline.poll(_END_NS)
-        found = self.pipeline.trajectory
-        poses = [StampedPose(item.stamp, self.base.pose(item.pose)) for item in found]
+        found = self.pipeline.trajectory.poses
+        poses = self.base.poses(found)
         points = self.pipeline.odometry.map_points()
-        if found:
-            turn = self.base.odom_from_map(found[0].pose)
+        if len(found):
+            turn = self.base.odom_from_map(found["pose"][0])
             points = points @ turn[:3, :3].T + turn[:3, 3]
         return OdometryRun(poses, points, self.pipeline.sweeps, self.pipeline.counts, self.refused)
 
@@ -234,9 +234,7 @@ def _plot(run: OdometryRun, path: Path) -> None:
     if len(run.map_points):
         shown = run.map_points[:: max(len(run.map_points) // 20_000, 1)]
         axes.scatter(shown[:, 0], shown[:, 1], s=0.5, c="0.7", linewidths=0)
-    if run.poses:
-        way = np.array([item.pose[:2, 3] for item in run.poses])
-        axes.plot(way[:, 0], way[:, 1], lw=1.5)
+    axes.plot(run.poses["pose"][:, 0, 3], run.poses["pose"][:, 1, 3], lw=1.5)
     FigureCanvasAgg(figure)
     with whole(path) as part:
         figure.savefig(part)

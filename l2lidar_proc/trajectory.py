@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,38 +13,50 @@ from l2lidar_proc import rotations
 F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StampedPose:
-    """A pose at an instant.
+STAMPED_POSE: Final = np.dtype([("stamp", "<i8"), ("pose", "<f8", (4, 4))])
+"""Instant [ns], and coordinates of the moving frame to those of the fixed one."""
 
-    Attributes
-    ----------
-    stamp : HostNs
-    pose : ndarray, shape (4, 4)
-        Coordinates of the moving frame to those of the fixed one.
-    """
-
-    stamp: HostNs
-    pose: F64
+StampedPoses = NDArray[np.void]
+"""Array of dtype STAMPED_POSE, shape (N,)."""
 
 
-def tum(poses: list[StampedPose]) -> str:
+class Trajectory:
+    """Poses of days, as they come."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty(256, STAMPED_POSE)
+        self._count = 0
+
+    @property
+    def poses(self) -> StampedPoses:
+        """All of them, shape (N,); a view."""
+        return self._rows[: self._count]
+
+    def append(self, stamp: HostNs, pose: F64) -> None:
+        """Add a pose, shape (4, 4)."""
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        self._rows[self._count] = stamp, pose
+        self._count += 1
+
+
+def tum(poses: StampedPoses) -> str:
     """Return the lines of a TUM file: seconds, x, y, z, then the quaternion as x, y, z, w."""
     lines = []
-    for item in poses:
-        seconds, rest = divmod(item.stamp, 1_000_000_000)
-        w, x, y, z = rotations.from_matrix(item.pose[:3, :3]).tolist()
-        numbers = " ".join(f"{value:.9f}" for value in (*item.pose[:3, 3].tolist(), x, y, z, w))
+    for stamp, pose in zip(poses["stamp"].tolist(), poses["pose"], strict=True):
+        seconds, rest = divmod(stamp, 1_000_000_000)
+        w, x, y, z = rotations.from_matrix(pose[:3, :3]).tolist()
+        numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3].tolist(), x, y, z, w))
         # not through a float: seconds since 1970 would lose the last hundreds of nanoseconds
         lines.append(f"{seconds}.{rest:09d} {numbers}\n")
     return "".join(lines)
 
 
-def kitti(poses: list[StampedPose]) -> str:
+def kitti(poses: StampedPoses) -> str:
     """Return the lines of a KITTI file: the upper three rows of each pose, without times."""
     return "".join(
-        " ".join(f"{value:.9e}" for value in item.pose[:3].ravel().tolist()) + "\n"
-        for item in poses
+        " ".join(f"{value:.9e}" for value in row) + "\n"
+        for row in poses["pose"][:, :3].reshape(-1, 12).tolist()
     )
 
 

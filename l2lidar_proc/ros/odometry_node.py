@@ -240,10 +240,7 @@ class OdometryNode(Node):
     ) -> Trigger.Response:
         del request
         path = FilePath(self._settings.value.topics.trajectory_file)
-        poses = [
-            trajectory.StampedPose(item.stamp, self._base.pose(item.pose))
-            for item in self._pipeline.trajectory
-        ]
+        poses = self._base.poses(self._pipeline.trajectory.poses)
         try:
             write_whole(path, trajectory.tum(poses))
             write_whole(path.with_suffix(".kitti"), trajectory.kitti(poses))

@@ -15,7 +15,7 @@ from l2lidar_proc.odometry_estimate import Status
 from l2lidar_proc.plain_odometry import PlainOdometry
 from l2lidar_proc.preintegration import integrate, track
 from l2lidar_proc.surfels import SurfelMap
-from l2lidar_proc.trajectory import StampedPose, kitti, levelled_start, tum
+from l2lidar_proc.trajectory import Trajectory, kitti, levelled_start, tum
 from tests.l2lidar_proc.analytic import EPOCH, G, Motion, at
 from tests.l2lidar_proc.odometry_world import recording
 from tools.odometry_runs import sweeps
@@ -101,13 +101,17 @@ def test_gaps_hold_rate_and_speed():
 def test_trajectory_files_keep_nanoseconds():
     pose = np.eye(4)
     pose[:3, 3] = [1.0, -2.0, 0.5]
-    text = tum([StampedPose(HostNs(1_700_000_000_123_456_789), pose)])
+    trajectory = Trajectory()
+    for index in range(300):
+        trajectory.append(HostNs(1_700_000_000_123_456_789 + index), pose)
+    text = tum(trajectory.poses[:1])
     assert text.split() == [
         "1700000000.123456789", "1.000000000", "-2.000000000", "0.500000000",
         "0.000000000", "0.000000000", "0.000000000", "1.000000000",
     ]  # fmt: skip
-    rows = np.array(kitti([StampedPose(HostNs(0), pose)]).split(), dtype=float)
-    np.testing.assert_array_equal(rows.reshape(3, 4), pose[:3])
+    rows = np.array(kitti(trajectory.poses).split(), dtype=float)
+    np.testing.assert_array_equal(rows.reshape(-1, 3, 4), np.tile(pose[:3], (300, 1, 1)))
+    assert tum(trajectory.poses[-1:]).startswith("1700000000.123457088 ")
 
 
 def test_the_start_keeps_roll_and_pitch_only():

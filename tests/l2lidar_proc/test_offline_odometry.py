@@ -76,7 +76,7 @@ def test_events_give_what_the_bag_gives(tmp_path):
     events += [(int(row["stamp"][0]), row) for row in run.imu[:600].reshape(-1, 1)]
     direct = run_events(iter(sorted(events, key=lambda event: event[0])), OdometryNodeConfig())
     assert len(direct.poses) == len(from_bag.poses) == 8
-    np.testing.assert_allclose(direct.poses[-1].pose, from_bag.poses[-1].pose, atol=2e-3)
+    np.testing.assert_allclose(direct.poses["pose"][-1], from_bag.poses["pose"][-1], atol=2e-3)
 
 
 def test_what_is_not_a_recording_is_refused(tmp_path, capsys):
