@@ -24,7 +24,8 @@ from l2lidar_proc.inertial_filter import (
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry_report import estimate_of, gaps_in
-from l2lidar_proc.sweep_matcher import SweepMatcher, xyz
+from l2lidar_proc.sweep_joining import cropped, joined
+from l2lidar_proc.sweep_matcher import SweepMatcher
 from l2lidar_proc.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
@@ -37,6 +38,7 @@ _OPENING_ROUNDS: Final = 6
 _OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the rounds
 _REST_SPEED: Final = 0.06  # [m/s] faster, the sensor did not rest, however quiet the IMU
 _WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
+_OPENING_SWEEP_NS: Final = 150_000_000  # shorter ones are joined: they would not meet
 _LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
 _PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
 _LOST_SWEEPS: Final = 25
@@ -120,7 +122,7 @@ class Odometry:
                 ]
             self._restart(reference)
             status.append(Status.RESTARTED)
-        sweep = self._cropped(sweep)
+        sweep = cropped(sweep, self.config.min_range, self.config.max_range)
         if self._state is None:
             return self._opened(sweep)
         motion = self._predicted(sweep, self._state, self._covariance)
@@ -172,26 +174,28 @@ class Odometry:
         if held and not 0 < sweep.start - held[-1].start < _LONG_GAP_NS:
             held.clear()
         held.append(sweep)
-        if held[-1].end - held[0].start < _OPENING_NS or len(held) < 2:
+        if held[-1].end - held[0].start < _OPENING_NS:
+            return []
+        whole = joined(held, _OPENING_SWEEP_NS)
+        if len(whole) < 2 or whole[-1].end < sweep.end:
             return []
         # the very first sweep is seldom whole
-        most = max(len(one.points) for one in held)
-        seed = next(k for k, one in enumerate(held) if len(one.points) >= _WHOLE * most)
-        if seed == len(held) - 1 and most:
+        most = max(len(one.points) for one in whole)
+        seed = next(k for k, one in enumerate(whole) if len(one.points) >= _WHOLE * most)
+        if seed == len(whole) - 1 and most:
             return []
-        motions = self._solved(held[seed:], held[0].start) if most > self.config.min_points else []
+        enough = most > self.config.min_points
+        motions = self._solved(whole[seed:], held[0].start) if enough else []
         if motions is None:
             return []
         if not motions:
             del held[0]
             return []
-        first = motions[0]
-        earlier = [
-            first.corrected(first.state_at(self._reference(one)), first.covariance)
-            for one in held[:seed]
-        ]
+        motions = [motions[0]] * seed + motions
         estimates = []
-        for one, motion in zip(held, earlier + motions, strict=True):
+        for one in held:
+            within = sum(part.end < one.end for part in whole)
+            motion = motions[within].seen_from(self._reference(one))
             status = [Status.STARTING, *gaps_in(motion)]
             quality = self.matcher.quality(len(one.points), None)
             moved = motion.deskewed(one, self._lever)
@@ -265,15 +269,6 @@ class Odometry:
         if self.config.reference == "end":
             return sweep.end
         return HostNs((sweep.start + sweep.end) // 2)
-
-    def _cropped(self, sweep: Sweep) -> Sweep:
-        """Return the sweep without points that are not finite or out of range."""
-        squared = (xyz(sweep.points) ** 2).sum(axis=1)
-        inside = (squared >= self.config.min_range**2) & (squared <= self.config.max_range**2)
-        inside &= np.isfinite(sweep.points["time"])
-        if inside.all():
-            return sweep
-        return dataclasses.replace(sweep, points=sweep.points[inside])
 
     def _predicted(
         self, sweep: Sweep, state: InertialState, covariance: F64, since: HostNs | None = None

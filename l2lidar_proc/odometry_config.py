@@ -157,7 +157,7 @@ class OdometryConfig:
         hi=1000.0,
     )
     min_points: int = setting(
-        200, "a sweep with fewer points to align is not aligned but predicted", lo=10, hi=100_000
+        30, "a sweep with fewer points to align is not aligned but predicted", lo=10, hi=100_000
     )
     inertial: InertialConfig = field(default_factory=InertialConfig)
     surfaces: SurfaceConfig = field(default_factory=SurfaceConfig)

@@ -23,6 +23,8 @@ F64 = NDArray[np.float64]
 _LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
 _AGREEMENT: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
 _OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
+_MATCHED: Final = (0, 50)  # and how many: a few fit in many places
+_MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
 _YOUNG: Final = 12  # sweeps in a map before a sweep without surfaces around is remarkable
 _PLACED: Final = (0.03, 0.15)  # [rad, m] what KISS-ICP's registration with few sweeps is worth
 _PRUNING: Final = 0.2  # the map is pruned whenever this part of its radius was travelled
@@ -168,13 +170,15 @@ class SweepMatcher:
     def _align(
         self, source: Source, motion: SweepMotion, start: InertialState
     ) -> Alignment | None:
+        share, enough = _MEETING
+        least = min(enough, max(self.config.min_points // 2, round(share * len(source.points))))
         return align(
             motion.state,
             motion.covariance,
             source,
             self.surfaces,
             self.config.surfaces,
-            self.config.min_points // 2,
+            least,
             start,
         )
 
@@ -207,7 +211,7 @@ def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
     return (
         found is not None
         and found.agreement >= _AGREEMENT[strict]
-        and found.matched >= _OVERLAP[strict] * len(source.points)
+        and found.matched >= max(_OVERLAP[strict] * len(source.points), _MATCHED[strict])
     )
 
 

@@ -66,6 +66,12 @@ class SweepMotion:
         """Return the state at the track's knot nearest after an instant."""
         return self.state.at(self.seen, self.felt.knot(stamp))
 
+    def seen_from(self, stamp: HostNs) -> SweepMotion:
+        """Return the same motion, its reference at the track's knot nearest after an instant."""
+        knot = self.felt.knot(stamp)
+        state = self.state.at(self.seen, knot)
+        return dataclasses.replace(self, seen=self.seen.seen_from(knot), state=state)
+
     def deskewed(self, sweep: Sweep, lever: F64) -> NDArray[np.void]:
         """Return the sweep's points as seen from the reference.
 

@@ -12,8 +12,10 @@ from l2lidar_proc.alignment import Source, align
 from l2lidar_proc.inertial_filter import ERRORS, POSITION, TURN, InertialState
 from l2lidar_proc.odometry import Odometry
 from l2lidar_proc.odometry_config import OdometryConfig, SurfaceConfig
+from l2lidar_proc.odometry_estimate import OdometryEstimate, Status
 from l2lidar_proc.startup import opening
 from l2lidar_proc.surfels import SurfelMap
+from l2lidar_proc.sweep_matcher import xyz
 from tests.l2lidar_proc.odometry_places import SEED, shaken, visited
 from tests.l2lidar_proc.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
 from tools.odometry_runs import sweeps
@@ -30,6 +32,30 @@ def test_foliage_and_poles_are_enough(place, cut):
     assert np.sqrt((found**2).mean()) < 0.012
     assert found.max() < 0.04
     assert estimates[-1].is_aligned
+
+
+@pytest.mark.parametrize("cut", ["10 packets", "18 packets"])
+def test_short_sweeps_below_an_open_sky_are_enough(cut):
+    """A hundred points each; half the packets of a turn do not meet what the other half saw."""
+    run = visited("poles")
+    estimates = drive(run, cut)
+    assert len(estimates) == len(list(sweeps(run, cut)))
+    assert all(item.is_aligned for item in estimates)
+    assert errors(run, estimates).max() < 0.03
+
+
+def test_the_cloud_of_a_first_part_of_a_turn_lies_where_it_says():
+    run = recording("room", "drone")
+    some = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.1e9][:8]
+    some[0] = dataclasses.replace(some[0], points=some[0].points[: len(some[0].points) // 2])
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some)
+    assert Status.STARTING in estimates[0].status
+    surfaces = SurfelMap((0.15, 0.3))
+    for item in estimates[1:]:
+        surfaces.add(_placed(item))
+    for item in estimates[:3]:
+        distances = np.abs(surfaces.match(_placed(item)).distances)
+        assert np.percentile(distances, 80) < 0.03
 
 
 def test_in_foliage_it_can_start_in_motion():
@@ -65,6 +91,12 @@ def test_a_long_blindness_ends_where_the_sensor_is():
     blind = [item for item in estimates if not item.is_aligned]
     assert blind
     assert all(item.velocity @ item.velocity > 0.2 for item in blind)
+
+
+def _placed(estimate: OdometryEstimate):
+    """Return the points of an estimate in the odometry frame, shape (N, 3)."""
+    pose = estimate.T_odom_lidar
+    return xyz(estimate.points) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def _corridor(rng: np.random.Generator, count: int):
