@@ -205,6 +205,8 @@ def run(
     With ``is_fed`` they get the clouds and samples of a chain that goes on all the time.
     """
     isolate_ros()
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background: it is inherited
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     with ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory())
         pool = stack.enter_context(ThreadPoolExecutor(at_once))
