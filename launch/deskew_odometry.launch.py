@@ -1,10 +1,8 @@
 """Starts the driver, deskew and odometry, and RViz where asked for."""
 
 from launch import LaunchDescription
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
 
-from l2lidar_node.ros.bringup import driver, for_deskew, rviz
+from l2lidar_node.ros.bringup import driver, for_deskew, rviz, start
 from l2lidar_node.ros.launch_arguments import (
     BOOL,
     CUTS,
@@ -24,9 +22,11 @@ def generate_launch_description() -> LaunchDescription:
             *arguments(*RVIZ_ARGUMENTS, rviz_config="rviz/slam.rviz"),
             Argument("turn", "where a cloud ends", CUTS).declare("sweep_cut"),
             Argument("true", "whether to start the odometry node", BOOL).declare("odometry"),
-            driver(lambda given: for_deskew(given["sweep_cut"])),
-            deskew(),
-            odometry(IfCondition(LaunchConfiguration("odometry"))),
-            rviz(),
+            start(
+                driver(lambda given: for_deskew(given["sweep_cut"])),
+                deskew(),
+                odometry("odometry"),
+                rviz(),
+            ),
         ]
     )

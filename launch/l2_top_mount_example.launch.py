@@ -2,7 +2,7 @@
 
 from launch import LaunchDescription
 
-from l2lidar_node.ros.bringup import driver, robot, rviz
+from l2lidar_node.ros.bringup import driver, robot, rviz, start
 from l2lidar_node.ros.launch_arguments import EXAMPLE_ARGUMENTS, RVIZ_ARGUMENTS, arguments
 
 
@@ -12,8 +12,6 @@ def generate_launch_description() -> LaunchDescription:
         [
             *arguments(*EXAMPLE_ARGUMENTS),
             *arguments(*RVIZ_ARGUMENTS, rviz="true", rviz_config="rviz/rvizl2lidar_example.rviz"),
-            robot("l2_top_mount_example.urdf"),
-            driver(),
-            rviz(),
+            start(robot("l2_top_mount_example.urdf"), driver(), rviz()),
         ]
     )

@@ -2,7 +2,7 @@
 
 from launch import LaunchDescription
 
-from l2lidar_node.ros.bringup import driver, rviz
+from l2lidar_node.ros.bringup import driver, rviz, start
 from l2lidar_node.ros.launch_arguments import DRIVER_ARGUMENTS, RVIZ_ARGUMENTS, arguments
 
 
@@ -11,7 +11,6 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *arguments(*DRIVER_ARGUMENTS, *RVIZ_ARGUMENTS, rviz="true"),
-            driver(),
-            rviz(),
+            start(driver(), rviz()),
         ]
     )

@@ -2,7 +2,7 @@
 
 from launch import LaunchDescription
 
-from l2lidar_node.ros.bringup import driver, rviz
+from l2lidar_node.ros.bringup import driver, rviz, start
 from l2lidar_node.ros.launch_arguments import (
     DRIVER_ARGUMENTS,
     RVIZ_ARGUMENTS,
@@ -20,9 +20,13 @@ def generate_launch_description() -> LaunchDescription:
         [
             Argument(None, "what the clouds are for", CONSUMERS).declare("consumer"),
             *arguments(*DRIVER_ARGUMENTS, *RVIZ_ARGUMENTS),
-            driver(
-                files=lambda given: [share(f"config/consumers/{given['consumer']}/driver.yaml")]
+            start(
+                driver(
+                    files=lambda given: [
+                        share(f"config/consumers/{given['consumer']}/driver.yaml")
+                    ]
+                ),
+                rviz(),
             ),
-            rviz(),
         ]
     )

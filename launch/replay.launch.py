@@ -3,10 +3,8 @@
 from pathlib import Path
 
 from launch import LaunchDescription
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
 
-from l2lidar_node.ros.bringup import driver, for_deskew, rviz
+from l2lidar_node.ros.bringup import driver, for_deskew, rviz, start
 from l2lidar_node.ros.launch_arguments import BOOL, RVIZ_ARGUMENTS, Argument, arguments
 from l2lidar_proc.ros.bringup import deskew, odometry
 
@@ -37,7 +35,6 @@ def _needs(given):
 
 def generate_launch_description() -> LaunchDescription:
     """Return a driver that reads a file, deskew and odometry, and RViz where asked for."""
-    wanted = IfCondition(LaunchConfiguration("deskew_odometry"))
     return LaunchDescription(
         [
             Argument(None, "capture (pcap) to play").declare("file"),
@@ -51,9 +48,11 @@ def generate_launch_description() -> LaunchDescription:
             *arguments("namespace", "name", "l2_name", "l2_ip", "log_level"),
             *arguments("params_file", "proc_params_file"),
             *arguments(*RVIZ_ARGUMENTS, rviz_config="rviz/slam.rviz"),
-            driver(_needs),
-            deskew(wanted, RECORDED_TIME),
-            odometry(wanted, RECORDED_TIME),
-            rviz(RECORDED_TIME),
+            start(
+                driver(_needs),
+                deskew("deskew_odometry", RECORDED_TIME),
+                odometry("deskew_odometry", RECORDED_TIME),
+                rviz(RECORDED_TIME),
+            ),
         ]
     )

@@ -185,10 +185,10 @@ class Launched:
             if isinstance(entity, DeclareLaunchArgument):
                 self.declared[entity.name] = entity
                 entity.visit(self.context)
-            elif isinstance(entity, OpaqueFunction):
-                self.actions += entity.visit(self.context) or []
-            else:
-                self.actions.append(entity)
+            else:  # one makes all: what fails then leaves nothing behind that was started
+                assert isinstance(entity, OpaqueFunction)
+                assert not self.actions
+                self.actions = entity.visit(self.context)
 
     def text(self, substitutions):
         from launch.utilities import perform_substitutions

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from launch.actions import ExecuteProcess, OpaqueFunction, Shutdown
-from launch.conditions import IfCondition
 from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.logging import launch_config
-from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
@@ -29,16 +27,25 @@ Given = Mapping[str, str]
 """Value of every launch argument, as text."""
 Parameters = Mapping[str, bool | int | float | str]
 """Value by parameter name."""
+Part = Callable[[LaunchContext], list[Any]]
+"""Makes what one part of a launch starts."""
 
 LOOPBACK: Final = "127.0.0.1"
 RESPAWN_DELAY_S: Final = 2.0
 _WRONG_USE: Final = 2  # exit code of a node that was given what it cannot take
 
 
+def start(*parts: Part) -> OpaqueFunction:
+    """Return what starts all parts, or none where one cannot be: all are made before."""
+    return OpaqueFunction(
+        function=lambda context: [action for part in parts for action in part(context)]
+    )
+
+
 def driver(
     needs: Callable[[Given], Parameters] = lambda given: {},
     files: Callable[[Given], Sequence[str]] = lambda given: (),
-) -> OpaqueFunction:
+) -> Part:
     """Return the driver, with a virtual L2 beside it where one is asked for.
 
     Parameters
@@ -64,7 +71,7 @@ def driver(
         )
         return [*_emulator(given, values), node]
 
-    return OpaqueFunction(function=actions)
+    return actions
 
 
 def for_deskew(sweep_cut: str = "turn") -> Parameters:
@@ -73,11 +80,8 @@ def for_deskew(sweep_cut: str = "turn") -> Parameters:
 
 
 def companion(
-    executable: str,
-    settings: type,
-    condition: IfCondition | None = None,
-    values: Parameters | None = None,
-) -> OpaqueFunction:
+    executable: str, settings: type, wanted: str = "", values: Parameters | None = None
+) -> Part:
     """Return a node that goes with the driver, named like its executable.
 
     Parameters
@@ -85,37 +89,43 @@ def companion(
     executable : str
     settings : type
         What it takes as parameters.
-    condition : IfCondition, optional
-        When to start it.
+    wanted : str
+        Argument that says whether to start it; empty for always.
     values : mapping, optional
         Parameters that hold whatever the parameter file says.
     """
 
     def actions(context: LaunchContext) -> list[Any]:
         given = _given(context)
+        if wanted and given[wanted] != "true":
+            return []
         files = [given["proc_params_file"]]
         return [_node(executable, executable, given, files, values or {}, settings)]
 
-    return OpaqueFunction(function=actions, condition=condition)
+    return actions
 
 
-def robot(urdf: str) -> Node:
+def robot(urdf: str) -> Part:
     """Return a robot_state_publisher for a plain URDF file of ``urdf/examples``."""
     text = Path(share(f"urdf/examples/{urdf}")).read_text(encoding="utf-8")
-    return Node(
-        package="robot_state_publisher",
-        executable="robot_state_publisher",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[{"robot_description": ParameterValue(text, value_type=str)}],
-        output="screen",
-    )
+    return lambda context: [
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            namespace=_given(context)["namespace"],
+            parameters=[{"robot_description": ParameterValue(text, value_type=str)}],
+            output="screen",
+        )
+    ]
 
 
-def rviz(values: Parameters | None = None) -> OpaqueFunction:
+def rviz(values: Parameters | None = None) -> Part:
     """Return RViz, started only where the argument ``rviz`` says so."""
 
     def actions(context: LaunchContext) -> list[Any]:
         given = _given(context)
+        if given["rviz"] != "true":
+            return []
         layout = given["rviz_config"]
         if not Path(layout).is_file():
             raise ValueError(f"rviz_config:={layout}: there is no such file")
@@ -135,7 +145,7 @@ def rviz(values: Parameters | None = None) -> OpaqueFunction:
             )
         ]
 
-    return OpaqueFunction(function=actions, condition=IfCondition(LaunchConfiguration("rviz")))
+    return actions
 
 
 def _node(

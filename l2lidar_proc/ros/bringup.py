@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from launch.actions import OpaqueFunction
-from launch.conditions import IfCondition
-
-from l2lidar_node.ros.bringup import Parameters, companion
+from l2lidar_node.ros.bringup import Parameters, Part, companion
 from l2lidar_proc.config import DeskewNodeConfig
 from l2lidar_proc.odometry_config import OdometryNodeConfig
 
 
-def deskew(
-    condition: IfCondition | None = None, values: Parameters | None = None
-) -> OpaqueFunction:
+def deskew(wanted: str = "", values: Parameters | None = None) -> Part:
     """Return the deskew node; see :func:`l2lidar_node.ros.bringup.companion`."""
-    return companion("deskew_node", DeskewNodeConfig, condition, values)
+    return companion("deskew_node", DeskewNodeConfig, wanted, values)
 
 
-def odometry(
-    condition: IfCondition | None = None, values: Parameters | None = None
-) -> OpaqueFunction:
+def odometry(wanted: str = "", values: Parameters | None = None) -> Part:
     """Return the odometry node; see :func:`l2lidar_node.ros.bringup.companion`."""
-    return companion("odometry_node", OdometryNodeConfig, condition, values)
+    return companion("odometry_node", OdometryNodeConfig, wanted, values)
