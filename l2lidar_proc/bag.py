@@ -65,6 +65,16 @@ def open_bag(path: Path) -> AnyReader:
     return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
 
 
+def unreadable(path: Path, error: Exception) -> RecordingError:
+    """Return what to say of a recording that its reader failed on."""
+    if not path.exists():
+        return RecordingError(f"{path}: there is no such file or folder")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        return RecordingError(f"{path} is no rosbag2 folder: it has no metadata.yaml")
+    words = " ".join(str(error).split()) or type(error).__name__
+    return RecordingError(f"{path} cannot be read as a recording: {words}")
+
+
 def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
     """Yield every message of a bag in the order it was recorded, with that instant [ns]."""
     yield from reader.messages()

@@ -147,8 +147,6 @@ def deskew_recording(
     FileExistsError
         If the target exists.
     """
-    if not source.exists():
-        raise RecordingError(f"{source}: there is no such file or folder")
     try:
         with bag.open_bag(source) as reader:
             kinds = {item.topic: item.msgtype for item in reader.connections}
@@ -164,8 +162,8 @@ def deskew_recording(
                         deskewer.take(connection.topic, connection.msgtype, message, recorded_ns)
                 deskewer.finish(_END_NS)
                 return deskewer.pipeline.counts, deskewer.refused
-    except AnyReaderError as error:
-        raise RecordingError(f"{source}: {error}") from None
+    except (AnyReaderError, FileNotFoundError) as error:
+        raise bag.unreadable(source, error) from None
 
 
 def _topics(config: DeskewNodeConfig, kinds: dict[str, str]) -> Topics:

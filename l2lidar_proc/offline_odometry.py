@@ -25,7 +25,6 @@ from l2lidar_node.programs import interruptible
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.types import Sweep
 from l2lidar_proc import bag, map_file
-from l2lidar_proc.bag import RecordingError
 from l2lidar_proc.base_frame import BaseFrame
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.frames import FrameTree
@@ -157,7 +156,7 @@ def run_bag(
                     progress(min(max((now - reader.start_time) / span, 0.0), 1.0))
             return listener.runner.finish()
     except (AnyReaderError, FileNotFoundError) as error:
-        raise RecordingError(f"{source}: {error}") from None
+        raise bag.unreadable(source, error) from None
 
 
 class _Listener:

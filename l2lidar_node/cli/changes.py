@@ -58,6 +58,7 @@ def work_mode(
 
     Interrupted after the command has gone out, it stores the old mode again.
     """
+    _checked(lambda: parsed_mode(mode, 0))  # what is no work mode needs no unit
     with Device(network) as device:
         before = device.read_parameters().work_mode
         after = _checked(lambda: parsed_mode(mode, before))

@@ -31,19 +31,14 @@ def observe(
     SourceError
         If the file cannot be read, or which topic to use is not plain.
     """
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        raise SourceError(f"{path} is no rosbag2 folder: it has no metadata.yaml")
     try:
         with bag.open_bag(path) as reader:
             return _read(reader, asked, needs_imu, seconds)
     except SourceError:
         raise
-    except FileNotFoundError:
-        raise SourceError(f"{path}: there is no such file") from None
     except Exception as error:
         # Of a damaged file, any byte may lead anywhere in its readers.
-        words = " ".join(str(error).split()) or type(error).__name__
-        raise SourceError(f"{path} cannot be read as a recording: {words}") from None
+        raise SourceError(str(bag.unreadable(path, error))) from None
 
 
 def _read(

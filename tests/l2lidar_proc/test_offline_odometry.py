@@ -80,7 +80,12 @@ def test_events_give_what_the_bag_gives(tmp_path):
 
 
 def test_what_is_not_a_recording_is_refused(tmp_path, capsys):
-    with pytest.raises(RecordingError, match="nothing"):
+    with pytest.raises(RecordingError, match="nothing: there is no such file"):
         run_bag(tmp_path / "nothing", OdometryNodeConfig())
+    with pytest.raises(RecordingError, match=r"no rosbag2 folder: it has no metadata\.yaml"):
+        run_bag(tmp_path, OdometryNodeConfig())
+    (tmp_path / "words.mcap").write_text("words")
+    with pytest.raises(RecordingError, match=r"words\.mcap cannot be read as a recording: "):
+        run_bag(tmp_path / "words.mcap", OdometryNodeConfig())
     assert main([str(tmp_path / "nothing"), str(tmp_path / "out")]) == 2
     assert "nothing" in capsys.readouterr().err

@@ -98,6 +98,7 @@ def test_silence_is_explained(run: Run, impatient: None) -> None:
         ["set", "mac"],
         ["sync-check", "--duration", "0"],
         ["replay", "no/such/file.pcap"],
+        ["set", "work-mode", "banana"],
         ["discover", "--probe", "lidar", "--timeout", "0.1"],
     ],
     ids=" ".join,
