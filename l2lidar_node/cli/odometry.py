@@ -114,5 +114,5 @@ def _taken(now: int, events: list[Event]) -> Iterator[tuple[int, Any]]:
 def _say(run: OdometryRun, files: list[Path]) -> None:
     for line in [*run.report, *(f"wrote {path}" for path in files)]:
         say(line)
-    if not run.poses:
+    if not len(run.poses):
         raise DeviceError("no way was found: are there clouds with times, and IMU samples?")
