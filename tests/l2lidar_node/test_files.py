@@ -19,6 +19,7 @@ from l2lidar_node.emulator.ledger import Ledger
 from l2lidar_node.emulator.motion import from_tum
 from l2lidar_node.files import whole, write_whole
 from l2lidar_proc import map_file, offline_odometry
+from l2lidar_proc.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[2]
 needs_open3d = pytest.mark.skipif(find_spec("open3d") is None, reason="needs open3d")
@@ -60,7 +61,7 @@ def test_the_name_to_write_to_tells_the_format(tmp_path: Path) -> None:
 
 
 def _way(folder: Path) -> None:
-    run = offline_odometry.OdometryRun([], POINTS, 0, Counter(), Counter())
+    run = offline_odometry.OdometryRun(Trajectory().poses, POINTS, 0, Counter(), Counter())
     offline_odometry.write(run, folder)
 
 
