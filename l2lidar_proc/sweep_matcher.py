@@ -26,7 +26,7 @@ _OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the ma
 _MATCHED: Final = (0, 50)  # and how many: a few fit in many places
 _MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
 _YOUNG: Final = 12  # sweeps in a map before a sweep without surfaces around is remarkable
-_PLACED: Final = (0.03, 0.15)  # [rad, m] what KISS-ICP's registration with few sweeps is worth
+_PLACED: Final = (0.03, 0.15)  # [rad, m] what KISS-ICP's registration by itself is worth
 _PRUNING: Final = 0.2  # the map is pruned whenever this part of its radius was travelled
 
 
@@ -128,8 +128,11 @@ class SweepMatcher:
         others = [found, *(self._align(source, motion, start) for start in starts)]
         good = [other for other in others if other and _believable(other, source, strict)]
         best = max(good, key=lambda other: other.agreement * other.matched, default=None)
-        if best is None and young and found is None:
-            best = self._placed(source, motion)
+        if best is None and motion.felt.missing.all():
+            # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
+            best = self._placed(source, motion, np.inf)
+        elif best is None and young and found is None:
+            best = self._placed(source, motion, _PLACED[1])
         return Match(best, False)
 
     def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> None:
@@ -182,9 +185,9 @@ class SweepMatcher:
             start,
         )
 
-    def _placed(self, source: Source, motion: SweepMotion) -> Alignment:
+    def _placed(self, source: Source, motion: SweepMotion, most: float) -> Alignment:
         """Return what the place that KISS-ICP's registration finds is worth by itself."""
-        place = self._registered(source, motion.state, _PLACED[1])
+        place = self._registered(source, motion.state, most)
         information = np.zeros_like(motion.covariance)
         information[TURN, TURN] = np.eye(3) / _PLACED[0] ** 2
         information[POSITION, POSITION] = np.eye(3) / _PLACED[1] ** 2

@@ -44,6 +44,14 @@ def test_short_sweeps_below_an_open_sky_are_enough(cut):
     assert errors(run, estimates).max() < 0.03
 
 
+@pytest.mark.parametrize(("place", "cut"), [("bushes", "turn"), ("poles", "half turn")])
+def test_without_an_imu_foliage_and_poles_are_no_worse_than_for_kiss_icp(place, cut):
+    run = visited(place)
+    estimates = drive(run, cut, imu=run.imu[:0])
+    assert all(item.is_aligned for item in estimates)
+    assert errors(run, estimates).max() < 0.25
+
+
 def test_the_cloud_of_a_first_part_of_a_turn_lies_where_it_says():
     run = recording("room", "drone")
     some = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.1e9][:8]
