@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.results import Results
 
-_DEADLINE_S: Final = 120.0  # for the end of a program
-_LIMIT_S: Final = 60.0
+_DEADLINE_S: Final = 120.0
 _PRIVILEGED_PORT: Final = 81
 _FREE_PORTS: Final = Path("/proc/sys/net/ipv4/ip_unprivileged_port_start")
 _PR_CAPBSET_DROP: Final = 24  # of Linux's sys/prctl.h
@@ -134,22 +133,16 @@ class World:
         process.communicate(timeout=_DEADLINE_S)
 
     def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Wait until a driver that runs is so far, however slow this machine is; return how far.
-
-        Raises
-        ------
-        TimeoutError
-            If it does not come so far.
-        """
+        """Wait until a running driver is so far, however slow the machine is; return how far."""
         path = self.folder / "host.now"
-        deadline = time.monotonic() + _LIMIT_S
-        while time.monotonic() < deadline:
-            if path.exists():
-                now: dict[str, Any] = json.loads(path.read_text())
-                if condition(now):
-                    return now
+        deadline = time.monotonic() + _DEADLINE_S
+        now: dict[str, Any] = {}
+        while not (now and condition(now)):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"after {_DEADLINE_S:.0f} s the driver is only so far: {now}")
             time.sleep(0.05)
-        raise TimeoutError(f"the driver is not so far after {_LIMIT_S:.0f} s")
+            now = json.loads(path.read_text()) if path.exists() else {}
+        return now
 
     def close(self) -> None:
         """End everything."""
