@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import startup, sweep_motion
+from l2lidar_proc.frame_jump import FrameJump
 from l2lidar_proc.imu_window import ImuWindow, Samples
 from l2lidar_proc.inertial_filter import (
     GYRO_BIAS,
@@ -42,6 +43,7 @@ _OPENING_SWEEP_NS: Final = 150_000_000  # shorter ones are joined: they would no
 _LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
 _PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
 _LOST_SWEEPS: Final = 25
+_AT_ORIGIN: Final = 1e-3  # [m, rad] of the pose with which a new map begins
 _STEADY_SIGMA: Final = 0.5  # [rad/s] of the assumption that the rate stays, where there is no gyro
 
 
@@ -89,6 +91,7 @@ class Odometry:
         self._trusts_gravity = False
         self._steady: F64 = np.zeros(3)
         self._lost_sweeps = 0
+        self._jump = FrameJump()
         self._last: OdometryEstimate | None = None
 
     def imu(self, samples: Samples) -> None:
@@ -115,11 +118,8 @@ class Odometry:
         status: list[Status] = []
         if self._last is not None and reference <= self._last.stamp:
             if reference > self._last.stamp - _LONG_GAP_NS:
-                return [
-                    dataclasses.replace(
-                        self._last, points=sweep.points[:0], status=(Status.REFUSED,)
-                    )
-                ]
+                refused = (Status.REFUSED,)
+                return [dataclasses.replace(self._last, points=sweep.points[:0], status=refused)]
             self._restart(reference)
             status.append(Status.RESTARTED)
         sweep = cropped(sweep, self.config.min_range, self.config.max_range)
@@ -143,7 +143,7 @@ class Odometry:
         moved = motion.deskewed(sweep, self._lever)
         if self._lost_sweeps >= _LOST_SWEEPS:
             status.append(Status.LOST)
-            self._forget_map()
+            motion = self._begun_again(motion)
         if found is not None or uncharted or Status.LOST in status:
             self.matcher.extend(moved, motion, guess)
         quality = self.matcher.quality(len(source.points), found)
@@ -161,10 +161,9 @@ class Odometry:
         if state is None or self._last is None or stamp <= state.stamp:
             return None
         motion = self._predicted_over(state, self._covariance, (state.stamp, stamp), stamp)
-        nothing = self._last.points[:0]
-        status = (Status.PREDICTED,)
-        noise = self.config.inertial.gyro_noise
-        return estimate_of(motion, self._lever, nothing, status, AlignmentQuality(), noise)
+        nothing, noise = self._last.points[:0], self.config.inertial.gyro_noise
+        say = ((Status.PREDICTED,), AlignmentQuality())
+        return estimate_of(motion, self._lever, nothing, *say, noise, self._jump)
 
     # ---- beginnings
 
@@ -191,7 +190,7 @@ class Odometry:
         if not motions:
             del held[0]
             return []
-        motions = [motions[0]] * seed + motions
+        motions[:0] = [motions[0]] * seed
         estimates = []
         for one in held:
             within = sum(part.end < one.end for part in whole)
@@ -221,7 +220,7 @@ class Odometry:
         # the odometry frame begins at the cloud frame's origin, the state is the IMU's
         start = dataclasses.replace(opening.state, position=opening.state.rotation @ self._lever)
         for _ in range(_OPENING_ROUNDS):
-            self._forget_map()
+            self.matcher.clear()
             first = self._predicted(sweeps[0], start, opening.covariance, since)
             motions = [first]
             self.matcher.extend(first.deskewed(sweeps[0], self._lever), first, first.state)
@@ -251,15 +250,21 @@ class Odometry:
     def _restart(self, reference: HostNs) -> None:
         """Keep pose and map, forget the motion."""
         assert self._state is not None
+        self._jump = self._jump.unseen(self._state)
         self._state = dataclasses.replace(
             self._state, stamp=HostNs(reference - 1), velocity=np.zeros(3)
         )
         for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
             self._covariance = loosened(self._covariance, errors, sigma)
 
-    def _forget_map(self) -> None:
+    def _begun_again(self, motion: SweepMotion) -> SweepMotion:
+        """Begin a new map where the sensor is now taken to be."""
+        self._jump = self._jump.added(motion.state, motion.covariance)
+        for errors in (TURN, POSITION):
+            self._covariance = loosened(self._covariance, errors, _AT_ORIGIN)
         self.matcher.clear()
         self._lost_sweeps = 0
+        return dataclasses.replace(motion, covariance=self._covariance)
 
     # ---- steps
 
@@ -329,8 +334,9 @@ class Odometry:
     ) -> OdometryEstimate:
         if not self._trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
+        noise = self.config.inertial.gyro_noise
         self._last = estimate_of(
-            motion, self._lever, moved, tuple(status), quality, self.config.inertial.gyro_noise
+            motion, self._lever, moved, tuple(status), quality, noise, self._jump
         )
         return self._last
 

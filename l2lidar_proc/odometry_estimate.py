@@ -72,7 +72,7 @@ class OdometryEstimate:
         Cloud coordinates to odometry coordinates. Where gravity is trusted z is up there.
     covariance : ndarray, shape (6, 6)
         Of x, y, z and of the turns about the axes of the odometry frame [m, rad], relative to the
-        map.
+        map, and from the first RESTARTED or LOST on what the map's own place is uncertain by.
     velocity : ndarray, shape (3,)
         Of the cloud frame's origin, cloud axes [m/s].
     angular_velocity : ndarray, shape (3,)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from l2lidar_proc import rotations
 from l2lidar_proc.alignment import WEAK
+from l2lidar_proc.frame_jump import FrameJump
 from l2lidar_proc.inertial_filter import GYRO_BIAS, POSITION, TURN, VELOCITY, InertialState
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.sweep_motion import SweepMotion
@@ -36,6 +37,7 @@ def estimate_of(
     status: tuple[Status, ...],
     quality: AlignmentQuality,
     gyro_noise: float,
+    jump: FrameJump,
 ) -> OdometryEstimate:
     """Return the estimate that a motion amounts to.
 
@@ -51,6 +53,8 @@ def estimate_of(
     quality : AlignmentQuality
     gyro_noise : float
         Of an angular velocity [rad/s].
+    jump : FrameJump
+        What the map's own place adds to the covariance.
     """
     state, p = motion.state, motion.covariance
     if quality.matched and quality.weakest < WEAK:
@@ -67,7 +71,7 @@ def estimate_of(
     return OdometryEstimate(
         stamp=state.stamp,
         T_odom_lidar=cloud_pose(state, lever),
-        covariance=pose @ p @ pose.T,
+        covariance=pose @ p @ pose.T + jump.at(state.position),
         velocity=state.rotation.T @ state.velocity - rotations.cross(rate, lever),
         angular_velocity=rate,
         twist_covariance=twist_covariance,

@@ -186,6 +186,23 @@ def test_clock_that_goes_back_keeps_pose_and_map():
     assert Status.RESTARTED in estimates[0].status
     assert np.abs(estimates[-1].T_odom_lidar[:3, 3]).max() < 0.02
     assert estimates[-1].is_aligned
+    # the hour between may have hidden a step
+    assert np.sqrt(np.diag(estimates[-1].covariance)).min() > 0.3
+
+
+def test_a_map_begun_elsewhere_is_as_uncertain_as_the_way_there():
+    """Carried blindly into another place: 25 sweeps without a match, then a new map."""
+    room, yard = recording("room", "walk"), recording("yard", "walk")
+    at = room.imu["stamp"][0] + 2_500_000_000
+    some = [one for one in sweeps(room, "half turn") if one.end < at]
+    some += [one for one in sweeps(yard, "half turn") if one.start >= at]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), room, some)
+    lost = next(k for k, item in enumerate(estimates) if Status.LOST in item.status)
+    after = estimates[lost + 1 :]
+    assert len(after) > 3
+    assert any(item.is_aligned for item in after)
+    before = np.linalg.eigvalsh(estimates[lost - 1].covariance[:3, :3])[-1]
+    assert all(np.linalg.eigvalsh(item.covariance[:3, :3])[-1] > before for item in after)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 9, 50])
