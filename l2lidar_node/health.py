@@ -39,6 +39,7 @@ _CLOCK_TROUBLES: Final = {
     ClockEventKind.SILENCE: "the device was silent",
     ClockEventKind.LOST: "the device's clock had been lost track of",
 }
+_LATE_NS: Final = 500_000_000  # whoever steers by these data should know
 _WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
 _MAX_TILT_DEG: Final = 10.0
 
@@ -204,6 +205,7 @@ def _clock(
         "ratio": f"{status.ratio:.7f}",
         "offset [s]": f"{status.offset_ns / 1e9:.6f}",
         "residual [ms]": f"{status.residual_ns / 1e6:.3f}",
+        "lateness [ms]": f"{status.late_ns / 1e6:.3f}",
         "path delay [ms]": f"{status.path_delay_ns / 1e6:.3f}",
         "epochs": str(status.epochs),
         "packets without stamp": str(sum(new.unlocked.values())),
@@ -223,6 +225,8 @@ def _clock(
         for kind, text in _CLOCK_TROUBLES.items()
         if after.clock_events.get(kind, 0) > before.clock_events.get(kind, 0)
     ]
+    if status.late_ns > _LATE_NS:
+        troubles.append(f"packets come {status.late_ns / 1e9:.1f} s late, stamps allow for it")
     if troubles:
         return Check("clock", Level.WARN, f"locked; {', '.join(troubles)}", values)
     return Check("clock", Level.OK, "locked", values)

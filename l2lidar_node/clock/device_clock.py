@@ -60,6 +60,8 @@ class ClockStatus:
         Host time minus device stamp of the latest packet.
     residual_ns : int
         Median height of the fitted packets above the line: how much arrivals vary.
+    late_ns : int
+        How late even the least delayed of the latest packets was, beyond the path's constant part.
     path_delay_ns : int
         Half the shortest measured round trip, which is taken off every stamp; 0 if not measured.
     synced : bool
@@ -79,6 +81,7 @@ class ClockStatus:
     ratio: float
     offset_ns: int
     residual_ns: int
+    late_ns: int
     path_delay_ns: int
     synced: bool
     epochs: int
@@ -253,6 +256,7 @@ class DeviceClock:
             ratio=line.ratio,
             offset_ns=self._offset,
             residual_ns=round(line.excess),
+            late_ns=self._host.late_ns,
             path_delay_ns=self._host.advance_ns,
             synced=self._schedule.in_force,
             epochs=self._device.epochs,

@@ -46,6 +46,8 @@ class HostLine:
     steps : deque of int
         Steps of what is published that arrivals made necessary [ns]: the host's clock was set, or
         if that ``is_told``, packets come earlier than thought; whoever reads it takes it out.
+    late_ns : int
+        How late the least delayed packet of the last 100 ms was, against the fit.
     is_told : bool
         Whether somebody tells when the host's clock is set; else that is inferred.
     advance_ns : int
@@ -76,6 +78,7 @@ class HostLine:
         "advance_ns",
         "due",
         "is_told",
+        "late_ns",
         "line",
         "ready",
         "steps",
@@ -92,6 +95,7 @@ class HostLine:
     def reset(self) -> None:
         """Forget everything but the ratio, as a guess."""
         self.ready = False
+        self.late_ns = 0
         self._envelope: Envelope | None = None
         self._packets: list[tuple[int, int]] = []
         self._suspects: list[tuple[int, int]] = []
@@ -195,6 +199,7 @@ class HostLine:
         """Look for a step of the host's clock; return whether the block was dealt with."""
         line = envelope.line
         off = self._low_at[1] - line.at(self._low_at[0])
+        self.late_ns = max(off, 0)
         spread = _SPREADS * line.excess
         suspects = self._suspects
         if -_EARLY_NS - spread <= off <= _STEP_NS + spread:

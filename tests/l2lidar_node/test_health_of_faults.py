@@ -65,6 +65,13 @@ def test_a_fault_is_named(faults, name, level, message):
     assert re.search(message, check.message)
 
 
+def test_packets_that_stay_late_are_told():
+    check = judged(6.0, 7.0, late=[(4.0, 9.0, 1.5)])["clock"]
+    assert check.level is WARN
+    assert check.message == "locked; packets come 1.5 s late, stamps allow for it"
+    assert judged(6.0, 7.0, late=[(4.0, 4.5, 0.2)])["clock"].message == "locked"
+
+
 def test_spinning_up_counts_down():
     checks = judged(9.0, 10.0, power=PowerConfig())
     assert checks["device"].level is WARN
