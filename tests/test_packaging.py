@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -146,13 +147,19 @@ def test_colcon_builds_the_package(tmp_path: Path) -> None:
 def test_transforms_have_the_type_every_ros_2_has() -> None:
     """Another machine's ROS 2 takes our transforms only if the message's type hash is its own."""
     import rclpy
+    from rclpy.executors import SingleThreadedExecutor
     from tf2_msgs.msg import TFMessage
 
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node("probe", context=context)
+    executor = SingleThreadedExecutor(context=context)
     publisher = node.create_publisher(TFMessage, "transforms", 1)
-    (endpoint,) = node.get_publishers_info_by_topic("transforms")
+    deadline = time.monotonic() + 60.0
+    while not (endpoints := node.get_publishers_info_by_topic("transforms")):
+        assert time.monotonic() < deadline
+        rclpy.spin_once(node, executor=executor, timeout_sec=0.05)
+    (endpoint,) = endpoints
     assert str(endpoint.topic_type_hash) == (
         "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
     )
