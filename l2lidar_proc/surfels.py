@@ -197,9 +197,6 @@ class _Level:
         self._thickness = thickness
         self._least = least
         self._capacity = capacity
-        self.clear()
-
-    def clear(self) -> None:
         self._keys: I64 = np.empty(0, np.int64)
         self._rows: I64 = np.empty(0, np.int64)
         self.cells: NDArray[np.void] = np.zeros(1, CELL)
@@ -207,6 +204,14 @@ class _Level:
         self._flat: NDArray[np.bool_] = np.zeros(1, np.bool_)
         self._narrow: NDArray[np.bool_] = np.zeros(1, np.bool_)
         self._count: I64 = np.zeros(1, np.int64)
+
+    def clear(self) -> None:
+        used = len(self._keys)
+        self._keys, self._rows = np.empty(0, np.int64), np.empty(0, np.int64)
+        # the arrays stay for the next map: memory freed and asked for again comes back in pieces
+        self.cells[:used] = np.zeros(1, CELL)
+        self._flat[:used] = self._narrow[:used] = False
+        self._count[:used] = 0
 
     def __len__(self) -> int:
         return len(self._keys)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -167,3 +168,25 @@ def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise, seed):
     moving["angular_velocity"] += noise * rng.standard_normal((230, 3))
     moving["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
     assert not opening(moving, HostNs(int(moving["stamp"][100]))).at_rest
+
+
+def test_a_map_begun_again_is_a_new_one_in_the_same_memory():
+    points = [_corridor(np.random.default_rng(seed), 20_000) for seed in range(4)]
+    again, fresh = SurfelMap((0.15, 0.6)), SurfelMap((0.15, 0.6))
+    tracemalloc.start()
+    try:
+        again.add(points[0] + 7.0)
+        again.add(points[1])
+        first, _ = tracemalloc.get_traced_memory()
+        again.clear()
+        before, _ = tracemalloc.get_traced_memory()
+        for part in points[2:]:
+            again.add(part)
+            fresh.add(part)
+        assert before > 0.6 * first
+    finally:
+        tracemalloc.stop()
+    assert len(again) == len(fresh)
+    assert np.array_equal(again.points(), fresh.points())
+    found, wanted = again.match(points[0], narrow=True), fresh.match(points[0], narrow=True)
+    assert np.array_equal(found.distances, wanted.distances)
