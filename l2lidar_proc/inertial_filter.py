@@ -133,6 +133,8 @@ BLIND_TURN: Final = (
 SLOW_FROM: Final = 0.2
 SLOW_SPEED: Final = 1.0
 
+_OWN_POSE: Final = 1e-3  # [m, rad] of the pose with which a new map begins
+
 
 def predicted(
     state: InertialState,
@@ -264,6 +266,35 @@ def loosened(covariance: F64, errors: slice, sigma: float) -> F64:
     out[:, errors] = 0.0
     out[errors, errors] = sigma**2 * np.eye(3)
     return out
+
+
+def at_origin(covariance: F64) -> F64:
+    """Return a covariance (18, 18) in which the pose is known: a new map begins with it."""
+    for errors in (TURN, POSITION):
+        covariance = loosened(covariance, errors, _OWN_POSE)
+    return covariance
+
+
+def same_bias(
+    state: InertialState, covariance: F64, before: InertialState, covariance_before: F64
+) -> tuple[InertialState, F64]:
+    """Return state and covariance (18, 18) with the gyro's bias as it was known before.
+
+    Without samples it stood for what the rate had changed by.
+    """
+    covariance = loosened(covariance, GYRO_BIAS, 0.0)
+    covariance[GYRO_BIAS, GYRO_BIAS] = covariance_before[GYRO_BIAS, GYRO_BIAS]
+    return dataclasses.replace(state, gyro_bias=before.gyro_bias), covariance
+
+
+def interrupted(state: InertialState, covariance: F64, stamp: HostNs) -> tuple[InertialState, F64]:
+    """Return state and covariance (18, 18) at an instant about which no more is known than before.
+
+    The sensor may have been moved meanwhile, but hardly far; how it moves now is not known.
+    """
+    for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
+        covariance = loosened(covariance, errors, sigma)
+    return dataclasses.replace(state, stamp=stamp, velocity=np.zeros(3)), covariance
 
 
 def skew(v: F64) -> F64:

@@ -9,29 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc import startup, sweep_motion
+from l2lidar_proc import standing_start, startup
 from l2lidar_proc.frame_jump import FrameJump
-from l2lidar_proc.imu_window import ImuWindow, Samples
-from l2lidar_proc.inertial_filter import (
-    GYRO_BIAS,
-    POSITION,
-    TURN,
-    VELOCITY,
-    InertialState,
-    Noise,
-    loosened,
-    slowed,
-)
+from l2lidar_proc.imu_window import Samples
+from l2lidar_proc.inertial_filter import InertialState, at_origin, interrupted, same_bias, slowed
 from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.odometry_estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry_report import estimate_of, gaps_in
+from l2lidar_proc.prediction import LONG_GAP_NS, Predictor
+from l2lidar_proc.standstill import PATIENCE_NS, Standstill, free_to_differ
 from l2lidar_proc.sweep_joining import cropped, joined
 from l2lidar_proc.sweep_matcher import SweepMatcher
 from l2lidar_proc.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
 
-_WINDOW_S: Final = 12.0  # more than a held-up node has waiting
 _OPENING_NS: Final = 450_000_000  # the first sweeps are held for so long
 _OPENING_LONGEST_NS: Final = 3_000_000_000  # or, at rest, until they meet each other
 _OPENING_FELT_NS: Final = 1_000_000_000  # whose samples tell whether the sensor rests
@@ -40,11 +32,10 @@ _OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the r
 _REST_SPEED: Final = 0.06  # [m/s] faster, the sensor did not rest, however quiet the IMU
 _WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
 _OPENING_SWEEP_NS: Final = 150_000_000  # shorter ones are joined: they would not meet
-_LONG_GAP_NS: Final = 1_000_000_000  # after that much silence the old velocity says nothing
-_PERIOD_S: Final = 0.004  # of the IMU, for which the noise settings are stated
 _LOST_SWEEPS: Final = 25
-_AT_ORIGIN: Final = 1e-3  # [m, rad] of the pose with which a new map begins
-_STEADY_SIGMA: Final = 0.5  # [rad/s] of the assumption that the rate stays, where there is no gyro
+_FELT_NS: Final = 250_000_000  # in which the IMU tells that rest has ended
+_EARLY_NS: Final = 4_000_000_000  # until then a rest that was none is begun again, as motion
+_EARLY_FARTHEST: Final = 0.5  # [m] if that went no farther
 
 
 class Odometry:
@@ -73,14 +64,14 @@ class Odometry:
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
         self.T_cloud_imu = np.array(T_cloud_imu, dtype=np.float64)
         self._lever: F64 = self.T_cloud_imu[:3, 3]
-        self._imu = ImuWindow(_WINDOW_S)
+        self._predictor = Predictor(config, self.T_cloud_imu)
         self.config = config
         self.reset()
 
     def configure(self, config: OdometryConfig) -> None:
         """Take new live settings; the others come into force with :meth:`reset`."""
         self.config = config
-        self.matcher.config = config
+        self.matcher.config = self._predictor.config = config
 
     def reset(self) -> None:
         """Forget map and motion; the next sweep begins a new map."""
@@ -88,20 +79,16 @@ class Odometry:
         self._held: list[Sweep] = []
         self._state: InertialState | None = None
         self._covariance: F64 = np.zeros((18, 18))
-        self._trusts_gravity = False
-        self._steady: F64 = np.zeros(3)
+        self._predictor.reset()
+        self._standstill = Standstill()
+        self._early: list[Sweep] = []
         self._lost_sweeps = 0
         self._jump = FrameJump()
         self._last: OdometryEstimate | None = None
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
-        turn = self.T_cloud_imu[:3, :3]
-        if not np.array_equal(turn, np.eye(3)):
-            samples = samples.copy()
-            for name in ("angular_velocity", "linear_acceleration"):
-                samples[name] = samples[name] @ turn.T
-        self._imu.push(samples)
+        self._predictor.imu(samples)
 
     def register(self, sweep: Sweep) -> list[OdometryEstimate]:
         """Return where the sensor was at the references of sweeps, oldest first.
@@ -114,19 +101,24 @@ class Odometry:
         sweep : Sweep
             Any layout of points with x, y, z and time; IMU samples up to its end should have come.
         """
-        reference = self._reference(sweep)
+        reference = self._predictor.reference(sweep)
         status: list[Status] = []
         if self._last is not None and reference <= self._last.stamp:
-            if reference > self._last.stamp - _LONG_GAP_NS:
-                refused = (Status.REFUSED,)
-                return [dataclasses.replace(self._last, points=sweep.points[:0], status=refused)]
+            if reference > self._last.stamp - LONG_GAP_NS:
+                return [self._last.refusing(sweep.points)]
             self._restart(reference)
             status.append(Status.RESTARTED)
         sweep = cropped(sweep, self.config.min_range, self.config.max_range)
         if self._state is None:
             return self._opened(sweep)
-        motion = self._predicted(sweep, self._state, self._covariance)
+        motion = self._predictor.over_sweep(sweep, self._state, self._covariance)
         status += gaps_in(motion)
+        if self._standstill.holds(self._predictor.felt(sweep.end - _FELT_NS, sweep.end)):
+            stayed = self._stayed(sweep, motion, status)
+            if stayed is not None:
+                return [stayed]
+            motion = self._predictor.over_sweep(sweep, self._state, self._covariance)
+        self._early.clear()
         source = self.matcher.source(sweep, motion)
         found, uncharted = self.matcher.match(source, motion)
         guess, state, covariance = motion.state, motion.state, motion.covariance
@@ -134,9 +126,12 @@ class Odometry:
             few = len(source.points) < self.config.min_points
             status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
             self._lost_sweeps += not few
+            self._standstill.clear()
         else:
             state, covariance = found.state, found.covariance
             self._lost_sweeps = 0
+            felt = self._predictor.felt(sweep.end - PATIENCE_NS, sweep.end)
+            self._standstill.watch(state, covariance, felt)
         lasted = (state.stamp - self._state.stamp) * 1e-9
         motion = motion.corrected(*slowed(state, covariance, lasted))
         self._keep(motion)
@@ -160,7 +155,7 @@ class Odometry:
         state = self._state
         if state is None or self._last is None or stamp <= state.stamp:
             return None
-        motion = self._predicted_over(state, self._covariance, (state.stamp, stamp), stamp)
+        motion = self._predictor.over(state, self._covariance, (state.stamp, stamp), stamp)
         nothing, noise = self._last.points[:0], self.config.inertial.gyro_noise
         say = ((Status.PREDICTED,), AlignmentQuality())
         return estimate_of(motion, self._lever, nothing, *say, noise, self._jump)
@@ -170,7 +165,7 @@ class Odometry:
     def _opened(self, sweep: Sweep) -> list[OdometryEstimate]:
         """Hold the first sweeps until they tell how the sensor moves, then begin the map."""
         held = self._held
-        if held and not 0 < sweep.start - held[-1].start < _LONG_GAP_NS:
+        if held and not 0 < sweep.start - held[-1].start < LONG_GAP_NS:
             held.clear()
         held.append(sweep)
         if held[-1].end - held[0].start < _OPENING_NS:
@@ -194,7 +189,7 @@ class Odometry:
         estimates = []
         for one in held:
             within = sum(part.end < one.end for part in whole)
-            motion = motions[within].seen_from(self._reference(one))
+            motion = motions[within].seen_from(self._predictor.reference(one))
             status = [Status.STARTING, *gaps_in(motion)]
             quality = self.matcher.quality(len(one.points), None)
             moved = motion.deskewed(one, self._lever)
@@ -212,21 +207,38 @@ class Odometry:
         it takes many sweeps at rest before one meets what others saw: None as long as that may
         still happen.
         """
-        reference = self._reference(sweeps[0])
+        reference = self._predictor.reference(sweeps[0])
         until = min(sweeps[-1].end, since + _OPENING_FELT_NS)
-        samples = self._imu.between(HostNs(since - _OPENING_NS), HostNs(until))
+        samples = self._predictor.felt(since - _OPENING_NS, until)
         opening = startup.opening(samples, reference, may_rest)
-        self._trusts_gravity = opening.gravity_trusted
+        self._predictor.trusts_gravity = opening.gravity_trusted
+        late = sweeps[-1].end - since >= _OPENING_LONGEST_NS
         # the odometry frame begins at the cloud frame's origin, the state is the IMU's
         start = dataclasses.replace(opening.state, position=opening.state.rotation @ self._lever)
+        self._standstill.clear()
+        if opening.at_rest and self._standstill.anchored(start, samples):
+            self.matcher.clear()
+            parts = (self._predictor, self.matcher, self._standstill)
+            motions, met = standing_start.begun(sweeps, since, start, opening.covariance, *parts)
+            if motions and not met and len(samples) and not late:
+                return None
+            if motions and (met or len(samples)):
+                self._early = list(sweeps)
+                self._keep(motions[-1])
+                return motions
+            self._standstill.clear()
+            if not len(samples):
+                return self._solved(sweeps, since, may_rest=False)
         for _ in range(_OPENING_ROUNDS):
             self.matcher.clear()
-            first = self._predicted(sweeps[0], start, opening.covariance, since)
+            first = self._predictor.over_sweep(sweeps[0], start, opening.covariance, since)
             motions = [first]
             self.matcher.extend(first.deskewed(sweeps[0], self._lever), first, first.state)
             met = False
             for sweep in sweeps[1:]:
-                motion = self._predicted(sweep, motions[-1].state, motions[-1].covariance)
+                motion = self._predictor.over_sweep(
+                    sweep, motions[-1].state, motions[-1].covariance
+                )
                 source = self.matcher.source(sweep, motion)
                 found, uncharted = self.matcher.match(source, motion, opening=True)
                 if found is not None:
@@ -239,7 +251,7 @@ class Odometry:
             velocity = motions[1].state_at(reference).velocity
             if opening.at_rest and np.linalg.norm(velocity) > _REST_SPEED:
                 return self._solved(sweeps, since, may_rest=False)
-            if not met and sweeps[-1].end - since < _OPENING_LONGEST_NS:
+            if not met and not late:
                 return None
             if np.linalg.norm(velocity - start.velocity) < _OPENING_STEP:
                 break
@@ -251,79 +263,70 @@ class Odometry:
         """Keep pose and map, forget the motion."""
         assert self._state is not None
         self._jump = self._jump.unseen(self._state)
-        self._state = dataclasses.replace(
-            self._state, stamp=HostNs(reference - 1), velocity=np.zeros(3)
-        )
-        for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
-            self._covariance = loosened(self._covariance, errors, sigma)
+        stamp = HostNs(reference - 1)
+        self._state, self._covariance = interrupted(self._state, self._covariance, stamp)
+        self._standstill.clear()
 
     def _begun_again(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map where the sensor is now taken to be."""
         self._jump = self._jump.added(motion.state, motion.covariance)
-        for errors in (TURN, POSITION):
-            self._covariance = loosened(self._covariance, errors, _AT_ORIGIN)
+        self._covariance = at_origin(self._covariance)
         self.matcher.clear()
         self._lost_sweeps = 0
         return dataclasses.replace(motion, covariance=self._covariance)
 
+    # ---- rest
+
+    def _stayed(
+        self, sweep: Sweep, motion: SweepMotion, status: list[Status]
+    ) -> OdometryEstimate | None:
+        """Return the estimate of a sweep at rest, None if it tells that the sensor moves."""
+        assert self._state is not None
+        trial = motion.at_rest(self._state, free_to_differ())
+        source = self.matcher.source(sweep, trial)
+        found, _ = self.matcher.match(source, trial)
+        if self._early:
+            self._early.append(sweep)
+        if found is None:
+            self._standstill.clear()
+            return None
+        if not self._standstill.stays(found):
+            self._covariance = self._standstill.loosened(self._covariance)
+            return self._opened_again(sweep, status)
+        if self._early and sweep.end - self._early[0].start > _EARLY_NS:
+            self._early.clear()
+        state = self._predictor.at_rest(self._state, self._covariance, trial.state.stamp)
+        still = motion.at_rest(*state)
+        self._keep(still)
+        moved = still.deskewed(sweep, self._lever)
+        self.matcher.extend(moved, still, still.state)
+        quality = self.matcher.quality(len(source.points), found)
+        return self._estimate(still, moved, status, quality)
+
+    def _opened_again(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
+        """Begin the map again if the sensor has not stood still since; None if it is older."""
+        early = self._early
+        if not early or not self._standstill.drifted:
+            return None
+        for may_rest in (False, True):
+            motions = self._solved(early, early[0].start, may_rest)
+            if motions and np.linalg.norm(motions[-1].state.position) < _EARLY_FARTHEST:
+                moved = motions[-1].deskewed(sweep, self._lever)
+                quality = self.matcher.quality(len(sweep.points), None)
+                self._early = []
+                return self._estimate(motions[-1], moved, [*status, Status.STARTING], quality)
+        self._lost_sweeps = _LOST_SWEEPS
+        return None
+
     # ---- steps
-
-    def _reference(self, sweep: Sweep) -> HostNs:
-        if self.config.reference == "start":
-            return sweep.start
-        if self.config.reference == "end":
-            return sweep.end
-        return HostNs((sweep.start + sweep.end) // 2)
-
-    def _predicted(
-        self, sweep: Sweep, state: InertialState, covariance: F64, since: HostNs | None = None
-    ) -> SweepMotion:
-        span = (sweep.start if since is None else since, sweep.end)
-        return self._predicted_over(state, covariance, span, self._reference(sweep))
-
-    def _predicted_over(
-        self, state: InertialState, covariance: F64, span: tuple[HostNs, HostNs], reference: HostNs
-    ) -> SweepMotion:
-        samples = self._imu.between(min(span[0], state.stamp), max(span[1], reference))
-        inside = (samples["stamp"] >= state.stamp) & (samples["stamp"] <= max(span[1], reference))
-        if not inside.any():
-            # the bias stands for what the rate has changed by: the sweep itself will tell
-            covariance = loosened(covariance, GYRO_BIAS, _STEADY_SIGMA)
-        gap = reference - state.stamp
-        if gap > _LONG_GAP_NS and len(samples) * _PERIOD_S * 1e9 < 0.5 * gap:
-            speed = float(np.linalg.norm(state.velocity))
-            covariance = loosened(covariance, VELOCITY, max(1.0, speed))
-            state = dataclasses.replace(state, velocity=np.zeros(3))
-        settings = self.config.inertial
-        scale = float(np.sqrt(_PERIOD_S))
-        noise = Noise(
-            max(settings.gyro_noise, startup.white_noise(samples["angular_velocity"])) * scale,
-            max(settings.accel_noise, startup.white_noise(samples["linear_acceleration"])) * scale,
-            settings.gyro_bias_walk,
-            settings.accel_bias_walk,
-        )
-        return sweep_motion.predict(
-            state,
-            covariance,
-            samples,
-            span,
-            reference,
-            noise=noise,
-            gap_ns=round(settings.imu_gap_ms * 1e6),
-            steady_rate=self._steady + state.gyro_bias,
-            uses_forces=self._trusts_gravity and settings.use_accelerometer,
-        )
 
     def _keep(self, motion: SweepMotion) -> None:
         """Remember the state for the next prediction."""
         state, covariance = motion.state, motion.covariance
         if motion.felt.missing.all() and self._state is not None:
-            bias = self._covariance[GYRO_BIAS, GYRO_BIAS]
-            covariance = loosened(covariance, GYRO_BIAS, 0.0)
-            covariance[GYRO_BIAS, GYRO_BIAS] = bias
-            state = dataclasses.replace(state, gyro_bias=self._state.gyro_bias)
+            state, covariance = same_bias(state, covariance, self._state, self._covariance)
         self._state, self._covariance = state, covariance
-        self._steady = motion.rate
+        self._predictor.steady = motion.rate
 
     def _estimate(
         self,
@@ -332,7 +335,7 @@ class Odometry:
         status: list[Status],
         quality: AlignmentQuality,
     ) -> OdometryEstimate:
-        if not self._trusts_gravity:
+        if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
         noise = self.config.inertial.gyro_noise
         self._last = estimate_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 
@@ -103,6 +104,10 @@ class OdometryEstimate:
     gyro_bias: F64
     accel_bias: F64
     gravity: F64
+
+    def refusing(self, points: NDArray[np.void]) -> OdometryEstimate:
+        """Return the same again for a sweep with points (N,) that was refused."""
+        return dataclasses.replace(self, points=points[:0], status=(Status.REFUSED,))
 
     @property
     def is_aligned(self) -> bool:

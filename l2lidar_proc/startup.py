@@ -50,6 +50,7 @@ class Opening:
     state : InertialState
     covariance : ndarray, shape (18, 18)
     at_rest : bool
+        Nothing was felt that speaks against it.
     gravity_trusted : bool
         False without samples and with an accelerometer whose norm is not that of gravity.
     """
@@ -75,7 +76,8 @@ def opening(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Opening:
     force = samples["linear_acceleration"].mean(axis=0) if len(samples) else np.zeros(3)
     norm = float(np.linalg.norm(force))
     trusted = bool(TRUSTED_NORM[0] < norm < TRUSTED_NORM[1])
-    at_rest = may_rest and _at_rest(samples)
+    # without samples only the clouds can tell
+    at_rest = may_rest and (not len(samples) or _at_rest(samples))
     rotation = np.eye(3)
     if trusted:
         rotation = rotations.matrices(rotations.between(force, (0.0, 0.0, 1.0)))
@@ -86,7 +88,7 @@ def opening(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Opening:
         rotation,
         np.zeros(3),
         np.zeros(3),
-        samples["angular_velocity"].mean(axis=0) if at_rest else np.zeros(3),
+        samples["angular_velocity"].mean(axis=0) if at_rest and len(samples) else np.zeros(3),
         excess,
         np.array([0.0, 0.0, -STANDARD_GRAVITY]) if trusted else np.zeros(3),
     )

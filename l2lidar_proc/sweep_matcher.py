@@ -59,13 +59,14 @@ class SweepMatcher:
     ----------
     config : OdometryConfig
         May be replaced; what is not live comes into force with a new matcher.
+    lever : ndarray, shape (3,)
     surfaces : SurfelMap
     kiss : KissMatcher
     """
 
     def __init__(self, config: OdometryConfig, lever: F64) -> None:
         self.config = config
-        self._lever = lever
+        self.lever = lever
         settings = config.surfaces
         self.surfaces = SurfelMap(
             settings.surface_sizes,
@@ -85,12 +86,12 @@ class SweepMatcher:
 
     def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
         """Return the points to align, deskewed along a predicted motion."""
-        points = xyz(motion.deskewed(sweep, self._lever))
+        points = xyz(motion.deskewed(sweep, self.lever))
         chosen = thinned(points, self.config.surfaces.source_voxel)
         chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
         offset = (sweep.start - motion.state.stamp) * 1e-9
         return Source(
-            points[chosen] - self._lever,
+            points[chosen] - self.lever,
             offset + sweep.points["time"][chosen].astype(np.float64),
             np.linalg.norm(points[chosen], axis=1),
         )
@@ -148,7 +149,7 @@ class SweepMatcher:
         """
         state = motion.state
         self._sweeps += 1
-        points = xyz(moved) - self._lever
+        points = xyz(moved) - self.lever
         self.surfaces.add(points @ state.rotation.T + state.position)
         self.kiss.update(points, _pose(state), _pose(guess))
         if np.linalg.norm(state.position - self._pruned_at) > _PRUNING * self.config.max_range:

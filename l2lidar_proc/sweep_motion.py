@@ -62,6 +62,21 @@ class SweepMotion:
         )
         return dataclasses.replace(self, seen=seen, state=state, covariance=covariance)
 
+    def at_rest(self, state: InertialState, covariance: F64) -> SweepMotion:
+        """Return the motion of a sensor that stands still instead, whatever the IMU felt.
+
+        Parameters
+        ----------
+        state : InertialState
+            Of any time; its velocity does not count.
+        covariance : ndarray, shape (18, 18)
+        """
+        state = dataclasses.replace(state, stamp=self.state.stamp, velocity=np.zeros(3))
+        nothing = np.zeros_like(self.felt.rates)
+        forces = nothing + state.accel_bias + at_rest(state)
+        felt = dataclasses.replace(self.felt, rates=nothing + state.gyro_bias, forces=forces)
+        return dataclasses.replace(self, felt=felt).corrected(state, covariance)
+
     def state_at(self, stamp: HostNs) -> InertialState:
         """Return the state at the track's knot nearest after an instant."""
         return self.state.at(self.seen, self.felt.knot(stamp))
