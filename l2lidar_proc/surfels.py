@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -323,8 +323,14 @@ class _Level:
 
     def _reserve(self, count: int) -> None:
         if count > len(self.cells):
-            extra = max(count, 2 * len(self.cells)) - len(self.cells)
-            self.cells = np.concatenate((self.cells, np.zeros(extra, CELL)))
-            self._flat = np.concatenate((self._flat, np.zeros(extra, np.bool_)))
-            self._narrow = np.concatenate((self._narrow, np.zeros(extra, np.bool_)))
-            self._count = np.concatenate((self._count, np.zeros(extra, np.int64)))
+            size = max(count, 2 * len(self.cells))
+            self.cells = _grown(self.cells, size)
+            self._flat, self._narrow = _grown(self._flat, size), _grown(self._narrow, size)
+            self._count = _grown(self._count, size)
+
+
+def _grown(rows: NDArray[Any], size: int) -> NDArray[Any]:
+    """Return rows with zeros after them; what is never used stays without memory."""
+    grown = np.zeros(size, rows.dtype)
+    grown[: len(rows)] = rows
+    return grown
