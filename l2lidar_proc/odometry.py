@@ -32,7 +32,7 @@ _OPENING_STEP: Final = 0.02  # [m/s] a smaller change of the velocity ends the r
 _REST_SPEED: Final = 0.06  # [m/s] faster, the sensor did not rest, however quiet the IMU
 _WHOLE: Final = 0.7  # a sweep with this part of the points of the fullest may begin the map
 _OPENING_SWEEP_NS: Final = 150_000_000  # shorter ones are joined: they would not meet
-_LOST_SWEEPS: Final = 25
+_LOST_NS: Final = 5_000_000_000  # of sweeps without a match
 _FELT_NS: Final = 250_000_000  # in which the IMU tells that rest has ended
 _EARLY_NS: Final = 4_000_000_000  # until then a rest that was none is begun again, as motion
 _EARLY_FARTHEST: Final = 0.5  # [m] if that went no farther
@@ -82,7 +82,7 @@ class Odometry:
         self._predictor.reset()
         self._standstill = Standstill()
         self._early: list[Sweep] = []
-        self._lost_sweeps = 0
+        self._lost_ns = 0
         self._jump = FrameJump()
         self._last: OdometryEstimate | None = None
 
@@ -125,18 +125,18 @@ class Odometry:
         if found is None:
             few = len(source.points) < self.config.min_points
             status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
-            self._lost_sweeps += not few
+            self._lost_ns += 0 if few else sweep.end - sweep.start
             self._standstill.clear()
         else:
             state, covariance = found.state, found.covariance
-            self._lost_sweeps = 0
+            self._lost_ns = 0
             felt = self._predictor.felt(sweep.end - PATIENCE_NS, sweep.end)
             self._standstill.watch(state, covariance, felt)
         lasted = (state.stamp - self._state.stamp) * 1e-9
         motion = motion.corrected(*slowed(state, covariance, lasted))
         self._keep(motion)
         moved = motion.deskewed(sweep, self._lever)
-        if self._lost_sweeps >= _LOST_SWEEPS:
+        if self._lost_ns >= _LOST_NS:
             status.append(Status.LOST)
             motion = self._begun_again(motion)
         if found is not None or uncharted or Status.LOST in status:
@@ -272,7 +272,7 @@ class Odometry:
         self._jump = self._jump.added(motion.state, motion.covariance)
         self._covariance = at_origin(self._covariance)
         self.matcher.clear()
-        self._lost_sweeps = 0
+        self._lost_ns = 0
         return dataclasses.replace(motion, covariance=self._covariance)
 
     # ---- rest
@@ -315,7 +315,7 @@ class Odometry:
                 quality = self.matcher.quality(len(sweep.points), None)
                 self._early = []
                 return self._estimate(motions[-1], moved, [*status, Status.STARTING], quality)
-        self._lost_sweeps = _LOST_SWEEPS
+        self._lost_ns = _LOST_NS
         return None
 
     # ---- steps
