@@ -220,15 +220,13 @@ class Odometry:
             self.matcher.clear()
             parts = (self._predictor, self.matcher, self._standstill)
             motions, met = standing_start.begun(sweeps, since, start, opening.covariance, *parts)
-            if motions and not met and len(samples) and not late:
+            if motions and not met and not late:
                 return None
-            if motions and (met or len(samples)):
+            if motions:
                 self._early = list(sweeps)
                 self._keep(motions[-1])
                 return motions
             self._standstill.clear()
-            if not len(samples):
-                return self._solved(sweeps, since, may_rest=False)
         for _ in range(_OPENING_ROUNDS):
             self.matcher.clear()
             first = self._predictor.over_sweep(sweeps[0], start, opening.covariance, since)

@@ -50,7 +50,6 @@ class Opening:
     state : InertialState
     covariance : ndarray, shape (18, 18)
     at_rest : bool
-        Nothing was felt that speaks against it.
     gravity_trusted : bool
         False without samples and with an accelerometer whose norm is not that of gravity.
     """
@@ -76,8 +75,7 @@ def opening(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Opening:
     force = samples["linear_acceleration"].mean(axis=0) if len(samples) else np.zeros(3)
     norm = float(np.linalg.norm(force))
     trusted = bool(TRUSTED_NORM[0] < norm < TRUSTED_NORM[1])
-    # without samples only the clouds can tell
-    at_rest = may_rest and (not len(samples) or _at_rest(samples))
+    at_rest = may_rest and _at_rest(samples)
     rotation = np.eye(3)
     if trusted:
         rotation = rotations.matrices(rotations.between(force, (0.0, 0.0, 1.0)))
@@ -88,7 +86,7 @@ def opening(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Opening:
         rotation,
         np.zeros(3),
         np.zeros(3),
-        samples["angular_velocity"].mean(axis=0) if at_rest and len(samples) else np.zeros(3),
+        samples["angular_velocity"].mean(axis=0) if at_rest else np.zeros(3),
         excess,
         np.array([0.0, 0.0, -STANDARD_GRAVITY]) if trusted else np.zeros(3),
     )
