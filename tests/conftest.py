@@ -3,9 +3,12 @@
 import importlib.util
 import os
 import signal
+from collections.abc import Iterator
 
 import hypothesis
 import pytest
+
+from tests.processes import end_all
 
 # Before anything imports rclpy. Fast DDS makes its ports from the domain, and those of domains
 # above 101 are in the range that Linux hands out to programs asking for any port.
@@ -37,3 +40,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("ros"):
             item.add_marker(skip)
+
+
+@pytest.fixture(autouse=True)
+def _no_process_is_left() -> Iterator[None]:
+    """End the processes that a test leaves behind."""
+    yield
+    end_all()

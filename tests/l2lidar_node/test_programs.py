@@ -7,11 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from tests.processes import ended_with_the_test
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 120.0
@@ -33,19 +34,6 @@ ENTRIES = [
 ]
 
 
-_processes: list[subprocess.Popen[str]] = []
-
-
-@pytest.fixture(autouse=True)
-def _no_process_is_left() -> Iterator[None]:
-    yield
-    for process in _processes:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-    _processes.clear()
-
-
 def started(*arguments: str) -> subprocess.Popen[str]:
     """Start Python; it cannot go on for long while nobody reads what it says."""
     reading, writing = os.pipe()
@@ -56,8 +44,7 @@ def started(*arguments: str) -> subprocess.Popen[str]:
     )  # fmt: skip
     os.close(writing)
     process.stdout = open(reading, buffering=1)  # noqa: SIM115 - communicate() closes it
-    _processes.append(process)
-    return process
+    return ended_with_the_test(process)
 
 
 def while_importing(process: subprocess.Popen[str]) -> None:

@@ -28,6 +28,7 @@ from l2lidar_node.emulator.results import Results
 from l2lidar_node.settings import build, settings_of
 from l2lidar_node.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import command, read
+from tests.processes import ended_with_the_test
 
 LIMIT_S = 120.0
 ROOT = Path(__file__).parents[3]
@@ -45,19 +46,6 @@ def host() -> Iterator[socket.socket]:
         yield item
 
 
-_processes: list[subprocess.Popen[str]] = []
-
-
-@pytest.fixture(autouse=True)
-def _no_process_is_left() -> Iterator[None]:
-    yield
-    for process in _processes:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-    _processes.clear()
-
-
 def started(*options: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
@@ -69,8 +57,7 @@ def started(*options: str) -> subprocess.Popen[str]:
         text=True,
         start_new_session=True,
     )
-    _processes.append(process)
-    return process
+    return ended_with_the_test(process)
 
 
 def run(*options: str) -> tuple[int, str, str]:
