@@ -18,6 +18,7 @@ from l2lidar_node.cli.addresses import hardware_address, local_addresses
 from l2lidar_node.cli.console import out, print_json, say
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.cli.options import JsonOption
+from l2lidar_node.cli.patience import Patience
 from l2lidar_node.framing import Frame, Framer
 from l2lidar_node.packets import Parameters, Version, decode
 from l2lidar_node.transport import TransportError
@@ -131,8 +132,8 @@ def listen(host_port: int, ask: list[tuple[str, int]], seconds: float) -> dict[A
             ) from None
         item.settimeout(_LOOK_S)
         next_probe = 0.0
-        left = seconds
-        while left > 0:
+        patience = Patience(seconds)
+        while not patience.is_over:
             begun = time.monotonic()
             if begun >= next_probe:
                 next_probe = begun + _PROBE_S
@@ -140,8 +141,7 @@ def listen(host_port: int, ask: list[tuple[str, int]], seconds: float) -> dict[A
             with suppress(OSError):  # nothing in time, or nobody at an address that was asked
                 data, sender = item.recvfrom(_MAX_DATAGRAM)
                 speakers.setdefault(sender, Speaker()).hear(data)
-            # While this machine pauses nothing is heard, so that does not count.
-            left -= min(time.monotonic() - begun, 2 * _LOOK_S)
+            patience.count(time.monotonic() - begun, _LOOK_S)
     return speakers
 
 

@@ -45,4 +45,8 @@ class Patience:
         asked = max(min(seconds, self._left_s), 0.0)
         begun = time.monotonic()
         rest(asked)
-        self._left_s -= max(min(time.monotonic() - begun, 2.0 * asked), asked)
+        self.count(max(time.monotonic() - begun, asked), asked)
+
+    def count(self, passed: float, asked: float) -> None:
+        """Take off what a wait took that was to take so long [s]."""
+        self._left_s -= min(passed, 2.0 * asked)
