@@ -164,9 +164,11 @@ class HostLine:
 
     def _acquire(self, u: int) -> None:
         packets = self._packets
+        if len(packets) < _FEWEST:  # none at all where they came before the clock was set
+            return
         packets.sort()
         span = packets[-1][1] - packets[0][1]
-        if len(packets) < _FEWEST or span < _QUIET_LOCK_NS:
+        if span < _QUIET_LOCK_NS:
             return
         line = supporting_line(packets, self.line.ratio)
         if line is None or not is_credible(line.ratio):

@@ -106,3 +106,16 @@ def test_memory_is_bounded(seed: int) -> None:
         sizes.append(len(pickle.dumps(checked.clock.__getstate__())))
 
     assert max(sizes) < 200_000
+
+
+def test_a_host_clock_set_before_the_lock_takes_nothing_but_time() -> None:
+    """As on a board that starts in the past: the socket still holds packets of the time before."""
+    checked = Promises(ClockConfig(enable_l2_host_sync=False))
+    checked.clock.host_stepped(0, HostNs(0))
+    for number in range(1500):
+        instant = number * 2_000_000
+        if number == 20:
+            checked.clock.host_stepped(10**18, HostNs(10**18 + instant))
+        begun = 10**18 if number >= 60 else 0
+        checked.observe(Stream.IMU, number, instant // 2, begun + instant, 0)
+    assert checked.last[Stream.IMU] > 10**18
