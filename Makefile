@@ -4,7 +4,7 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-BENCHES := $(patsubst tools/bench_%.py,%,$(wildcard tools/bench_*.py))
+BENCHES := $(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py))
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
@@ -41,16 +41,16 @@ format: setup ## put every Python file into the project's format
 	$(PYTHON) -m ruff format .
 
 $(BENCHES:%=bench-%): bench-%: setup
-	$(PYTHON) -m tools.bench_$* $(BENCH_ARGS)
+	$(PYTHON) -m benchmarks.bench_$* $(BENCH_ARGS)
 
 faults: setup ## every fault the virtual L2 can make, and what the driver says to it
-	$(PYTHON) -m tools.faults $(BENCH_ARGS)
+	$(PYTHON) -m benchmarks.faults $(BENCH_ARGS)
 
 soak: setup ## a long run, watched for growth, loss and drift
-	$(PYTHON) -m tools.soak $(BENCH_ARGS)
+	$(PYTHON) -m benchmarks.soak $(BENCH_ARGS)
 
 fuzz: setup ## hostile input for everything that reads input from outside
-	$(PYTHON) -m tools.fuzz $(BENCH_ARGS)
+	$(PYTHON) -m benchmarks.fuzz $(BENCH_ARGS)
 
 clean: ## remove .venv and everything built, measured or cached
 	rm -rf .venv build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \

@@ -9,8 +9,8 @@ import ipaddress
 from dataclasses import dataclass, field
 from typing import Final
 
-from l2lidar_node import wire
-from l2lidar_node.layouts import LAYOUTS
+from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.protocol import wire
 from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 
 MIN_CLOCK_RATIO: Final = 0.5

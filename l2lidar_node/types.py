@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final, NamedTuple, NewType
+from typing import Final, NamedTuple, NewType, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,3 +82,26 @@ class Sweep:
     points: NDArray[np.void]
     packets: int
     missing: int
+
+
+class Datagram(NamedTuple):
+    """Bytes with the host time at which they arrived."""
+
+    data: bytes
+    arrival: HostNs
+
+
+class Transport(Protocol):
+    """Where bytes come from and go to."""
+
+    foreign: int
+    kernel_drops: int
+
+    def receive(self, timeout_s: float) -> list[Datagram]:
+        """Return what has arrived, waiting at most ``timeout_s`` for the first of it."""
+
+    def send(self, frame: bytes) -> None:
+        """Send one frame to the device."""
+
+    def close(self) -> None:
+        """Release what is held; may be called more than once."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from l2lidar_node.layouts import LAYOUTS
+from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.settings import TOPIC, SettingError, setting
 from l2lidar_proc import rotations
 from l2lidar_proc.rotations import F64

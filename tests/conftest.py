@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import hypothesis
 import pytest
 
-from tests.processes import end_all
+from tests.support.processes import end_all
 
 # Before anything imports rclpy. Fast DDS makes its ports from the domain, and those of domains
 # above 101 are in the range that Linux hands out to programs asking for any port.

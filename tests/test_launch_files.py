@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from l2lidar_node.clouds.rings import RINGS
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.rings import RINGS
 from l2lidar_node.ros import topics
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import build

@@ -6,12 +6,12 @@ import pytest
 import yaml
 
 from l2lidar_node.settings import build
-from tools.make_reference import FILES, ROOT, outputs
+from scripts.make_reference import FILES, ROOT, outputs
 
 
 @pytest.mark.parametrize("path", outputs(), ids=lambda path: path.name)
 def test_a_file_that_follows_from_the_settings_is_up_to_date(path):
-    assert path.read_text() == outputs()[path], "run `python -m tools.make_reference`"
+    assert path.read_text() == outputs()[path], "run `python -m scripts.make_reference`"
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from l2lidar_node import wire
 from l2lidar_node.config import FrameConfig
+from l2lidar_node.protocol import wire
 
 ROOT = Path(__file__).resolve().parent.parent
 MESH = ROOT / "meshes" / "l2_lidar.stl"
@@ -54,7 +54,7 @@ def roots(parents):
 
 
 def test_mesh_is_what_its_script_makes(tmp_path):
-    script = runpy.run_path(str(ROOT / "tools" / "make_mesh.py"))
+    script = runpy.run_path(str(ROOT / "benchmarks" / "make_mesh.py"))
     for name in ("first.stl", "second.stl"):
         script["main"]([str(tmp_path / name)])
         assert (tmp_path / name).read_bytes() == MESH.read_bytes()

@@ -10,18 +10,18 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from l2lidar_node.cli.changes import UsageError
+from l2lidar_node.check.consumers import CONSUMERS
+from l2lidar_node.check.findings import Finding, Level, worst
+from l2lidar_node.check.report import as_data, verdict
+from l2lidar_node.check.requirements import Consumer, Use
+from l2lidar_node.check.topics import SourceError, Topics
+from l2lidar_node.check.verdict import judge
 from l2lidar_node.cli.console import out, print_json
 from l2lidar_node.cli.options import JsonOption
-from l2lidar_node.readiness.consumers import CONSUMERS
-from l2lidar_node.readiness.demands import Consumer, Use
-from l2lidar_node.readiness.findings import Finding, Level, worst
-from l2lidar_node.readiness.report import as_data, verdict
-from l2lidar_node.readiness.topics import SourceError, Topics
-from l2lidar_node.readiness.verdict import judge
+from l2lidar_node.cli.set import UsageError
 
 if TYPE_CHECKING:
-    from l2lidar_node.readiness.observation import Observation
+    from l2lidar_node.check.observation import Observation
 
 _COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
 _LISTEN_S: Final = 10.0

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from l2lidar_node.health import Check, Level
+from l2lidar_node.driver.health import Check, Level
 
 out: Final = Console(highlight=False)
 _COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "dim"}

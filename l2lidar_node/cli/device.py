@@ -8,16 +8,18 @@ from concurrent.futures import TimeoutError as NoAnswerError
 from types import TracebackType
 from typing import Final, TypeVar
 
-from l2lidar_node import commands, health, source
 from l2lidar_node.cli.addresses import local_addresses
-from l2lidar_node.cli.patience import Patience
-from l2lidar_node.commands import Command
+from l2lidar_node.cli.timeout import Patience
 from l2lidar_node.config import DriverConfig, NetworkConfig
-from l2lidar_node.driver import Driver, Event
-from l2lidar_node.packets import Parameters
-from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
-from l2lidar_node.session import Session, Tap
+from l2lidar_node.driver import health
+from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.driver.requests import REPEAT_NS, TRIES, Answer
+from l2lidar_node.protocol import commands
+from l2lidar_node.protocol.commands import Command
+from l2lidar_node.protocol.packets import Parameters
 from l2lidar_node.settings import build, values_of
+from l2lidar_node.transport import source
+from l2lidar_node.transport.session import Session, Tap
 from l2lidar_node.types import HostNs
 
 T = TypeVar("T")

@@ -13,15 +13,15 @@ from typing import Annotated, Any, Final
 import typer
 from rich.table import Table
 
-from l2lidar_node import commands, wire
 from l2lidar_node.cli.addresses import hardware_address, local_addresses
 from l2lidar_node.cli.console import out, print_json, say
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.cli.options import JsonOption
-from l2lidar_node.cli.patience import Patience
-from l2lidar_node.framing import Frame, Framer
-from l2lidar_node.packets import Parameters, Version, decode
-from l2lidar_node.transport import TransportError
+from l2lidar_node.cli.timeout import Patience
+from l2lidar_node.protocol import commands, wire
+from l2lidar_node.protocol.framing import Frame, Framer
+from l2lidar_node.protocol.packets import Parameters, Version, decode
+from l2lidar_node.transport.udp import TransportError
 
 _PROBE_S: Final = 0.5
 _LOOK_S: Final = 0.1

@@ -8,21 +8,21 @@ from typing import Final
 
 import typer
 
-from l2lidar_node.cli import changes, readings
-from l2lidar_node.cli.changes import UsageError
+from l2lidar_node.cli import get, set
 from l2lidar_node.cli.check import check
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.cli.discover import discover
 from l2lidar_node.cli.odometry import odometry
 from l2lidar_node.cli.record import convert, record
 from l2lidar_node.cli.replay import replay
-from l2lidar_node.cli.rotation import reset, start, stop
+from l2lidar_node.cli.set import UsageError
+from l2lidar_node.cli.standby import reset, start, stop
 from l2lidar_node.cli.status import info, monitor
 from l2lidar_node.cli.sync_check import sync_check
 from l2lidar_node.cli.view import view
 from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import SettingError
-from l2lidar_node.transport import TransportError
+from l2lidar_node.transport.udp import TransportError
 
 _UNIT: Final = "The unit"
 _DATA: Final = "Its data"
@@ -42,8 +42,8 @@ def app() -> typer.Typer:
     )
     for verb in (discover, info, monitor, start, stop, reset):
         made.command(rich_help_panel=_UNIT)(verb)
-    made.add_typer(readings.app, name="get", rich_help_panel=_UNIT)
-    made.add_typer(changes.app, name="set", rich_help_panel=_UNIT)
+    made.add_typer(get.app, name="get", rich_help_panel=_UNIT)
+    made.add_typer(set.app, name="set", rich_help_panel=_UNIT)
     made.command("sync-check", rich_help_panel=_UNIT)(sync_check)
     for verb in (record, replay, convert, check, odometry, view):
         made.command(rich_help_panel=_DATA)(verb)

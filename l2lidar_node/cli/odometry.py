@@ -10,19 +10,19 @@ import numpy as np
 import typer
 from rich.progress import Progress
 
-from l2lidar_node.cli.changes import UsageError
 from l2lidar_node.cli.console import out, say
 from l2lidar_node.cli.device import DeviceError
+from l2lidar_node.cli.set import UsageError
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.driver import Driver, Event
-from l2lidar_node.pcap import CaptureError, is_capture
-from l2lidar_node.recording import Recording
-from l2lidar_node.replay import feed
+from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.recording.pcap import CaptureError, is_capture
+from l2lidar_node.recording.recording import Recording
+from l2lidar_node.recording.replay import feed
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, ImuSample, Sweep
 
 if TYPE_CHECKING:
-    from l2lidar_proc.offline_odometry import OdometryRun
+    from l2lidar_proc.verbs.odometry import OdometryRun
 
 _CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
 _CAPTURES: Final = (".pcap", ".pcapng", ".cap")
@@ -49,9 +49,9 @@ def odometry(
     The trajectory in TUM format is what evo reads. Of a capture, sweeps of a full turn are used.
     """
     from l2lidar_node.ros.parameter_files import settings_for
-    from l2lidar_proc import offline_odometry
-    from l2lidar_proc.bag import RecordingError
     from l2lidar_proc.odometry_config import OdometryNodeConfig
+    from l2lidar_proc.recording.bag import RecordingError
+    from l2lidar_proc.verbs import odometry
 
     try:
         config = settings_for(params_file, "odometry_node", OdometryNodeConfig)
@@ -69,11 +69,11 @@ def odometry(
                 with source.open("rb") as stream:
                     recording = Recording(stream, l2_ip)
                     taken = _events(recording, source.stat().st_size, progress)
-                    run = offline_odometry.run_events(taken, config)
+                    run = odometry.run_events(taken, config)
             else:
-                run = offline_odometry.run_bag(source, config, progress)
+                run = odometry.run_bag(source, config, progress)
             progress(1.0)
-        files = offline_odometry.write(run, folder)
+        files = odometry.write(run, folder)
     except RecordingError as error:
         raise DeviceError(str(error)) from None
     except CaptureError as error:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from l2lidar_node.readiness.observation import Gathering, Observation, Qos
-from l2lidar_node.readiness.topics import CLOUD, IMU, TRANSFORMS, SourceError, Topics, choose
-from l2lidar_proc import bag
+from l2lidar_node.check.observation import Gathering, Observation, Qos
+from l2lidar_node.check.topics import CLOUD, IMU, TRANSFORMS, SourceError, Topics, choose
+from l2lidar_proc.recording import bag
 
 _KINDS: Final = (CLOUD, IMU, TRANSFORMS)
 

@@ -11,11 +11,11 @@ from typing import Annotated, Final
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-from l2lidar_node import wire
 from l2lidar_node.cli.console import out, say
 from l2lidar_node.cli.device import DeviceError
-from l2lidar_node.pcap import CaptureError
-from l2lidar_node.recording import Received, Recording
+from l2lidar_node.protocol import wire
+from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.recording import Received, Recording
 
 _UNSWEPT: Final = 64  # commands of the driver that are thrown away between two looks
 _SHOW_S: Final = 0.1

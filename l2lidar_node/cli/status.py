@@ -11,15 +11,15 @@ from typing import Annotated, Any
 import typer
 from rich.live import Live
 
-from l2lidar_node import health
 from l2lidar_node.cli.console import as_data, facts, judgement, out, print_json
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.options import JsonOption, with_network
-from l2lidar_node.cli.patience import Patience, rest
 from l2lidar_node.cli.stored import work_mode_text
+from l2lidar_node.cli.timeout import Patience, rest
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver import Driver
-from l2lidar_node.metadata import metadata
+from l2lidar_node.driver import health
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.driver.metadata import metadata
 
 _WAIT_S = 3.0
 

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from l2lidar_node import wire
-from l2lidar_node.wire import WorkMode
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import WorkMode
 
 _NAMES: Final = {bit.name.lower(): bit for bit in WorkMode if bit.name}
 _AT_ONCE: Final = WorkMode.WIDE_FOV | WorkMode.IMU_OFF

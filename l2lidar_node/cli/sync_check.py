@@ -17,9 +17,9 @@ from l2lidar_node.cli.options import JsonOption, with_network
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.clock.envelope import supporting_line
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver import Driver, Event
-from l2lidar_node.framing import Frame, Framer
-from l2lidar_node.packets import ImuPacket, PointPacket, decode
+from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.protocol.framing import Frame, Framer
+from l2lidar_node.protocol.packets import ImuPacket, PointPacket, decode
 from l2lidar_node.types import HostNs, Stream
 
 _FEWEST: Final = 50

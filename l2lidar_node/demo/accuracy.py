@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.emulator.results import Results
-from l2lidar_node.wire import PacketType
+from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.protocol.wire import PacketType
 
 F8 = NDArray[np.float64]
 

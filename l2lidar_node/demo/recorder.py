@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
-from l2lidar_node.bag import BagFile
+from l2lidar_node.recording.bag import BagFile
 
 _TOPICS: Final[dict[str, tuple[type, str, bool]]] = {
     "/points": (PointCloud2, "sensor_msgs/msg/PointCloud2", False),

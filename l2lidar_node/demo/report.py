@@ -11,8 +11,8 @@ from rich.table import Table
 
 from l2lidar_node.demo import accuracy, picture
 from l2lidar_node.demo.observer import Observer
-from l2lidar_node.emulator.results import Results
-from l2lidar_node.wire import PacketType
+from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.protocol.wire import PacketType
 
 _SPACING_MS: Final = {"/points": 229.8, "/imu/data": 4.0}  # a cloud per turn of the head
 _TOLERANCE: Final = 0.02

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Final
 
 from l2lidar_node.emulator.config import DeviceConfig
-from l2lidar_node.emulator.device import Link, VirtualL2
-from l2lidar_node.emulator.firmware import version_payload
-from l2lidar_node.emulator.flash import Flash
-from l2lidar_node.emulator.ledger import Ledger
-from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.link.port import Port, SerialPort, UdpPort
 from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.port import Port, SerialPort, UdpPort
-from l2lidar_node.emulator.sources import VIEW, PointSource
-from l2lidar_node.emulator.studio import Studio
-from l2lidar_node.wire import WorkMode
+from l2lidar_node.emulator.ray_cast_worker import Studio
+from l2lidar_node.emulator.truth.packet_log import Ledger
+from l2lidar_node.emulator.unit.device import Link, VirtualL2
+from l2lidar_node.emulator.unit.firmware import version_payload
+from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.sources import VIEW, PointSource
+from l2lidar_node.protocol.wire import WorkMode
 
 WORLDLESS: Final = ("pattern", "none")
 """Worlds that are not ray-cast: a shell, and nothing at all."""

@@ -24,16 +24,16 @@ from l2lidar_node.emulator.config import (
     IdentityConfig,
     PowerConfig,
 )
-from l2lidar_node.emulator.device import Link, VirtualL2
-from l2lidar_node.emulator.flash import Flash
-from l2lidar_node.emulator.inertial import ImuNoise
+from l2lidar_node.emulator.link.port import PortError
 from l2lidar_node.emulator.options import group, with_options
 from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.port import PortError
-from l2lidar_node.emulator.results import write_ledger
-from l2lidar_node.emulator.returns import RangeNoise
+from l2lidar_node.emulator.ray_cast_worker import Studio, StudioError
 from l2lidar_node.emulator.server import MAX_SPEED, Server
-from l2lidar_node.emulator.studio import Studio, StudioError
+from l2lidar_node.emulator.truth.results import write_ledger
+from l2lidar_node.emulator.unit.device import Link, VirtualL2
+from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.emulator.unit.inertial import ImuNoise
+from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.files import write_whole
 from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import Setting, Value, settings_of, values_of

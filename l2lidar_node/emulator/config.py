@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Final
 
-from l2lidar_node import wire
+from l2lidar_node.protocol import wire
 from l2lidar_node.settings import Form, setting
 
 _PRODUCT: Final = Form(re.compile(r"[ -~]{1,23}"), "a product name", "1 to 23 ASCII characters")

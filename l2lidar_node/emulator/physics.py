@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from l2lidar_node.emulator import gaits, scenes
-from l2lidar_node.emulator.inertial import ImuNoise, Inertial
-from l2lidar_node.emulator.motion import MOUNTS, Motion, from_tum
-from l2lidar_node.emulator.returns import RangeNoise
-from l2lidar_node.emulator.scanner import Scanner
-from l2lidar_node.emulator.units import UNITS
-from l2lidar_node.emulator.world import World
+from l2lidar_node.emulator.motion import trajectories
+from l2lidar_node.emulator.motion.motion import MOUNTS, Motion, from_tum
+from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
+from l2lidar_node.emulator.unit.returns import RangeNoise
+from l2lidar_node.emulator.unit.scanner import Scanner
+from l2lidar_node.emulator.unit.units import UNITS
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.emulator.world.world import World
 from l2lidar_node.settings import setting
 
 
@@ -82,10 +83,10 @@ def assemble(config: PhysicsConfig) -> Physics:
     if config.mount_rpy_deg:
         roll, pitch, yaw = np.deg2rad(config.mount_rpy_deg).tolist()
         mount = (roll, pitch, yaw)
-    if config.motion not in gaits.MOTIONS and _is_path(config.motion):
+    if config.motion not in trajectories.MOTIONS and _is_path(config.motion):
         motion = from_tum(config.motion, rest_s=config.rest_s, mount=mount)
     else:
-        motion = gaits.make(
+        motion = trajectories.make(
             config.motion,
             scene,
             speed=config.speed,

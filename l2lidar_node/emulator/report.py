@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 from l2lidar_node.emulator.assembly import WORLDLESS
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig
-from l2lidar_node.emulator.device import VirtualL2
-from l2lidar_node.emulator.flash import Flash
+from l2lidar_node.emulator.link.port import Port
 from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.port import Port
 from l2lidar_node.emulator.server import Server
+from l2lidar_node.emulator.unit.device import VirtualL2
+from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.settings import values_of
-from l2lidar_node.wire import PacketType
 
 
 def beginning(

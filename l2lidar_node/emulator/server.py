@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from l2lidar_node.emulator.device import VirtualL2
-from l2lidar_node.emulator.flash import Flash
-from l2lidar_node.emulator.lateness import Lateness
-from l2lidar_node.emulator.port import Port
+from l2lidar_node.emulator.latency import Lateness
+from l2lidar_node.emulator.link.port import Port
+from l2lidar_node.emulator.unit.device import VirtualL2
+from l2lidar_node.emulator.unit.flash import Flash
 
 _LONGEST_WAIT_S: Final = 0.05  # to notice a stop or a held-back packet
 _CHUNK_NS: Final = 20_000_000  # of the unit's time between two looks at the receiver

@@ -16,8 +16,8 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
-from l2lidar_node import wire
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.protocol import wire
 from l2lidar_node.ros.launch_arguments import ARGUMENTS, PACKAGE, share
 from l2lidar_node.ros.parameter_files import parameter_file, parameters_for
 from l2lidar_node.ros.topics import DRIVER_TOPICS, SHOWN_TOPICS

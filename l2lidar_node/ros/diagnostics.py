@@ -12,12 +12,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from l2lidar_node import health
-from l2lidar_node.driver import Driver
-from l2lidar_node.loop import Loop
-from l2lidar_node.metadata import metadata
+from l2lidar_node.driver import health
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.driver.metadata import metadata
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.ros.program import StartError
+from l2lidar_node.transport.loop import Loop
 from l2lidar_node.types import HostNs
 
 PERIOD_S = 1.0

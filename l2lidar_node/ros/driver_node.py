@@ -14,12 +14,12 @@ from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
-from l2lidar_node import layouts
 from l2lidar_node.clock import ClockEvent
+from l2lidar_node.clouds import layouts
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.driver import Driver, Event, Silence
-from l2lidar_node.packets import Parameters, Version
-from l2lidar_node.requests import REPEAT_NS, TRIES, Answer
+from l2lidar_node.driver.driver import Driver, Event, Silence
+from l2lidar_node.driver.requests import REPEAT_NS, TRIES, Answer
+from l2lidar_node.protocol.packets import Parameters, Version
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
 from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.driver_source import open_loop

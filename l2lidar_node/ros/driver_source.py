@@ -9,18 +9,18 @@ import rclpy
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from l2lidar_node import source
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.driver import Driver, Event
-from l2lidar_node.loop import Loop
-from l2lidar_node.pcap import CaptureError
-from l2lidar_node.playback import Playback
-from l2lidar_node.recorder import Recorder, free_name
-from l2lidar_node.recording import Recording
+from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.playback import Playback
+from l2lidar_node.recording.recorder import Recorder, free_name
+from l2lidar_node.recording.recording import Recording
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.ros.program import StartError
-from l2lidar_node.session import Session
-from l2lidar_node.transport import TransportError
+from l2lidar_node.transport import source
+from l2lidar_node.transport.loop import Loop
+from l2lidar_node.transport.session import Session
+from l2lidar_node.transport.udp import TransportError
 from l2lidar_node.types import HostNs
 
 _CLOCK_DEPTH = 10

@@ -16,20 +16,20 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
-from l2lidar_node.layouts import LAYOUTS
+from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.ros.conversions import CloudTemplate, from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.types import HostNs
-from l2lidar_proc import report
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
-from l2lidar_proc.pipeline import Deskewed, Pipeline
+from l2lidar_proc.deskew import report
+from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
+from l2lidar_proc.motion.velocity import carried_over
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
-from l2lidar_proc.velocity import carried_over
 
 _RELIABILITY = {
     "best_effort": ReliabilityPolicy.BEST_EFFORT,

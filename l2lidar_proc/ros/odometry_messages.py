@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.types import HostNs
 from l2lidar_proc import rotations
-from l2lidar_proc.base_frame import BaseMotion
+from l2lidar_proc.odometry.base_frame import BaseMotion
 
 F64 = NDArray[np.float64]
 

@@ -22,13 +22,15 @@ from l2lidar_node.files import write_whole
 from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_proc import map_file, odometry_health, rotations, trajectory
-from l2lidar_proc.base_frame import BaseFrame
+from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError, to_sweep
-from l2lidar_proc.odometry import Odometry
+from l2lidar_proc.odometry import health
+from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.odometry_config import OdometryNodeConfig
-from l2lidar_proc.odometry_estimate import OdometryEstimate
-from l2lidar_proc.odometry_pipeline import OdometryPipeline
+from l2lidar_proc.recording import map_file, trajectory
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
@@ -263,7 +265,7 @@ class OdometryNode(Node):
     def _diagnose(self) -> None:
         since = self._pipeline.sweeps - self._looked_at
         self._looked_at = self._pipeline.sweeps
-        level, text, values = odometry_health.judged(
+        level, text, values = health.judged(
             self._pipeline.last,
             self._pipeline.sweeps,
             since,

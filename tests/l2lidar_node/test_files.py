@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2lidar_node.bag import BagFile
-from l2lidar_node.emulator import results, truth
-from l2lidar_node.emulator.ledger import Ledger
-from l2lidar_node.emulator.motion import from_tum
+from l2lidar_node.emulator.motion.motion import from_tum
+from l2lidar_node.emulator.truth import results, truth
+from l2lidar_node.emulator.truth.packet_log import Ledger
 from l2lidar_node.files import whole, write_whole
-from l2lidar_proc import map_file, offline_odometry
-from l2lidar_proc.trajectory import Trajectory
+from l2lidar_node.recording.bag import BagFile
+from l2lidar_proc.recording import map_file
+from l2lidar_proc.recording.trajectory import Trajectory
+from l2lidar_proc.verbs import odometry
 
 ROOT = Path(__file__).parents[2]
 needs_open3d = pytest.mark.skipif(find_spec("open3d") is None, reason="needs open3d")
@@ -61,8 +62,8 @@ def test_the_name_to_write_to_tells_the_format(tmp_path: Path) -> None:
 
 
 def _way(folder: Path) -> None:
-    run = offline_odometry.OdometryRun(Trajectory().poses, POINTS, 0, Counter(), Counter())
-    offline_odometry.write(run, folder)
+    run = odometry.OdometryRun(Trajectory().poses, POINTS, 0, Counter(), Counter())
+    odometry.write(run, folder)
 
 
 def _a_way(folder: Path) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import ended_with_the_test
+from tests.support.processes import ended_with_the_test
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 120.0

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.config import ProcConfig
-from l2lidar_proc.pipeline import Pipeline
-from tests.l2lidar_proc.analytic import EPOCH, Motion, at, seen
+from l2lidar_proc.deskew.pipeline import Pipeline
+from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, seen
 
 MS = 1_000_000
 POINTS = seen(Motion(), 0, 0.1, 0, count=50)[0]

@@ -18,20 +18,20 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from l2lidar_node import wire
 from l2lidar_node.config import DriverConfig, NetworkConfig
-from l2lidar_node.driver import Driver, Event
-from l2lidar_node.recorder import Recorder, endpoints, free_name
-from l2lidar_node.recording import Received, Recording
-from l2lidar_node.replay import events
-from l2lidar_node.session import Session
+from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import WorkMode
+from l2lidar_node.recording.recorder import Recorder, endpoints, free_name
+from l2lidar_node.recording.recording import Received, Recording
+from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
-from l2lidar_node.transport import UdpTransport
+from l2lidar_node.transport.session import Session
+from l2lidar_node.transport.udp import UdpTransport
 from l2lidar_node.types import HostNs, ImuSample, Sweep
-from l2lidar_node.wire import WorkMode
-from tests.build import SHARED_DATA
 from tests.l2lidar_node.cli.conftest import LIMIT_S, Run, Unit, free_port
-from tests.l2lidar_node.virtual_host import essence
+from tests.l2lidar_node.driver.virtual_host import essence
+from tests.support.build import SHARED_DATA
 
 ROOT = Path(__file__).parents[3]
 

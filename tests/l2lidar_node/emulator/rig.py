@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from l2lidar_node import wire
 from l2lidar_node.emulator.config import DeviceConfig, PowerConfig
-from l2lidar_node.emulator.device import Link, VirtualL2
-from l2lidar_node.emulator.flash import Flash
-from l2lidar_node.emulator.ledger import Ledger
-from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
-from l2lidar_node.wire import PacketType
+from l2lidar_node.emulator.truth.packet_log import Ledger
+from l2lidar_node.emulator.unit.device import Link, VirtualL2
+from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import PacketType
 
 S = 1_000_000_000
 MS = 1_000_000

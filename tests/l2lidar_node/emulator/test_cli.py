@@ -17,18 +17,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2lidar_node import wire
-from l2lidar_node.emulator import tum
 from l2lidar_node.emulator.cli import main
 from l2lidar_node.emulator.config import DeviceConfig
-from l2lidar_node.emulator.flash import Flash
-from l2lidar_node.emulator.ledger import Fault
+from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
-from l2lidar_node.emulator.results import Results
+from l2lidar_node.emulator.truth.packet_log import Fault
+from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.settings import build, settings_of
-from l2lidar_node.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import command, read
-from tests.processes import ended_with_the_test
+from tests.support.processes import ended_with_the_test
 
 LIMIT_S = 120.0
 ROOT = Path(__file__).parents[3]

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2lidar_node import wire
 from l2lidar_node.emulator.config import (
     AddressConfig,
     DelayConfig,
@@ -16,12 +15,13 @@ from l2lidar_node.emulator.config import (
     IdentityConfig,
     PowerConfig,
 )
-from l2lidar_node.emulator.device import Link, VirtualL2
-from l2lidar_node.emulator.flash import Flash, network_payload
-from l2lidar_node.emulator.inbox import Inbox
-from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.device import Link, VirtualL2
+from l2lidar_node.emulator.unit.flash import Flash, network_payload
+from l2lidar_node.emulator.unit.inbox import Inbox
+from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.settings import SettingError
-from l2lidar_node.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import MS, READY, Bench, S, acks, command, identity, read
 
 OK, CRC_ERROR, HEADER_ERROR, BLOCK_ERROR, NOT_READY = 1, 2, 3, 4, 5

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2lidar_node import wire
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig
-from l2lidar_node.emulator.damage import HOSTILE_SIZES
-from l2lidar_node.emulator.datagram import Datagram, Piece
-from l2lidar_node.emulator.flash import Flash
-from l2lidar_node.emulator.ledger import Fault, Ledger
-from l2lidar_node.emulator.path import Path
-from l2lidar_node.wire import WorkMode
+from l2lidar_node.emulator.link.damage import HOSTILE_SIZES
+from l2lidar_node.emulator.link.datagram import Datagram, Piece
+from l2lidar_node.emulator.link.path import Path
+from l2lidar_node.emulator.truth.packet_log import Fault, Ledger
+from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import (
     MS,
     READY,

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node import wire
-from l2lidar_node.emulator import gaits, scenes
-from l2lidar_node.emulator.inertial import ImuNoise, Inertial
-from l2lidar_node.emulator.motion import STANDARD_GRAVITY
-from l2lidar_node.emulator.units import UNITS
+from l2lidar_node.emulator.motion import trajectories
+from l2lidar_node.emulator.motion.motion import STANDARD_GRAVITY
+from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
+from l2lidar_node.emulator.unit.units import UNITS
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.protocol import wire
 
 ROOM = scenes.make("room")
 CLEAN = ImuNoise.clean()
@@ -20,7 +21,7 @@ RATE = 250.0
 def inertial(
     motion: str, noise: ImuNoise = CLEAN, *, seed: int = 0, unit: str = "a", **more: object
 ) -> Inertial:
-    return Inertial(gaits.make(motion, ROOM, **more), noise, seed, UNITS[unit])  # type: ignore[arg-type]
+    return Inertial(trajectories.make(motion, ROOM, **more), noise, seed, UNITS[unit])  # type: ignore[arg-type]
 
 
 def orientation(samples: np.ndarray) -> Rotation:
@@ -151,7 +152,7 @@ def test_the_gyro_has_lines_at_the_heads_frequency_and_its_double(
 
 
 def test_the_gyros_line_has_a_fixed_phase_to_the_head() -> None:
-    from l2lidar_node.emulator.head import mean_angle
+    from l2lidar_node.emulator.unit.head import mean_angle
 
     noise = ImuNoise(gyro_line=0.1, gyro_noise=0.0)
     phases = []

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.emulator import gaits, scenes, truth, tum
-from l2lidar_node.emulator.motion import (
+from l2lidar_node.emulator.motion import trajectories, tum
+from l2lidar_node.emulator.motion.motion import (
     MOUNTS,
     STANDARD_GRAVITY,
     Motion,
@@ -19,8 +19,10 @@ from l2lidar_node.emulator.motion import (
     mount_quaternion,
     rpy_quaternions,
 )
-from l2lidar_node.emulator.spline import PoseSpline, quaternion_product, rotation_matrices
-from l2lidar_node.emulator.world import World
+from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product, rotation_matrices
+from l2lidar_node.emulator.truth import truth
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.emulator.world.world import World
 
 ROOM = scenes.make("room")
 
@@ -44,10 +46,10 @@ def loop_file(folder: Path, count: int = 200) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", gaits.MOTIONS)
+@pytest.mark.parametrize("name", trajectories.MOTIONS)
 @pytest.mark.parametrize("mount", ["upright", "forward"])
 def test_derivatives_agree_with_differences(name: str, mount: str) -> None:
-    motion = gaits.make(name, ROOM, mount=mount, rest_s=0.5)
+    motion = trajectories.make(name, ROOM, mount=mount, rest_s=0.5)
     t = np.linspace(0.2, 6.0, 300)
     h = 1e-4
     here = motion.kinematics(t)
@@ -68,9 +70,9 @@ def test_derivatives_agree_with_differences(name: str, mount: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", gaits.MOTIONS)
+@pytest.mark.parametrize("name", trajectories.MOTIONS)
 def test_a_motion_begins_with_a_rest_and_speeds_up_smoothly(name: str) -> None:
-    motion = gaits.make(name, ROOM, rest_s=2.0)
+    motion = trajectories.make(name, ROOM, rest_s=2.0)
     positions, quaternions = motion.poses(np.array([-3.0, 0.0, 1.0, 2.0]))
     np.testing.assert_array_equal(positions, np.tile(positions[0], (4, 1)))
     np.testing.assert_array_equal(quaternions, np.tile(quaternions[0], (4, 1)))
@@ -85,7 +87,7 @@ def test_a_motion_begins_with_a_rest_and_speeds_up_smoothly(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["spin", "walk", "trot", "drone"])
 def test_a_lap_closes_without_a_seam(name: str) -> None:
-    motion = gaits.make(name, ROOM)
+    motion = trajectories.make(name, ROOM)
     begin = motion.rest_s + motion.ramp_s / 2 + motion.lap_s
     around = motion.kinematics(begin + np.linspace(-2e-3, 2e-3, 41))
 
@@ -98,14 +100,14 @@ def test_a_lap_closes_without_a_seam(name: str) -> None:
     ("name", "speed"), [("walk", 0.35), ("walk", 1.2), ("trot", 0.8), ("drone", 2.0)]
 )
 def test_the_asked_speed_is_kept(name: str, speed: float) -> None:
-    motion = gaits.make(name, ROOM, speed=speed)
+    motion = trajectories.make(name, ROOM, speed=speed)
     moving = motion.kinematics(np.arange(4.0, lap_of(motion), 0.01))
 
     assert np.linalg.norm(moving.velocity, axis=1).mean() == pytest.approx(speed, rel=0.08)
 
 
 def test_spin_turns_at_its_rate_about_a_near_axis() -> None:
-    motion = gaits.make("spin", ROOM, speed=3.0)
+    motion = trajectories.make("spin", ROOM, speed=3.0)
     moving = motion.kinematics(np.arange(4.0, 8.0, 0.01))
 
     np.testing.assert_allclose(moving.angular_velocity, np.tile([0, 0, 3.0], (400, 1)), atol=1e-6)
@@ -117,9 +119,9 @@ def test_no_motion_collides_with_a_scene(scene_name: str) -> None:
     pytest.importorskip("open3d")
     scene = scenes.make(scene_name)
     world = World(scene.triangles)
-    for name in gaits.MOTIONS:
+    for name in trajectories.MOTIONS:
         for seed in (0, 1):
-            motion = gaits.make(name, scene, seed=seed)
+            motion = trajectories.make(name, scene, seed=seed)
             positions, _ = motion.poses(np.arange(0.0, lap_of(motion), 0.05))
             assert world.clearance(positions).min() > 0.2, (name, seed)
 
@@ -128,7 +130,8 @@ def test_another_seed_is_another_walk() -> None:
     t = np.array([10.0])
 
     assert not np.allclose(
-        gaits.make("walk", ROOM, seed=1).poses(t)[0], gaits.make("walk", ROOM, seed=2).poses(t)[0]
+        trajectories.make("walk", ROOM, seed=1).poses(t)[0],
+        trajectories.make("walk", ROOM, seed=2).poses(t)[0],
     )
 
 
@@ -137,7 +140,7 @@ def test_another_seed_is_another_walk() -> None:
 )
 def test_bad_requests_are_refused(name: str, speed: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        gaits.make(name, ROOM, speed=speed)
+        trajectories.make(name, ROOM, speed=speed)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +157,7 @@ def test_bad_requests_are_refused(name: str, speed: float, message: str) -> None
 def test_a_mount_turns_gravity_in_the_cloud_frame(
     mount: str | tuple[float, float, float], up: tuple[float, float, float]
 ) -> None:
-    motion = gaits.make("still", ROOM, mount=mount)
+    motion = trajectories.make("still", ROOM, mount=mount)
 
     force = motion.kinematics(np.zeros(1)).specific_force()[0]
 
@@ -169,7 +172,10 @@ def test_the_forward_mount_looks_ahead() -> None:
 
 def test_a_mount_changes_the_orientation_but_not_the_place() -> None:
     t = np.arange(3.0, 9.0, 0.1)
-    plain, mounted = gaits.make("walk", ROOM), gaits.make("walk", ROOM, mount=(0.3, -0.4, 1.1))
+    plain, mounted = (
+        trajectories.make("walk", ROOM),
+        trajectories.make("walk", ROOM, mount=(0.3, -0.4, 1.1)),
+    )
 
     np.testing.assert_allclose(plain.poses(t)[0], mounted.poses(t)[0], atol=1e-12)
     expected = rotation(plain.poses(t)[1]) * Rotation.from_euler("ZYX", [1.1, -0.4, 0.3])
@@ -301,7 +307,7 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
 
 
 def test_the_true_trajectory_is_written_in_host_time(tmp_path: Path) -> None:
-    motion = gaits.make("trot", ROOM)
+    motion = trajectories.make("trot", ROOM)
     t = np.arange(0.0, 6.0, 0.01)
     origin = 1_750_000_000_000_000_001
     path = tmp_path / "truth.tum"

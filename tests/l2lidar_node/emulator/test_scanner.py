@@ -7,15 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from l2lidar_node import wire
-from l2lidar_node.emulator import gaits, scenes
-from l2lidar_node.emulator.motion import Motion
-from l2lidar_node.emulator.returns import RangeNoise, noise_sigma
-from l2lidar_node.emulator.scanner import TWO_D_PERIOD_S, Scan, Scanner
-from l2lidar_node.emulator.shapes import box
-from l2lidar_node.emulator.truth import into_cloud
-from l2lidar_node.emulator.units import UNITS
-from l2lidar_node.emulator.world import World
+from l2lidar_node.emulator.motion import trajectories
+from l2lidar_node.emulator.motion.motion import Motion
+from l2lidar_node.emulator.truth.truth import into_cloud
+from l2lidar_node.emulator.unit.returns import RangeNoise, noise_sigma
+from l2lidar_node.emulator.unit.scanner import TWO_D_PERIOD_S, Scan, Scanner
+from l2lidar_node.emulator.unit.units import UNITS
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.emulator.world.shapes import box
+from l2lidar_node.emulator.world.world import World
+from l2lidar_node.protocol import wire
 
 pytest.importorskip("open3d")
 
@@ -26,11 +27,11 @@ HALF_STEP_M = 0.000978 / 2
 
 
 def still() -> Motion:
-    return gaits.make("still", scenes.make("box"), rest_s=0.0)
+    return trajectories.make("still", scenes.make("box"), rest_s=0.0)
 
 
 def scanner(motion: str = "walk", noise: RangeNoise = CLEAN, **more: object) -> Scanner:
-    return Scanner(ROOM_WORLD, gaits.make(motion, ROOM), noise=noise, **more)  # type: ignore[arg-type]
+    return Scanner(ROOM_WORLD, trajectories.make(motion, ROOM), noise=noise, **more)  # type: ignore[arg-type]
 
 
 def decode_3d(packet: np.void, j: int) -> tuple[float, float, float]:
@@ -87,7 +88,7 @@ def _with_range(packet: np.void, j: int, raw: int) -> np.void:
 
 def test_hits_lie_on_the_walls_of_a_box() -> None:
     scene = scenes.make("box")
-    motion = gaits.make("trot", scene)
+    motion = trajectories.make("trot", scene)
     scan = Scanner(World(scene.triangles), motion, noise=CLEAN).scan(900, 20)
 
     gap = np.abs(np.stack([np.abs(scan.hits[..., 0]) - 3.0, np.abs(scan.hits[..., 1]) - 2.5,
@@ -287,7 +288,7 @@ def test_dark_and_distant_surfaces_do_not_return() -> None:
 
 def test_nothing_returns_from_the_sky() -> None:
     scene = scenes.make("yard")
-    motion = gaits.make("walk", scene)
+    motion = trajectories.make("walk", scene)
     scan = Scanner(World(scene.triangles, scene.reflectivity), motion).scan(800, 50)
 
     sky = np.isinf(scan.rays["distance"])

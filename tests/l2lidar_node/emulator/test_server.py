@@ -13,17 +13,17 @@ from collections.abc import Iterator
 
 import pytest
 
-from l2lidar_node import wire
 from l2lidar_node.demo.processes import free_udp_ports
-from l2lidar_node.emulator import backlog
 from l2lidar_node.emulator.config import AddressConfig, DeviceConfig, FaultConfig, IdentityConfig
-from l2lidar_node.emulator.device import Link, VirtualL2
-from l2lidar_node.emulator.flash import Flash, Network, network_payload
-from l2lidar_node.emulator.lateness import Lateness
-from l2lidar_node.emulator.pattern import PatternScanner, StillInertial
-from l2lidar_node.emulator.port import Port, PortError, SerialPort, UdpPort
+from l2lidar_node.emulator.latency import Lateness
+from l2lidar_node.emulator.link import backlog
+from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort
 from l2lidar_node.emulator.server import MAX_SPEED, Server
-from l2lidar_node.wire import WorkMode
+from l2lidar_node.emulator.unit.device import Link, VirtualL2
+from l2lidar_node.emulator.unit.flash import Flash, Network, network_payload
+from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import READY, Frame, acks, command, identity, read
 
 LIMIT_S = 60.0

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from l2lidar_node.emulator import gaits, scenes
+from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
-from l2lidar_node.emulator.returns import RangeNoise
-from l2lidar_node.emulator.scanner import Scan, Scanner, local_rays
-from l2lidar_node.emulator.truth import into_cloud, undistorted
-from l2lidar_node.emulator.world import World
+from l2lidar_node.emulator.truth.truth import into_cloud, undistorted
+from l2lidar_node.emulator.unit.returns import RangeNoise
+from l2lidar_node.emulator.unit.scanner import Scan, Scanner, local_rays
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.emulator.world.world import World
 from l2lidar_node.settings import SettingError, build
 
 pytest.importorskip("open3d")
@@ -27,7 +28,7 @@ def decoded(scan: Scan) -> np.ndarray:
 
 
 def test_a_still_sensors_cloud_is_the_decoded_one() -> None:
-    motion = gaits.make("still", SCENE, mount="tilted")
+    motion = trajectories.make("still", SCENE, mount="tilted")
     scan = Scanner(WORLD, motion).scan(0, 30)
 
     np.testing.assert_allclose(
@@ -36,7 +37,7 @@ def test_a_still_sensors_cloud_is_the_decoded_one() -> None:
 
 
 def test_a_moving_sensors_cloud_is_distorted() -> None:
-    motion = gaits.make("walk", SCENE, speed=1.2)
+    motion = trajectories.make("walk", SCENE, speed=1.2)
     scan = Scanner(WORLD, motion, noise=RangeNoise.clean()).scan(1200, 50)
     exact = undistorted(scan, motion, float(scan.times_s[0]), measured=True)
 
@@ -46,7 +47,7 @@ def test_a_moving_sensors_cloud_is_distorted() -> None:
 
 
 def test_measured_and_surface_points_differ_by_the_noise() -> None:
-    motion = gaits.make("trot", SCENE)
+    motion = trajectories.make("trot", SCENE)
     scan = Scanner(WORLD, motion, noise=RangeNoise(divergence_mrad=0.0)).scan(1000, 30)
     t = float(scan.times_s[10])
     difference = undistorted(scan, motion, t, measured=True) - undistorted(scan, motion, t)
@@ -59,7 +60,7 @@ def test_measured_and_surface_points_differ_by_the_noise() -> None:
 
 
 def test_the_reference_instant_moves_the_cloud_rigidly() -> None:
-    motion = gaits.make("drone", SCENE)
+    motion = trajectories.make("drone", SCENE)
     scan = Scanner(WORLD, motion, noise=RangeNoise.clean()).scan(1500, 5)
     early, late = (undistorted(scan, motion, t).reshape(-1, 3) for t in (7.0, 7.2))
 
@@ -71,14 +72,14 @@ def test_the_reference_instant_moves_the_cloud_rigidly() -> None:
 
 
 def test_the_origin_of_the_cloud_frame_is_where_the_motion_says() -> None:
-    motion = gaits.make("walk", SCENE)
+    motion = trajectories.make("walk", SCENE)
     positions, _ = motion.poses(np.array([6.5]))
 
     np.testing.assert_allclose(into_cloud(positions, motion, 6.5), [[0, 0, 0]], atol=1e-12)
 
 
 def test_slots_have_their_own_instants() -> None:
-    motion = gaits.make("still", SCENE)
+    motion = trajectories.make("still", SCENE)
     scan = Scanner(WORLD, motion).scan(40, 2)
 
     assert scan.first == 40

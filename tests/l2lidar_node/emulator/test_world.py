@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2lidar_node.emulator import gaits, scenes
-from l2lidar_node.emulator.shapes import box, cone, ellipsoid, placed
-from l2lidar_node.emulator.world import World
+from l2lidar_node.emulator.motion import trajectories
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.emulator.world.shapes import box, cone, ellipsoid, placed
+from l2lidar_node.emulator.world.world import World
 
 pytest.importorskip("open3d")
 
@@ -258,7 +259,7 @@ def test_any_world_has_a_way_where_there_is_room() -> None:
 
     scene = scenes.of_world(world)
 
-    motion = gaits.make("walk", scene)
+    motion = trajectories.make("walk", scene)
     positions, _ = motion.poses(np.arange(0.0, 40.0, 0.1))
     assert world.clearance(positions).min() > 0.5
     assert (positions[:, 0] > 5.0).all()

@@ -18,8 +18,8 @@ from std_srvs.srv import SetBool
 
 from l2lidar_node.demo.processes import assigned, free_udp_ports
 from l2lidar_node.ros.conversions import from_cloud
-from tests.build import NS, REAL_L2, frames_3d, points_3d, real_capture
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
+from tests.support.build import NS, REAL_L2, frames_3d, points_3d, real_capture
 
 pytestmark = pytest.mark.ros
 
@@ -245,7 +245,7 @@ def test_a_real_recording_comes_out_at_its_recorded_points(rig: Rig) -> None:
 
 def test_a_driver_whose_receiving_thread_fails_ends_and_says_why(rig: Rig) -> None:
     code = (
-        "import sys; from l2lidar_node.driver import Driver\n"
+        "import sys; from l2lidar_node.driver.driver import Driver\n"
         "from l2lidar_node.ros import driver_node\n"
         "def fail(self, *arguments): raise RuntimeError('no idea')\n"
         "Driver.tick = fail\n"

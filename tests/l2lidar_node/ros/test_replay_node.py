@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from l2lidar_node.demo.processes import Program, assigned
-from l2lidar_node.recording import Recording
+from l2lidar_node.recording.recording import Recording
 from l2lidar_node.ros.conversions import from_time
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
 

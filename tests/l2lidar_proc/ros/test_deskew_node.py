@@ -20,7 +20,7 @@ from l2lidar_node.ros.conversions import from_cloud, from_time, to_time  # noqa:
 from l2lidar_node.settings import SettingError  # noqa: E402
 from l2lidar_proc.ros import deskew_node  # noqa: E402
 from l2lidar_proc.ros.deskew_node import DeskewNode  # noqa: E402
-from tests.l2lidar_proc.analytic import Motion, at, rms, seen, xyz  # noqa: E402
+from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz  # noqa: E402
 from tests.l2lidar_proc.ros.bench import FRAME, IMU_FRAME, Bench  # noqa: E402
 
 pytestmark = pytest.mark.ros

@@ -16,9 +16,9 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_cloud, from_time  # noqa: E402
 from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
-from tests.l2lidar_proc.odometry_world import recording  # noqa: E402
+from tests.l2lidar_proc.odometry.odometry_world import recording  # noqa: E402
 from tests.l2lidar_proc.ros.bench import FRAME, LATCHED, Bench  # noqa: E402
-from tools.odometry_runs import sweeps, truth  # noqa: E402
+from tests.support.odometry_runs import sweeps, truth  # noqa: E402
 
 pytestmark = pytest.mark.ros
 

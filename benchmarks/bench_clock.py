@@ -1,0 +1,282 @@
+"""Measures how true the driver's stamps are, against the virtual L2's own ledger.
+
+``make bench-clock`` prints the table and writes ``out/bench/clock.json``; ``--docs`` renews the
+table in ``docs/clock.md`` too. The same packets also go through upstream's rule and through
+stamping with the time of arrival.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from benchmarks.results import Target, at_least, at_most, publish
+from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.settings import Value
+from tests.support.clock_rig import Case, run
+
+RATIOS: Final = (1.0, 1.95, 1.99866, 2.0)
+SYNCS: Final = ("off", "once", "periodic")
+_UPSTREAM_RATIO: Final = 2  # timeScaleNum / timeScaleDenom as shipped
+_MS: Final = 1e6
+_DRIFT: Final = {"clock_wave_ppm": 50.0, "clock_wave_s": 300.0}
+_JITTERS: Final[dict[str, dict[str, Value]]] = {
+    "none": {},
+    "0.5 ms": {"jitter": "uniform", "jitter_ms": 0.5},
+    "20 ms tail": {"jitter": "heavy", "jitter_ms": 20.0},
+}
+_FAULTS: Final[dict[str, dict[str, Value]]] = {
+    "bursts 100 ms": {"burst_ms": 100.0, "burst_every_s": 1.0},
+    "loss 5 %": {"loss": 0.05, "command_loss": 0.05},
+    "reordering 2 %": {"reorder": 0.02, "reorder_ms": 10.0},
+    "reboot": {"reboot_at": (30.0,)},
+    "coalescing": {"coalesce": 0.2, "split": 0.1},
+}
+_EVERYTHING: Final[dict[str, Value]] = {
+    **_JITTERS["20 ms tail"],
+    **_FAULTS["bursts 100 ms"],
+    **_FAULTS["loss 5 %"],
+    **_FAULTS["reordering 2 %"],
+    **_FAULTS["reboot"],
+}
+_DOCS: Final = Path("docs") / "clock.md"
+_MARKS: Final = ("<!-- table: begin -->", "<!-- table: end -->")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A named case."""
+
+    drift: str
+    jitter: str
+    fault: str
+    case: Case
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether arrivals are."""
+        return self.jitter != "none" or "burst" in self.fault or self.fault == "everything"
+
+
+def rows() -> list[Row]:
+    """Return the benchmark: every ratio, sync mode and jitter with drift, then the faults."""
+    out = [
+        Row("yes", name, "", Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=faults))
+        for ratio in RATIOS
+        for sync in SYNCS
+        for name, faults in _JITTERS.items()
+    ]
+    out += [
+        Row("no", name, "", Case(ratio=1.99866, sync=sync, faults=faults))
+        for sync in SYNCS
+        for name, faults in _JITTERS.items()
+    ]
+    out += [
+        Row("yes", "none", name, Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=faults))
+        for name, faults in _FAULTS.items()
+        for ratio in (1.0, 1.99866)
+        for sync in SYNCS
+    ]
+    out += [
+        Row(
+            "yes",
+            "20 ms tail",
+            "everything",
+            Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=_EVERYTHING),
+        )
+        for ratio in RATIOS
+        for sync in SYNCS
+    ]
+    out += [
+        Row(
+            "yes",
+            "0.5 ms",
+            "IMU off",
+            Case(ratio=1.99866, sync=sync, crystal=_DRIFT, faults=_JITTERS["0.5 ms"], imu=False),
+        )
+        for sync in SYNCS
+    ]
+    return out
+
+
+def measure(row: Row, seed: int) -> dict[str, Any]:
+    """Return the figures of one row."""
+    notes, _ = run(row.case, seed)
+    used = notes[notes["published"] != 0]
+    ours = _errors(used, used["published"], [np.ones(len(used), bool)])
+    is_imu = used["type"] == PacketType.IMU
+    streams = [is_imu, ~is_imu]
+    elapsed = used["stamp"] - used["sync"]
+    upstream = _errors(used, elapsed * _UPSTREAM_RATIO + used["sync"], streams)
+    arrival = _errors(used, used["arrival"], streams)
+    spacing = _spacing(used[is_imu])
+    return {
+        "ratio": row.case.ratio,
+        "drift": row.drift,
+        "sync": row.case.sync,
+        "jitter": row.jitter,
+        "fault": row.fault,
+        "mean_ms": _round(float(np.mean(np.abs(ours)))),
+        "p99_ms": _round(_p99(ours)),
+        "max_ms": _round(float(np.max(np.abs(ours)))),
+        "constant_ms": _round(float(np.median(used["published"] - used["truth"])) / _MS),
+        "imu_spacing_p99_us": _round(spacing[0]),
+        "imu_spacing_max_us": _round(spacing[1]),
+        "backward": _backward(used),
+        "future": int(np.sum(used["published"] > used["arrival"])),
+        "lock_s": _round(_lock_s(notes)),
+        "upstream_p99_ms": _round(_p99(upstream)),
+        "upstream_max_ms": _round(float(np.max(np.abs(upstream)))),
+        "arrival_p99_ms": _round(_p99(arrival)),
+        "arrival_max_ms": _round(float(np.max(np.abs(arrival)))),
+    }
+
+
+def targets(results: list[dict[str, Any]]) -> list[Target]:
+    """Return what was asked for."""
+    asked = [item for item in results if item["fault"] != "IMU off"]
+    disturbed = [item for item in asked if _is_disturbed(item)]
+    synced = [item for item in asked if item["sync"] != "off"]
+    return [
+        at_most("p99 of the error in every row (ms)", _most(results, "p99_ms"), 0.5),
+        at_most("largest error in every row (ms)", _most(results, "max_ms"), 2.0),
+        at_most("backward steps, all rows", sum(item["backward"] for item in results), 0),
+        at_most("stamps after arrival, all rows", sum(item["future"] for item in results), 0),
+        at_most("data until locked (s)", _most(results, "lock_s"), 2.0),
+        at_most("p99 of the IMU spacing error (us)", _most(results, "imu_spacing_p99_us"), 10.0),
+        at_least(
+            "p99 of arrival stamping over ours, IMU on, rows with jitter or bursts",
+            _least_gain(disturbed, "arrival_p99_ms"),
+            20.0,
+        ),
+        at_least(
+            "p99 of upstream's rule over ours, IMU on, rows with jitter, bursts or sync",
+            _least_gain(disturbed + synced, "upstream_p99_ms"),
+            20.0,
+        ),
+    ]
+
+
+def _errors(
+    notes: NDArray[np.void], stamps: NDArray[np.int64], groups: Iterable[NDArray[np.bool_]]
+) -> NDArray[np.float64]:
+    """Return stamp minus truth [ms], the median of each group set aside."""
+    errors = (stamps - notes["truth"]).astype(np.float64)
+    for group in groups:
+        if group.any():
+            errors[group] -= np.median(errors[group])
+    return np.asarray(errors / _MS)
+
+
+def _spacing(imu: NDArray[np.void]) -> tuple[float, float]:
+    """Return p99 and maximum of the error of the time between IMU samples [us]."""
+    if len(imu) < 2:
+        return 0.0, 0.0
+    truth = np.diff(imu["truth"])
+    off = np.abs(np.diff(imu["published"]) - truth)[truth < 1e9] * 1e-3
+    return float(np.percentile(off, 99)), float(off.max())
+
+
+def _backward(used: NDArray[np.void]) -> int:
+    return sum(
+        int(np.sum(np.diff(used["published"][used["type"] == kind]) <= 0))
+        for kind in np.unique(used["type"])
+    )
+
+
+def _lock_s(notes: NDArray[np.void]) -> float:
+    """Return the longest time from a boot's first packet to its first stamp [s]."""
+    times = []
+    for boot in np.unique(notes["boot"]):
+        mine = notes[notes["boot"] == boot]
+        stamped = mine[mine["published"] != 0]
+        times.append(
+            (stamped["arrival"][0] - mine["arrival"][0]) * 1e-9 if len(stamped) else np.inf
+        )
+    return float(max(times))
+
+
+def _p99(errors: NDArray[np.float64]) -> float:
+    return float(np.percentile(np.abs(errors), 99))
+
+
+def _most(results: list[dict[str, Any]], key: str) -> float:
+    return max(float(item[key]) for item in results)
+
+
+def _least_gain(results: list[dict[str, Any]], key: str) -> float:
+    return min(float(item[key]) / max(float(item["p99_ms"]), 1e-6) for item in results)
+
+
+def _is_disturbed(item: dict[str, Any]) -> bool:
+    return item["jitter"] != "none" or "burst" in item["fault"]
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def markdown(results: list[dict[str, Any]]) -> str:
+    """Return the results as a table in Markdown."""
+    heads = [
+        "ratio", "drift", "sync", "jitter", "fault", "mean", "p99", "max",
+        "IMU spacing p99 / max [us]", "lock [s]", "upstream p99 / max", "arrival p99 / max",
+    ]  # fmt: skip
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for item in results:
+        cells = [
+            f"{item['ratio']:g}",
+            item["drift"],
+            item["sync"],
+            item["jitter"],
+            item["fault"],
+            f"{item['mean_ms']:.4f}",
+            f"**{item['p99_ms']:.4f}**",
+            f"{item['max_ms']:.4f}",
+            f"{item['imu_spacing_p99_us']:.2f} / {item['imu_spacing_max_us']:.1f}",
+            f"{item['lock_s']:.2f}",
+            f"{item['upstream_p99_ms']:.4g} / {item['upstream_max_ms']:.4g}",
+            f"{item['arrival_p99_ms']:.4g} / {item['arrival_max_ms']:.4g}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Run the benchmark; return 0 when every target is met."""
+    if not sys.stdout.isatty():
+        os.environ.setdefault("COLUMNS", "240")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
+    parser.add_argument("--docs", action="store_true", help=f"renew the table in {_DOCS}")
+    parser.add_argument("--jobs", type=int, help="processes, as many as cores if left out")
+    arguments = parser.parse_args()
+    todo = rows()
+    seeds = [1000 * arguments.seed + number for number in range(len(todo))]
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        running = pool.map(measure, todo, seeds)
+        results = list(track(running, "measuring", total=len(todo)))
+    found = targets(results)
+    publish(
+        "clock", "Error of every published stamp, constant path delay set aside", results, found
+    )
+    if arguments.docs:
+        text = _DOCS.read_text()
+        head, rest = text.split(_MARKS[0])
+        _, tail = rest.split(_MARKS[1])
+        _DOCS.write_text(f"{head}{_MARKS[0]}\n{markdown(results)}\n{_MARKS[1]}{tail}")
+    return 0 if all(target.met for target in found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,278 @@
+"""Measures how far deskewed points are from where they should be, and what deskewing costs.
+
+``make bench-deskew`` prints the table and writes ``out/bench/deskew.json``; with ``--docs`` it
+also draws ``docs/deskew.png`` and puts the tables into ``docs/deskew.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from kiss_icp.pybind import kiss_icp_pybind
+from numpy.typing import NDArray
+
+from benchmarks import deskew_pages, deskew_real
+from benchmarks.results import Target, at_least, at_most, publish
+from l2lidar_node.emulator.unit.inertial import ImuNoise
+from l2lidar_node.settings import build
+from l2lidar_proc import rotations
+from l2lidar_proc.config import MotionConfig, ProcConfig
+from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.deskew.pipeline import Pipeline
+from l2lidar_proc.motion.sweep_trajectory import VELOCITY
+from l2lidar_proc.motion.tracker import MotionTracker
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry_config import OdometryConfig
+from tests.support.deskew_scenarios import Recording, Scenario, TrueSweep, record, stamp
+
+F64 = NDArray[np.float64]
+
+METHODS: Final = (
+    "none",
+    "per packet",
+    "KISS ideal",
+    "gyro only",
+    "odometry",
+    "true velocity",
+)
+_CLEAN: Final = ImuNoise.clean()
+_WALK: Final = Scenario("walk 0.7 m/s", "walk", 0.7)
+
+SCENARIOS: Final = (
+    Scenario("still", "still", 0.0, imu=ImuNoise()),
+    Scenario("pure rotation 3 rad/s", "pivot", 3.0),
+    Scenario("spin 0.5 rad/s", "spin", 0.5),
+    Scenario("spin 1 rad/s", "spin", 1.0),
+    Scenario("spin 3 rad/s", "spin", 3.0),
+    Scenario("walk 0.35 m/s", "walk", 0.35),
+    _WALK,
+    Scenario("walk 1.2 m/s", "walk", 1.2),
+    Scenario("trot 0.8 m/s", "trot", 0.8),
+    Scenario("drone 1 m/s", "drone", 1.0),
+    replace(
+        _WALK, name="walk, gyro bias 0.03", imu=replace(_CLEAN, gyro_bias=(0.03, -0.03, 0.03))
+    ),
+    replace(_WALK, name="walk, IMU noise", imu=ImuNoise()),
+    Scenario("spin 3, IMU noise", "spin", 3.0, imu=ImuNoise()),
+    replace(_WALK, name="walk, 10 ms IMU gaps", gap_s=0.010),
+    replace(_WALK, name="walk, 5 % packet loss", loss=0.05),
+    replace(_WALK, name="walk, mounted forward", mount="forward"),
+    replace(_WALK, name="walk, mounted tilted", mount="tilted"),
+)
+_SETTLED_S: Final = 4.0  # rest and start of the motion are over; judged from here on
+
+
+def main() -> None:
+    """Measure everything and write it down."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--docs", action="store_true", help="write docs/deskew.{md,png} as well")
+    parser.add_argument("--no-node", action="store_true", help="leave the latency of the node out")
+    arguments = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    shown = {}
+    for scenario in SCENARIOS:
+        recording = record(scenario)
+        errors, clouds = evaluate(recording)
+        rows += _rows(scenario, errors)
+        shown[scenario.name] = clouds
+        print(f"{scenario.name}: done", flush=True)
+    costs = cost(record(replace(_WALK, seconds=5.0)))
+    changed = _changed_bits(record(SCENARIOS[0]))
+    targets = [*_targets(rows), *_cost_targets(costs)]
+    targets.append(at_most("sweeps of a still sensor that changed", changed, 0))
+    if not arguments.no_node:
+        from benchmarks.deskew_latency import latency_ms
+
+        milliseconds = latency_ms()
+        targets.append(at_most("sweep end to published cloud, p99, ms", milliseconds, 15.0))
+    real = deskew_real.newer_college()
+    targets += [at_most(f"{name}, median, mm", after, bound) for name, _, after, bound in real]
+    publish("deskew", "RMS and 95th percentile of the error of deskewed points, mm", rows, targets)
+    for name, value in costs.items():
+        print(f"{name}: {value:.2f}")
+    if arguments.docs:
+        deskew_pages.write(rows, targets, costs, real, shown["walk 1.2 m/s"])
+
+
+def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]]:
+    """Return the errors of every method.
+
+    Returns
+    -------
+    errors : dict of list of ndarray
+        By method, for each settled sweep the distance of each point from its true place [m].
+    clouds : dict of ndarray, shape (N, 3)
+        The last sweep by method, and the truth.
+    """
+    errors: dict[str, list[F64]] = {method: [] for method in METHODS}
+    trackers = {name: MotionTracker(MotionConfig()) for name in METHODS[3:]}
+    odometry = Odometry(OdometryConfig(), MotionConfig().T_cloud_imu)
+    fed = 0
+    clouds: dict[str, F64] = {}
+    for item in recording.sweeps:
+        until = int(np.searchsorted(recording.samples["stamp"], item.sweep.end)) + 1
+        for first in range(fed, until, 5):
+            part = recording.samples[first : min(first + 5, until)]
+            for tracker in trackers.values():
+                tracker.imu(part)
+            odometry.imu(part)
+        fed = until
+        for row in _true_velocities(recording, item):
+            trackers["true velocity"].velocity(row["stamp"], row["velocity"], "truth")
+        if item.start_s >= _SETTLED_S:
+            clouds = {
+                "none": _xyz(item.sweep.points),
+                "per packet": _per_packet(recording, item),
+                **{name: _ours(tracker, item) for name, tracker in trackers.items()},
+            }
+            for name, cloud in clouds.items():
+                errors[name].append(np.linalg.norm(cloud - item.at_start, axis=1))
+            kiss = _kiss(recording, item)
+            errors["KISS ideal"].append(np.linalg.norm(kiss - item.at_end, axis=1))
+            clouds["truth"] = item.at_start
+        _follow(odometry, trackers["odometry"], item)
+    return errors, clouds
+
+
+def _follow(odometry: Odometry, tracker: MotionTracker, item: TrueSweep) -> None:
+    """Let the odometry tell the tracker how the sensor moved: of use from the next sweep on."""
+    for estimate in odometry.register(item.sweep):
+        tracker.velocity(estimate.stamp, estimate.velocity, "odometry")
+
+
+def _ours(tracker: MotionTracker, item: TrueSweep) -> F64:
+    path, _ = tracker.path(item.sweep.start, item.sweep.end)
+    return _xyz(deskew(item.sweep.points, item.sweep.start, path, item.sweep.start))
+
+
+def _true_velocities(recording: Recording, item: TrueSweep) -> NDArray[np.void]:
+    """Return the true velocities of a sweep at 50 Hz."""
+    times = np.arange(item.start_s, item.end_s + 0.02, 0.02)
+    found = np.zeros(len(times), dtype=VELOCITY)
+    found["stamp"] = [stamp(t) for t in times]
+    found["velocity"] = recording.motion.kinematics(times).velocity_body
+    return found
+
+
+def _per_packet(recording: Recording, item: TrueSweep) -> F64:
+    """Turn every packet by the newest onboard orientation: what a driver's levelling can do."""
+    packets = np.array([stamp(t) for t in np.unique(item.packet_start_s)])
+    newest = np.searchsorted(recording.samples["stamp"], packets, side="right") - 1
+    q = rotations.normalised(recording.samples["orientation_wxyz"][np.maximum(newest, 0)])
+    turn = rotations.matrices(rotations.multiply(rotations.conjugate(q[0]), q))
+    packet = np.unique(item.packet_start_s, return_inverse=True)[1]
+    return np.asarray(np.einsum("nij,nj->ni", turn[packet], _xyz(item.sweep.points)))
+
+
+def _kiss(recording: Recording, item: TrueSweep) -> F64:
+    """Let kiss-icp's preprocessing move the points to the end, given the true motion."""
+    delta = _pose(recording, item.start_s, item.end_s)
+    vector = kiss_icp_pybind._Vector3dVector(_xyz(item.sweep.points))
+    times = item.sweep.points["time"].astype(np.float64)
+    return np.asarray(
+        kiss_icp_pybind._Preprocessor(1e6, 0.0, True, 1)._preprocess(vector, times, delta)
+    )
+
+
+def _pose(recording: Recording, start_s: float, end_s: float) -> F64:
+    """Return the true transform from the frame at the end to the frame at the start, (4, 4)."""
+    positions, q = recording.motion.poses(np.array([start_s, end_s]))
+    ends = [rotations.transform(q[i], positions[i]) for i in range(2)]
+    return rotations.inverse(ends[0]) @ ends[1]
+
+
+def cost(recording: Recording, rounds: int = 100) -> dict[str, float]:
+    """Return milliseconds for a full turn of 15,000 points on one core, the best of many."""
+    item = recording.sweeps[-2]
+    tracker = MotionTracker(MotionConfig())
+    for first in range(0, len(recording.samples), 10):
+        tracker.imu(recording.samples[first : first + 10])
+    for row in _true_velocities(recording, recording.sweeps[-3])[:6]:
+        tracker.velocity(row["stamp"], row["velocity"], "truth")
+    assert not tracker.path(item.sweep.start, item.sweep.end)[1].is_still
+    delta = _pose(recording, item.start_s, item.end_s)
+    xyz = _xyz(item.sweep.points)
+    vector = kiss_icp_pybind._Vector3dVector(xyz)
+    times = item.sweep.points["time"].astype(np.float64)
+    kiss = kiss_icp_pybind._Preprocessor(1e6, 0.0, True, 1)
+    jobs: dict[str, Callable[[], object]] = {
+        "ours, path and points": lambda: _timed_ours(tracker, item),
+        "kiss-icp preprocess from an array": lambda: np.asarray(
+            kiss._preprocess(kiss_icp_pybind._Vector3dVector(xyz), times, delta)
+        ),
+        "kiss-icp preprocess alone": lambda: kiss._preprocess(vector, times, delta),
+    }
+    best = dict.fromkeys(jobs, np.inf)
+    for _ in range(rounds):  # in turns, so that all of them meet the same neighbours
+        for name, job in jobs.items():
+            begin = time.perf_counter()
+            job()
+            best[name] = min(best[name], 1e3 * (time.perf_counter() - begin))
+    best["points"] = float(len(xyz))
+    return best
+
+
+def _timed_ours(tracker: MotionTracker, item: TrueSweep) -> None:
+    path, _ = tracker.path(item.sweep.start, item.sweep.end)
+    deskew(item.sweep.points, item.sweep.start, path, item.sweep.start)
+
+
+def _rows(scenario: Scenario, errors: dict[str, list[F64]]) -> list[dict[str, Any]]:
+    rms: dict[str, Any] = {"scenario": scenario.name, "figure": "RMS"}
+    far: dict[str, Any] = {"scenario": scenario.name, "figure": "p95"}
+    for method, found in errors.items():
+        millimetres = 1e3 * np.concatenate(found)
+        rms[method] = round(float(np.sqrt((millimetres**2).mean())), 2)
+        far[method] = round(float(np.quantile(millimetres, 0.95)), 2)
+    return [rms, far]
+
+
+def _targets(rows: list[dict[str, Any]]) -> list[Target]:
+    by_name = {row["scenario"]: row for row in rows if row["figure"] == "RMS"}
+    moving = [row for name, row in by_name.items() if name != "still"]
+    clean = [row for row in moving if "noise" not in row["scenario"]]
+    travelling = [row for row in moving if "pure rotation" not in row["scenario"]]
+    found = []
+    for method in ("odometry", "true velocity"):
+        worst = max(row[method] for row in clean)
+        found.append(at_most(f"{method}: worst RMS without IMU noise, mm", worst, 10.0))
+        least = min(row["none"] / max(row[method], 0.01) for row in travelling)
+        found.append(at_least(f"{method}: least gain over no deskew", least, 10.0))
+    pure = by_name["pure rotation 3 rad/s"]
+    for method in ("gyro only", "odometry"):
+        found.append(at_most(f"{method}: pure rotation at 3 rad/s, mm", pure[method], 5.0))
+    found.append(
+        at_most("spin 3 rad/s with odometry, mm", by_name["spin 3 rad/s"]["odometry"], 5.0)
+    )
+    return found
+
+
+def _cost_targets(costs: dict[str, float]) -> list[Target]:
+    return [at_most("deskew of a full turn, ms", costs["ours, path and points"], 2.0)]
+
+
+def _changed_bits(recording: Recording) -> int:
+    """Return how many sweeps of a still sensor do not come out bit for bit."""
+    pipeline = Pipeline(build(ProcConfig, {"keep_time": True}))
+    fed = changed = 0
+    for item in recording.sweeps:
+        until = int(np.searchsorted(recording.samples["stamp"], item.sweep.end)) + 1
+        pipeline.imu(recording.samples[fed:until])
+        fed = until
+        pipeline.sweep(item.sweep, 0)
+        (done,) = pipeline.poll(0)
+        changed += done.points.tobytes() != item.sweep.points.tobytes()
+    return changed
+
+
+def _xyz(points: NDArray[np.void]) -> F64:
+    return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,267 @@
+"""Measures what the driver costs: packets per CPU second, and the node's share of a core.
+
+``make bench-load`` prints the table and writes ``out/bench/load.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import struct
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import rclpy
+
+from benchmarks import load_chain, load_node, load_scale
+from benchmarks.results import Target, at_least, at_most, publish
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.demo.observer import Observer
+from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.driver.geometry import Projector
+from l2lidar_node.emulator.unit.pattern import PatternScanner
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.framing import Frame, Framer
+from l2lidar_node.protocol.packets import PointPacket, decode
+from l2lidar_node.settings import build
+from l2lidar_node.transport.udp import UdpTransport
+from l2lidar_node.types import HostNs, Sweep
+from tests.support.cpu import process_cpu_s, resident_mb
+
+FULL_TURN = 50
+_SYNTHETIC_PACKETS = 5_000
+_STAMP = struct.Struct("<II")
+_CLOCK_RATIO = 1.99866  # of the virtual L2
+Row = Callable[..., None]
+_EPOCH_NS = 1_700_000_000 * 10**9
+
+
+def decode_rate(rounds: int) -> float:
+    """Return packets per CPU second of framing, CRC, decoding and geometry, full turns."""
+    payloads, _ = PatternScanner().packets(0, _SYNTHETIC_PACKETS)
+    datagrams = [wire.encode_frame(wire.PacketType.POINTS_3D, item.tobytes()) for item in payloads]
+    starts = np.arange(FULL_TURN, dtype=np.float64) * wire.MIRROR_PERIOD_S
+    rates = []
+    for _ in range(rounds):
+        framer, projector = Framer(), Projector(wire.PacketType.POINTS_3D)
+        begin = time.process_time()
+        batch: list[bytes] = []
+        for datagram in datagrams:
+            for event in framer.feed(datagram):
+                if isinstance(event, Frame):
+                    packet = decode(event)
+                    if isinstance(packet, PointPacket):
+                        batch.append(packet.payload)
+            if len(batch) == FULL_TURN:
+                projector.points(batch, starts)
+                batch.clear()
+        rates.append(len(datagrams) / (time.process_time() - begin))
+    return statistics.median(rates)
+
+
+def socket_rate(seconds: float, with_imu: bool) -> dict[str, float]:
+    """Return what it costs to make full-turn sweeps of packets from a socket.
+
+    A virtual L2 in a process of its own sends as fast as this one reads. Only this process's CPU
+    time counts, and only its point packets.
+    """
+    host_port, lidar_port = free_udp_ports(2)
+    values = {
+        "l2_ip": "127.0.0.1", "l2_port": lidar_port,
+        "host_ip": "127.0.0.1", "host_port": host_port,
+        "imu_adjust": False, "sweep_cut": "turn", "enable_l2_host_sync": False,
+    }  # fmt: skip
+    config = build(DriverConfig, values)
+    driver, transport = Driver(config), UdpTransport(config.network)
+    mode = "0" if with_imu else str(int(wire.WorkMode.IMU_OFF))
+    arguments = [
+        "--ready", "--world", "pattern", "--speed", "max", "--work-mode", mode,
+        "--host-port", str(host_port), "--lidar-port", str(lidar_port),
+    ]  # fmt: skip
+    with Programs() as programs:
+        programs.start("l2lidar_node.emulator", arguments)
+        while not driver.counters.sweeps:
+            _take(driver, transport, programs)
+        before, cpu, wall = driver.counters.snapshot(), time.process_time(), time.monotonic()
+        sweeps = 0
+        while time.monotonic() - wall < seconds:
+            sweeps += _take(driver, transport, programs)
+        spent, elapsed = time.process_time() - cpu, time.monotonic() - wall
+    transport.close()
+    after = driver.counters
+    kind = wire.PacketType.POINTS_3D
+    packets = after.frames[kind] - before.frames[kind]
+    lost = sum(after.sequence[key].lost - before.sequence[key].lost for key in after.sequence)
+    return {
+        "rate": packets / spent,
+        "speed": packets * wire.MIRROR_PERIOD_S / elapsed,
+        "lost": lost,
+    }
+
+
+def _take(driver: Driver, transport: UdpTransport, programs: Programs) -> int:
+    """Handle what has arrived; return how many sweeps it completed."""
+    sweeps = 0
+    batch = transport.receive(0.1)
+    if not batch:
+        programs.check()
+    arrival = HostNs(0)
+    for data, _ in batch:
+        arrival = _arrival_at_real_time(data)
+        sweeps += sum(isinstance(event, Sweep) for event in driver.receive(data, arrival))
+    driver.tick(arrival)
+    return sweeps
+
+
+def _arrival_at_real_time(data: bytes) -> HostNs:
+    """Return when a datagram would have come at the real rate: the clock has its usual work."""
+    seconds, nanoseconds = _STAMP.unpack_from(data, wire.HEADER.size + 8)
+    return HostNs(_EPOCH_NS + round((seconds * 10**9 + nanoseconds) * _CLOCK_RATIO))
+
+
+def node_share(seconds: float) -> dict[str, float]:
+    """Return the driver node's CPU share at the real rate, with one subscriber of both topics."""
+    isolate_ros()
+    host_port, lidar_port = free_udp_ports(2)
+    parameters = {
+        "l2_ip": "127.0.0.1", "l2_port": lidar_port,
+        "host_ip": "127.0.0.1", "host_port": host_port,
+        "enable_IMU_publishing": "true",
+    }  # fmt: skip
+    rclpy.init()
+    observer = Observer()
+    try:
+        with Programs() as programs:
+            node = programs.start("l2lidar_node.ros.driver_node", assigned(parameters))
+            programs.start(
+                "l2lidar_node.emulator",
+                ["--ready", "--world", "pattern",
+                 "--host-port", str(host_port), "--lidar-port", str(lidar_port)],
+            )  # fmt: skip
+            while not observer.clouds.stamps:
+                observer.watch(time.monotonic() + 0.5)
+                programs.check()
+            observer.watch(time.monotonic() + 2.0)
+            seen = len(observer.clouds.stamps), len(observer.imu.stamps)
+            cpu, wall = process_cpu_s(node.pid), time.monotonic()
+            observer.watch(wall + seconds)
+            share = (process_cpu_s(node.pid) - cpu) / (time.monotonic() - wall)
+            clouds = (len(observer.clouds.stamps) - seen[0]) / seconds
+            imu = (len(observer.imu.stamps) - seen[1]) / seconds
+            memory = resident_mb(node.pid)
+    finally:
+        observer.destroy_node()
+        rclpy.try_shutdown()
+    return {"share": share, "clouds": clouds, "imu": imu, "memory": memory}
+
+
+def main() -> int:
+    """Run the measurements; return 0 whatever they found."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of each measurement")
+    parser.add_argument("--chain-seconds", type=float, default=0.0, help="of the whole chain")
+    parser.add_argument("--world", default="pattern", help="what the chain sees")
+    options = parser.parse_args()
+    seconds: float = options.seconds
+    rows: list[dict[str, Any]] = []
+
+    def row(what: str, value: float, unit: str, remark: str = "") -> None:
+        rows.append({"what": what, "value": round(value, 4), "unit": unit, "remark": remark})
+
+    pure = decode_rate(5)
+    row("framing + CRC + decode + geometry, full turns", pure, "packets per CPU s")
+    points = socket_rate(seconds, with_imu=False)
+    row(
+        "socket to sweep, points only", points["rate"], "packets per CPU s",
+        f"{points['speed']:.0f} x real time, {points['lost']:.0f} lost",
+    )  # fmt: skip
+    mixed = socket_rate(seconds, with_imu=True)
+    row(
+        "socket to sweep, points with their share of IMU", mixed["rate"],
+        "point packets per CPU s",
+        f"{mixed['speed']:.0f} x real time, {mixed['lost']:.0f} lost",
+    )  # fmt: skip
+    node = node_share(seconds)
+    row(
+        "driver node, one subscriber", 100 * node["share"], "% of a core",
+        f"{node['clouds']:.2f} clouds/s, {node['imu']:.1f} IMU samples/s received",
+    )  # fmt: skip
+    row("driver node, memory", node["memory"], "MB")
+    alone = load_node.measured(seconds)
+    p50, p99 = np.percentile(alone.latencies_ms, (50, 99))
+    row(
+        "driver alone: last packet sent -> cloud received, p50", p50, "ms",
+        f"p99 {p99:.2f} ms, max {alone.latencies_ms.max():.2f} ms, {len(alone.latencies_ms)} "
+        f"clouds; {100 * alone.share:.1f} % of a core; sender up to {alone.latest_ms:.1f} ms late",
+    )  # fmt: skip
+    targets: list[Target] = [
+        at_least("framing + CRC + decode + geometry [packets per CPU s]", pure, 60_000),
+        at_least("socket to sweep [packets per CPU s]", points["rate"], 30_000),
+        at_most("driver node [% of a core]", 100 * node["share"], 5.0),
+        at_most("driver alone: publish latency p99 [ms]", float(p99), 5.0),
+    ]
+    targets += _chain_rows(row, options.chain_seconds or seconds, options.world)
+    targets += _scale_rows(row, min(seconds, 4.0))
+    publish("load", "What the driver costs", rows, targets)
+    return 0
+
+
+def _chain_rows(row: Row, seconds: float, world: str) -> list[Target]:
+    cost = load_chain.measured(seconds, world)
+    for name, share in cost.shares.items():
+        row(f"chain: {name}", 100 * share, "% of a core", f"{cost.memory_mb[name]:.0f} MB")
+    for topic, values in cost.latencies_ms.items():
+        if not len(values):
+            continue
+        p50, p99 = np.percentile(values, (50, 99))
+        row(
+            f"chain: last packet sent -> {topic} received, p50", p50, "ms",
+            f"p99 {p99:.2f} ms, max {values.max():.2f} ms, {len(values)} messages",
+        )  # fmt: skip
+    clouds = cost.latencies_ms["/points"]
+    return [
+        at_most("chain: publish latency p99 [ms]", float(np.percentile(clouds, 99)), 5.0),
+        at_most("chain: clouds missing", cost.missing, 0),
+    ]
+
+
+def _scale_rows(row: Row, seconds: float) -> list[Target]:
+    targets: list[Target] = []
+    lengths = dict(load_scale.by_length(25.0))
+    for length, rate in lengths.items():
+        row(f"datagram to sweep, {length} packets a sweep", rate, "packets per CPU s")
+    dearer = lengths[200] / lengths[4000]
+    targets.append(at_most("a packet in a sweep of 4000, in those of one of 200", dearer, 1.25))
+    for sensors, processes in load_scale.CROWDS:
+        got = load_scale.crowd(sensors, processes, 1.0, seconds)
+        row(f"{sensors} sensors, {processes} processes", got["cpu"], "cores", _crowd_remark(got))
+        if (sensors, processes) == (8, 1):
+            targets.append(at_most("8 sensors in one process: lost", _gone(got), 0))
+    for rate in load_scale.RATES:
+        got = load_scale.crowd(1, 1, rate, seconds)
+        sent = "" if got["rate"] > 0.98 * rate else f", sent at {got['rate']:.0f} x"
+        row(f"one sensor, {rate} x the packets{sent}", got["cpu"], "cores", _crowd_remark(got))
+        targets.append(at_most(f"{rate} x: lost without being counted", got["unsaid"], 0))
+        if rate == 5:
+            targets.append(at_most("5 x: lost", _gone(got), 0))
+    return targets
+
+
+def _gone(got: dict[str, Any]) -> int:
+    return int(got["sent"] - got["received"])
+
+
+def _crowd_remark(got: dict[str, Any]) -> str:
+    remark = (
+        f"{got['received']} of {got['sent']} packets, {got['kernel_drops']} dropped by the kernel "
+        f"and counted, {got['sweeps']} sweeps; sender up to {got['latest_ms']:.0f} ms late"
+    )
+    return "; ".join((remark, *(f"it says: {text}" for text in got["complaints"])))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""Puts what the deskew bench found into the documentation: tables and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from benchmarks.results import Target, machine
+
+PAGE: Final = Path("docs") / "deskew.md"
+PICTURE: Final = Path("docs") / "deskew.png"
+
+F64 = NDArray[np.float64]
+
+
+def write(
+    rows: Sequence[dict[str, Any]],
+    targets: Sequence[Target],
+    costs: dict[str, float],
+    real: Sequence[tuple[str, float, float, float]],
+    clouds: dict[str, F64],
+) -> None:
+    """Replace tables and picture.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        RMS and p95 of each scenario: error of every method [mm].
+    targets : sequence of Target
+    costs : dict of float
+        [ms] by what was timed.
+    real : sequence
+        Name, error before and after, bound [mm] of real scans.
+    clouds : dict of ndarray, shape (N, 3)
+        One sweep as different methods leave it, and the truth.
+    """
+    text = PAGE.read_text(encoding="utf-8")
+    text = _replaced(text, "errors", _errors(rows))
+    text = _replaced(text, "targets", _targets(targets))
+    text = _replaced(text, "costs", _costs(costs))
+    text = _replaced(text, "real", _real(real))
+    PAGE.write_text(text, encoding="utf-8")
+    _draw(clouds)
+
+
+def _marks(name: str) -> tuple[str, str]:
+    return f"<!-- {name}: generated -->\n", f"<!-- /{name} -->"
+
+
+def _replaced(text: str, name: str, content: str) -> str:
+    begin, end = _marks(name)
+    before, found, rest = text.partition(begin)
+    _, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"{PAGE}: the marks of block '{name}' are missing")
+    return f"{before}{begin}{content}\n{end}{after}"
+
+
+def _table(heading: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    lines = [list(heading), *(list(row) for row in rows)]
+    lines.insert(1, ["---", *["---:"] * (len(lines[0]) - 1)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _errors(rows: Sequence[dict[str, Any]]) -> str:
+    methods = [name for name in rows[0] if name not in ("scenario", "figure")]
+    far = {row["scenario"]: row for row in rows if row["figure"] == "p95"}
+    lines = []
+    for row in rows:
+        if row["figure"] == "RMS":
+            pairs = (f"{row[m]:.1f} / {far[row['scenario']][m]:.1f}" for m in methods)
+            lines.append([row["scenario"], *pairs])
+    return _table(["RMS / p95 [mm]", *methods], lines)
+
+
+def _targets(targets: Sequence[Target]) -> str:
+    return _table(
+        ["target", "measured", "bound", ""],
+        (
+            [item.name, f"{item.value:.3g}", f"{item.bound:g}", "met" if item.met else "not met"]
+            for item in targets
+        ),
+    )
+
+
+def _costs(costs: dict[str, float]) -> str:
+    rows = [[name, f"{value:.2f}"] for name, value in costs.items() if name != "points"]
+    table = _table([f"{costs['points']:.0f} points on one core", "ms"], rows)
+    return f"{table}\n\nMeasured on one core of an {machine()['processor']}, the best of 100."
+
+
+def _real(real: Sequence[tuple[str, float, float, float]]) -> str:
+    rows = [[n, f"{a:.0f}", f"{b:.1f}", f"{c:.0f}"] for n, a, b, c in real]
+    return _table(["median error [mm]", "raw", "ours", "constant rate and velocity"], rows)
+
+
+def _draw(clouds: dict[str, F64]) -> None:
+    shown = {"as measured": "none", "gyro only": "gyro only", "with odometry": "odometry"}
+    figure = Figure(figsize=(11, 4.2), dpi=85, layout="constrained")
+    FigureCanvasAgg(figure)
+    truth = clouds["truth"]
+    inside = (truth[:, 2] > -0.3) & (truth[:, 2] < 1.6)
+    for place, (title, method) in enumerate(shown.items(), start=1):
+        plan = figure.add_subplot(1, 3, place)
+        error = 1e3 * np.linalg.norm(clouds[method] - truth, axis=1)[inside]
+        x, y, _ = clouds[method][inside].T
+        plan.scatter(truth[inside, 0], truth[inside, 1], s=3.0, c="0.75", linewidths=0)
+        dots = plan.scatter(x, y, s=3.0, c=error, cmap="turbo", vmin=0, vmax=400, linewidths=0)
+        plan.set_aspect("equal")
+        plan.set_title(f"{title}: RMS {np.sqrt((error**2).mean()):.1f} mm", fontsize=10)
+        plan.tick_params(labelsize=7)
+    figure.colorbar(dots, ax=figure.axes, label="error [mm]", shrink=0.8)
+    figure.savefig(PICTURE)

@@ -1,0 +1,100 @@
+"""Measures the driver node alone, with one subscriber: from the last packet sent to the cloud."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+
+from benchmarks.chain import DRIVER
+from benchmarks.load_sender import address
+from benchmarks.topic_watch import CLOUDS, IMU, TopicWatch
+from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
+from l2lidar_node.protocol import wire
+from tests.support.cpu import process_cpu_s
+
+_PACKETS: Final = 38  # in a cloud
+_PERIOD_NS: Final = round(wire.MIRROR_PERIOD_S * 1e9)
+_TO_SENT_NS: Final = round(_PERIOD_NS / 2) + 150_000  # from a packet's first slot, at the unit
+_WARM_UP_S: Final = 5.0  # the clock locks and settles
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCost:
+    """What the driver node needs beside a sender and a subscriber that need little.
+
+    Attributes
+    ----------
+    share : float
+        Of a core.
+    latencies_ms : ndarray, shape (N,)
+        From the last packet of each cloud sent to the cloud at the subscriber.
+    latest_ms : float
+        The largest delay of the sender: how much the machine does beside.
+    """
+
+    share: float
+    latencies_ms: NDArray[np.float64]
+    latest_ms: float
+
+
+def measured(seconds: float) -> NodeCost:
+    """Run the node for so long and measure it."""
+    isolate_ros()
+    (port,) = free_udp_ports(1)
+    parameters = {
+        "l2_ip": address(0), "host_ip": "127.0.0.1", "host_port": port,
+        "enable_IMU_publishing": "true", "enable_l2_host_sync": "false",
+    }  # fmt: skip
+    rclpy.init()
+    watch = TopicWatch([CLOUDS, IMU])
+    try:
+        with Programs() as programs:
+            node = programs.start(DRIVER, assigned(parameters))
+            watch.until(
+                lambda: watch.count_publishers(CLOUDS) > 0, programs, "the driver does not start"
+            )
+            with subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "benchmarks.load_sender"),
+                    *("1", str(seconds + _WARM_UP_S + 1.0), str(port), "--instants"),
+                ],
+                stdout=subprocess.PIPE,
+                text=True,
+            ) as sender:
+                while not len(watch.seen(CLOUDS)) and sender.poll() is None:
+                    watch.watch(0.1)
+                watch.watch(_WARM_UP_S - 1.0)
+                watch.forget()
+                cpu, begin = process_cpu_s(node.pid), time.monotonic()
+                watch.watch(seconds)
+                share = (process_cpu_s(node.pid) - cpu) / (time.monotonic() - begin)
+                clouds = watch.seen(CLOUDS)
+                told = json.loads(sender.communicate()[0])
+    finally:
+        watch.destroy_node()
+        rclpy.try_shutdown()
+    sent = np.array(told["points_sent_ns"], np.int64)
+    return NodeCost(share, _latencies_ms(clouds, sent), told["latest_ms"])
+
+
+def _latencies_ms(clouds: NDArray[np.int64], sent: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the time from the last packet of each cloud to its arrival.
+
+    ``clouds`` are stamps and arrivals, shape (N, 2), ``sent`` the instants at which the packets
+    left, both [ns]. A cloud's stamp tells its first packet: it lies within its slots, which take
+    half a period.
+    """
+    number = np.arange(len(sent))
+    begun = np.median(sent - number * _PERIOD_NS) - _TO_SENT_NS  # robust: a sender may be late
+    first = np.floor((clouds[:, 0] - begun) / _PERIOD_NS + 0.25).astype(np.int64)
+    last = first + _PACKETS - 1
+    known = (first >= 0) & (last < len(sent))
+    return np.asarray((clouds[known, 1] - sent[last[known]]) / 1e6)

@@ -1,0 +1,150 @@
+"""What the odometry bench has to run, in which order, and the file that keeps what it found."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from benchmarks.odometry_methods import REFEREES
+from tests.support.odometry_runs import CUTS
+
+SLOW = ("ct_icp", "lio_sam")
+KEY = ("scene", "motion", "seed", "seconds", "sweeps", "method")
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is run over one recording.
+
+    Attributes
+    ----------
+    scene, motion : str
+    seed : int
+    seconds : float
+    wanted : tuple of (str, str)
+        Kind of sweeps and method of each run.
+    """
+
+    scene: str
+    motion: str
+    seed: int
+    seconds: float
+    wanted: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Which runs there are.
+
+    Attributes
+    ----------
+    scenes, motions : tuple of str
+    seeds : int
+    seconds : float
+        Length of a recording.
+    sweeps, methods : tuple of str
+    referee_seeds : int
+        Seeds that the referees get.
+    slow_seeds : int
+        Seeds that those of :data:`SLOW` get with other sweeps than full turns.
+    """
+
+    scenes: tuple[str, ...]
+    motions: tuple[str, ...]
+    seeds: int
+    seconds: float
+    sweeps: tuple[str, ...]
+    methods: tuple[str, ...]
+    referee_seeds: int
+    slow_seeds: int
+
+    def tasks(self, done: Sequence[Row] = ()) -> list[Task]:
+        """Return what is to be done, without what is.
+
+        First the first seed, then the other seeds without referees, then with them, slow ones
+        last: whenever it is cut, what is there can be compared.
+        """
+        known = {tuple(row[name] for name in KEY) for row in done}
+        found = []
+        orders = [
+            *((rank, 0) for rank in (0, 1)),
+            *((rank, seed) for rank in (0, 1) for seed in range(1, self.seeds)),
+            *((2, seed) for seed in range(self.seeds)),
+        ]
+        for (rank, seed), scene, motion in product(orders, self.scenes, self.motions):
+            wanted = tuple(
+                (cut, name)
+                for cut, name in product(self.sweeps, self.methods)
+                if self._rank(seed, cut, name) == rank
+                and (scene, motion, seed, self.seconds, cut, name) not in known
+            )
+            if wanted:
+                found.append(Task(scene, motion, seed, self.seconds, wanted))
+        return found
+
+    def has(self, row: Row) -> bool:
+        """Return whether a row is of this plan."""
+        return (
+            row["scene"] in self.scenes
+            and row["motion"] in self.motions
+            and row["seconds"] == self.seconds
+            and row["seed"] < self.seeds
+            and row["sweeps"] in self.sweeps
+            and row["method"] in self.methods
+            and self._rank(row["seed"], row["sweeps"], row["method"]) is not None
+        )
+
+    def _rank(self, seed: int, cut: str, name: str) -> int | None:
+        """Return when a run's turn is: 0 first, None never."""
+        if name not in REFEREES:
+            return 0
+        if seed >= self.referee_seeds:
+            return None
+        if name not in SLOW or cut == CUTS[0]:
+            return 1
+        return 2 if seed < self.slow_seeds else None
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """The rows found so far, one a line; several processes may append."""
+
+    path: Path = Path("out") / "bench" / "odometry.jsonl"
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.path.unlink(missing_ok=True)
+
+    def append(self, row: Row) -> None:
+        """Keep a row, and tell of it on standard error."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a", encoding="utf-8") as file:
+            # the line before may have been cut off
+            file.write("\n" + json.dumps(row, default=float) + "\n")
+        words = " ".join(str(row[name]) for name in ("scene", "motion", "seed"))
+        print(
+            f"{words}, {row['sweeps']}, {row['method']}: {1e3 * row['ate_m']:.1f} mm,"
+            f" {row['real_time_factor']:.1f} x real time",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def read(self) -> list[Row]:
+        """Return the rows, the last of each run; a line that was cut off does not count."""
+        return list({tuple(row[name] for name in KEY): row for row in self._rows()}.values())
+
+    def _rows(self) -> Iterator[Row]:
+        if not self.path.exists():
+            return
+        for line in self.path.read_text(encoding="utf-8").splitlines():
+            try:
+                yield json.loads(line)
+            except ValueError:
+                continue

@@ -1,0 +1,164 @@
+"""Gives what a consumer demands of its topics a form that the checks can read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple
+
+from l2lidar_node.check.findings import Level
+
+
+class Use(Enum):
+    """Whether a consumer needs something, makes use of it, or ignores it."""
+
+    NEEDED = Level.ERROR
+    USED = Level.WARN
+    IGNORED = Level.OK
+
+    @property
+    def level(self) -> Level:
+        """How bad it is when it is missing."""
+        return self.value
+
+
+class TimeUnit(Enum):
+    """How a consumer takes the numbers of a time field."""
+
+    S = "s after the stamp"
+    NS = "ns after the stamp"
+    EPOCH_S = "s since the epoch"
+    EPOCH_AUTO = "s since the epoch below 1e14, else ns"  # DLIO
+    SPREAD = "any unit"  # KISS-ICP and GenZ-ICP: first to last is the sweep
+    RKO = "RKO-LIO's rules"
+    GLIM = "GLIM's rules"
+
+
+class TimeField(NamedTuple):
+    """A time field that a consumer knows.
+
+    Attributes
+    ----------
+    name : str
+    codes : tuple of str
+        Types it may have.
+    unit : TimeUnit
+    """
+
+    name: str
+    codes: tuple[str, ...]
+    unit: TimeUnit
+
+
+class Order(Enum):
+    """The order of points in time that a consumer relies on."""
+
+    ASCENDING = "ascending"
+    LAST = "last"  # the last point is the latest
+    ANY = "any"
+
+
+class Subscription(NamedTuple):
+    """QoS of a subscription.
+
+    Attributes
+    ----------
+    reliability : str
+        ``reliable``; ``best_effort``; ``default``, which middlewares take for either; or
+        ``varies`` among versions.
+    depth : int
+        Length of its queue, 0 where that is not known.
+    """
+
+    reliability: str
+    depth: int
+
+
+_UNASKED: Final = Subscription("best_effort", 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Input:
+    """One form of cloud that a consumer reads.
+
+    Attributes
+    ----------
+    layout : str
+        The driver's ``point_layout`` that gives it.
+    fields : mapping
+        Types by name of the fields it has to have.
+    times : tuple of TimeField
+        One of which it has to have; as the consumer prefers them.
+    when : str
+        The consumer's own setting for it; empty where there is no choice.
+    """
+
+    layout: str
+    fields: Mapping[str, tuple[str, ...]]
+    times: tuple[TimeField, ...] = ()
+    when: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Consumer:
+    """What one consumer demands.
+
+    Attributes
+    ----------
+    name, title : str
+        As typed and as written.
+    inputs : tuple of Input
+        The usual one first.
+    time : Use
+        Of the points' times: it deskews by itself.
+    several_times : Level
+        How bad a second time field is.
+    constant_times : str
+        What it does with times that are all the same.
+    order : Order
+    max_sweep_s : float
+        From there on it mistakes the times.
+    late_first : Level
+        How bad it is that the first point is 1 ms or more after the stamp.
+    is_dense : Use
+        Of the cloud's word that no point is NaN.
+    row_step : Use
+        Of the length of a row.
+    exact : bool
+        It takes the layout's very bytes, not fields by name.
+    contiguous : bool
+        It takes y and z to follow x.
+    ring_count : int
+        Rows of its projection as in our configuration for it; 0 where it has none.
+    imu, orientation : Use
+    imu_rate_hz : float
+        The least that it asks for.
+    any_acceleration_unit : bool
+        It scales accelerations by their mean norm.
+    tf : Use
+        Of transforms between the frame of the clouds, that of the IMU and the robot's.
+    cloud_qos, imu_qos : Subscription
+    """
+
+    name: str
+    title: str
+    inputs: tuple[Input, ...]
+    time: Use
+    several_times: Level = Level.WARN
+    constant_times: str = "does not deskew"
+    order: Order = Order.ANY
+    max_sweep_s: float = 1.0
+    late_first: Level = Level.WARN
+    is_dense: Use = Use.IGNORED
+    row_step: Use = Use.USED
+    exact: bool = False
+    contiguous: bool = False
+    ring_count: int = 0
+    imu: Use = Use.IGNORED
+    orientation: Use = Use.IGNORED
+    imu_rate_hz: float = 100.0
+    any_acceleration_unit: bool = False
+    tf: Use = Use.USED
+    cloud_qos: Subscription
+    imu_qos: Subscription = _UNASKED

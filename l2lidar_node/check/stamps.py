@@ -1,0 +1,220 @@
+"""Checks the stamps of a topic against each other and against when its messages came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.check.findings import Finding, Level, not_judged, ok
+from l2lidar_node.check.observation import Observation
+from l2lidar_node.check.requirements import Consumer, Use
+
+I64 = NDArray[np.int64]
+F64 = NDArray[np.float64]
+
+_RATIO_MIN_S: Final = 1.0
+_RATIO_TOLERANCE: Final = 0.05
+_LATENCY_TOLERANCE_S: Final = 0.5  # on a busy machine messages come late at either end
+_HALF: Final = (0.45, 0.55)
+_MUCH_LOST: Final = 0.2
+_OLD_S: Final = 2.0
+_L2_IMU_HZ: Final = 250.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """The stamps of one topic.
+
+    Attributes
+    ----------
+    subject : str
+        cloud or imu.
+    stamps, arrivals : ndarray, shape (N,), int64
+        [ns], in the order they came.
+    lengths_s : ndarray, shape (N,), float64
+        From the stamp to the end of what was measured [s], NaN where that is not known.
+    jitter : float
+        Share of the period that intervals may deviate from it.
+    """
+
+    subject: str
+    stamps: I64
+    arrivals: I64
+    lengths_s: F64
+    jitter: float
+
+    @property
+    def has_arrivals(self) -> bool:
+        """Whether arrivals say anything: some recordings are written with the stamps instead."""
+        return bool((self.arrivals != self.stamps).any())
+
+    @property
+    def latency_s(self) -> float:
+        """Usual time from the end of a measurement to its arrival [s]; or from its stamp.
+
+        Exceeded by nine of ten messages, so that those held up on a busy machine do not count.
+        """
+        lengths = self.lengths_s if self.has_lengths else np.zeros(len(self.stamps))
+        return float(np.nanpercentile((self.arrivals - self.stamps) / 1e9 - lengths, 10))
+
+    @property
+    def has_lengths(self) -> bool:
+        """Whether any length is known."""
+        return bool(np.isfinite(self.lengths_s).any())
+
+
+def cloud_track(seen: Observation, lengths_s: F64) -> Track:
+    """Return the stamps of the clouds."""
+    stamps = np.array([cloud.stamp for cloud in seen.clouds], np.int64)
+    arrivals = np.array([cloud.arrival for cloud in seen.clouds], np.int64)
+    return Track("cloud", stamps, arrivals, lengths_s, 0.2)
+
+
+def imu_track(seen: Observation) -> Track:
+    """Return the stamps of the IMU samples."""
+    imu = seen.imu
+    # Units send pairs of samples 2.6 to 4.7 ms apart.
+    return Track("imu", imu["stamp"], imu["arrival"], np.zeros(len(imu)), 0.6)
+
+
+def check(track: Track, consumer: Consumer) -> Iterator[Finding]:
+    """Yield findings on the stamps of a topic."""
+    if len(track.stamps) < 3:
+        yield Finding(
+            Level.WARN,
+            track.subject,
+            "few",
+            f"{len(track.stamps)} messages are too few to judge their rate",
+            "look at more with --seconds",
+        )
+        return
+    intervals = np.diff(track.stamps) / 1e9
+    yield from _check_order(track, intervals, consumer)
+    forward = intervals[intervals > 0]
+    if not len(forward):
+        return
+    period = float(np.median(forward))
+    yield from _check_rate(track, period, forward, consumer)
+    yield from _check_gaps(track, period, forward)
+    yield from _check_pace(track)
+
+
+def _check_order(track: Track, intervals: F64, consumer: Consumer) -> Iterator[Finding]:
+    backward, equal = int((intervals < 0).sum()), int((intervals == 0).sum())
+    level = Level.WARN if consumer.time is Use.IGNORED else Level.ERROR
+    if backward:
+        text = f"{backward} stamps are before the one that came before, by up to "
+        yield Finding(
+            level,
+            track.subject,
+            "stamps-backward",
+            f"{text}{-intervals.min():.4g} s; buffers are ordered by stamp or cleared",
+            "is there a second publisher, or did a recording start anew?",
+        )
+    if equal:
+        yield Finding(
+            level,
+            track.subject,
+            "stamps-equal",
+            f"{equal} stamps are the same as the one before; integration divides by their steps",
+            "is there a second publisher?",
+        )
+    if not backward and not equal:
+        yield ok(track.subject, "stamps", "stamps ascend")
+
+
+def _check_rate(
+    track: Track, period: float, forward: F64, consumer: Consumer
+) -> Iterator[Finding]:
+    rate = 1.0 / period
+    # But one: the first sweep of a recording may be a part of one.
+    near = np.sort(np.abs(forward[forward < 1.5 * period] - period))[:-1]
+    deviation = float(np.percentile(near, 95)) if len(near) else 0.0
+    text = f"{rate:.4g} Hz by stamp, intervals within {deviation * 1e3:.3g} ms for 95 %"
+    if track.subject == "imu" and rate < consumer.imu_rate_hz:
+        yield Finding(
+            consumer.imu.level,
+            "imu",
+            "rate",
+            f"{text}; {consumer.title} asks for {consumer.imu_rate_hz:g} Hz or more",
+            "the L2 sends 250 Hz: are samples lost? set qos_reliability: reliable",
+        )
+    elif deviation > track.jitter * period:
+        yield Finding(
+            Level.WARN,
+            track.subject,
+            "jitter",
+            f"{text}: that is {deviation / period:.0%} of the period, as when stamps are arrivals",
+            "set UseSystemTimeTS: false",
+        )
+    else:
+        yield ok(track.subject, "rate", text)
+
+
+def _check_gaps(track: Track, period: float, forward: F64) -> Iterator[Finding]:
+    missing = np.round(forward / period) - 1
+    wide = missing >= (1 if track.subject == "cloud" else 3)
+    lost = int(missing[wide].sum())
+    if not lost:
+        yield ok(track.subject, "gaps", "no gaps")
+        return
+    share = lost / (len(forward) + lost)
+    yield Finding(
+        Level.ERROR if share > _MUCH_LOST else Level.WARN,
+        track.subject,
+        "gaps",
+        f"{int(wide.sum())} gaps of up to {forward.max():.4g} s, {lost} messages missing "
+        f"({share:.1%})",
+        "set qos_reliability: reliable, or look at the driver's diagnostics for lost packets",
+    )
+
+
+def _check_pace(track: Track) -> Iterator[Finding]:
+    """Check how fast stamps advance and how old they are when they come."""
+    passed = (track.arrivals[-1] - track.arrivals[0]) / 1e9
+    if not track.has_arrivals or passed < _RATIO_MIN_S:
+        why = "no times of arrival" if not track.has_arrivals else f"only {passed:.2g} s"
+        yield not_judged(track.subject, "clock", f"pace of the stamps, {why}")
+        return
+    ratio = float(track.stamps[-1] - track.stamps[0]) / 1e9 / float(passed)
+    latency = track.latency_s
+    text = f"stamps advance {ratio:.4g} s per s"
+    if _HALF[0] <= ratio <= _HALF[1]:
+        yield Finding(
+            Level.ERROR,
+            track.subject,
+            "clock-half",
+            f"{text}: that is the L2's own clock, which is half as fast",
+            "set enable_l2_time_correction: true and timeScaleNum: 2",
+        )
+    elif abs(ratio - 1.0) > _RATIO_TOLERANCE + _LATENCY_TOLERANCE_S / passed:
+        yield Finding(
+            Level.WARN,
+            track.subject,
+            "clock-pace",
+            f"{text}: replayed at another speed, or a clock that steps",
+            "record at speed 1; look at the driver's diagnostics of the clock",
+        )
+    elif latency < -1e-3:
+        yield Finding(
+            Level.WARN,
+            track.subject,
+            "clock-ahead",
+            f"messages come {-latency:.4g} s before what they say was measured: their stamp is "
+            "of the end, or of a clock that is ahead",
+            "stamp clouds at their first point, as the driver does",
+        )
+    elif latency > _OLD_S:
+        yield Finding(
+            Level.WARN,
+            track.subject,
+            "clock-behind",
+            f"messages come {latency:.4g} s after what they say was measured",
+            "set use_sim_time: true in the consumer for a replay; else enable_l2_host_sync: true",
+        )
+    else:
+        yield ok(track.subject, "clock", f"{text}, messages come {latency * 1e3:.3g} ms later")

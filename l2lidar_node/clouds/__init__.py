@@ -1,0 +1,1 @@
+"""Point layouts: the fields of a published cloud."""

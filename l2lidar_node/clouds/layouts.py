@@ -1,0 +1,177 @@
+"""Names the point layouts that clouds can be published in, and turns POINT records into them.
+
+Every layout has at most one time field, since consumers choose among several by their own rules.
+Offsets, types and units are those that the consumer's own driver publishes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.clouds.rings import rings
+from l2lidar_node.types import POINT, HostNs
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A point layout.
+
+    Attributes
+    ----------
+    name : str
+    dtype : dtype
+        Of one point as published, little-endian.
+    meant_for : str
+        Who reads it.
+    """
+
+    name: str
+    dtype: np.dtype[np.void]
+    meant_for: str
+
+    @property
+    def time_field(self) -> str:
+        """Name of the time field; empty if there is none."""
+        names = self.dtype.names or ()
+        return next((name for name in _TIME_FIELDS if name in names), "")
+
+    def without_time(self) -> Layout:
+        """Return the layout without its time field, for points that need none any more."""
+        fields = dict(self.dtype.fields or {})
+        kept = [name for name in self.dtype.names or () if name != self.time_field]
+        layout = np.dtype(
+            {
+                "names": kept,
+                "formats": [fields[name][0] for name in kept],
+                "offsets": [fields[name][1] for name in kept],
+                "itemsize": self.dtype.itemsize,
+            }
+        )
+        return Layout(self.name, layout, self.meant_for)
+
+    def convert(self, points: NDArray[np.void], start: HostNs) -> NDArray[np.void]:
+        """Return points in this layout.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N,), dtype POINT
+            Or any other with x, y and z, and with ``time`` where the layout has a time: a missing
+            range is computed, a missing intensity is 0.
+        start : HostNs
+            Instant at which ``time`` is 0.
+
+        Returns
+        -------
+        ndarray, shape (N,), dtype ``dtype``
+            ``points`` itself when it has this layout already; bytes between fields are 0.
+        """
+        if points.dtype == self.dtype:
+            return points
+        converted = np.zeros(len(points), self.dtype)
+        for name in self.dtype.names or ():
+            converted[name] = _field(name, points, start)
+        if self.name == "ouster_legacy":
+            converted["range"] = np.rint(_range(points) * 1e3)  # whole millimetres
+        return converted
+
+
+_TIME_FIELDS: Final = ("time", "t", "timestamp", "time_stamp")
+
+
+def _field(name: str, points: NDArray[np.void], start: HostNs) -> NDArray[Any]:
+    """Return the values of one field of a layout."""
+    if name in ("t", "time_stamp"):  # ns after the header's stamp
+        return np.rint(points["time"].astype(np.float64) * 1e9)
+    if name == "timestamp":  # s since the epoch
+        return np.float64(start / 1e9) + points["time"].astype(np.float64)
+    if name in ("ring", "channel"):
+        return rings(points)
+    if name in ("range", "distance"):
+        return _range(points)
+    if name == "azimuth":
+        return np.asarray(np.arctan2(points["y"], points["x"]))
+    if name == "elevation":
+        return np.asarray(np.arctan2(points["z"], np.hypot(points["x"], points["y"])))
+    if name in ("intensity", "reflectivity"):
+        known = "intensity" in (points.dtype.names or ())
+        return np.asarray(points["intensity"]) if known else np.zeros(len(points))
+    if name in ("noise", "return_type"):
+        return np.full(len(points), _CONSTANTS[name])
+    return np.asarray(points[name])
+
+
+def _range(points: NDArray[np.void]) -> NDArray[Any]:
+    if "range" in (points.dtype.names or ()):
+        return np.asarray(points["range"])
+    return np.asarray(np.sqrt(points["x"] ** 2 + points["y"] ** 2 + points["z"] ** 2))
+
+
+_CONSTANTS: Final = {
+    "noise": 0,  # the L2 measures no ambient light
+    "return_type": 1,  # Autoware's number for "strongest" among single returns
+}
+
+
+def _layout(name: str, meant_for: str, fields: str, itemsize: int) -> Layout:
+    """Return a layout from ``name:type@offset`` words."""
+    names, formats, offsets = [], [], []
+    for word in fields.split():
+        field_name, _, rest = word.partition(":")
+        code, _, offset = rest.partition("@")
+        names.append(field_name)
+        formats.append(f"<{code}" if code != "u1" else code)
+        offsets.append(int(offset))
+    layout: np.dtype[np.void] = np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize}
+    )
+    return Layout(name, layout, meant_for)
+
+
+_XYZ: Final = "x:f4@0 y:f4@4 z:f4@8"
+
+LAYOUTS: Final[dict[str, Layout]] = {
+    layout.name: layout
+    for layout in (
+        Layout("native", POINT, "deskew, KISS-ICP, RKO-LIO, GLIM, RViz"),
+        Layout("native_ring", np.dtype([*POINT.descr, ("ring", "<u2")]), "as native, with ring"),
+        _layout(
+            "velodyne",
+            "LIO-SAM, FAST-LIO, rtabmap",
+            f"{_XYZ} intensity:f4@12 ring:u2@16 time:f4@18",
+            22,
+        ),
+        _layout(
+            "unitree",
+            "Point-LIO for Unitree: the vendor's own layout",
+            f"{_XYZ} intensity:f4@16 ring:u2@20 time:f4@24",
+            32,
+        ),
+        _layout(
+            "ouster_legacy",
+            "LIO-SAM with sensor ouster, FAST-LIO with lidar_type 3; range in mm",
+            f"{_XYZ} intensity:f4@16 t:u4@20 reflectivity:u2@24 ring:u1@26 noise:u2@28 "
+            "range:u4@32",
+            48,
+        ),
+        _layout(
+            "hesai",
+            "whoever reads Hesai; timestamp is absolute",
+            f"{_XYZ} intensity:f4@12 ring:u2@16 timestamp:f8@18",
+            26,
+        ),
+        _layout(
+            "autoware",
+            "Autoware (PointXYZIRCAEDT)",
+            f"{_XYZ} intensity:u1@12 return_type:u1@13 channel:u2@14 azimuth:f4@16 "
+            "elevation:f4@20 distance:f4@24 time_stamp:u4@28",
+            32,
+        ),
+        _layout(
+            "xyzi", "costmaps and everything that wants no time", f"{_XYZ} intensity:f4@12", 16
+        ),
+    )
+}

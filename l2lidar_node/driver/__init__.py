@@ -1,0 +1,1 @@
+"""From ordered packets to sweeps, and how the device is doing."""

@@ -1,0 +1,349 @@
+"""Composes the driver's parts: bytes with their arrival in, sweeps and samples out; no socket.
+
+Every method takes the time as an argument and returns what happened. What comes out depends on
+the calls of :meth:`Driver.receive`, :meth:`Driver.sent`, :meth:`Driver.settle` and
+:meth:`Driver.host_stepped`, their order and their arguments alone, so a recording of those gives
+what the live sensor gave, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver.counters import Counters
+from l2lidar_node.driver.device import DeviceState, Watchdog
+from l2lidar_node.driver.gravity import GravityMonitor
+from l2lidar_node.driver.orientation import Levelling
+from l2lidar_node.driver.queries import Queries
+from l2lidar_node.driver.reorder import Intake, Released
+from l2lidar_node.driver.requests import Answer, Requests
+from l2lidar_node.driver.sweep import MAX_GAP_NS, SweepAssembler
+from l2lidar_node.protocol import commands, wire
+from l2lidar_node.protocol.commands import Command
+from l2lidar_node.protocol.framing import FrameError, Framer
+from l2lidar_node.protocol.packets import (
+    Ack,
+    DecodeError,
+    ImuPacket,
+    Packet,
+    Parameters,
+    PointPacket,
+    Version,
+    decode,
+)
+from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep
+
+_ROUND_TRIPS: Final = 60  # the last minute's
+# Looking up a member of an Enum takes long.
+_IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """The device has been silent for longer than the watchdog allows."""
+
+    duration_ns: int
+
+
+class Outgoing(NamedTuple):
+    """A frame for the device, and the instant at which the driver counts it as sent."""
+
+    frame: bytes
+    at: HostNs
+
+
+Event = Sweep | ImuSample | Version | Parameters | Answer | ClockEvent | Silence
+
+
+class Driver:
+    """One device: its byte stream, its clock, its sweeps, its commands.
+
+    Parameters
+    ----------
+    config : DriverConfig
+    """
+
+    def __init__(self, config: DriverConfig) -> None:
+        self.counters = Counters()
+        self.version: Version | None = None
+        self.parameters: Parameters | None = None
+        self.last_points: bytes | None = None
+        self.last_imu: ImuSample | None = None
+        self.gravity = GravityMonitor()
+        self.round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
+        self._config = config
+        self._framer = Framer()
+        self._intake = Intake(config.sweep.reorder_window)
+        self.counters.sequence = self._intake.counts
+        self._clock = DeviceClock(config.clock)
+        self._levelling = Levelling(config.imu.roll_pitch_only)
+        self._assembler = SweepAssembler(config.sweep, self._level())
+        self._requests = Requests()
+        self._watchdog = Watchdog(config.watchdog)
+        self._outbox: list[Outgoing] = []
+        self._queries = Queries(config.clock.enable_latency_measure)
+
+    @property
+    def config(self) -> DriverConfig:
+        """The settings in force."""
+        return self._config
+
+    def receive(self, data: bytes, arrival: HostNs) -> list[Event]:
+        """Return what the bytes of one datagram complete.
+
+        Parameters
+        ----------
+        data : bytes
+            As they came from the device, cut anywhere.
+        arrival : HostNs
+            When they reached this host, at best as the kernel noted it.
+        """
+        counters = self.counters
+        counters.datagrams += 1
+        counters.octets += len(data)
+        events = [] if self._intake.is_flowing(arrival) else self.settle(arrival)
+        for item in self._framer.feed(data):
+            if isinstance(item, FrameError):
+                counters.faults[item.fault.value] += 1
+                counters.skipped_octets += item.skipped
+                continue
+            counters.frames[item.packet_type if item.packet_type in wire.FRAME_SIZES else 0] += 1
+            events += self._handle(decode(item), arrival)
+        if self._clock.happened:
+            events += self._clock.events()
+        return events
+
+    def tick(self, now: HostNs, heard_until: HostNs | None = None) -> list[Event]:
+        """Return what is due by now; to be called every few milliseconds.
+
+        Parameters
+        ----------
+        now : HostNs
+        heard_until : HostNs, optional
+            Instant up to which everything that arrived has been handed to :meth:`receive`: where
+            the host is behind, a packet that still waits in the socket is not late. ``now`` if
+            left out.
+        """
+        events = self.settle(now if heard_until is None else heard_until)
+        events += self._send_due(now)
+        if self._watchdog.expired(now):
+            events.append(Silence(self._watchdog.silence_ns(now)))
+        return events
+
+    def settle(self, until: HostNs) -> list[Event]:
+        """Return what need not wait any longer, nothing more having arrived until then.
+
+        Packets that waited :data:`~l2lidar_node.driver.reorder.REORDER_NS` for an earlier one, and
+        the sweep of a stream of points that paused for :data:`MAX_GAP_NS`.
+        """
+        events = self._released(self._intake.settle(until))
+        if self._has_stalled(until):
+            events += self._finished(self._assembler.flush())
+        return events
+
+    def host_stepped(self, by_ns: int, at: HostNs) -> list[Event]:
+        """Take note that the clock of arrivals was set and shows ``at``; return what that makes.
+
+        A step of 0 says that steps will be told. Where nobody tells they are inferred.
+        """
+        self._clock.host_stepped(by_ns, at)
+        return [*self._clock.events()]
+
+    def is_overdue(self, until: HostNs) -> bool:
+        """Tell whether :meth:`settle` would do anything."""
+        return self._intake.is_overdue(until) or self._has_stalled(until)
+
+    def outbox(self) -> list[Outgoing]:
+        """Return the frames to send now, in order, once."""
+        frames, self._outbox = self._outbox, []
+        return frames
+
+    def send(self, command: Command, now: HostNs) -> int:
+        """Queue a command and return the ticket that its :class:`Answer` will carry."""
+        self._outbox.append(Outgoing(command.encode(), now))
+        if not command.acknowledged:
+            return 0
+        return self._requests.add(command, now)
+
+    def sent(self, command: Command, at: HostNs) -> list[Event]:
+        """Do what sending a command does to the driver itself; return what it completes.
+
+        The driver calls it for everything it sends. Whoever replays a recording calls it for the
+        commands in there.
+        """
+        if command.time is not None:
+            self._clock.synced(command.time, at)
+        elif command.is_latency:
+            self._requests.add(command, at, tries=1)
+        elif command.is_start:
+            self._watchdog.started(at)
+            self._intake.forget()
+        elif command.is_standby:
+            self._watchdog.stopped(at)
+            return self.flush()
+        elif command.is_reset:
+            self._watchdog.started(at)
+            events = self.flush()
+            self._intake.forget()
+            self._forget_device()
+            return events
+        return []
+
+    def start_rotation(self, now: HostNs) -> int:
+        """Queue the command to leave standby; return its ticket."""
+        self.sent(commands.start(), now)
+        return self.send(commands.start(), now)
+
+    def stop_rotation(self, now: HostNs) -> tuple[int, list[Event]]:
+        """Queue the command for standby; return its ticket and what had been collected so far."""
+        return self.send(commands.standby(), now), self.sent(commands.standby(), now)
+
+    def reset_device(self, now: HostNs) -> list[Event]:
+        """Queue the command to reboot and return what had been collected so far."""
+        self.send(commands.reset(), now)
+        return self.sent(commands.reset(), now)
+
+    def flush(self) -> list[Event]:
+        """Return everything that is still being collected."""
+        events = self._released(self._intake.flush())
+        return events + self._finished(self._assembler.flush())
+
+    def configure(self, config: DriverConfig) -> None:
+        """Use other live settings from the next packet on."""
+        self._config = config
+        self._levelling.roll_pitch_only = config.imu.roll_pitch_only
+        self._assembler.configure(config.sweep, self._level())
+        self._clock.configure(config.clock)
+
+    def clock_status(self) -> ClockStatus:
+        """Return what is known about the device's clock."""
+        return self._clock.status()
+
+    def state(self, now: HostNs) -> DeviceState:
+        """Return what the device is doing."""
+        return self._watchdog.state(now)
+
+    def spin_up_left_s(self, now: HostNs) -> float:
+        """Return the seconds until points can be expected."""
+        return self._watchdog.spin_up_left_s(now)
+
+    def _level(self) -> Levelling | None:
+        return self._levelling if self._config.imu.adjust else None
+
+    def _handle(self, packet: Packet, arrival: HostNs) -> list[Event]:
+        if isinstance(packet, ImuPacket):
+            self._watchdog.heard(_IMU, arrival)
+            if self._intake.follows(_IMU, packet, arrival):
+                return self._imu(packet, arrival)
+            return self._reordered(_IMU, packet, arrival)
+        if isinstance(packet, PointPacket):
+            self._watchdog.heard(_POINTS, arrival)
+            if (packet.packet_type == _POINTS_3D) != self._config.sweep.frame3d:
+                self.counters.ignored_points += 1
+                return []
+            if self._intake.follows(_POINTS, packet, arrival):
+                return self._points(packet, arrival)
+            return self._reordered(_POINTS, packet, arrival)
+        if isinstance(packet, Ack):
+            return self._acknowledged(packet, arrival)
+        if isinstance(packet, Version):
+            known, self.version = self.version, packet
+            return [] if packet == known else [packet]  # asked twice, it answers twice
+        if isinstance(packet, Parameters):
+            self.parameters = packet
+            return [packet]
+        if isinstance(packet, DecodeError):
+            self.counters.rejected[f"{packet.packet_type}.{packet.reason}"] += 1
+        return []
+
+    def _reordered(
+        self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
+    ) -> list[Event]:
+        events: list[Event] = []
+        if self._intake.begins_anew(stream, packet, arrival):
+            events = self._released(self._intake.restart(stream))
+            self._forget_device()
+        return events + self._released(self._intake.push(stream, packet, arrival))
+
+    def _released(self, released: Released) -> list[Event]:
+        events: list[Event] = []
+        for missing, (packet, arrival) in released:
+            if isinstance(packet, ImuPacket):
+                events += self._imu(packet, arrival)
+            else:
+                events += self._points(packet, arrival, missing)
+        return events
+
+    def _imu(self, packet: ImuPacket, arrival: HostNs) -> list[Event]:
+        stamp = self._clock.observe(_IMU, packet.seq, packet.stamp, arrival)
+        if stamp is None:
+            self.counters.unlocked[_IMU] += 1
+            return []
+        sample = ImuSample(stamp, *packet[2:])
+        self.counters.samples += 1
+        self.last_imu = sample
+        self._levelling.add(sample)
+        self.gravity.add(sample)
+        return [sample]
+
+    def _points(self, packet: PointPacket, arrival: HostNs, missing: int = 0) -> list[Event]:
+        start = self._clock.observe(_POINTS, packet.seq, packet.stamp, arrival, packet.duration_ns)
+        if start is None:
+            self.counters.unlocked[_POINTS] += 1
+            return []
+        self.last_points = packet.payload
+        events: list[Event] = []
+        for sweep in self._assembler.push(packet, start, missing):
+            events += self._finished(sweep)
+        return events
+
+    def _finished(self, sweep: Sweep | None) -> list[Event]:
+        if sweep is None:
+            return []
+        self.counters.sweeps += 1
+        self.counters.unlevelled = self._assembler.unlevelled
+        self.counters.points += len(sweep.points)
+        is_3d = self._config.sweep.frame3d
+        slots = wire.POINTS_PER_3D_PACKET if is_3d else wire.POINTS_PER_2D_PACKET
+        self.counters.slots += sweep.packets * slots
+        if not len(sweep.points):
+            self.counters.empty_sweeps += 1
+            return []
+        return [sweep]
+
+    def _acknowledged(self, ack: Ack, now: HostNs) -> list[Event]:
+        answer = self._requests.answer(ack, now)
+        if answer is None:
+            self.counters.stray_acks += 1
+            return []
+        if answer.command.is_latency:
+            if answer.round_trip_ns is not None:
+                self.round_trips.append(answer.round_trip_ns)
+                self._clock.round_trip(answer.round_trip_ns)
+            return []
+        return [answer]
+
+    def _has_stalled(self, until: HostNs) -> bool:
+        return self._assembler.is_collecting and self._intake.pause_ns(until) > MAX_GAP_NS
+
+    def _send_due(self, now: HostNs) -> list[Event]:
+        due = [commands.sync_time(now)] if self._clock.sync_due(now) else []
+        due += self._queries.due(
+            now, version=self.version is not None, parameters=self.parameters is not None
+        )
+        repeats, given_up = self._requests.expire(now)
+        events: list[Event] = []
+        for command in due + repeats:
+            self._outbox.append(Outgoing(command.encode(), now))
+            events += self.sent(command, now)
+        return events + [answer for answer in given_up if not answer.command.is_latency]
+
+    def _forget_device(self) -> None:
+        """Ask again who the device is: it may have another version or work mode after a reboot."""
+        self._levelling.clear()
+        self.version = None
+        self.parameters = None

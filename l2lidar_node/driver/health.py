@@ -1,0 +1,303 @@
+"""Judges a device from what was counted in a period: one check per aspect.
+
+OK needs nobody's attention, WARN should be looked at, ERROR means that data are missing or wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from l2lidar_node.clock import ClockEventKind, ClockStatus
+from l2lidar_node.driver.counters import Counters
+from l2lidar_node.driver.device import DeviceState
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.driver.gravity import GRAVITY, GravityReport
+from l2lidar_node.protocol import wire
+from l2lidar_node.types import HostNs, Stream, Transport
+
+POINTS_3D_HZ: Final = 1 / wire.MIRROR_PERIOD_S
+POINTS_2D_HZ: Final = 50.0
+
+_RATE_TOLERANCE: Final = 0.1
+_LOSS_ERROR: Final = 0.05
+_MIN_VALID_SHARE: Final = 0.1
+_MAX_DIRT_PERCENT: Final = 5.0
+_MAX_APD_CELSIUS: Final = 80.0
+_MAX_IMU_CELSIUS: Final = 85.0
+_GRAVITY_TOLERANCE: Final = 0.9  # [m/s^2]; units at rest have shown 9.6 to 10.1
+_CLOCK_TROUBLES: Final = {
+    ClockEventKind.REBOOT: "the device restarted",
+    ClockEventKind.FOREIGN_SYNC: "somebody else sets the device's clock",
+    ClockEventKind.HOST_STEP: "this host's clock was stepped",
+    ClockEventKind.EARLIER: "packets come earlier than before",
+    ClockEventKind.SILENCE: "the device was silent",
+    ClockEventKind.LOST: "the device's clock had been lost track of",
+}
+_LATE_NS: Final = 500_000_000  # whoever steers by these data should know
+_WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
+_MAX_TILT_DEG: Final = 10.0
+
+
+class Level(IntEnum):
+    """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """The judgement of one aspect.
+
+    Attributes
+    ----------
+    name : str
+    level : Level
+    message : str
+        One sentence.
+    values : dict
+        Figures by name, the unit in the name.
+    """
+
+    name: str
+    level: Level
+    message: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Period:
+    """What the transport and the driver counted, at one instant."""
+
+    now: HostNs
+    counters: Counters
+    foreign: int
+    kernel_drops: int
+    clock_events: dict[ClockEventKind, int]
+
+
+def observe(driver: Driver, transport: Transport, now: HostNs) -> Period:
+    """Return the counts of this instant."""
+    return Period(
+        now,
+        driver.counters.snapshot(),
+        transport.foreign,
+        transport.kernel_drops,
+        driver.clock_status().events,
+    )
+
+
+def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
+    """Return the checks of the time between two instants."""
+    seconds = max((after.now - before.now) / 1e9, 1e-6)
+    checks = [
+        _device(driver, before, after, seconds),
+        _link(before, after),
+        _clock(driver.clock_status(), driver.round_trips, before, after),
+        _points(before.counters, after.counters, seconds),
+    ]
+    if driver.last_points is not None:
+        checks.append(_hardware(driver.last_points))
+    report = driver.gravity.take()
+    if report is not None:
+        checks.append(_imu(report))
+    return checks
+
+
+def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Check:
+    state = driver.state(after.now)
+    packets = _measured(before, after)
+    old, new = before.counters, after.counters
+    rates = {stream: count / seconds for stream, count in packets.items()}
+    values = {
+        "state": state.value,
+        "point packets [1/s]": f"{rates[Stream.POINTS]:.1f}",
+        "IMU packets [1/s]": f"{rates[Stream.IMU]:.1f}",
+        "datagrams [1/s]": f"{(new.datagrams - old.datagrams) / seconds:.1f}",
+        "traffic [kB/s]": f"{(new.octets - old.octets) / seconds / 1e3:.1f}",
+    }
+    address = driver.config.network.l2_ip
+    if state is DeviceState.WAITING:
+        return Check("device", Level.ERROR, f"nothing heard from {address} yet", values)
+    if state is DeviceState.STALLED:
+        return Check("device", Level.ERROR, f"{address} has fallen silent", values)
+    if state is DeviceState.STANDBY:
+        return Check("device", Level.OK, "in standby as asked", values)
+    if state is DeviceState.SPINNING_UP:
+        left = driver.spin_up_left_s(after.now)
+        values["seconds to go"] = f"{left:.0f}"
+        message = f"spinning up, points in about {left:.0f} s" if left else "points are overdue"
+        return Check("device", Level.WARN, message, values)
+    if new.ignored_points > old.ignored_points and new.slots == old.slots:
+        asked, measured = ("3D", "2D") if driver.config.sweep.frame3d else ("2D", "3D")
+        message = f"it measures {measured} where frame3d asks for {asked}"
+        return Check("device", Level.ERROR, message, values)
+    nominal = POINTS_3D_HZ if driver.config.sweep.frame3d else POINTS_2D_HZ
+    slow = rates[Stream.POINTS] < nominal * (1 - _RATE_TOLERANCE)
+    imu_slow = 0 < rates[Stream.IMU] < wire.IMU_RATE_HZ * (1 - _RATE_TOLERANCE)
+    if slow or imu_slow:
+        return Check("device", Level.WARN, "streaming below its nominal rate", values)
+    if not rates[Stream.IMU]:
+        return Check("device", Level.WARN, "streaming points but no IMU", values)
+    return Check("device", Level.OK, "streaming", values)
+
+
+def _measured(before: Period, after: Period) -> dict[Stream, int]:
+    def count(*kinds: wire.PacketType) -> int:
+        return sum(after.counters.frames[kind] - before.counters.frames[kind] for kind in kinds)
+
+    return {
+        Stream.POINTS: count(wire.PacketType.POINTS_3D, wire.PacketType.POINTS_2D),
+        Stream.IMU: count(wire.PacketType.IMU),
+    }
+
+
+def _link(before: Period, after: Period) -> Check:
+    old, new = before.counters, after.counters
+    values: dict[str, str] = {}
+    lost = 0
+    for stream, counts in new.sequence.items():
+        lost += counts.lost - old.sequence[stream].lost
+        for name in ("lost", "late", "duplicates", "reordered", "restarts"):
+            values[f"{stream.value} {name}"] = str(getattr(counts, name))
+    for name, number in sorted(new.faults.items()):
+        values[f"damaged: {name}"] = str(number)
+    for name, number in sorted(new.rejected.items()):
+        values[f"rejected: {name}"] = str(number)
+    values["foreign datagrams"] = str(after.foreign)
+    values["kernel drops"] = str(after.kernel_drops)
+    damaged = sum((new.faults - old.faults).values()) + sum((new.rejected - old.rejected).values())
+    received = sum(_measured(before, after).values())
+    drops = after.kernel_drops - before.kernel_drops
+    foreign = after.foreign - before.foreign
+    is_grave = lost > _LOSS_ERROR * (received + lost)
+    troubles = [
+        text
+        for number, text in (
+            (lost, f"{lost} packets lost" + (f" in {received + lost}" if is_grave else "")),
+            (damaged, f"{damaged} damaged or impossible packets"),
+            (drops, f"{drops} datagrams dropped by the kernel; raise receive_buffer_bytes"),
+            (foreign, f"{foreign} datagrams of other senders refused"),
+        )
+        if number > 0
+    ]
+    if troubles:
+        level = Level.ERROR if is_grave else Level.WARN
+        return Check("link", level, "; ".join(troubles), values)
+    return Check("link", Level.OK, "no loss", values)
+
+
+def _clock(
+    status: ClockStatus, round_trips: Collection[int], before: Period, after: Period
+) -> Check:
+    old, new = before.counters, after.counters
+    unlocked = sum(new.unlocked.values()) - sum(old.unlocked.values())
+    values = {
+        "mode": status.mode,
+        "ratio": f"{status.ratio:.7f}",
+        "offset [s]": f"{status.offset_ns / 1e9:.6f}",
+        "residual [ms]": f"{status.residual_ns / 1e6:.3f}",
+        "lateness [ms]": f"{status.late_ns / 1e6:.3f}",
+        "path delay [ms]": f"{status.path_delay_ns / 1e6:.3f}",
+        "epochs": str(status.epochs),
+        "packets without stamp": str(sum(new.unlocked.values())),
+        **{f"{kind.value} events": str(count) for kind, count in status.events.items()},
+    }
+    if round_trips:
+        values |= {
+            "round trip min [ms]": f"{min(round_trips) / 1e6:.3f}",
+            "round trip mean [ms]": f"{sum(round_trips) / len(round_trips) / 1e6:.3f}",
+            "round trip max [ms]": f"{max(round_trips) / 1e6:.3f}",
+        }
+    if not status.locked:
+        level = Level.WARN if unlocked else Level.OK
+        return Check("clock", level, "not locked yet" if unlocked else "no data yet", values)
+    troubles = [
+        text
+        for kind, text in _CLOCK_TROUBLES.items()
+        if after.clock_events.get(kind, 0) > before.clock_events.get(kind, 0)
+    ]
+    if status.late_ns > _LATE_NS:
+        troubles.append(f"packets come {status.late_ns / 1e9:.1f} s late, stamps allow for it")
+    if troubles:
+        return Check("clock", Level.WARN, f"locked; {', '.join(troubles)}", values)
+    return Check("clock", Level.OK, "locked", values)
+
+
+def _points(old: Counters, new: Counters, seconds: float) -> Check:
+    slots = new.slots - old.slots
+    share = (new.points - old.points) / slots if slots else 0.0
+    values = {
+        "sweeps [1/s]": f"{(new.sweeps - old.sweeps) / seconds:.2f}",
+        "points [1/s]": f"{(new.points - old.points) / seconds:.0f}",
+        "valid share [%]": f"{100 * share:.1f}",
+        "empty sweeps": str(new.empty_sweeps),
+        "points without orientation": str(new.unlevelled),
+    }
+    if new.unlevelled > old.unlevelled:
+        message = "imu_adjust drops points for want of IMU data"
+        return Check("points", Level.WARN, message, values)
+    if slots and share < _MIN_VALID_SHARE:
+        return Check("points", Level.WARN, "hardly any returns: is the sensor covered?", values)
+    return Check("points", Level.OK, f"{100 * share:.0f} % of the slots return", values)
+
+
+def _hardware(payload: bytes) -> Check:
+    state = np.frombuffer(payload, wire.INSIDE_STATE, 1, wire.DATA_INFO.itemsize)[0]
+    values = {
+        "mirror period [us]": str(state["sys_rotation_period"]),
+        "head period [us]": str(state["com_rotation_period"]),
+        "dirt index [%]": f"{state['dirty_index']:.2f}",
+        "upper link loss": f"{state['packet_lost_up']:.4f}",
+        "lower link loss": f"{state['packet_lost_down']:.4f}",
+        "APD temperature [degC]": f"{state['apd_temperature']:.1f}",
+        "APD voltage [V]": f"{state['apd_voltage']:.2f}",
+        "laser voltage [V]": f"{state['laser_voltage']:.2f}",
+        "IMU temperature [degC]": f"{state['imu_temperature']:.1f}",
+    }
+    troubles = [
+        text
+        for wrong, text in (
+            (state["dirty_index"] > _MAX_DIRT_PERCENT, "the cover is dirty"),
+            (state["apd_temperature"] > _MAX_APD_CELSIUS, "the detector is hot"),
+            (state["imu_temperature"] > _MAX_IMU_CELSIUS, "the IMU is hot"),
+            (
+                state["packet_lost_up"] + state["packet_lost_down"] > 0.01,
+                "inner links lose packets",
+            ),
+            (
+                not all(np.isfinite(state[name]) for name in state.dtype.names or ()),
+                "it reports values that are no numbers",
+            ),
+        )
+        if wrong
+    ]
+    if troubles:
+        return Check("hardware", Level.WARN, "; ".join(troubles), values)
+    return Check("hardware", Level.OK, "healthy", values)
+
+
+def _imu(report: GravityReport) -> Check:
+    values = {
+        "specific force [m/s^2]": f"{report.norm:.3f}",
+        "orientation against gravity [deg]": f"{report.tilt_deg:.2f}",
+    }
+    if report.norm > _WRONG_GRAVITY:
+        message = (
+            f"|a| is {report.norm:.1f} m/s^2: the accelerometer fault of a unit that was not "
+            "level at power-on; power it up level and still"
+        )
+        return Check("imu", Level.ERROR, message, values)
+    if abs(report.norm - GRAVITY) > _GRAVITY_TOLERANCE:
+        return Check("imu", Level.WARN, f"|a| is {report.norm:.1f} m/s^2, not gravity", values)
+    if report.tilt_deg > _MAX_TILT_DEG:
+        message = f"the orientation is {report.tilt_deg:.0f} degrees off gravity"
+        return Check("imu", Level.WARN, message, values)
+    return Check("imu", Level.OK, "agrees with gravity", values)

@@ -1,0 +1,1 @@
+"""The way to the host: ports, faults and damage."""

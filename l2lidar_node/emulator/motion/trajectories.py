@@ -1,0 +1,213 @@
+"""Makes the motions that come with the emulator: still, spin, walk, trot, drone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.emulator.motion.motion import Motion, mount_quaternion, rpy_quaternions
+from l2lidar_node.emulator.motion.spline import PoseSpline
+from l2lidar_node.emulator.rng import Stream, generator
+from l2lidar_node.emulator.world.scene import Scene
+
+MOTIONS: Final = ("still", "spin", "walk", "trot", "drone")
+"""Names for :func:`make`."""
+
+DEFAULT_SPEEDS: Final = {"still": 0.0, "spin": 1.0, "walk": 0.7, "trot": 0.8, "drone": 1.0}
+"""Speed by motion [m/s], for spin the rate [rad/s]."""
+
+_KNOTS_PER_S: Final = {"still": 4.0, "spin": 50.0, "walk": 100.0, "trot": 250.0, "drone": 250.0}
+
+
+def make(
+    name: str,
+    scene: Scene,
+    *,
+    speed: float = 0.0,
+    rest_s: float = 2.0,
+    mount: str | tuple[float, float, float] = "upright",
+    seed: int = 0,
+) -> Motion:
+    """Return a built-in motion along a scene's route.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`MOTIONS`.
+    scene : Scene
+        Gives the route (walk, trot, drone) or the spot (still, spin).
+    speed : float
+        [m/s], for spin the rate [rad/s]; 0 = the motion's own.
+    rest_s : float
+        Rest at the beginning [s], see :class:`Motion`.
+    mount : str or tuple of float
+        See :func:`motion.mount_quaternion`.
+    seed : int
+        Shifts the phases of bobbing, swaying and vibrating.
+
+    Raises
+    ------
+    ValueError
+        For a name that is not known or a speed that is negative.
+    """
+    if name not in MOTIONS:
+        raise ValueError(f"motion '{name}' is not known, expected one of {', '.join(MOTIONS)}")
+    if not 0.0 <= speed < 100.0:
+        raise ValueError(f"speed {speed!r} is out of range, expected 0 to 100")
+    speed = speed or DEFAULT_SPEEDS[name]
+    route = _Route(scene.route)
+    lap_s = {"still": 2.0, "spin": 2.0 * np.pi / (speed or 1.0)}.get(
+        name, route.length / (speed or 1.0)
+    )
+    lap = _Lap(lap_s, _KNOTS_PER_S[name], speed, scene, route, generator(seed, Stream.MOTION, 0))
+    position, rpy = _GAITS[name](lap)
+    curve = PoseSpline(lap.t, position, rpy_quaternions(rpy), periodic=True, degree=5)
+    return Motion(curve, rest_s=rest_s, mount_wxyz=mount_quaternion(mount))
+
+
+class _Route:
+    """A closed smooth curve through corners, by distance along it."""
+
+    def __init__(self, corners: NDArray[np.float64]) -> None:
+        from scipy.interpolate import CubicSpline, make_interp_spline
+
+        closed = np.vstack([corners, corners[:1]])
+        knots = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
+        self._curve = make_interp_spline(knots, closed, k=5, bc_type="periodic")
+        self._u = np.linspace(0.0, knots[-1], 4001)
+        pace = CubicSpline(self._u, np.linalg.norm(self._curve(self._u, nu=1), axis=1))
+        self._pace, self._distance = pace, pace.antiderivative()
+        self.length = float(self._distance(knots[-1]))
+
+    def at(
+        self, s: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return x y (N, 2) [m], unwrapped heading [rad] and curvature [1/m] at distances."""
+        lap = np.mod(s, self.length)
+        u = np.interp(lap, self._distance(self._u), self._u)
+        for _ in range(3):  # Newton: without kinks, which would be jerks
+            u = u - (self._distance(u) - lap) / self._pace(u)
+        u = np.mod(u, self._u[-1])
+        d1, d2 = self._curve(u, nu=1).T, self._curve(u, nu=2).T
+        curvature = (d1[0] * d2[1] - d1[1] * d2[0]) / np.hypot(*d1) ** 3
+        return self._curve(u), np.unwrap(np.arctan2(d1[1], d1[0])), curvature
+
+
+class _Lap:
+    """What a gait is made of: the knots of one lap, the route there, whole numbers of waves."""
+
+    def __init__(
+        self,
+        period: float,
+        rate: float,
+        speed: float,
+        scene: Scene,
+        route: _Route,
+        source: np.random.Generator,
+    ) -> None:
+        self.t = np.linspace(0.0, period, max(round(period * rate), 16) + 1)
+        self.speed = speed
+        self.scene = scene
+        self._period = period
+        self._source = source
+        begin = source.uniform(0.0, route.length)
+        self.xy, self.heading, self.curvature = route.at(begin + speed * self.t)
+        self.left = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=1)
+
+    def wave(self, frequency: float) -> NDArray[np.float64]:
+        """Return a sine of about this frequency [Hz], fitted to the lap, shape (N,)."""
+        turns = max(round(frequency * self._period), 1)
+        return np.sin(
+            2.0 * np.pi * turns / self._period * self.t + self._source.uniform(0.0, 2.0 * np.pi)
+        )
+
+    def pose(
+        self,
+        height: NDArray[np.float64],
+        sideways: NDArray[np.float64],
+        roll: NDArray[np.float64],
+        pitch: NDArray[np.float64],
+        yaw: NDArray[np.float64],
+    ) -> _Poses:
+        """Return poses on the route; angles [deg] are relative to the heading."""
+        xy = self.xy + self.left * sideways[:, None]
+        z = self.scene.ground(self.xy[:, 0], self.xy[:, 1]) + height
+        rpy = np.deg2rad(np.stack([roll, pitch, yaw], axis=1))
+        rpy[:, 2] += self.heading
+        return np.column_stack([xy, z]), rpy
+
+
+_Poses = tuple[
+    NDArray[np.float64], NDArray[np.float64]
+]  # positions (N, 3) [m], roll pitch yaw (N, 3) [rad]
+
+
+def _spot(lap: _Lap, height: float) -> NDArray[np.float64]:
+    x, y = lap.scene.spot
+    z = float(lap.scene.ground(np.array(x), np.array(y))) + height
+    return np.tile([x, y, z], (len(lap.t), 1))
+
+
+def _still(lap: _Lap) -> _Poses:
+    return _spot(lap, 1.0), np.zeros((len(lap.t), 3))
+
+
+def _spin(lap: _Lap) -> _Poses:
+    """Turn on a table, the sensor 40 mm off its axis."""
+    yaw = lap.speed * lap.t
+    zero = np.zeros_like(yaw)
+    position = _spot(lap, 0.8) + 0.04 * np.column_stack([np.cos(yaw), np.sin(yaw), zero])
+    return position, np.column_stack([zero, zero, yaw])
+
+
+def _walk(lap: _Lap) -> _Poses:
+    """Walk with the sensor in the hand: a bob per step, a sway per stride, a wandering look."""
+    step, vigour = 1.8 * np.sqrt(lap.speed / 1.2), min(lap.speed / 1.2, 1.5)
+    return lap.pose(
+        1.1 + 0.025 * vigour * lap.wave(step) + 0.03 * lap.wave(0.11),
+        0.025 * vigour * lap.wave(step / 2) + 0.04 * lap.wave(0.17),
+        2.0 * vigour * lap.wave(step / 2) + 3.0 * lap.wave(0.31),
+        1.5 * vigour * lap.wave(step) + 4.0 * lap.wave(0.23),
+        3.0 * vigour * lap.wave(step / 2) + 12.0 * lap.wave(0.13),
+    )
+
+
+def _trot(lap: _Lap) -> _Poses:
+    """Trot on four legs: body motion at 2-3 Hz, its harmonic at footfall, and vibration."""
+    stride = 1.9 + 0.7 * lap.speed
+    return lap.pose(
+        0.42
+        + 0.012 * lap.wave(stride)
+        + 0.003 * lap.wave(2 * stride)
+        + 1.5e-4 * lap.wave(17.0)
+        + 4e-5 * lap.wave(31.0),
+        0.010 * lap.wave(stride / 2) + 5e-5 * lap.wave(23.0),
+        1.8 * lap.wave(stride / 2) + 0.4 * lap.wave(stride) + 0.03 * lap.wave(19.0),
+        1.2 * lap.wave(stride) + 0.3 * lap.wave(2 * stride) + 0.02 * lap.wave(29.0),
+        1.5 * lap.wave(stride / 2) + 4.0 * lap.wave(0.19),
+    )
+
+
+def _drone(lap: _Lap) -> _Poses:
+    """Fly: climb and sink, bank into turns, and the rotors' vibration."""
+    room = lap.scene.headroom
+    bank = -np.rad2deg(np.arctan(lap.speed**2 * lap.curvature / 9.81))
+    return lap.pose(
+        0.55 * room + 0.12 * room * lap.wave(0.09) + 0.02 * lap.wave(0.7) + 2e-5 * lap.wave(45.0),
+        0.03 * lap.wave(0.4),
+        bank + 1.5 * lap.wave(0.8) + 0.02 * lap.wave(38.0),
+        2.0 + 2.0 * lap.wave(0.5) + 3.0 * lap.wave(0.13) + 0.02 * lap.wave(41.0),
+        20.0 * lap.wave(0.07) + 1.0 * lap.wave(0.9),
+    )
+
+
+_GAITS: Final[dict[str, Callable[[_Lap], _Poses]]] = {
+    "still": _still,
+    "spin": _spin,
+    "walk": _walk,
+    "trot": _trot,
+    "drone": _drone,
+}

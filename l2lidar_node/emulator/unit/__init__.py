@@ -1,0 +1,1 @@
+"""The virtual unit: electronics, scanner and IMU."""

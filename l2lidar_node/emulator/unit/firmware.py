@@ -1,0 +1,196 @@
+"""The unit's control program: obeys commands, keeps settings, clock and power, reboots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig
+from l2lidar_node.emulator.unit.clock import UnitClock
+from l2lidar_node.emulator.unit.flash import Flash, Network, mac_text, parameters_payload
+from l2lidar_node.emulator.unit.inbox import Received
+from l2lidar_node.emulator.unit.power import Power, Readiness
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import AckStatus, Command, PacketType, UserCommand, WorkMode
+from l2lidar_node.settings import SettingError
+
+_LIVE: Final = WorkMode.WIDE_FOV | WorkMode.IMU_OFF
+_VERSION: Final = {
+    (PacketType.USER_COMMAND, UserCommand.VERSION),
+    (PacketType.COMMAND, Command.VERSION),
+}
+_PARAMETERS: Final = {
+    (PacketType.USER_COMMAND, UserCommand.CONFIG_GET),
+    (PacketType.COMMAND, Command.PARAM_GET),
+}
+_STANDBY: Final = {
+    (PacketType.USER_COMMAND, UserCommand.STANDBY),
+    (PacketType.COMMAND, Command.STANDBY),
+}
+_FACTORY: Final = {
+    (PacketType.USER_COMMAND, UserCommand.CONFIG_RESET),
+    (PacketType.COMMAND, Command.CONFIG_RESET),
+}
+_RESET: Final = (PacketType.USER_COMMAND, UserCommand.RESET)
+
+Reply = tuple[PacketType, bytes]
+"""Packet type and payload of an answer."""
+
+
+class Firmware:
+    """Everything about the unit but its measurements.
+
+    Parameters
+    ----------
+    config : DeviceConfig
+    flash : Flash
+        Stored settings to boot with.
+    now_ns : int
+        True instant of power-on.
+    """
+
+    def __init__(self, config: DeviceConfig, flash: Flash, now_ns: int) -> None:
+        self._config = config
+        self._identity = version_payload(config.identity)
+        self._factory = Flash.factory(config.addresses, config.identity)
+        self.flash = flash
+        self.clock = UnitClock(config.crystal, now_ns)
+        self.power = Power(config.power, now_ns)
+        self.boots = -1
+        self.reboot(now_ns)
+
+    def reboot(self, now_ns: int) -> None:
+        """Restart: the clock counts from 0 and stored settings come into force."""
+        self.boots += 1
+        self._booted_with = self.flash
+        self.clock.set(now_ns, 0)
+        self.power.boot(now_ns, bool(self.flash.work_mode & WorkMode.WAIT_FOR_START))
+
+    @property
+    def mode(self) -> WorkMode:
+        """Work mode in force: field of view and IMU act at once, the rest since the boot."""
+        return WorkMode(
+            (self._booted_with.work_mode & ~int(_LIVE)) | (self.flash.work_mode & int(_LIVE))
+        )
+
+    @property
+    def network(self) -> Network:
+        """Network settings in force, those stored at the boot."""
+        return self._booted_with.network
+
+    def answer(self, received: Received, now_ns: int) -> list[Reply]:
+        """Carry out a packet from the host and return the answers in the order of leaving.
+
+        Every packet is acknowledged but a reset, a version request before the unit has come far
+        enough, and whatever comes before the link is up. A packet with a wrong CRC gets status
+        CRC_ERROR; an unknown type or command number, or a size that does not fit the type,
+        HEADER_ERROR; a value that the command cannot take, BLOCK_ERROR.
+        """
+        if self.power.readiness(now_ns) is Readiness.DEAF:
+            return []
+        packet_type, payload, status = received
+        if status is not AckStatus.OK:
+            return [_ack(packet_type, status)]
+        if packet_type in (PacketType.USER_COMMAND, PacketType.COMMAND):
+            command, value = (int(word) for word in np.frombuffer(payload, "<u4"))
+            return self._command(PacketType(packet_type), command, value, now_ns)
+        return [_ack(packet_type, self._store(packet_type, payload, now_ns))]
+
+    def _command(self, family: PacketType, command: int, value: int, now_ns: int) -> list[Reply]:
+        key = (family, command)
+        status = AckStatus.OK
+        data: list[Reply] = []
+        if key == _RESET:
+            self.reboot(now_ns)
+            return []
+        if key in _VERSION:
+            readiness = self.power.readiness(now_ns)
+            if readiness is Readiness.BOOTING:
+                return []
+            if readiness is Readiness.SPINNING_UP:
+                status = AckStatus.NOT_READY
+            else:
+                data.append((PacketType.VERSION, self._identity))
+        elif key in _PARAMETERS:
+            data.append((PacketType.PARAMETERS, parameters_payload(self.flash)))
+        elif key in _STANDBY:
+            status = self._standby(value, now_ns)
+        elif key in _FACTORY:
+            self.flash = self._factory
+        elif key == (PacketType.COMMAND, Command.PARAM_RESET):
+            self.flash = replace(self.flash, parameters="")
+        elif key == (PacketType.USER_COMMAND, UserCommand.AUTO_STANDBY):
+            self.flash = replace(self.flash, auto_standby=value)
+        elif not _is_known(family, command):
+            status = AckStatus.HEADER_ERROR
+        return [*data, _ack(family, status, command, value)]
+
+    def _standby(self, value: int, now_ns: int) -> AckStatus:
+        if value == 0:
+            self.power.start(now_ns)
+        elif value == 1:
+            self.power.stop(now_ns)
+        else:
+            return AckStatus.BLOCK_ERROR
+        return AckStatus.OK
+
+    def _store(self, packet_type: int, payload: bytes, now_ns: int) -> AckStatus:
+        """Carry out a packet that is no command but a value."""
+        if packet_type == PacketType.TIME_SYNC:
+            sec, nsec = (int(word) for word in np.frombuffer(payload, "<u4"))
+            self.clock.set(now_ns, sec * 1_000_000_000 + nsec)
+        elif packet_type in (PacketType.WORK_MODE, PacketType.WORK_MODE_CONFIG):
+            mode = int.from_bytes(payload, "little")
+            self.flash = replace(self.flash, work_mode=mode & wire.WORK_MODE_MASK)
+        elif packet_type == PacketType.NETWORK:
+            flash = self.flash.with_network(payload)
+            if not (flash.network.lidar_port and flash.network.user_port):
+                return AckStatus.BLOCK_ERROR
+            self.flash = flash
+        elif packet_type == PacketType.MAC:
+            self.flash = replace(self.flash, mac=mac_text(payload[:6]))
+        elif packet_type == PacketType.PARAMETERS:
+            self.flash = replace(self.flash, parameters=payload.hex())
+        else:
+            return AckStatus.HEADER_ERROR
+        return AckStatus.OK
+
+
+def version_payload(identity: IdentityConfig) -> bytes:
+    """Return the payload of packet 105.
+
+    Raises
+    ------
+    SettingError
+        If a version is not four numbers.
+    """
+    row = np.zeros(1, wire.VERSION_PAYLOAD)
+    row["hardware"] = tuple(_version_bytes("hardware", identity.hardware))
+    row["software"] = tuple(_version_bytes("firmware", identity.firmware))
+    row["name"] = identity.product.encode()
+    row["date"] = identity.firmware_date.encode()
+    return row.tobytes()
+
+
+def _ack(packet_type: int, status: AckStatus, command: int = 0, value: int = 0) -> Reply:
+    row = np.array([(packet_type, command, value, status)], wire.ACK_PAYLOAD)
+    return PacketType.ACK, row.tobytes()
+
+
+def _version_bytes(name: str, text: str) -> bytes:
+    try:
+        numbers = bytes(int(part) for part in text.split("."))
+    except ValueError:
+        numbers = b""
+    if len(numbers) != 4:
+        raise SettingError(
+            f"parameter '{name}': {text!r} is no version, expected four numbers as 2.8.11.1"
+        )
+    return numbers
+
+
+def _is_known(family: PacketType, command: int) -> bool:
+    commands = UserCommand if family is PacketType.USER_COMMAND else Command
+    return command in {int(item) for item in commands}

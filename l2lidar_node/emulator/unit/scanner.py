@@ -1,0 +1,248 @@
+"""Measures the world as the L2 does: where each slot looks and what the packet says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.emulator.motion.motion import Motion
+from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node.emulator.unit import head, returns
+from l2lidar_node.emulator.unit.returns import RangeNoise
+from l2lidar_node.emulator.unit.units import UNITS, Unit
+from l2lidar_node.emulator.world.world import World
+from l2lidar_node.protocol import wire
+
+RAY: Final = np.dtype(
+    [
+        ("time", "<f8"),  # [s] on the motion's time line
+        ("origin", "<f8", (3,)),  # [m] world frame
+        ("direction", "<f8", (3,)),  # unit, world frame
+        (
+            "distance",
+            "<f8",
+        ),  # [m] noise-free distance of the beam's centre ray, inf = nothing there
+        ("measured", "<f8"),  # [m] what the packet's raw count decodes to, 0 = no return
+    ]
+)
+"""The truth about one slot; ``distance`` and ``measured`` are along ``direction``."""
+
+TWO_D_PERIOD_S: Final = 0.02  # a 2D packet covers one turn of a mirror at 50 Hz
+WIDE_MARGIN_RAD: Final = np.deg2rad(
+    6.0
+)  # wide field of view: this much below the horizon on both sides
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Consecutive packets and the truth about them.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first packet.
+    packets : ndarray, shape (P,), dtype wire.POINTS_3D_PAYLOAD or wire.POINTS_2D_PAYLOAD
+        ``info`` holds only the payload size; sequence number and stamp are the device's business.
+    times_s : ndarray, shape (P,)
+        Instant of each packet's slot 0 [s] on the motion's time line.
+    rays : ndarray, shape (P, N), dtype RAY
+        N is 300, in 2D mode 1800.
+    """
+
+    first: int
+    packets: NDArray[np.void]
+    times_s: NDArray[np.float64]
+    rays: NDArray[np.void]
+
+    @property
+    def returned(self) -> NDArray[np.bool_]:
+        """Which slots carry a range, shape (P, N)."""
+        return np.asarray(self.packets["ranges"] > 0)
+
+    @property
+    def hits(self) -> NDArray[np.float64]:
+        """Noise-free points on the beams' axes, world frame [m], (P, N, 3), NaN for none."""
+        return self._along("distance")
+
+    @property
+    def measured_points(self) -> NDArray[np.float64]:
+        """The measured points at their true places, world frame [m], (P, N, 3), NaN for none.
+
+        They contain range noise, mixed pixels and quantisation but no motion distortion: a
+        deskewed cloud differs from them by the error of the deskewing alone.
+        """
+        return self._along("measured")
+
+    def _along(self, name: str) -> NDArray[np.float64]:
+        distance = self.rays[name]
+        distance = np.where((distance > 0) & np.isfinite(distance), distance, np.nan)
+        points: NDArray[np.float64] = (
+            self.rays["origin"] + self.rays["direction"] * distance[..., None]
+        )
+        return points
+
+
+class Scanner:
+    """The rotating head, the mirror and the range finder.
+
+    Packet k (k >= 0) starts at ``k * period_s`` on the motion's time line. A packet depends on the
+    seed and its number alone, not on which packets are asked for together. Asking for 20 or more
+    at a time is fastest (0.3 ms each, one by one 1 ms).
+
+    Parameters
+    ----------
+    world : World
+    motion : Motion
+        Moves the cloud frame.
+    unit : Unit
+    noise : RangeNoise
+        ``RangeNoise.clean()`` leaves the raw count's step (0.978 mm, so at most 0.489 mm of error)
+        alone.
+    seed : int
+    """
+
+    def __init__(
+        self,
+        world: World,
+        motion: Motion,
+        unit: Unit = UNITS["a"],
+        noise: RangeNoise | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.world = world
+        self.motion = motion
+        self.unit = unit
+        self.noise = RangeNoise() if noise is None else noise
+        self.seed = seed
+
+    @property
+    def period_s(self) -> float:
+        """Time between the starts of 3D packets [s]."""
+        return self.unit.packet_period_s
+
+    def packets(
+        self, first: int, count: int, *, wide_fov: bool = False
+    ) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+        """Return ``scan(...).packets`` and ``scan(...).times_s``."""
+        scan = self.scan(first, count, wide_fov=wide_fov)
+        return scan.packets, scan.times_s
+
+    def scan(self, first: int, count: int, *, wide_fov: bool = False) -> Scan:
+        """Return 3D packets ``first`` to ``first + count - 1`` with the truth about them.
+
+        Parameters
+        ----------
+        first, count : int
+        wide_fov : bool
+            192 degrees instead of 180.
+        """
+        packets = np.zeros(count, wire.POINTS_3D_PAYLOAD)
+        numbers = np.arange(first, first + count)
+        times = numbers.astype(np.float64) * self.period_s
+        packets["info"]["payload_size"] = wire.POINTS_3D_PAYLOAD.itemsize
+        self._describe(packets, numbers, times)
+        packets["point_num"] = wire.POINTS_PER_3D_PACKET
+        packets["scan_period"] = self.period_s
+        _set_fan(packets, self.period_s, wide_fov)
+        head.set_angles(packets, times, self.unit, self.noise.head_wobble, self.seed, first)
+        return self._measure(first, packets, times)
+
+    def scan_2d(self, first: int, count: int, *, wide_fov: bool = False) -> Scan:
+        """Return 2D packets with the truth about them; packet k starts at ``k * TWO_D_PERIOD_S``.
+
+        The field values of real 2D packets are not published. Here one packet is one arc of 1800
+        slots, 0.1 degrees apart (wide: 0.1067), from a mirror turning at 50 Hz, in the cloud
+        frame's y-z plane.
+        """
+        packets = np.zeros(count, wire.POINTS_2D_PAYLOAD)
+        numbers = np.arange(first, first + count)
+        times = numbers.astype(np.float64) * TWO_D_PERIOD_S
+        packets["info"]["payload_size"] = wire.POINTS_2D_PAYLOAD.itemsize
+        self._describe(packets, numbers, times)
+        packets["state"]["sys_rotation_period"] = round(TWO_D_PERIOD_S * 1e6)
+        packets["state"]["com_rotation_period"] = 0
+        packets["point_num"] = wire.POINTS_PER_2D_PACKET
+        packets["scan_period"] = TWO_D_PERIOD_S
+        _set_fan(packets, TWO_D_PERIOD_S, wide_fov)
+        return self._measure(first, packets, times)
+
+    def _describe(
+        self, packets: NDArray[np.void], numbers: NDArray[np.int64], times: NDArray[np.float64]
+    ) -> None:
+        """Fill in calibration, range limits and state."""
+        packets["calibration"] = self.unit.calibration_record
+        packets["range_min"] = self.unit.range_min
+        packets["range_max"] = self.unit.range_max
+        head.set_state(packets, numbers, times, self.unit, self.seed)
+
+    def _measure(self, first: int, packets: NDArray[np.void], times: NDArray[np.float64]) -> Scan:
+        """Cast the rays that the packets' own float32 fields describe and fill in the returns."""
+        count, slots = packets["ranges"].shape
+        rays = np.zeros((count, slots), RAY)
+        rays["time"] = times[:, None] + packets["time_increment"].astype(np.float64)[
+            :, None
+        ] * np.arange(slots)
+        origin, direction = local_rays(packets)
+        position, quaternion = self.motion.poses(rays["time"].ravel())
+        turn = rotation_matrices(quaternion)
+        flat = rays.reshape(-1)
+        flat["origin"] = position + np.einsum("nij,nj->ni", turn, origin.reshape(-1, 3))
+        flat["direction"] = np.einsum("nij,nj->ni", turn, direction.reshape(-1, 3))
+        returns.fill(packets, rays, self.world, self.noise, self.seed, first)
+        return Scan(first, packets, times, rays)
+
+
+def local_rays(packets: NDArray[np.void]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return origins and unit directions (P, N, 3) of every slot in the cloud frame.
+
+    The point of a range D is ``origin + D * direction``: the protocol's formula, which is affine
+    in D, taken apart. Evaluated in double precision from the packets' float32 fields.
+    """
+    slots = np.arange(packets["ranges"].shape[1])
+    c = {
+        name: packets["calibration"][name].astype(np.float64)[:, None]
+        for name in wire.CALIBRATION.fields or ()
+    }
+    alpha = _ramp(packets["angle_min"], packets["angle_increment"], slots) + c["alpha_angle_bias"]
+    origin = np.zeros((*alpha.shape, 3))
+    origin[..., 2] = c["a_axis_dist"]
+    direction = np.zeros_like(origin)
+    if packets.dtype == wire.POINTS_2D_PAYLOAD:
+        direction[..., 1], direction[..., 2] = np.cos(alpha), np.sin(alpha)
+        return origin, direction
+    theta = c["theta_angle_bias"] + _ramp(
+        packets["com_horizontal_angle_start"], packets["com_horizontal_angle_step"], slots
+    )
+    sin_beta, cos_beta = np.sin(c["beta_angle"]), np.cos(c["beta_angle"])
+    sin_xi, cos_xi = np.sin(c["xi_angle"]), np.cos(c["xi_angle"])
+    sin_theta, cos_theta = np.sin(theta), np.cos(theta)
+    along = -cos_beta * sin_xi + sin_beta * cos_xi * np.sin(alpha)
+    across = np.cos(alpha) * cos_xi
+    origin[..., 0] = cos_theta * c["b_axis_dist"]
+    origin[..., 1] = sin_theta * c["b_axis_dist"]
+    direction[..., 0] = cos_theta * along - sin_theta * across
+    direction[..., 1] = sin_theta * along + cos_theta * across
+    direction[..., 2] = sin_beta * sin_xi + cos_beta * cos_xi * np.sin(alpha)
+    return origin, direction
+
+
+def _ramp(
+    start: NDArray[np.float32], step: NDArray[np.float32], slots: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = (
+        start.astype(np.float64)[:, None] + step.astype(np.float64)[:, None] * slots
+    )
+    return values
+
+
+def _set_fan(packets: NDArray[np.void], turn_s: float, wide_fov: bool) -> None:
+    """Fill in the mirror's angles and the slots' times: its speed is constant."""
+    slots = packets["ranges"].shape[1]
+    margin = WIDE_MARGIN_RAD if wide_fov else 0.0
+    increment = (np.pi + 2.0 * margin) / slots
+    packets["angle_min"] = -margin
+    packets["angle_increment"] = increment
+    packets["time_increment"] = turn_s * increment / (2.0 * np.pi)

@@ -1,0 +1,161 @@
+"""One stream of measurements: knows which packet is due next and makes frames of them."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.emulator.unit.sources import Feed
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import PacketType
+
+SEQ_MODULUS: Final = 1025  # what units show
+
+
+class Due(NamedTuple):
+    """Consecutive packets that are due, arrays of the same length.
+
+    Attributes
+    ----------
+    frames : ndarray, shape (N,)
+        Whole frames; sequence number, stamp and CRC are still missing.
+    numbers : ndarray, shape (N,), int64
+        Index in the source.
+    start_ns, left_ns : ndarray, shape (N,), int64
+        True instants of the stamp and of leaving the unit.
+    """
+
+    frames: NDArray[np.void]
+    numbers: NDArray[np.int64]
+    start_ns: NDArray[np.int64]
+    left_ns: NDArray[np.int64]
+
+    def part(self, first: int, stop: int) -> Due:
+        """Return the packets ``first`` to ``stop - 1``."""
+        cut = slice(first, stop)
+        return Due(self.frames[cut], self.numbers[cut], self.start_ns[cut], self.left_ns[cut])
+
+
+class MeasurementStream:
+    """Hands out the packets of one feed by the time at which they leave the unit.
+
+    Parameters
+    ----------
+    feed : Feed
+    origin_ns : int
+        True instant that is zero on the source's time line.
+    delay_ns : int
+        From the last measurement in a packet to its leaving.
+    from_ns : int
+        The first packet is the first one whose stamp is not before this true instant.
+    """
+
+    def __init__(self, feed: Feed, origin_ns: int, delay_ns: int, from_ns: int) -> None:
+        self._feed = feed
+        self._origin_ns = origin_ns
+        self._delay_ns = delay_ns
+        self._at = 0
+        self._load(0)
+        self._seek(from_ns)
+
+    @property
+    def packet_type(self) -> PacketType:
+        """What the frames are."""
+        return self._feed.packet_type
+
+    @property
+    def next_ns(self) -> int:
+        """True instant at which the next packet leaves the unit."""
+        return int(self._block.left_ns[self._at])
+
+    def take(self, until_ns: int) -> Due:
+        """Return the packets that leave the unit until a true instant and are not taken yet."""
+        parts: list[Due] = []
+        while self.next_ns <= until_ns:
+            stop = int(np.searchsorted(self._block.left_ns, until_ns, side="right"))
+            parts.append(self._block.part(self._at, stop))
+            self._at = stop
+            if stop == self._feed.block:
+                self._load(self._number + 1)
+                self._at = 0
+        if len(parts) == 1:
+            return parts[0]
+        parts = parts or [self._block.part(0, 0)]
+        return Due(
+            np.concatenate([part.frames for part in parts]),
+            np.concatenate([part.numbers for part in parts]),
+            np.concatenate([part.start_ns for part in parts]),
+            np.concatenate([part.left_ns for part in parts]),
+        )
+
+    def _seek(self, from_ns: int) -> None:
+        """Find the first packet not before an instant; the blocks themselves tell the period."""
+        while True:
+            start = self._block.start_ns
+            period = max((int(start[-1]) - int(start[0])) // max(len(start) - 1, 1), 1)
+            jump = (from_ns - int(start[0])) // (period * self._feed.block)
+            if abs(jump) <= 1 or self._number + jump < 0:
+                break
+            self._load(self._number + jump)
+        while from_ns < self._block.start_ns[0] and self._number > 0:
+            self._load(self._number - 1)
+        while from_ns > self._block.start_ns[-1]:
+            self._load(self._number + 1)
+        self._at = int(np.searchsorted(self._block.start_ns, from_ns, side="left"))
+
+    def _load(self, number: int) -> None:
+        feed = self._feed
+        payloads, t_s = feed.source(number * feed.block, feed.block)
+        start_ns = self._origin_ns + np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
+        lasts_ns = _duration_ns(payloads)
+        numbers = np.arange(number * feed.block, (number + 1) * feed.block, dtype=np.int64)
+        left_ns = start_ns + lasts_ns + self._delay_ns
+        self._number = number
+        self._block = Due(_frames(feed.packet_type, payloads), numbers, start_ns, left_ns)
+
+
+def finish(
+    due: Due, packet_type: PacketType, seq: NDArray[np.int64], stamp_ns: NDArray[np.int64]
+) -> list[bytes]:
+    """Fill in sequence numbers, stamps and CRCs and return the frames as bytes."""
+    info = due.frames["payload"]["info"]
+    info["seq"] = seq
+    info["sec"], info["nsec"] = np.divmod(stamp_ns, 1_000_000_000)
+    size = wire.FRAME_SIZES[packet_type]
+    raw = due.frames.view(np.uint8).reshape(-1, size)
+    due.frames["crc"] = [zlib.crc32(row[wire.HEADER.size : -wire.TAIL.size].data) for row in raw]
+    return [row.tobytes() for row in raw]
+
+
+def _duration_ns(payloads: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the true time from a packet's first to its last measurement, shape (N,)."""
+    names = payloads.dtype.names or ()
+    if "time_increment" not in names:
+        return np.zeros(len(payloads), np.int64)
+    slots = payloads["point_num"].astype(np.float64) - 1.0
+    return np.asarray(np.rint(slots * payloads["time_increment"] * 1e9), dtype=np.int64)
+
+
+def _frames(packet_type: PacketType, payloads: NDArray[np.void]) -> NDArray[np.void]:
+    layout = np.dtype(
+        [
+            ("magic", "u1", (4,)),
+            ("type", "<u4"),
+            ("size", "<u4"),
+            ("payload", payloads.dtype),
+            ("crc", "<u4"),
+            ("unused", "u1", (6,)),
+            ("end", "u1", (2,)),
+        ]
+    )
+    frames = np.zeros(len(payloads), layout)
+    frames["magic"] = np.frombuffer(wire.MAGIC, np.uint8)
+    frames["type"] = packet_type
+    frames["size"] = layout.itemsize
+    frames["payload"] = payloads
+    frames["payload"]["info"]["payload_size"] = payloads.dtype.itemsize
+    frames["end"] = np.frombuffer(wire.TAIL_END, np.uint8)
+    return frames

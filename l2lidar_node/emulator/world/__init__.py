@@ -1,0 +1,1 @@
+"""What the virtual L2 sees: scenes and ray casting."""

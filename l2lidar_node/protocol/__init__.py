@@ -1,0 +1,1 @@
+"""The wire: layout, framing, packets and commands."""

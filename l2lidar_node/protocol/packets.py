@@ -1,0 +1,270 @@
+"""Turns a frame into a typed packet or a decode error."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.framing import Frame
+from l2lidar_node.types import DeviceNs, Quaternion, Vector3
+
+NS: Final = 1_000_000_000
+
+# Measurements are decoded hundreds of times a second: one precompiled struct each instead of a
+# dtype view.
+_IMU = struct.Struct("<4I 4f 3f 3f")
+
+_MAX_FIELD: Final = 1e6  # in any unit: all real ones are below 1e4, and points must fit float32
+_MAX_TIME_INCREMENT_S: Final = 1e-3
+_MIN_QUATERNION_NORM: Final = 0.5  # with its IMU switched off a unit may send zeros
+_MAX_RATE: Final = 1e3  # [rad/s]; broken units have been seen to send 1e24
+_MAX_ACCELERATION: Final = 1e4  # [m/s^2]
+
+
+class PointPacket(NamedTuple):
+    """One packet of ranges, still raw.
+
+    Attributes
+    ----------
+    packet_type : int
+        ``POINTS_3D`` or ``POINTS_2D``.
+    seq : int
+        Number within its type.
+    stamp : DeviceNs
+        Instant of the first slot.
+    duration_ns : int
+        From the first slot to the last one, in true time, rounded up.
+    head_angle : float
+        Head angle at the first slot [rad]; 0 for 2D packets.
+    payload : bytes
+        The whole payload, one item of ``wire.PAYLOADS[packet_type]``.
+    """
+
+    packet_type: int
+    seq: int
+    stamp: DeviceNs
+    duration_ns: int
+    head_angle: float
+    payload: bytes
+
+
+class ImuPacket(NamedTuple):
+    """One IMU packet; the quaternion is normalised, IMU to a z-up world."""
+
+    seq: int
+    stamp: DeviceNs
+    orientation_wxyz: Quaternion
+    angular_velocity: Vector3
+    linear_acceleration: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """What a unit says it is; versions as printed, most significant number first."""
+
+    hardware: str
+    firmware: str
+    name: str
+    date: str
+    reserve: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """The device's answer to a command; ``status`` need not be a :class:`wire.AckStatus`."""
+
+    packet_type: int
+    command: int
+    value: int
+    status: int
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """The parameter block; only what has a known meaning is named.
+
+    Attributes
+    ----------
+    work_mode : int
+        Bits of :class:`wire.WorkMode`.
+    range_min, range_max : float or None
+        [m]; None when the firmware's block is too short to hold them.
+    payload : bytes
+        The block as it came.
+    """
+
+    work_mode: int
+    range_min: float | None
+    range_max: float | None
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownPacket:
+    """A good frame of a type that nothing is known about, or that only a host sends."""
+
+    packet_type: int
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeError:
+    """A good frame whose content cannot be true.
+
+    Attributes
+    ----------
+    packet_type : int
+    reason : str
+        One of a fixed set of words, fit for a counter's name.
+    """
+
+    packet_type: int
+    reason: str
+
+
+Packet = PointPacket | ImuPacket | Version | Ack | Parameters | UnknownPacket | DecodeError
+
+
+def decode(frame: Frame) -> Packet:
+    """Return the typed packet of a frame, or why there is none. Never raises."""
+    decoder = _DECODERS.get(frame.packet_type)
+    if decoder is None:
+        return UnknownPacket(frame.packet_type, frame.payload)
+    return decoder(frame.payload)
+
+
+class _PointLayout(NamedTuple):
+    """Where the numbers are in a packet of ranges."""
+
+    packet_type: int
+    size: int
+    capacity: int
+    fields: struct.Struct  # time increment and number of points are the last ones
+    head_angle: int | None  # place among the fields
+
+
+_POINTS_3D: Final = _PointLayout(
+    wire.PacketType.POINTS_3D,
+    wire.POINTS_3D_PAYLOAD.itemsize,
+    wire.POINTS_PER_3D_PACKET,
+    struct.Struct("<4I 36x 8f 8f I"),
+    12,
+)
+_POINTS_2D: Final = _PointLayout(
+    wire.PacketType.POINTS_2D,
+    wire.POINTS_2D_PAYLOAD.itemsize,
+    wire.POINTS_PER_2D_PACKET,
+    struct.Struct("<4I 36x 8f 6f I"),
+    None,
+)
+
+
+def _points(layout: _PointLayout, payload: bytes) -> PointPacket | DecodeError:
+    packet_type, size, capacity, numbers, head_angle = layout
+    if len(payload) != size:
+        return DecodeError(packet_type, "length")
+    fields = numbers.unpack_from(payload)
+    seq, _, sec, nsec = fields[:4]
+    time_increment, count = fields[-2:]
+    if count > capacity:
+        return DecodeError(packet_type, "point_num")
+    if nsec >= NS:
+        return DecodeError(packet_type, "stamp")
+    length = math.hypot(*fields[4:-1])  # one NaN or infinity anywhere makes it one
+    if not length <= _MAX_FIELD:
+        is_finite = math.isfinite(length)
+        return DecodeError(packet_type, "implausible" if is_finite else "not_finite")
+    if not 0.0 < time_increment < _MAX_TIME_INCREMENT_S:
+        return DecodeError(packet_type, "time_increment")
+    return PointPacket(
+        packet_type,
+        seq,
+        DeviceNs(sec * NS + nsec),
+        math.ceil(max(count - 1, 0) * time_increment * NS),
+        0.0 if head_angle is None else fields[head_angle],
+        payload,
+    )
+
+
+def _imu(payload: bytes) -> ImuPacket | DecodeError:
+    if len(payload) != _IMU.size:
+        return DecodeError(wire.PacketType.IMU, "length")
+    seq, _, sec, nsec, w, x, y, z, p, q, r, ax, ay, az = _IMU.unpack(payload)
+    if nsec >= NS:
+        return DecodeError(wire.PacketType.IMU, "stamp")
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if not math.isfinite(norm + p + q + r + ax + ay + az):
+        return DecodeError(wire.PacketType.IMU, "not_finite")
+    if norm < _MIN_QUATERNION_NORM:
+        return DecodeError(wire.PacketType.IMU, "quaternion_norm")
+    fastest = max(p, q, r, -p, -q, -r)
+    strongest = max(ax, ay, az, -ax, -ay, -az)
+    if fastest > _MAX_RATE or strongest > _MAX_ACCELERATION:
+        return DecodeError(wire.PacketType.IMU, "implausible")
+    return ImuPacket(
+        seq,
+        DeviceNs(sec * NS + nsec),
+        (w / norm, x / norm, y / norm, z / norm),
+        (p, q, r),
+        (ax, ay, az),
+    )
+
+
+def _version(payload: bytes) -> Version | DecodeError:
+    if len(payload) != wire.VERSION_PAYLOAD.itemsize:
+        return DecodeError(wire.PacketType.VERSION, "length")
+    block = np.frombuffer(payload, wire.VERSION_PAYLOAD)[0]
+    return Version(
+        hardware=".".join(str(number) for number in block["hardware"]),
+        firmware=".".join(str(number) for number in block["software"]),
+        name=_text(block["name"]),
+        date=_text(block["date"]),
+        reserve=_text(block["reserve"]),
+    )
+
+
+def _text(raw: bytes) -> str:
+    return bytes(raw).split(b"\0", 1)[0].decode("ascii", "replace")
+
+
+def _ack(payload: bytes) -> Ack | DecodeError:
+    if len(payload) != wire.ACK_PAYLOAD.itemsize:
+        return DecodeError(wire.PacketType.ACK, "length")
+    return Ack(*struct.unpack("<4I", payload))
+
+
+def _parameters(payload: bytes) -> Parameters | DecodeError:
+    fields = wire.PARAMETERS_PAYLOAD.fields
+    assert fields is not None
+    if len(payload) < fields["work_mode"][1] + 4:
+        return DecodeError(wire.PacketType.PARAMETERS, "length")
+
+    def metres(name: str) -> float | None:
+        offset = fields[name][1]
+        if len(payload) < offset + 4:
+            return None
+        return float(struct.unpack_from("<f", payload, offset)[0])
+
+    return Parameters(
+        work_mode=struct.unpack_from("<I", payload, fields["work_mode"][1])[0],
+        range_min=metres("range_min"),
+        range_max=metres("range_max"),
+        payload=payload,
+    )
+
+
+_DECODERS: Final[dict[int, Callable[[bytes], Packet]]] = {
+    wire.PacketType.POINTS_3D: partial(_points, _POINTS_3D),
+    wire.PacketType.POINTS_2D: partial(_points, _POINTS_2D),
+    wire.PacketType.IMU: _imu,
+    wire.PacketType.VERSION: _version,
+    wire.PacketType.ACK: _ack,
+    wire.PacketType.PARAMETERS: _parameters,
+}

@@ -1,0 +1,1 @@
+"""Captures and bags: writing, reading, replay."""

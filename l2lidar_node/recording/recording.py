@@ -1,0 +1,232 @@
+"""Tells what a capture holds of one L2: what it sent, what was sent to it, and when."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from typing import BinaryIO, Final, NamedTuple
+
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.commands import Command, recorded
+from l2lidar_node.protocol.framing import Frame, Framer
+from l2lidar_node.recording.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
+from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.types import HostNs
+
+WAITED: Final = b"l2lidar_node: nothing that was due is waited for from here on"
+"""Content of the datagram, from the host to itself, that stands for :class:`Waited`."""
+
+STEPPED: Final = b"l2lidar_node: the host's clock was set by %+d ns"
+"""Likewise for :class:`Stepped`."""
+
+_STEP: Final = re.compile(re.escape(STEPPED).replace(re.escape(b"%+d"), rb"([+-][0-9]{1,18})"))
+
+_FROM_DEVICE: Final = frozenset(
+    int(kind)
+    for kind in (
+        wire.PacketType.ACK,
+        wire.PacketType.POINTS_3D,
+        wire.PacketType.POINTS_2D,
+        wire.PacketType.IMU,
+        wire.PacketType.VERSION,
+        wire.PacketType.PARAMETERS,
+    )
+)
+_ENOUGH: Final = 2_000  # datagrams of L2s after which no further one is looked for
+_IN_FLIGHT_NS: Final = 50_000_000  # from making a sync to seeing it on the network, at most
+
+
+class Received(NamedTuple):
+    """Bytes that came from the device, and when."""
+
+    data: bytes
+    time: HostNs
+
+
+class Sent(NamedTuple):
+    """A command that went to the device, and when."""
+
+    command: Command
+    time: HostNs
+
+
+class Waited(NamedTuple):
+    """The instant until which the driver had waited when it gave up on what was due."""
+
+    time: HostNs
+
+
+class Stepped(NamedTuple):
+    """By how much the host's clock was set [ns], and the instant at which the driver was told."""
+
+    by_ns: int
+    time: HostNs
+
+
+Entry = Received | Sent | Waited | Stepped
+
+
+class Recording:
+    """What a capture holds of one L2.
+
+    Parameters
+    ----------
+    stream : binary file
+        Seekable, pcap or pcapng; read anew for every iteration.
+    l2_ip : str
+        Whose packets to take if there are those of several. With only one L2 in the capture it is
+        taken whatever its address.
+
+    Attributes
+    ----------
+    device : Endpoint
+        The L2.
+    host : Endpoint
+        Whom it sent to.
+    start : HostNs
+        Time of the first datagram of the L2.
+
+    Raises
+    ------
+    CaptureError
+        If this is no capture, or there is no L2 in it, or several and none has ``l2_ip``; while
+        iterating, where the file is damaged.
+    """
+
+    def __init__(self, stream: BinaryIO, l2_ip: str = "") -> None:
+        self._stream = stream
+        self._reader = CaptureReader(stream)
+        talks: Counter[tuple[Endpoint, Endpoint]] = Counter()
+        starts: dict[Endpoint, HostNs] = {}
+        seen: Counter[Endpoint] = Counter()
+        try:
+            for datagram in islice(_of_devices(self._from_start(), seen), _ENOUGH):
+                talks[datagram.source, datagram.destination] += 1
+                starts.setdefault(datagram.source, datagram.time)
+        except CaptureError:
+            if not talks:  # what is before the damage can be used
+                raise
+        self.device, self.host = _chosen(talks, l2_ip, seen, self._reader)
+        self.start = starts[self.device]
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether the file, read to its end, ended within a packet."""
+        return self._reader.is_cut_off
+
+    @property
+    def position(self) -> int:
+        """How much of the file has been read [B]."""
+        return self._stream.tell()
+
+    def __iter__(self) -> Iterator[Entry]:
+        """Yield everything in the order of the capture."""
+        framer = Framer()
+        for datagram in self._from_start():
+            is_for_host = datagram.destination == self.host
+            if datagram.source != self.host:
+                # As on a live socket the address counts, not the port. Cooked captures of the
+                # loopback interface show everything twice.
+                is_device = datagram.source.ip == self.device.ip
+                if is_device and is_for_host and not datagram.outgoing:
+                    yield Received(datagram.data, datagram.time)
+            elif is_for_host:
+                note = _noted(datagram.data, datagram.time)
+                if note is not None:
+                    yield note
+            elif datagram.destination == self.device and datagram.outgoing is not False:
+                for item in framer.feed(datagram.data):
+                    if isinstance(item, Frame):
+                        yield from _sent(item, datagram.time)
+
+    def _from_start(self) -> Iterator[UdpDatagram]:
+        self._stream.seek(0)
+        self._reader = CaptureReader(self._stream)
+        return iter(self._reader)
+
+
+class RecordingWriter:
+    """Writes a capture that :class:`Recording` reads.
+
+    Parameters
+    ----------
+    stream : binary file
+        At its beginning.
+    device, host : Endpoint
+    """
+
+    def __init__(self, stream: BinaryIO, device: Endpoint, host: Endpoint) -> None:
+        self._capture = CaptureWriter(stream)
+        self._device = device
+        self._host = host
+
+    def received(self, data: bytes, arrival: HostNs) -> None:
+        """Append bytes that came from the device."""
+        self._capture.write(UdpDatagram(arrival, self._device, self._host, data))
+
+    def sent(self, frame: bytes, at: HostNs) -> None:
+        """Append a frame that goes to the device."""
+        self._capture.write(UdpDatagram(at, self._host, self._device, frame))
+
+    def waited(self, until: HostNs) -> None:
+        """Append that the driver gave up waiting."""
+        self._capture.write(UdpDatagram(until, self._host, self._host, WAITED))
+
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Append that the driver was told that the host's clock was set."""
+        self._capture.write(UdpDatagram(at, self._host, self._host, STEPPED % by_ns))
+
+
+def _noted(data: bytes, time: HostNs) -> Waited | Stepped | None:
+    """Return what a datagram from the host to itself stands for."""
+    if data == WAITED:
+        return Waited(time)
+    step = _STEP.fullmatch(data)
+    return None if step is None else Stepped(int(step[1]), time)
+
+
+def _sent(frame: Frame, time: HostNs) -> Iterator[Sent]:
+    command = recorded(frame.packet_type, frame.payload)
+    if command is None:
+        return
+    # Whoever captured it saw it a little after it was made, and the driver counts from then.
+    made = command.time
+    if made is not None and 0 <= time - made < _IN_FLIGHT_NS:
+        time = made
+    yield Sent(command, time)
+
+
+def _of_devices(
+    datagrams: Iterator[UdpDatagram], seen: Counter[Endpoint]
+) -> Iterator[UdpDatagram]:
+    for datagram in datagrams:
+        seen[datagram.destination] += 1
+        header = datagram.data[: wire.HEADER.size]
+        if len(header) == wire.HEADER.size:
+            magic, packet_type, _ = wire.HEADER.unpack(header)
+            if magic == wire.MAGIC and packet_type in _FROM_DEVICE:
+                yield datagram
+
+
+def _chosen(
+    talks: Counter[tuple[Endpoint, Endpoint]],
+    l2_ip: str,
+    seen: Counter[Endpoint],
+    reader: CaptureReader,
+) -> tuple[Endpoint, Endpoint]:
+    if not talks:
+        ports = ", ".join(f"{count} to port {end.port}" for end, count in seen.most_common(3))
+        others = ", ".join(f"{count} {reason}" for reason, count in reader.ignored.most_common(3))
+        found = f"{sum(seen.values())} UDP datagrams" + (f" ({ports})" if ports else "")
+        raise CaptureError(
+            f"no L2 packets in it, only {found}" + (f"; packets {others}" if others else "")
+        )
+    devices = sorted({source.ip for source, _ in talks})
+    if l2_ip not in devices and len(devices) > 1:
+        raise CaptureError(
+            f"packets of several L2s in it, {', '.join(devices)}: say which one (l2_ip)"
+        )
+    wanted = l2_ip if l2_ip in devices else devices[0]
+    return max((talk for talk in talks if talk[0].ip == wanted), key=lambda talk: talks[talk])

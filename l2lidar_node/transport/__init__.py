@@ -1,0 +1,1 @@
+"""Sockets, serial lines and the thread that runs a driver on them."""

@@ -1,0 +1,1 @@
+"""Deskew and filters."""

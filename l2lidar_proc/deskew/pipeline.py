@@ -1,0 +1,229 @@
+"""Takes sweeps, IMU samples and velocities as they come and gives deskewed, filtered clouds.
+
+Composes sequencer, tracker, filters and deskew; node, offline tool and tests all use this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc.cloud import without_time
+from l2lidar_proc.config import ProcConfig
+from l2lidar_proc.deskew import filters
+from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.deskew.organise import organise
+from l2lidar_proc.deskew.outliers import FilterError
+from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
+from l2lidar_proc.motion.sweep_trajectory import Path
+from l2lidar_proc.motion.tracker import Flag, MotionTracker, Quality
+from l2lidar_proc.rotations import F64
+
+_MS: Final = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deskewed:
+    """A sweep as seen from one instant.
+
+    Attributes
+    ----------
+    stamp : HostNs
+        The instant whose cloud frame the points are in.
+    points : ndarray, shape (N,) or, organised, (P, 300)
+        Fields of the sweep; ``time`` only if asked for or not deskewed, in seconds after
+        ``stamp``, and never constant.
+    sweep : Sweep
+        What came in.
+    quality : Quality
+    waited_ns : int
+        How long the sweep was held for the IMU.
+    """
+
+    stamp: HostNs
+    points: NDArray[np.void]
+    sweep: Sweep
+    quality: Quality
+    waited_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class PipelineCounts:
+    """What went through since the start.
+
+    Attributes
+    ----------
+    sweeps : int
+        Sweeps that came out; none that came in is lost.
+    deskewed, still, passed_on : int
+        Of these: moved, found at rest, passed on as they came.
+    uncovered : int
+        Sweeps whose end the IMU samples did not reach in time.
+    jumps : int
+        Times the clock jumped.
+    """
+
+    sweeps: int = 0
+    deskewed: int = 0
+    still: int = 0
+    passed_on: int = 0
+    uncovered: int = 0
+    jumps: int = 0
+
+
+class Pipeline:
+    """Everything between messages and messages.
+
+    Parameters
+    ----------
+    config : ProcConfig
+    T_cloud_imu : ndarray, shape (4, 4), optional
+        IMU coordinates to cloud coordinates, in place of the configured ones.
+
+    Attributes
+    ----------
+    tracker : MotionTracker
+    counts : PipelineCounts
+    problems : str
+        What the last filter that could not work said.
+    """
+
+    def __init__(self, config: ProcConfig, T_cloud_imu: F64 | None = None) -> None:
+        self.tracker = MotionTracker(config.motion, T_cloud_imu)
+        self._sequencer = Sequencer(config.deskew.imu_wait_ms * _MS)
+        self.counts = PipelineCounts()
+        self.problems = ""
+        self.configure(config)
+
+    def configure(self, config: ProcConfig) -> None:
+        """Take new live settings."""
+        self._config = config
+        self.tracker.configure(config.motion)
+        self._sequencer.wait_ns = config.deskew.imu_wait_ms * _MS
+
+    @property
+    def due_ns(self) -> int | None:
+        """When :meth:`poll` should be called at the latest, None if nothing waits."""
+        return self._sequencer.due_ns
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a sweep waits to be handed out."""
+        return len(self._sequencer) > 0
+
+    def imu(self, samples: Samples) -> None:
+        """Take IMU samples, shape (N,), in any order and state."""
+        if self.tracker.imu(samples):
+            self._jumped()
+            self._sequencer.jump()
+
+    def velocity(self, stamp: HostNs, velocity: ArrayLike, source: str) -> bool:
+        """Take a velocity of the cloud origin, cloud axes [m/s]; return whether it is of use."""
+        return self.tracker.velocity(stamp, velocity, source)
+
+    def sweep(self, sweep: Sweep, now: int) -> None:
+        """Take a sweep that arrives at ``now`` [ns]."""
+        if self._sequencer.push(sweep, now):
+            self._jumped()
+            newest = self.tracker.window.newest
+            if newest is not None and newest > sweep.end + 1000 * _MS:
+                # the IMU has not jumped yet: what it said is of another time
+                self.tracker.reset()
+
+    def poll(self, now: int) -> list[Deskewed]:
+        """Return what is finished by ``now`` [ns], in order."""
+        released = self._sequencer.release(self.tracker.window.newest, now)
+        return [self._process(release) for release in released]
+
+    def _process(self, release: Release) -> Deskewed:
+        sweep = release.sweep
+        path, quality = self.tracker.path(sweep.start, sweep.end)
+        if release.reason is Reason.CLOCK_JUMP:
+            quality = replace(quality, flags=(*quality.flags, Flag.CLOCK_JUMP))
+        deskews = Flag.NO_IMU not in quality.flags
+        stamp, points, problems = self._assemble(sweep, path if deskews else None)
+        if problems:
+            quality = replace(quality, flags=(*quality.flags, Flag.FILTER_LEFT_OUT))
+            self.problems = problems
+        self._count(quality)
+        return Deskewed(stamp, points, sweep, quality, release.waited_ns)
+
+    def _assemble(self, sweep: Sweep, path: Path | None) -> tuple[HostNs, NDArray[np.void], str]:
+        """Filter, deskew, filter again; return stamp, points to publish, what went wrong.
+
+        Without a path the points stay as they are and keep their times.
+        """
+        chain = self._config.filters
+        before, problem = self._kept(sweep.points, chain.filters_before)
+        points = sweep.points if len(before) == len(sweep.points) else sweep.points[before]
+        reference = self._config.deskew.reference if path is not None else "start"
+        stamp = _instant(reference, sweep, points)
+        moved = deskew(points, sweep.start, path, stamp) if path is not None else points
+        after, another = self._kept(moved, chain.filters_after)
+        if len(after) < len(moved):
+            points, moved = points[after], moved[after]
+            if _instant(reference, sweep, points) != stamp:
+                stamp = _instant(reference, sweep, points)
+                moved = deskew(points, sweep.start, path, stamp) if path is not None else points
+        times = points["time"]
+        # a constant time ends some consumers
+        keeps = (
+            (self._config.deskew.keep_time or path is None)
+            and len(times) > 0
+            and bool(np.ptp(times) > 0.0)
+        )
+        moved = _timed(moved, times, sweep.start, stamp) if keeps else without_time(moved)
+        if self._config.deskew.organised:
+            moved = organise(moved, times)
+        return stamp, moved, problem or another
+
+    def _kept(
+        self, points: NDArray[np.void], names: tuple[str, ...]
+    ) -> tuple[NDArray[np.intp], str]:
+        try:
+            return filters.apply(points, names, self._config.filters), ""
+        except FilterError as error:
+            return np.arange(len(points)), str(error)
+
+    def _count(self, quality: Quality) -> None:
+        passed_on = Flag.NO_IMU in quality.flags
+        counts = self.counts
+        self.counts = replace(
+            counts,
+            sweeps=counts.sweeps + 1,
+            still=counts.still + quality.is_still,
+            passed_on=counts.passed_on + passed_on,
+            deskewed=counts.deskewed + (not quality.is_still and not passed_on),
+            uncovered=counts.uncovered + (passed_on or Flag.IMU_ENDS_EARLY in quality.flags),
+        )
+
+    def _jumped(self) -> None:
+        self.counts = replace(self.counts, jumps=self.counts.jumps + 1)
+
+
+def _instant(reference: str, sweep: Sweep, points: NDArray[np.void]) -> HostNs:
+    """Return the instant to move the points to."""
+    if reference == "middle":
+        return HostNs((sweep.start + sweep.end) // 2)
+    if reference == "end":
+        return sweep.end
+    if not len(points) or len(points) == len(sweep.points):
+        return sweep.start
+    return HostNs(sweep.start + round(float(points["time"][0]) * 1e9))
+
+
+def _timed(
+    points: NDArray[np.void], times: NDArray[np.float32], start: HostNs, stamp: HostNs
+) -> NDArray[np.void]:
+    """Return the points with times after the stamp in place of times after the start."""
+    if stamp == start:
+        return points
+    timed = points.copy()
+    # to whole nanoseconds, so that the first is exactly 0
+    timed["time"] = np.round(times - np.float64((stamp - start) * 1e-9), 9) + 0.0
+    return timed

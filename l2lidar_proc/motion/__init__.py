@@ -1,0 +1,1 @@
+"""The motion core: IMU buffer, preintegration, filter, static detection."""

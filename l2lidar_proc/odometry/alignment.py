@@ -1,0 +1,198 @@
+"""Aligns a sweep with the map of surfaces: iterated update of the inertial filter, point to plane.
+
+The residual of a point y (deskewed to the reference, IMU axes) measured dt after the reference is
+``n . (R y + p - m)``. It also depends on what deskewed the point, velocity, gravity and biases,
+linearly in dt: so a sweep corrects the motion within itself as well as its place.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc import rotations
+from l2lidar_proc.motion.filter import (
+    ACCEL_BIAS,
+    ERRORS,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    TURN,
+    VELOCITY,
+    InertialState,
+    corrected,
+)
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry_config import SurfaceConfig
+
+F64 = NDArray[np.float64]
+
+_FIRST_REACH_M = 0.5  # farthest point from its plane in the first step; each step halves it
+_LAST_REACH_SCALES = 3.0  # down to this many outlier scales
+WEAK = 0.01  # share of points below which a direction counts as hardly observed
+_TILTED = 4  # one in so many matches stands for what is taken off for uncertain normals
+_SCATTER_SHARED = 3.0  # neighbours in a cell that is not flat err together
+_DONE = 2e-4  # a step below this, in radians and metres, is the last
+_FAR_NOISE = 0.00056  # range noise grows as this times range^1.25, measured on a real unit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """The points to align.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        Deskewed to the reference, from the IMU's origin, cloud axes [m].
+    since : ndarray, shape (N,)
+        Instant of each point after the reference [s], negative before it.
+    ranges : ndarray, shape (N,)
+        [m]
+    """
+
+    points: F64
+    since: F64
+    ranges: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """What an alignment found.
+
+    Attributes
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    information : ndarray, shape (18, 18)
+        What the points alone say, at the last step.
+    matched : int
+        Points that took part in the last step.
+    agreement : float
+        Share of the points at known surfaces that are near them, 0 to 1: unknown surroundings do
+        not lower it, a wrong pose does.
+    residual : float
+        Weighted root mean square of their distances [m].
+    steps : int
+    """
+
+    state: InertialState
+    covariance: F64
+    information: F64
+    matched: int
+    agreement: float
+    residual: float
+    steps: int
+
+
+def align(
+    prior: InertialState,
+    covariance: F64,
+    source: Source,
+    surfaces: SurfelMap,
+    config: SurfaceConfig,
+    least: int,
+    start: InertialState | None = None,
+) -> Alignment | None:
+    """Return the posterior of a sweep, None where fewer than ``least`` points meet a surface.
+
+    Parameters
+    ----------
+    prior : InertialState
+        At the reference; it also deskewed the source.
+    covariance : ndarray, shape (18, 18)
+        Of the prior.
+    source : Source
+    surfaces : SurfelMap
+    config : SurfaceConfig
+    least : int
+    start : InertialState, optional
+        Where to begin instead of the prior.
+    """
+    state = prior if start is None else start
+    noise2 = config.point_noise**2 + (2.0 * _FAR_NOISE * source.ranges**1.25) ** 2
+    result = None
+    for step in range(config.iterations):
+        error = state.minus(prior)
+        points = _redone(source, error, prior.rotation)
+        places = points @ state.rotation.T + state.position
+        found = surfaces.match(places, narrow=True)
+        reach = max(_FIRST_REACH_M * 0.5**step, _LAST_REACH_SCALES * config.outlier_scale)
+        spread = np.sqrt(config.outlier_scale**2 + found.scatter)
+        near = np.abs(found.distances) < np.maximum(reach, _LAST_REACH_SCALES * spread)
+        if np.count_nonzero(near) < least:
+            return result
+        index, normals, distances = found.index[near], found.normals[near], found.distances[near]
+        spread = spread[near]
+        known2 = found.variances[near] + _SCATTER_SHARED * found.scatter[near]
+        weights = _trust(distances, spread) / (noise2[index] + known2)
+        h = _derivatives(points[index], source.since[index], normals, state.rotation)
+        weighted = h * weights[:, None]
+        information = weighted.T @ h
+        some = np.flatnonzero(near)[::_TILTED]
+        at = found.index[some]
+        for axis in range(2):
+            tilted = _derivatives(
+                points[at], source.since[at], found.across[some, axis], state.rotation
+            )
+            tilts = _TILTED * weights[::_TILTED] * found.tilts[some, axis]
+            information -= (tilted * tilts[:, None]).T @ tilted
+        state, posterior = corrected(
+            prior, covariance, state, information, -(weighted.T @ distances)
+        )
+        residual = float(np.sqrt((weights * distances**2).sum() / weights.sum()))
+        agreement = np.count_nonzero(np.abs(distances) < 2.0 * spread) / len(near)
+        result = Alignment(
+            state, posterior, information, len(index), agreement, residual, step + 1
+        )
+        change = state.minus(prior) - error
+        if np.abs(change[:6]).max() < _DONE:
+            break
+    return None if result is None else _cautious(result, covariance)
+
+
+def _cautious(found: Alignment, before: F64) -> Alignment:
+    """Return an alignment that claims less in directions for which only few points speak.
+
+    The few that there are err together, and lie in parts of the map that were seen as seldom: what
+    they agree on is hardly news. So in these directions the covariance stays near that of before.
+    """
+    strength, directions = np.linalg.eigh(found.information[POSITION, POSITION])
+    share = strength / max(float(strength.sum()), 1e-12)
+    doubt = directions * np.sqrt(1.0 - np.clip(share / WEAK, 0.0, 1.0)) @ directions.T
+    kept = np.zeros((ERRORS, ERRORS))
+    kept[POSITION, POSITION] = kept[VELOCITY, VELOCITY] = kept[GRAVITY, GRAVITY] = doubt
+    kept[ACCEL_BIAS, ACCEL_BIAS] = found.state.rotation.T @ doubt @ found.state.rotation
+    covariance = found.covariance + kept @ (before - found.covariance) @ kept
+    return dataclasses.replace(found, covariance=covariance)
+
+
+def _redone(source: Source, error: F64, rotation: F64) -> F64:
+    """Return the points (N, 3) as a corrected motion deskews them, to first order."""
+    since = source.since[:, None]
+    turned = rotations.cross(-error[GYRO_BIAS] * since, source.points)
+    moved = since * error[VELOCITY] + 0.5 * since**2 * error[GRAVITY]
+    return np.asarray(
+        source.points + turned + moved @ rotation - 0.5 * since**2 * error[ACCEL_BIAS]
+    )
+
+
+def _trust(distances: F64, scale: F64) -> F64:
+    """Return the weights (N,) of Geman and McClure: 1 for no distance, a quarter at the scale."""
+    return np.asarray(1.0 / (1.0 + (distances / scale) ** 2) ** 2)
+
+
+def _derivatives(points: F64, since: F64, normals: F64, rotation: F64) -> F64:
+    """Return the derivatives of the residuals by the errors, shape (N, 18)."""
+    dt = since[:, None]
+    inner = normals @ rotation
+    h = np.empty((len(points), ERRORS))
+    h[:, TURN] = rotations.cross(points, inner)
+    h[:, POSITION] = normals
+    h[:, VELOCITY] = dt * normals
+    h[:, GYRO_BIAS] = -dt * h[:, TURN]
+    h[:, ACCEL_BIAS] = -0.5 * dt * dt * inner
+    h[:, GRAVITY] = 0.5 * dt * dt * normals
+    return h

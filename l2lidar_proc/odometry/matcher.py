@@ -1,0 +1,225 @@
+"""Keeps the maps and matches sweeps with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import Sweep
+from l2lidar_proc.motion.filter import POSITION, TURN, InertialState, corrected
+from l2lidar_proc.odometry.alignment import Alignment, Source, align
+from l2lidar_proc.odometry.estimate import AlignmentQuality, weakest
+from l2lidar_proc.odometry.kiss import KissMatcher, thinned
+from l2lidar_proc.odometry.relocalization import is_turned, likely_places
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.sweep_motion import SweepMotion
+from l2lidar_proc.odometry_config import OdometryConfig
+
+F64 = NDArray[np.float64]
+
+_LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
+_AGREEMENT: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
+_OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
+_MATCHED: Final = (0, 50)  # and how many: a few fit in many places
+_MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
+_YOUNG: Final = 12  # sweeps in a map before a sweep without surfaces around is remarkable
+_PLACED: Final = (0.03, 0.15)  # [rad, m] what KISS-ICP's registration by itself is worth
+_PRUNING: Final = 0.2  # the map is pruned whenever this part of its radius was travelled
+
+
+class Match(NamedTuple):
+    """What came of matching a sweep with the map.
+
+    Attributes
+    ----------
+    alignment : Alignment or None
+        The one that can be believed.
+    uncharted : bool
+        There is none because the map has only just begun and has no surfaces here yet; the
+        prediction is good enough to add the sweep where it is.
+    """
+
+    alignment: Alignment | None
+    uncharted: bool
+
+
+class SweepMatcher:
+    """Two maps of the same points, surfaces and KISS-ICP's, and the matching of sweeps with them.
+
+    Parameters
+    ----------
+    config : OdometryConfig
+    lever : ndarray, shape (3,)
+        Place of the IMU in the cloud frame [m].
+
+    Attributes
+    ----------
+    config : OdometryConfig
+        May be replaced; what is not live comes into force with a new matcher.
+    lever : ndarray, shape (3,)
+    surfaces : SurfelMap
+    kiss : KissMatcher
+    """
+
+    def __init__(self, config: OdometryConfig, lever: F64) -> None:
+        self.config = config
+        self.lever = lever
+        settings = config.surfaces
+        self.surfaces = SurfelMap(
+            settings.surface_sizes,
+            thickness=settings.surface_thickness,
+            least=settings.surface_points,
+            capacity=settings.surface_capacity,
+        )
+        self.kiss = KissMatcher(config)
+        self._pruned_at = np.zeros(3)
+        self._sweeps = 0
+
+    def clear(self) -> None:
+        """Forget the maps."""
+        self._sweeps = 0
+        self.surfaces.clear()
+        self.kiss.clear()
+
+    def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
+        """Return the points to align, deskewed along a predicted motion."""
+        points = xyz(motion.deskewed(sweep, self.lever))
+        chosen = thinned(points, self.config.surfaces.source_voxel)
+        chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
+        offset = (sweep.start - motion.state.stamp) * 1e-9
+        return Source(
+            points[chosen] - self.lever,
+            offset + sweep.points["time"][chosen].astype(np.float64),
+            np.linalg.norm(points[chosen], axis=1),
+        )
+
+    def match(self, source: Source, motion: SweepMotion, *, opening: bool = False) -> Match:
+        """Return the alignment that can be believed, if there is one.
+
+        A prediction that may be a surface off is not the only one to begin from: KISS-ICP's
+        registration and a search around it give others, and the result has to fit the map as
+        wrong ones do not.
+
+        Parameters
+        ----------
+        source : Source
+        motion : SweepMotion
+            The one that deskewed the source.
+        opening : bool
+            The map has only just begun: it cannot be searched, and wrong results are sorted out
+            later.
+        """
+        if len(source.points) < self.config.min_points or not len(self.surfaces):
+            return Match(None, False)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
+        loose = sigma > _LOOSE_M or is_turned(motion.covariance)
+        young = self._sweeps < _YOUNG
+        strict = loose and not opening and not young
+        found = self._align(source, motion, motion.state)
+        if not loose or (strict and _believable(found, source, strict)):
+            if _believable(found, source, strict):
+                return Match(found, False)
+            return Match(None, young and not loose and found is None)
+        starts = [self._registered(source, motion.state)]
+        if strict:
+            starts += likely_places(motion.state, motion.covariance, source, self.surfaces)
+        others = [found, *(self._align(source, motion, start) for start in starts)]
+        good = [other for other in others if other and _believable(other, source, strict)]
+        best = max(good, key=lambda other: other.agreement * other.matched, default=None)
+        if best is None and motion.felt.missing.all():
+            # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
+            best = self._placed(source, motion, np.inf)
+        elif best is None and young and found is None:
+            best = self._placed(source, motion, _PLACED[1])
+        return Match(best, False)
+
+    def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> None:
+        """Add the deskewed points (N,) of a sweep to the maps.
+
+        Parameters
+        ----------
+        moved : ndarray, shape (N,)
+        motion : SweepMotion
+            The one that deskewed them.
+        guess : InertialState
+            What was predicted: from it KISS-ICP learns how good predictions are.
+        """
+        state = motion.state
+        self._sweeps += 1
+        points = xyz(moved) - self.lever
+        self.surfaces.add(points @ state.rotation.T + state.position)
+        self.kiss.update(points, _pose(state), _pose(guess))
+        if np.linalg.norm(state.position - self._pruned_at) > _PRUNING * self.config.max_range:
+            self.surfaces.forget(state.position, self.config.max_range)
+            self._pruned_at = state.position
+
+    def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
+        """Return how well a sweep with so many points to align could be matched."""
+        quality = AlignmentQuality(
+            points=points, kiss_threshold_m=self.kiss.threshold, map_cells=len(self.surfaces)
+        )
+        if found is None:
+            return quality
+        return dataclasses.replace(
+            quality,
+            matched=found.matched,
+            agreement=found.agreement,
+            residual_m=found.residual,
+            weakest=weakest(found.information[POSITION, POSITION]),
+        )
+
+    def _align(
+        self, source: Source, motion: SweepMotion, start: InertialState
+    ) -> Alignment | None:
+        share, enough = _MEETING
+        least = min(enough, max(self.config.min_points // 2, round(share * len(source.points))))
+        return align(
+            motion.state,
+            motion.covariance,
+            source,
+            self.surfaces,
+            self.config.surfaces,
+            least,
+            start,
+        )
+
+    def _placed(self, source: Source, motion: SweepMotion, most: float) -> Alignment:
+        """Return what the place that KISS-ICP's registration finds is worth by itself."""
+        place = self._registered(source, motion.state, most)
+        information = np.zeros_like(motion.covariance)
+        information[TURN, TURN] = np.eye(3) / _PLACED[0] ** 2
+        information[POSITION, POSITION] = np.eye(3) / _PLACED[1] ** 2
+        still = np.zeros(len(information))
+        state, covariance = corrected(motion.state, motion.covariance, place, information, still)
+        return Alignment(state, covariance, information, 0, 0.0, 0.0, 1)
+
+    def _registered(
+        self, source: Source, guess: InertialState, most: float = np.inf
+    ) -> InertialState:
+        """Return the guess with the pose that KISS-ICP's registration finds."""
+        better = self.kiss.register(source.points, _pose(guess), most)
+        if better is None:
+            return guess
+        return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
+
+
+def xyz(points: NDArray[np.void]) -> F64:
+    """Return the coordinates of structured points (N,) as float64, shape (N, 3)."""
+    return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+
+
+def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
+    return (
+        found is not None
+        and found.agreement >= _AGREEMENT[strict]
+        and found.matched >= max(_OVERLAP[strict] * len(source.points), _MATCHED[strict])
+    )
+
+
+def _pose(state: InertialState) -> F64:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = state.rotation, state.position
+    return pose

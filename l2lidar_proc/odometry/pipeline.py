@@ -1,0 +1,113 @@
+"""Takes sweeps and IMU samples as they come and gives estimates; node and offline tool use it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.sequencer import Sequencer
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.plain import PlainOdometry
+from l2lidar_proc.odometry_config import OdometryConfig
+from l2lidar_proc.recording.trajectory import Trajectory
+
+_MS: Final = 1_000_000
+
+
+class OdometryPipeline:
+    """Sequencer and odometry, and what they have said so far.
+
+    Parameters
+    ----------
+    config : OdometryConfig
+        Its mode decides which odometry runs.
+    T_cloud_imu : ndarray, shape (4, 4)
+        IMU coordinates to cloud coordinates.
+    imu_wait_ms : int
+        Longest wait for IMU samples up to the end of a sweep; plain KISS-ICP does not wait.
+
+    Attributes
+    ----------
+    odometry : Odometry or PlainOdometry
+    trajectory : Trajectory
+        Of the cloud frame.
+    sweeps : int
+        Sweeps that came in.
+    counts : Counter of Status
+        How often what was reported.
+    last : OdometryEstimate or None
+    """
+
+    def __init__(
+        self, config: OdometryConfig, T_cloud_imu: NDArray[np.float64], imu_wait_ms: int = 50
+    ) -> None:
+        self._config = config
+        self._wait_ns = imu_wait_ms * _MS if config.mode == "inertial" else 0
+        self._newest_imu: HostNs | None = None
+        self.mount(T_cloud_imu)
+
+    def mount(self, T_cloud_imu: NDArray[np.float64]) -> None:
+        """Take another place of the IMU (4, 4); everything begins again."""
+        self.odometry: Odometry | PlainOdometry = (
+            PlainOdometry(self._config)
+            if self._config.mode == "plain"
+            else Odometry(self._config, T_cloud_imu)
+        )
+        self._begin()
+
+    def configure(self, config: OdometryConfig) -> None:
+        """Take new live settings."""
+        self._config = config
+        self.odometry.configure(config)
+
+    def reset(self) -> None:
+        """Forget map and trajectory; begin again with the next sweep."""
+        self.odometry.reset()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._sequencer = Sequencer(self._wait_ns)
+        self.trajectory = Trajectory()
+        self.sweeps = 0
+        self.counts: Counter[Status] = Counter()
+        self.last: OdometryEstimate | None = None
+
+    @property
+    def due_ns(self) -> int | None:
+        """When :meth:`poll` should be called at the latest, None if nothing waits."""
+        return self._sequencer.due_ns
+
+    @property
+    def newest_imu(self) -> HostNs | None:
+        """Stamp of the newest IMU sample."""
+        return self._newest_imu
+
+    def imu(self, samples: Samples) -> None:
+        """Take IMU samples (N,) in any order and state."""
+        self.odometry.imu(samples)
+        if len(samples):
+            self._newest_imu = HostNs(int(samples["stamp"][-1]))
+
+    def sweep(self, sweep: Sweep, now: int) -> None:
+        """Take a sweep that arrives at ``now`` [ns]."""
+        self.sweeps += 1
+        self._sequencer.push(sweep, now)
+
+    def poll(self, now: int) -> list[OdometryEstimate]:
+        """Return the estimates that are due by ``now`` [ns], in order."""
+        estimates: list[OdometryEstimate] = []
+        for release in self._sequencer.release(self._newest_imu, now):
+            for estimate in self.odometry.register(release.sweep):
+                self.counts.update(estimate.status)
+                if Status.REFUSED in estimate.status:
+                    continue
+                self.last = estimate
+                self.trajectory.append(estimate.stamp, estimate.T_odom_lidar)
+                estimates.append(estimate)
+        return estimates

@@ -1,0 +1,1 @@
+"""Bags, trajectories and map files."""

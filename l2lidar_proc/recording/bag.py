@@ -1,0 +1,224 @@
+"""Turns the messages of a recording into plain values and back; needs rosbags, not ROS."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from l2lidar_node.clouds import fields
+from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_proc.rotations import F64, normalised, transform
+
+CLOUD: Final = "sensor_msgs/msg/PointCloud2"
+IMU: Final = "sensor_msgs/msg/Imu"
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+TWIST: Final = "geometry_msgs/msg/TwistStamped"
+TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
+
+_NUMBERS: Final = {code: number for number, code in fields.DATATYPES.items()}
+
+
+class RecordingError(ValueError):
+    """A recording that cannot be used; the message says which and why."""
+
+
+def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:
+    """Return the topic that was asked for, or the only one of its kind.
+
+    Parameters
+    ----------
+    kinds : dict
+        Types of the recording's topics, by name.
+    wanted : str
+    kind : str
+        Type to look for.
+    parameter : str
+        What ``wanted`` is the value of, for the message.
+
+    Raises
+    ------
+    RecordingError
+        If there is none, or more than one and none of that name.
+    """
+    found = [topic for topic, its in kinds.items() if its == kind]
+    if wanted in found:
+        return wanted
+    if len(found) == 1:
+        return found[0]
+    listed = ", ".join(found) or "none"
+    raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
+
+
+def open_bag(path: Path) -> AnyReader:
+    """Return a reader of a rosbag2 folder or an MCAP file; use it in a ``with``."""
+    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+
+
+def unreadable(path: Path, error: Exception) -> RecordingError:
+    """Return what to say of a recording that its reader failed on."""
+    if not path.exists():
+        return RecordingError(f"{path}: there is no such file or folder")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        return RecordingError(f"{path} is no rosbag2 folder: it has no metadata.yaml")
+    words = " ".join(str(error).split()) or type(error).__name__
+    return RecordingError(f"{path} cannot be read as a recording: {words}")
+
+
+def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield every message of a bag in the order it was recorded, with that instant [ns]."""
+    yield from reader.messages()
+
+
+def stamp_of(message: Any) -> HostNs:
+    """Return the stamp in a message's header."""
+    return HostNs(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+
+
+def points_of(message: Any) -> NDArray[np.void]:
+    """Return the points of a cloud message, row by row, shape (N,).
+
+    Raises
+    ------
+    ValueError
+        If fields and sizes do not agree.
+    """
+    return fields.points_of(message)
+
+
+def sample_of(message: Any) -> NDArray[np.void]:
+    """Return an IMU message as a sample, shape (1,), dtype IMU_SAMPLE."""
+    q, rate, force = message.orientation, message.angular_velocity, message.linear_acceleration
+    row = (
+        stamp_of(message),
+        (q.w, q.x, q.y, q.z),
+        (rate.x, rate.y, rate.z),
+        (force.x, force.y, force.z),
+    )
+    return np.array([row], dtype=IMU_SAMPLE)
+
+
+def twist_of(message: Any) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
+    """Return frame, velocity [m/s] and rate [rad/s] of an Odometry or a TwistStamped."""
+    is_odometry = hasattr(message, "child_frame_id")
+    twist = message.twist.twist if is_odometry else message.twist
+    frame = message.child_frame_id if is_odometry else message.header.frame_id
+    linear, angular = twist.linear, twist.angular
+    return (
+        str(frame),
+        (linear.x, linear.y, linear.z),
+        (angular.x, angular.y, angular.z),
+    )
+
+
+def transforms_of(message: Any) -> Iterator[tuple[str, str, F64]]:
+    """Yield parent, child and transform (4, 4) of a TFMessage."""
+    for item in message.transforms:
+        q, p = item.transform.rotation, item.transform.translation
+        turn = normalised((q.w, q.x, q.y, q.z))
+        yield item.header.frame_id, item.child_frame_id, transform(turn, (p.x, p.y, p.z))
+
+
+class BagWriter:
+    """Writes a rosbag2 folder, or one MCAP file where the name ends so; use it in a ``with``.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    typestore : Typestore
+        Of the messages.
+
+    Raises
+    ------
+    FileExistsError
+        If there is something already.
+    """
+
+    def __init__(self, path: Path, typestore: Typestore) -> None:
+        if path.exists():
+            raise FileExistsError(f"{path} exists already")
+        self._path = path
+        self._is_file = path.suffix == ".mcap"
+        self._folder = path.with_suffix(".part") if self._is_file else path
+        if self._is_file:  # what a run that was killed left can be made again
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._types = typestore
+        self._connections: dict[tuple[str, str], Connection] = {}
+        self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
+
+    def __enter__(self) -> BagWriter:
+        """Open the bag."""
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the bag; of a single file the folder around it goes, after an exception all."""
+        self._writer.close()
+        if kind is not None:
+            shutil.rmtree(self._folder)
+        elif self._is_file:
+            (content,) = self._folder.glob("*.mcap")
+            content.replace(self._path)
+            shutil.rmtree(self._folder)
+
+    def copy(self, connection: Connection, recorded_ns: int, data: bytes) -> None:
+        """Write a message as it is."""
+        self._writer.write(
+            self._connection(connection.topic, connection.msgtype), recorded_ns, data
+        )
+
+    def cloud(
+        self, topic: str, recorded_ns: int, points: NDArray[np.void], stamp: HostNs, frame: str
+    ) -> None:
+        """Write points, shape (N,) or (H, W), as a cloud."""
+        types = self._types.types
+        seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
+        time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+        layout = points.dtype
+        places = layout.fields or MappingProxyType({})
+        fields = [
+            types["sensor_msgs/msg/PointField"](
+                name=name,
+                offset=places[name][1],
+                datatype=_NUMBERS[layout[name].base.str[1:]],
+                count=int(np.prod(layout[name].shape)),
+            )
+            for name in layout.names or ()
+        ]
+        height, width = points.shape if points.ndim == 2 else (1, len(points))
+        message = types[CLOUD](
+            header=types["std_msgs/msg/Header"](stamp=time, frame_id=frame),
+            height=height,
+            width=width,
+            fields=fields,
+            is_bigendian=False,
+            point_step=layout.itemsize,
+            row_step=layout.itemsize * width,
+            data=np.frombuffer(np.ascontiguousarray(points).tobytes(), np.uint8),
+            is_dense=all(bool(np.isfinite(points[axis]).all()) for axis in "xyz"),
+        )
+        connection = self._connection(topic, CLOUD)
+        self._writer.write(connection, recorded_ns, self._types.serialize_cdr(message, CLOUD))
+
+    def _connection(self, topic: str, kind: str) -> Connection:
+        key = (topic, kind)
+        if key not in self._connections:
+            made = self._writer.add_connection(topic, kind, typestore=self._types)
+            self._connections[key] = made
+        return self._connections[key]

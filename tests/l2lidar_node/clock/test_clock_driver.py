@@ -1,0 +1,32 @@
+"""The clock where it works: in the driver, against the virtual L2 and its own truth."""
+
+import numpy as np
+import pytest
+
+from l2lidar_node.protocol.wire import PacketType
+from tests.support.clock_rig import Case, run
+
+
+@pytest.mark.parametrize("sync", ["off", "once", "periodic"])
+def test_the_driver_stamps_packets_of_the_virtual_unit_truly(sync: str) -> None:
+    faults = {"jitter": "heavy", "jitter_ms": 20.0, "loss": 0.05, "reorder": 0.02}
+    notes, clock = run(Case(ratio=1.99866, sync=sync, faults=faults, seconds=10.0), seed=5)
+    stamped = notes[notes["published"] != 0]
+    errors = (stamped["published"] - stamped["truth"]) * 1e-6
+
+    assert clock.status().locked
+    assert clock.status().epochs > 150 if sync == "periodic" else clock.status().epochs < 2
+    assert np.abs(errors - np.median(errors)).max() < 0.25
+    assert np.all(stamped["published"] + stamped["duration"] <= stamped["arrival"])
+    for kind in (PacketType.IMU, PacketType.POINTS_3D):
+        assert np.all(np.diff(stamped["published"][stamped["type"] == kind]) > 0)
+
+
+def test_the_measured_round_trip_takes_the_path_delay_off() -> None:
+    case = Case(ratio=1.99866, sync="once", latency=True, seconds=12.0)
+    notes, clock = run(case, seed=5)
+    late = notes[-1000:]
+
+    assert clock.status().path_delay_ns > 100_000
+    without = np.median(late["published"] - late["truth"]) + clock.status().path_delay_ns
+    assert without == pytest.approx(150_000, abs=5_000)  # what the virtual unit needs to send

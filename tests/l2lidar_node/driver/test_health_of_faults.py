@@ -1,0 +1,113 @@
+"""Every level of the diagnostics, provoked by the fault of the virtual L2 that it is for."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.driver.health import Check, Level, Period, judge, observe
+from l2lidar_node.emulator.config import PowerConfig
+from l2lidar_node.protocol.wire import WorkMode
+from l2lidar_node.recording.playback import NoTransport
+from l2lidar_node.types import HostNs
+from tests.l2lidar_node.driver.virtual_host import live_run
+
+OK, WARN, ERROR = Level.OK, Level.WARN, Level.ERROR
+PLAIN = {"imu_adjust": False}
+
+
+def judged(begin: float = 2.5, end: float = 3.5, **run: object) -> dict[str, Check]:
+    """Return how a driver judges a stretch of a run."""
+    periods: list[Period] = []
+    found: list[Check] = []
+
+    def look(driver: Driver, now: HostNs) -> None:
+        periods.append(observe(driver, NoTransport(), now))
+        if len(periods) == 2:
+            found.extend(judge(driver, *periods))
+        driver.gravity.take()
+
+    calls = [(begin, look), (end, look), *run.pop("calls", ())]
+    run.setdefault("settings", PLAIN)
+    live_run(end + 0.1, calls=sorted(calls, key=lambda call: call[0]), **run)
+    return {check.name: check for check in found}
+
+
+def test_without_a_fault_everything_is_ok():
+    checks = judged()
+    assert {name: check.level for name, check in checks.items()} == dict.fromkeys(
+        ("device", "link", "clock", "points", "hardware", "imu"), OK
+    )
+
+
+@pytest.mark.parametrize(
+    ("faults", "name", "level", "message"),
+    [
+        ({"loss": 0.01}, "link", WARN, "packets lost"),
+        ({"loss": 0.2}, "link", ERROR, "packets lost in"),
+        ({"bad_crc": 0.02}, "link", WARN, "lost|damaged"),
+        ({"garbage": 0.1}, "link", WARN, "damaged"),
+        ({"hostile_count": 0.02}, "link", WARN, "lost|impossible"),
+        ({"nan": 0.02}, "link", WARN, "lost|impossible"),
+        ({"loss": 0.5}, "device", WARN, "below its nominal rate"),
+        ({"silence_at": (4.0,), "silence_s": 5.0}, "device", WARN, "below its nominal rate"),
+        ({"silence_at": (2.0,), "silence_s": 5.0}, "device", ERROR, "fallen silent"),
+        ({"reboot_at": (2.6,)}, "clock", WARN, "the device restarted"),
+        ({"foreign_sync_at": (2.8,)}, "clock", WARN, "somebody else"),
+    ],
+    ids=str,
+)
+def test_a_fault_is_named(faults, name, level, message):
+    check = judged(end=4.5, faults=faults)[name]
+    assert check.level is level
+    assert re.search(message, check.message)
+
+
+def test_packets_that_stay_late_are_told():
+    check = judged(6.0, 7.0, late=[(4.0, 9.0, 1.5)])["clock"]
+    assert check.level is WARN
+    assert check.message == "locked; packets come 1.5 s late, stamps allow for it"
+    assert judged(6.0, 7.0, late=[(4.0, 4.5, 0.2)])["clock"].message == "locked"
+
+
+def test_spinning_up_counts_down():
+    checks = judged(9.0, 10.0, power=PowerConfig())
+    assert checks["device"].level is WARN
+    assert checks["device"].message == "spinning up, points in about 15 s"
+    assert checks["clock"].level is OK
+
+
+def test_a_clock_that_has_not_locked_yet():
+    faults = {"jitter": "heavy", "jitter_ms": 50.0}
+    assert judged(0.1, 0.3, faults=faults)["clock"].level is WARN
+
+
+def test_a_unit_told_to_stop_is_as_asked():
+    calls = [(1.0, lambda driver, now: driver.stop_rotation(now))]
+    check = judged(calls=calls)["device"]
+    assert (check.level, check.message) == (OK, "in standby as asked")
+
+
+def test_a_covered_sensor():
+    assert judged(empty=True)["points"].level is WARN
+
+
+@pytest.mark.parametrize(
+    ("mode", "level", "message"),
+    [
+        (WorkMode.IMU_OFF, WARN, "no IMU"),
+        (WorkMode.MODE_2D, ERROR, "2D"),
+        (WorkMode.WAIT_FOR_START, ERROR, "nothing heard"),
+    ],
+)
+def test_work_modes_that_do_not_fit(mode, level, message):
+    check = judged(mode=mode)["device"]
+    assert check.level is level
+    assert message in check.message
+
+
+def test_levelling_without_imu():
+    checks = judged(mode=WorkMode.IMU_OFF, settings={"imu_adjust": True})
+    assert checks["points"].level is WARN

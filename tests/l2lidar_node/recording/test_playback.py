@@ -1,0 +1,137 @@
+"""A recording in a thread like a live session's."""
+
+from __future__ import annotations
+
+import io
+import struct
+import threading
+
+import pytest
+
+from l2lidar_node.driver.driver import Event
+from l2lidar_node.recording.playback import Playback
+from l2lidar_node.recording.recording import Recording
+from l2lidar_node.settings import change
+from l2lidar_node.types import ImuSample, Sweep
+from tests.l2lidar_node.driver.virtual_host import essence, live_run
+
+LIMIT_S = 120.0  # generous: only a failure waits that long
+
+
+class Played:
+    """A playback and everything it says."""
+
+    def __init__(self, stream: io.BytesIO, config, laps: int = 1, **files: object) -> None:
+        self.events: list[Event] = []
+        self.laps: list[list[Event]] = []
+        self.shifts: list[int | None] = []
+        self.times: list[int] = []
+        self.ended = threading.Event()
+        self._laps = laps
+        settings = change(config, {"replay_rate": 0.0, **files})
+        self.playback = Playback(
+            Recording(stream), settings, self.events.append, self.times.append, self._lap
+        )
+        self.playback.start()
+
+    def _lap(self, shift: int | None) -> None:
+        self.laps.append(list(self.events))
+        self.events.clear()
+        self.shifts.append(shift)
+        if len(self.laps) == self._laps:
+            self.ended.set()
+
+
+@pytest.fixture
+def recorded():
+    config, events, tap = live_run(2.5, faults={"loss": 0.01, "reorder": 0.02})
+    return config, events, tap.stream
+
+
+def test_it_hands_out_what_the_live_session_did_and_ends(recorded):
+    config, live, stream = recorded
+    played = Played(stream, config)
+    assert played.playback.wait(LIMIT_S)
+    assert played.playback.failure is None
+    assert played.shifts == [None]
+    assert essence(played.laps[0]) == essence(live)
+
+
+def test_its_time_is_the_recordings(recorded):
+    config, _, stream = recorded
+    played = Played(stream, config)
+    assert played.playback.wait(LIMIT_S)
+    assert played.times == sorted(played.times)
+    assert all(9e6 < b - a < 80e6 for a, b in zip(played.times, played.times[1:], strict=False))
+    assert played.times[0] >= Recording(stream).start
+    done = played.playback.call(lambda driver, now: now)
+    assert done.cancelled()
+
+
+def test_its_time_stands_where_the_recordings_goes_back(recorded):
+    config, _, stream = recorded
+    data = bytearray(stream.getvalue())
+    at, number, last = 24, 0, 0
+    while at < len(data):
+        seconds, nanoseconds, length = struct.unpack_from("<3I", data, at)
+        when = 10**9 * seconds + nanoseconds
+        if number % 3 == 2:  # as packets do that waited in the kernel while a command was sent
+            when = last - 15_000_000
+            struct.pack_into("<2I", data, at, *divmod(when, 10**9))
+        last = when
+        at += 16 + length
+        number += 1
+    played = Played(io.BytesIO(bytes(data)), config)
+    assert played.playback.wait(LIMIT_S)
+    assert len(played.times) > 20
+    assert played.times == sorted(played.times)
+
+
+def test_laps_are_alike_and_never_go_back_in_time(recorded):
+    config, live, stream = recorded
+    played = Played(stream, config, laps=3, replay_loop=True)
+    assert played.ended.wait(LIMIT_S)
+    played.playback.stop()
+    assert played.shifts[:2] == [played.shifts[0], 2 * played.shifts[0]]
+    stamps: list[int] = []
+    for number, lap in enumerate(played.laps[:3]):
+        later = number * played.shifts[0]
+        samples = [item for item in lap if isinstance(item, ImuSample)]
+        assert [item.stamp - later for item in samples] == [
+            item.stamp for item in live if isinstance(item, ImuSample)
+        ]
+        assert [(item.start - later, item.points.tobytes()) for item in lap
+                if isinstance(item, Sweep)] == [
+            (item.start, item.points.tobytes()) for item in live if isinstance(item, Sweep)
+        ]  # fmt: skip
+        stamps += [item.stamp for item in samples]
+    assert stamps == sorted(stamps)
+    assert played.times == sorted(played.times)
+
+
+def test_it_answers_calls_and_stops_while_it_waits(recorded):
+    config, _, stream = recorded
+    played = Played(stream, config, replay_rate=0.01)
+    start = Recording(io.BytesIO(stream.getvalue())).start
+    now = played.playback.call(lambda driver, now: now).result(LIMIT_S)
+    assert 0 <= now - start < 1e9
+    played.playback.stop()
+    assert played.playback.wait(0)
+    assert played.shifts == []
+
+
+def test_damage_ends_it_with_a_reason(recorded):
+    config, live, stream = recorded
+    data = bytearray(stream.getvalue())
+    at = 24
+    while at < len(data) // 2:
+        at += 16 + struct.unpack_from("<I", data, at + 8)[0]
+    struct.pack_into("<I", data, at + 8, 1 << 30)
+    played = Played(io.BytesIO(bytes(data)), config)
+    assert played.playback.wait(LIMIT_S)
+    assert played.playback.failure is None
+    assert "claims 1073741824 bytes" in played.playback.damage
+    part = [item for item in played.laps[0] if isinstance(item, ImuSample)]
+    whole = [item for item in live if isinstance(item, ImuSample)]
+    assert part
+    assert part == whole[: len(part)]

@@ -1,0 +1,144 @@
+import io
+from itertools import pairwise
+
+import pytest
+
+from l2lidar_node.clock import ClockEvent, ClockEventKind
+from l2lidar_node.recording.recording import Recording, Stepped, Waited
+from l2lidar_node.recording.replay import events, shifted
+from l2lidar_node.types import ImuSample, Sweep
+from tests.l2lidar_node.driver.virtual_host import EPOCH_NS, essence, live_run
+
+ROUGH = {
+    "loss": 0.01,
+    "duplicate": 0.01,
+    "reorder": 0.03,
+    "reorder_ms": 70.0,
+    "split": 0.05,
+    "coalesce": 0.1,
+    "bad_crc": 0.01,
+    "truncate": 0.005,
+    "garbage": 0.01,
+    "jitter": "heavy",
+    "jitter_ms": 5.0,
+}
+SETTINGS = {
+    "default": {},
+    "periodic": {"l2_sync_mode": "periodic", "enable_latency_measure": True},
+    "half turns": {"sweep_cut": "half_turn", "imu_adjust": False},
+    "device stamps": {"enable_l2_time_correction": False},
+    "arrival stamps": {"UseSystemTimeTS": True, "imu_adjust": False},
+    "unlocked": {"publish_unlocked": True, "aggregateNframes": 0},
+}
+FAULTS = {
+    "none": {},
+    "rough": ROUGH,
+    "silences": {**ROUGH, "silence_at": (1.5, 2.5), "silence_s": 0.25},
+    "reboot": {"reorder": 0.02, "reboot_at": (2.0,), "foreign_sync_at": (3.5,)},
+    "bursts": {"burst_ms": 230.0, "burst_every_s": 0.7, "reorder": 0.02},
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "faults"),
+    [*((name, "rough") for name in SETTINGS), *(("periodic", name) for name in FAULTS)],
+)
+def test_replay_is_the_live_run_bit_for_bit(settings, faults):
+    config, live, tap = live_run(4.0, settings=SETTINGS[settings], faults=FAULTS[faults])
+    replayed = list(events(Recording(tap.stream), config))
+    assert any(isinstance(event, Sweep) for event in live)
+    assert essence(replayed) == essence(live)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_busy_host_makes_no_difference(seed):
+    config, live, tap = live_run(
+        6.0,
+        settings=SETTINGS["periodic"],
+        faults=FAULTS["silences"],
+        busy=0.02,
+        seed=seed,
+    )
+    assert essence(list(events(Recording(tap.stream), config))) == essence(live)
+
+
+def test_commands_of_the_live_run_cut_the_same_sweeps():
+    calls = [
+        (1.2, lambda driver, now: driver.stop_rotation(now)),
+        (1.9, lambda driver, now: driver.start_rotation(now)),
+        (3.3, lambda driver, now: driver.reset_device(now)),
+    ]
+    config, live, tap = live_run(
+        5.0, calls=calls, faults={"command_loss": 0.5, "reorder": 0.02}, seed=3
+    )
+    assert essence(list(events(Recording(tap.stream), config))) == essence(live)
+
+
+def test_giving_up_is_recorded_only_where_it_matters():
+    _, _, smooth = live_run(2.0)
+    assert not [item for item in Recording(smooth.stream) if isinstance(item, Waited)]
+    _, _, pulled = live_run(4.0, faults={"silence_at": (2.0,), "silence_s": 1.0})
+    assert len([item for item in Recording(pulled.stream) if isinstance(item, Waited)]) == 1
+
+
+def test_other_settings_decode_the_same_recording_otherwise():
+    config, live, tap = live_run(3.0, settings={"imu_adjust": False})
+    replayed = list(events(Recording(tap.stream), config))
+    assert essence(replayed) == essence(live)
+    other = live_run(0.1, settings={"imu_adjust": False, "sweep_cut": "turn"})[0]
+    turns = [event for event in events(Recording(tap.stream), other) if isinstance(event, Sweep)]
+    assert turns[1].packets in (49, 50)
+
+
+def test_a_file_that_was_cut_off_gives_what_it_holds():
+    config, live, tap = live_run(3.0)
+    data = tap.stream.getvalue()
+    recording = Recording(io.BytesIO(data[: len(data) * 2 // 3 + 7]))
+    replayed = essence(list(events(recording, config)))
+    assert recording.is_cut_off
+    assert len(replayed) > 100
+    whole = [item for item in essence(live) if isinstance(item, ImuSample)]
+    part = [item for item in replayed if isinstance(item, ImuSample)]
+    assert part == whole[: len(part)]
+
+
+def test_shifted_events_move_in_time_and_in_nothing_else():
+    _, live, _ = live_run(2.0)
+    later = [shifted(event, 1_000) for event in live]
+    for before, after in zip(live, later, strict=True):
+        if isinstance(before, Sweep):
+            assert (after.start, after.end) == (before.start + 1_000, before.end + 1_000)
+            assert after.points is before.points
+        elif isinstance(before, ImuSample):
+            assert after.stamp == before.stamp + 1_000
+            assert after[1:] == before[1:]
+        else:
+            assert after is before
+
+
+@pytest.mark.parametrize("step", [-1.0, 0.05, 3600.0])
+def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step):
+    config, live, tap = live_run(6.0, host_steps=((3.0, step),), settings={"imu_adjust": False})
+
+    entries = [entry for entry in Recording(tap.stream) if isinstance(entry, Stepped)]
+    assert [entry.by_ns for entry in entries] == [0, round(step * 1e9)]
+    assert 0 <= entries[1].time - (EPOCH_NS + 3_000_000_000 + round(step * 1e9)) < 15_000_000
+    texts = [event.text for event in live if isinstance(event, ClockEvent)]
+    assert [text for text in texts if "stepped" in text] == [
+        f"host clock stepped by {step:+.3f} s"
+        + (f", stamps are held for {-step:.3f} s" if step < 0 else "")
+    ]
+    assert essence(list(events(Recording(tap.stream), config))) == essence(live)
+
+
+@pytest.mark.parametrize("late", [1.0, 5.0])
+def test_packets_that_stay_late_are_stamped_as_measured(late):
+    config, live, tap = live_run(12.0, late=[(2.0, 5.0, late)], settings={"imu_adjust": False})
+
+    stamps = [event.stamp for event in live if isinstance(event, ImuSample)]
+    assert stamps[0] < EPOCH_NS + 2_000_000_000
+    assert stamps[-1] > EPOCH_NS + 11_900_000_000
+    assert all(3_990_000 < after - before < 4_010_000 for before, after in pairwise(stamps))
+    kinds = [event.kind for event in live if isinstance(event, ClockEvent)]
+    assert kinds == [ClockEventKind.LOCKED]
+    assert essence(list(events(Recording(tap.stream), config))) == essence(live)

@@ -1,0 +1,201 @@
+"""The socket, over the loopback interface."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from l2lidar_node.config import NetworkConfig
+from l2lidar_node.demo.processes import free_udp_ports
+from l2lidar_node.transport import udp
+from l2lidar_node.transport.udp import TransportError, UdpTransport
+from l2lidar_node.types import Datagram
+
+DEVICE, FOREIGNER, HOST = "127.0.0.1", "127.0.0.2", "127.0.0.3"
+PATIENCE_S = 60.0  # generous: only a failure waits that long
+
+
+@pytest.fixture
+def device() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind((DEVICE, 0))
+        end.settimeout(PATIENCE_S)
+        yield end
+
+
+@contextmanager
+def opened(device: socket.socket, **config) -> Iterator[UdpTransport]:
+    given = {
+        "l2_ip": DEVICE, "l2_port": device.getsockname()[1], "host_ip": HOST,
+        "host_port": free_udp_ports(1)[0],
+    }  # fmt: skip
+    link = UdpTransport(NetworkConfig(**given | config))
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def receive(link: UdpTransport, count: int) -> list[Datagram]:
+    """Return so many datagrams, or as many as come before patience ends."""
+    deadline = time.monotonic() + PATIENCE_S
+    got: list[Datagram] = []
+    while len(got) < count and time.monotonic() < deadline:
+        got += link.receive(0.1)
+    return got
+
+
+def test_datagrams_come_whole_and_in_order(device):
+    sent = [b"", b"x", bytes(1472), bytes(range(256)) * 200]
+    with opened(device) as link:
+        for data in sent:
+            device.sendto(data, (HOST, link.port))
+        assert [item.data for item in receive(link, 4)] == sent
+        assert link.foreign == 0
+
+
+def test_more_than_one_batch(device):  # and no more than the kernel keeps by default
+    with opened(device) as link:
+        for number in range(400):
+            device.sendto(number.to_bytes(2), (HOST, link.port))
+        assert [item.data for item in receive(link, 400)] == [n.to_bytes(2) for n in range(400)]
+
+
+def test_arrivals_are_the_kernels_and_ascend(device):
+    with opened(device) as link:
+        before = time.time_ns()
+        for _ in range(3):
+            device.sendto(b"x", (HOST, link.port))
+        after = time.time_ns()
+        time.sleep(0.05)  # read late: the stamps must not be those of the reading
+        arrivals = [item.arrival for item in receive(link, 3)]
+    assert arrivals == sorted(arrivals)
+    assert before - 1_000_000 <= arrivals[0]
+    assert arrivals[-1] <= after + 40_000_000
+
+
+def test_other_senders_are_counted_and_dropped(device):
+    with opened(device) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreigner:
+        foreigner.bind((FOREIGNER, 0))
+        for _ in range(3):
+            foreigner.sendto(b"fake", (HOST, link.port))
+        device.sendto(b"true", (HOST, link.port))
+        assert [item.data for item in receive(link, 1)] == [b"true"]
+        assert link.foreign == 3
+
+
+def test_another_port_of_the_device_is_the_device(device):
+    with opened(device) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((DEVICE, 0))
+        other.sendto(b"x", (HOST, link.port))
+        assert [item.data for item in receive(link, 1)] == [b"x"]
+
+
+def test_nothing_comes_in_time(device):
+    with opened(device) as link:
+        assert link.receive(0.01) == []
+        assert link.receive(0.0) == []
+
+
+def test_a_listener_on_all_addresses(device):
+    with opened(device, host_ip="0.0.0.0") as link:
+        device.sendto(b"x", (DEVICE, link.port))
+        assert [item.data for item in receive(link, 1)] == [b"x"]
+
+
+def test_drops_of_the_kernel_are_counted(device):
+    with opened(device, receive_buffer_bytes=4096) as link:
+        assert 4096 <= link.receive_buffer_bytes < 100_000
+        for _ in range(400):
+            device.sendto(bytes(1000), (HOST, link.port))
+        got = 0
+        while batch := link.receive(0.05):
+            got += len(batch)
+        device.sendto(b"last", (HOST, link.port))  # the kernel tells with the next datagram
+        batch = []
+        while not any(item.data == b"last" for item in batch):
+            batch = receive(link, 1)
+            assert batch
+            got += len(batch)
+        assert 0 < got < 401
+        assert got + link.kernel_drops == 401
+
+
+def test_frames_go_to_the_device_from_the_port_that_receives(device):
+    with opened(device) as link:
+        link.send(b"command")
+        data, sender = device.recvfrom(100)
+        assert data == b"command"
+        assert sender == (HOST, link.port)
+
+
+def test_a_frame_that_cannot_be_sent_is_counted(device):
+    with opened(device) as link:
+        link.send(bytes(70_000))
+        assert link.send_errors == 1
+        link.send(b"next")
+        assert device.recvfrom(100)[0] == b"next"
+
+
+def test_a_device_that_is_not_there_stops_nothing(device):
+    with opened(device, l2_port=free_udp_ports(1)[0]) as link:
+        for _ in range(3):
+            link.send(b"x")
+            assert link.receive(0.01) == []
+        device.sendto(b"back", (HOST, link.port))
+        assert [item.data for item in receive(link, 1)] == [b"back"]
+
+
+def refusal(device: socket.socket, **config) -> TransportError:
+    """Return the error of listening where one cannot."""
+    with pytest.raises(TransportError) as caught, opened(device, **config):
+        pass
+    return caught.value
+
+
+def test_a_port_in_use(device):
+    with opened(device) as first:
+        error = refusal(device, host_port=first.port)
+        assert error.errno == errno.EADDRINUSE
+        assert f"cannot listen on {HOST}:{first.port}" in str(error)
+        assert "in use; end the other program" in str(error)
+
+
+def test_an_address_of_another_machine(device):
+    error = refusal(device, host_ip="192.0.2.1")
+    assert error.errno == errno.EADDRNOTAVAIL
+    assert "host_ip '192.0.2.1' is no address of this machine" in str(error)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may listen on any port")
+def test_a_privileged_port(device):
+    error = refusal(device, host_port=80)
+    assert "no permission; set host_port to 1024 or above" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [
+        (errno.EACCES, "no permission; set host_port to 1024 or above"),
+        (errno.ENOBUFS, os.strerror(errno.ENOBUFS)),
+    ],
+)
+def test_the_advice_for_what_a_test_cannot_provoke(number, advice):
+    error = OSError(number, os.strerror(number))
+    text = udp._bind_advice(NetworkConfig(), error)
+    assert text == f"cannot listen on 192.168.1.2:6201: {advice}"
+
+
+def test_closing_twice_and_listening_again(device):
+    with opened(device) as link:
+        port = link.port
+        link.close()
+        link.close()
+    with opened(device, host_port=port) as again:
+        assert again.port == port

@@ -1,0 +1,71 @@
+"""What is short of ideal is said, and at a level that fits."""
+
+from __future__ import annotations
+
+import pytest
+
+from l2lidar_proc.deskew import report
+from l2lidar_proc.deskew.pipeline import PipelineCounts
+from l2lidar_proc.deskew.report import Level
+from l2lidar_proc.motion.imu_buffer import WindowCounts
+from l2lidar_proc.motion.tracker import Flag, Quality
+
+
+def quality(*flags: Flag, still: bool = False) -> Quality:
+    return Quality(
+        1.0, 4_000_000, 0.1, 0.2, "odometry", 120_000_000, (0.01, 0, 0), still, True, flags
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "level"),
+    [
+        ((), Level.OK),
+        ((Flag.NO_VELOCITY,), Level.WARN),
+        ((Flag.IMU_GAP,), Level.WARN),
+        ((Flag.NO_IMU,), Level.ERROR),
+        ((Flag.NO_VELOCITY, Flag.ACCELEROMETER_FAULT), Level.ERROR),
+    ],
+)
+def test_a_sweep(flags, level):
+    told = report.of_sweep(quality(*flags), 7_000_000)
+    assert told.level == level
+    assert all(flag.value in told.message for flag in flags)
+    assert told.values["velocity source"] == "odometry"
+    assert told.values["velocity age [ms]"] == "120"
+    assert told.values["rotation [deg]"] == "5.73"
+    assert told.values["waited for the IMU [ms]"] == "7.0"
+
+
+def period(
+    before: int, after: int, last, *, is_levelled: bool = False, untied: str = ""
+) -> report.Report:
+    return report.of_period(
+        PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, WindowCounts(), None,
+        {"no time field": 3}, is_levelled=is_levelled, untied=untied,
+    )  # fmt: skip
+
+
+def test_a_period():
+    last = report.of_sweep(quality(still=True), 0)
+    told = period(3, 8, last)
+    assert told.level == Level.OK
+    assert "5 sweeps" in told.message
+    assert "at rest" in told.message
+    assert told.values["clouds refused: no time field"] == "3"
+    assert told.values["last: at rest"] == "true"
+    assert period(8, 8, last).level == Level.WARN
+    assert period(3, 8, None).level == Level.OK
+
+
+def test_a_velocity_that_cannot_be_used_is_told_unless_worse_is():
+    told = period(3, 8, report.of_sweep(quality(), 0), untied="'base' is not tied")
+    assert told.level == Level.WARN
+    assert told.message.endswith("velocity not used: 'base' is not tied")
+    assert period(3, 8, report.of_sweep(quality(Flag.NO_IMU), 0), untied="x").level == Level.ERROR
+
+
+def test_levelled_clouds_are_an_error_whatever_else():
+    told = period(3, 8, report.of_sweep(quality(), 0), is_levelled=True)
+    assert told.level == Level.ERROR
+    assert "imu_adjust" in told.message

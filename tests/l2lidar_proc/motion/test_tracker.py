@@ -1,0 +1,148 @@
+"""The tracker puts IMU, attitude and velocities together and is honest about what it has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from l2lidar_node.protocol import wire
+from l2lidar_node.settings import SettingError, build
+from l2lidar_proc import rotations
+from l2lidar_proc.config import MotionConfig
+from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.motion.tracker import Flag, MotionTracker
+from tests.l2lidar_proc.motion.analytic import (
+    EPOCH,
+    T_CLOUD_IMU,
+    Motion,
+    at,
+    noisy,
+    rms,
+    seen,
+    xyz,
+)
+
+WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
+START, END = 6.0, 6.23
+
+
+def tracked(samples, motion=None, config=None) -> MotionTracker:
+    """Return a tracker that followed samples, with velocities up to 0.1 s before the sweep."""
+    tracker = MotionTracker(config or MotionConfig())
+    for i in range(0, len(samples), 10):
+        tracker.imu(samples[i : i + 10])
+        t = (int(samples["stamp"][min(i + 9, len(samples) - 1)]) - EPOCH) * 1e-9
+        if motion is not None and t < START - 0.1:
+            tracker.velocity(at(t), motion.velocity(np.array([t]))[0], "odometry")
+    return tracker
+
+
+def test_a_walk_with_a_velocity_from_before_the_sweep():
+    tracker = tracked(WALK.imu(0, END + 0.01), WALK)
+    path, quality = tracker.path(at(START), at(END))
+    points, truth = seen(WALK, START, END, START)
+    assert rms(xyz(points) - truth) > 0.3
+    assert rms(xyz(deskew(points, at(START), path, at(START))) - truth) < 0.004
+    assert quality.flags == ()
+    assert quality.velocity_source == "odometry"
+    assert quality.velocity_age_ns == pytest.approx(0.35e9, abs=0.06e9)
+    assert quality.rotation_rad == pytest.approx(0.24, abs=0.05)
+    assert quality.translation_m == pytest.approx(0.23, abs=0.02)
+    assert quality.imu_covered == 1.0
+    assert quality.imu_gap_ns == 4_000_000
+    assert quality.is_gravity_trusted
+    assert not quality.is_still
+
+
+def test_the_accelerometer_makes_the_difference():
+    points, truth = seen(WALK, START, END, START)
+    errors = []
+    for use in (True, False):
+        config = replace(MotionConfig(), use_accelerometer=use)
+        path, _ = tracked(WALK.imu(0, END + 0.01), WALK, config).path(at(START), at(END))
+        errors.append(rms(xyz(deskew(points, at(START), path, at(START))) - truth))
+    assert errors[0] < errors[1] / 3
+
+
+def test_without_velocity_rotation_only_and_it_says_so():
+    path, quality = tracked(WALK.imu(0, END + 0.01)).path(at(START), at(END))
+    assert quality.flags == (Flag.NO_VELOCITY,)
+    assert quality.translation_m == 0.0
+    assert quality.rotation_rad > 0.2
+    assert not path.positions.any()
+
+
+def test_a_sensor_at_rest_has_a_path_that_does_not_move():
+    samples = noisy(Motion().imu(0, END + 0.01, (0.02, -0.03, 0.01)))
+    for tracker, (start, end) in (
+        (tracked(samples), (START, END)),
+        (tracked(samples[:60]), (0.0, 0.23)),
+    ):
+        path, quality = tracker.path(at(start), at(end))
+        assert quality.is_still
+        assert quality.flags == ()
+        points, _ = seen(Motion(), start, end, start)
+        assert deskew(points, at(start), path, at(end)).tobytes() == points.tobytes()
+
+
+def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise():
+    samples = noisy(Motion().imu(0, END + 0.01))
+    _, quality = tracked(samples, Motion(speed=0.5)).path(at(START), at(END))
+    assert not quality.is_still
+    assert quality.translation_m == pytest.approx(0.115, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("keep", "flags", "covered"),
+    [
+        (lambda t: t < 6.1, (Flag.IMU_ENDS_EARLY, Flag.IMU_GAP), 0.1 / 0.23),
+        (lambda t: t > 6.1, (Flag.IMU_STARTS_LATE, Flag.IMU_GAP), 0.13 / 0.23),
+        (lambda t: (t < 6.1) | (t > 6.15), (Flag.IMU_GAP,), 1.0),
+        (lambda t: (t < 6.1) | (t > 6.11), (), 1.0),
+        (lambda t: t < 5.9, (Flag.NO_IMU,), 0.0),
+        (lambda t: t < 0, (Flag.NO_IMU,), 0.0),
+    ],
+)
+def test_missing_samples_are_reported(keep, flags, covered):
+    samples = WALK.imu(0, END + 0.01)
+    samples = samples[keep((samples["stamp"] - EPOCH) * 1e-9)]
+    path, quality = tracked(samples).path(at(START), at(END))
+    assert tuple(flag for flag in quality.flags if flag is not Flag.NO_VELOCITY) == flags
+    assert quality.imu_covered == pytest.approx(covered, abs=0.03)
+    assert np.isfinite(path.rotations_wxyz).all()
+    assert (path.rates.any() or path.positions.any()) == (Flag.NO_IMU not in flags)
+
+
+def test_a_faulty_accelerometer_is_reported_and_left_alone():
+    samples = Motion(turn=1.0, speed=1.0).imu(0, END + 0.01)
+    samples["linear_acceleration"] *= 2.0
+    tracker = tracked(samples, Motion(turn=1.0, speed=1.0))
+    _, quality = tracker.path(at(START), at(END))
+    assert quality.flags == (Flag.ACCELEROMETER_FAULT,)
+    assert not quality.is_gravity_trusted
+    assert quality.translation_m == pytest.approx(0.23, abs=0.02)
+
+
+def test_a_jump_of_the_imu_clock_forgets_what_was():
+    tracker = tracked(WALK.imu(0, 3), WALK)
+    assert tracker.imu(WALK.imu(10, 10.5))
+    assert tracker.window.samples["stamp"][0] == at(10)
+    assert tracker.velocities.at(at(2.9)) is None
+    _, quality = tracker.path(at(10.1), at(10.3))
+    assert quality.flags == (Flag.NO_VELOCITY,)
+
+
+def test_the_mount_of_the_imu():
+    assert MotionConfig().imu_xyz == wire.IMU_POSITION_M
+    np.testing.assert_allclose(MotionConfig().T_cloud_imu, T_CLOUD_IMU)
+    turned = build(
+        MotionConfig, {"imu_rpy": [0.0, 0.0, 90.0], "imu_xyz": [1.0, 2.0, 3.0]}
+    ).T_cloud_imu
+    np.testing.assert_allclose(turned @ (1, 0, 0, 1), (1, 3, 3, 1), atol=1e-12)
+    both = build(MotionConfig, {"imu_rpy": [90.0, 0.0, 90.0]}).T_cloud_imu[:3, :3]
+    np.testing.assert_allclose(both @ (0, 1, 0), (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(rotations.from_matrix(both), (0.5, 0.5, 0.5, 0.5), atol=1e-12)
+    with pytest.raises(SettingError, match="imu_xyz"):
+        build(MotionConfig, {"imu_xyz": [1.0]})

@@ -1,0 +1,53 @@
+"""Short recordings of the virtual L2 for the tests of the odometry, made once per test run."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.protocol import wire
+from l2lidar_node.types import Sweep
+from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry_config import OdometryConfig
+from tests.support.odometry_runs import Run, record, sweeps, truth
+
+T_CLOUD_IMU = np.eye(4)
+T_CLOUD_IMU[:3, 3] = wire.IMU_POSITION_M
+
+
+@lru_cache(maxsize=4)
+def recording(scene: str, motion: str, seconds: float = 6.0) -> Run:
+    return record(scene, motion, 1, seconds)
+
+
+def feed(
+    odometry: Odometry, run: Run, some: list[Sweep], imu: NDArray[np.void] | None = None
+) -> list[OdometryEstimate]:
+    """Give the odometry sweeps and, before each, the samples up to its end."""
+    imu = run.imu if imu is None else imu
+    out: list[OdometryEstimate] = []
+    first = 0
+    for sweep in some:
+        last = int(np.searchsorted(imu["stamp"], sweep.end)) + 1
+        odometry.imu(imu[first:last])
+        first = last
+        out += odometry.register(sweep)
+    return out
+
+
+def drive(run: Run, cut: str = "turn", config: OdometryConfig | None = None, imu=None):
+    odometry = Odometry(config or OdometryConfig(), T_CLOUD_IMU)
+    return feed(odometry, run, list(sweeps(run, cut)), imu)
+
+
+def errors(run: Run, estimates: list[OdometryEstimate]) -> NDArray[np.float64]:
+    """Return distances from the truth after a rigid alignment [m], shape (N,)."""
+    found = np.array([item.T_odom_lidar[:3, 3] for item in estimates])
+    true, _ = truth(run, np.array([item.stamp for item in estimates]))
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return np.linalg.norm(a @ turn.T - b, axis=1)

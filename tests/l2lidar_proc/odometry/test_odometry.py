@@ -1,0 +1,287 @@
+"""The odometry against the virtual L2's truth, and what it does when something is missing."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_proc.odometry.estimate import Status
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry_config import OdometryConfig
+from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
+from tests.support.odometry_runs import sweeps, truth
+
+
+@pytest.mark.parametrize(
+    ("scene", "motion", "cut"),
+    [("room", "walk", "turn"), ("yard", "drone", "38 packets"), ("room", "trot", "half turn")],
+)
+def test_error_is_a_few_millimetres(scene, motion, cut):
+    run = recording(scene, motion)
+    estimates = drive(run, cut)
+    found = errors(run, estimates)
+    assert np.sqrt((found**2).mean()) < 0.006
+    assert found.max() < 0.02
+    assert [item.stamp for item in estimates] == sorted({item.stamp for item in estimates})
+    assert not estimates[-1].status
+
+
+def test_every_sweep_has_its_estimate_at_its_middle():
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    estimates = drive(run)
+    assert [item.stamp for item in estimates] == [(one.start + one.end) // 2 for one in some]
+
+
+@pytest.mark.parametrize("reference", ["start", "end"])
+def test_other_references_are_stamped_and_met(reference):
+    run = recording("room", "walk")
+    estimates = drive(run, config=OdometryConfig(reference=reference))
+    some = list(sweeps(run, "turn"))
+    assert [item.stamp for item in estimates] == [getattr(one, reference) for one in some]
+    assert errors(run, estimates).max() < 0.02
+
+
+def test_covariance_and_twist_are_those_of_the_errors():
+    run = recording("room", "walk")
+    estimates = drive(run)[8:]
+    found = errors(run, estimates)
+    sigma = np.array([np.sqrt(np.trace(item.covariance[:3, :3])) for item in estimates])
+    assert 0.2 < np.sqrt((found**2 / sigma**2).mean()) < 3.0
+    moving = run.motion.kinematics(
+        (np.array([e.stamp for e in estimates]) - sweep_epoch(run)) * 1e-9
+    )
+    velocity = np.array([item.velocity for item in estimates])
+    assert np.abs(velocity - moving.velocity_body).max() < 0.06
+    rate = np.array([item.angular_velocity for item in estimates])
+    assert np.abs(rate - moving.angular_velocity).max() < 0.1
+
+
+def sweep_epoch(run):
+    return int(run.imu["stamp"][0])
+
+
+def test_biases_and_up_are_found():
+    run = recording("room", "walk")
+    last = drive(run)[-1]
+    assert np.abs(last.gyro_bias - [0.01, -0.02, 0.015]).max() < 0.01
+    assert np.linalg.norm(last.gravity) == pytest.approx(9.80665, abs=0.1)
+    assert last.gravity[2] < -9.7
+
+
+def test_the_cloud_is_the_one_of_the_stamp():
+    run = recording("room", "walk")
+    estimates = drive(run)
+    position, quaternion = truth(run, np.array([estimates[-1].stamp]))
+    first, q0 = truth(run, np.array([estimates[5].stamp]))
+    points = {}
+    for index, p, q in ((-1, position[0], quaternion), (5, first[0], q0)):
+        cloud = estimates[index].points
+        xyz = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        points[index] = xyz @ rotation_matrices(q)[0].T + p
+    # both in the world: the ceiling is at one height
+    for xyz in points.values():
+        ceiling = xyz[(xyz[:, 2] > 2.72) & (np.abs(xyz[:, 0]) < 0.9)]
+        assert abs(np.median(ceiling[:, 2]) - 2.8) < 0.01
+
+
+def test_standing_still_stays_there():
+    run = recording("room", "still", 3.0)
+    estimates = drive(run)
+    way = np.array([item.T_odom_lidar[:3, 3] for item in estimates])
+    assert np.abs(way - way[0]).max() < 0.008
+    assert np.abs(estimates[-1].velocity).max() < 0.02
+
+
+def test_without_imu_it_holds_and_says_so():
+    run = recording("room", "walk")
+    estimates = drive(run, imu=run.imu[:0])
+    assert errors(run, estimates).max() < 0.04
+    assert Status.NO_IMU in estimates[-1].status
+    assert Status.GRAVITY_UNTRUSTED in estimates[-1].status
+
+
+def test_imu_gap_is_bridged_and_reported():
+    run = recording("room", "walk")
+    seconds = (run.imu["stamp"] - sweep_epoch(run)) * 1e-9
+    estimates = drive(run, imu=run.imu[(seconds < 3.6) | (seconds > 4.1)])
+    assert errors(run, estimates).max() < 0.03
+    assert sum(Status.IMU_GAP in e.status or Status.NO_IMU in e.status for e in estimates) >= 2
+    assert Status.IMU_GAP not in estimates[-1].status
+
+
+def test_doubled_gravity_is_not_trusted_and_survived():
+    run = recording("room", "walk")
+    imu = run.imu.copy()
+    imu["linear_acceleration"] *= 2.05
+    estimates = drive(run, imu=imu)
+    assert all(Status.GRAVITY_UNTRUSTED in item.status for item in estimates)
+    assert errors(run, estimates).max() < 0.04
+
+
+def test_blocked_sensor_is_predicted_with_growing_covariance():
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    blind = slice(15, 20)
+    some[blind] = [dataclasses.replace(one, points=one.points[:3]) for one in some[blind]]
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some)
+    for item in estimates[blind]:
+        assert {Status.PREDICTED, Status.SPARSE} <= set(item.status)
+        assert not item.is_aligned
+    traces = [np.trace(item.covariance[:3, :3]) for item in estimates[14:20]]
+    assert all(later > earlier for earlier, later in pairwise(traces))
+    assert traces[-1] > 4.0 * traces[0]
+    assert estimates[-1].is_aligned
+    assert errors(run, estimates).max() < 0.05
+
+
+def test_dropped_sweeps_are_survived():
+    run = recording("room", "walk")
+    some = [one for k, one in enumerate(sweeps(run, "turn")) if not 12 <= k < 17]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some)
+    assert errors(run, estimates).max() < 0.03
+
+
+def test_corridor_tells_its_weak_direction():
+    run = recording("corridor", "walk")
+    estimates = drive(run)
+    assert errors(run, estimates).max() < 0.05
+    item = estimates[-1]
+    along = np.abs(np.linalg.eigh(item.covariance[:3, :3])[1][:, -1])
+    _, q = truth(run, np.array([item.stamp, estimates[0].stamp]))
+    axis = rotation_matrices(q)[1].T @ [1.0, 0.0, 0.0]
+    assert along @ np.abs(axis) > 0.8
+    assert any(Status.DEGENERATE in one.status for one in estimates)
+
+
+def test_a_sweep_that_is_not_later_is_refused():
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    before = feed(odometry, run, some[:8])[-1]
+    (again,) = odometry.register(some[6])
+    assert again.status == (Status.REFUSED,)
+    assert again.stamp == before.stamp
+
+
+def test_clock_that_goes_back_keeps_pose_and_map():
+    run = recording("room", "still", 6.0)
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    feed(odometry, run, some[:12])
+    back = 3_600_000_000_000
+    imu = run.imu.copy()
+    imu["stamp"] -= back
+    late = [
+        dataclasses.replace(s, start=HostNs(s.start - back), end=HostNs(s.end - back))
+        for s in some[12:]
+    ]
+    estimates = feed(odometry, run, late, imu)
+    assert Status.RESTARTED in estimates[0].status
+    assert np.abs(estimates[-1].T_odom_lidar[:3, 3]).max() < 0.02
+    assert estimates[-1].is_aligned
+    # the hour between may have hidden a step
+    assert np.sqrt(np.diag(estimates[-1].covariance)).min() > 0.3
+
+
+def test_a_map_begun_elsewhere_is_as_uncertain_as_the_way_there():
+    """Carried blindly into another place: five seconds without a match, then a new map."""
+    room, yard = recording("room", "walk", 9.0), recording("yard", "walk", 9.0)
+    at = room.imu["stamp"][0] + 2_500_000_000
+    some = [one for one in sweeps(room, "half turn") if one.end < at]
+    some += [one for one in sweeps(yard, "half turn") if one.start >= at]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), room, some)
+    lost = next(k for k, item in enumerate(estimates) if Status.LOST in item.status)
+    after = estimates[lost + 1 :]
+    assert estimates[lost].stamp > at + 4_000_000_000
+    assert len(after) > 3
+    assert any(item.is_aligned for item in after)
+    before = np.linalg.eigvalsh(estimates[lost - 1].covariance[:3, :3])[-1]
+    assert all(np.linalg.eigvalsh(item.covariance[:3, :3])[-1] > before for item in after)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 9, 50])
+@pytest.mark.parametrize("mode", ["alone", "in the middle"])
+def test_thin_clouds_do_no_harm(count, mode):
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    if mode == "in the middle":
+        feed(odometry, run, some[:6])
+    for one in some[6:9]:
+        odometry.register(dataclasses.replace(one, points=one.points[:count]))
+    rest = feed(odometry, run, some[9:14])
+    assert rest[-1].is_aligned
+
+
+def test_equal_times_and_numbers_that_are_not_finite_do_no_harm():
+    run = recording("room", "walk")
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    some = list(sweeps(run, "turn"))
+    for k, one in enumerate(some[:8]):
+        points = one.points.copy()
+        points["x"][k::97] = np.nan
+        points["z"][k::89] = np.inf
+        if k == 6:
+            points["time"] = 0.0
+        estimates = feed(odometry, run, [dataclasses.replace(one, points=points)])
+    assert np.isfinite(estimates[-1].T_odom_lidar).all()
+    assert estimates[-1].is_aligned
+
+
+def test_reset_begins_again():
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    first = feed(odometry, run, some[:12])
+    odometry.reset()
+    again = feed(odometry, run, some[:12])
+    np.testing.assert_array_equal(again[-1].T_odom_lidar, first[-1].T_odom_lidar)
+
+
+def test_extrapolation_leads_to_the_next_sweep():
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    assert odometry.extrapolated(some[0].start) is None
+    last = feed(odometry, run, some[:20])[-1]
+    odometry.imu(run.imu[run.imu["stamp"] > some[19].end][:25])
+    ahead = odometry.extrapolated(HostNs(last.stamp + 150_000_000))
+    true, _ = truth(run, np.array([last.stamp, ahead.stamp]))
+    moved = np.linalg.norm(ahead.T_odom_lidar[:3, 3] - last.T_odom_lidar[:3, 3])
+    assert moved == pytest.approx(np.linalg.norm(true[1] - true[0]), abs=0.01)
+    assert np.trace(ahead.covariance) > np.trace(last.covariance)
+
+
+def test_any_layout_with_times_will_do():
+    run = recording("room", "walk")
+    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")]
+    some = []
+    for one in sweeps(run, "turn"):
+        points = np.zeros(len(one.points), layout)
+        for name, _ in layout:
+            points[name] = one.points[name]
+        some.append(Sweep(one.start, one.end, points, 0, 0))
+    plain = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some[:10])
+    assert plain[-1].points.dtype == np.dtype(layout)
+    assert np.dtype(layout) != POINT
+    full = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, list(sweeps(run, "turn"))[:10])
+    np.testing.assert_array_equal(plain[-1].T_odom_lidar, full[-1].T_odom_lidar)
+
+
+def test_imu_axes_follow_the_extrinsic():
+    run = recording("room", "walk")
+    turned = T_CLOUD_IMU.copy()
+    turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    imu = run.imu.copy()
+    for name in ("angular_velocity", "linear_acceleration"):
+        imu[name] = run.imu[name] @ turned[:3, :3]
+    odometry = Odometry(OdometryConfig(), turned)
+    estimates = feed(odometry, run, list(sweeps(run, "turn")), imu)
+    assert errors(run, estimates).max() < 0.02

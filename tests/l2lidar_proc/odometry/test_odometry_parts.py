@@ -1,0 +1,195 @@
+"""The parts of the odometry on their own: surfaces, sums of samples, files, KISS-ICP's guards."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_node.settings import SettingError, build
+from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
+from l2lidar_proc import rotations
+from l2lidar_proc.motion.preintegration import integrate, track
+from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.estimate import Status
+from l2lidar_proc.odometry.kiss import thinned
+from l2lidar_proc.odometry.plain import PlainOdometry
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry_config import OdometryConfig, OdometryNodeConfig
+from l2lidar_proc.recording.trajectory import Trajectory, kitti, levelled_start, tum
+from tests.l2lidar_proc.motion.analytic import EPOCH, G, Motion, at
+from tests.l2lidar_proc.odometry.odometry_world import recording
+from tests.support.odometry_runs import sweeps
+
+RNG_SEED = 4
+
+
+def wall(x: float = 2.0):
+    """Return points on a wall across x, with 1 cm of noise."""
+    rng = np.random.default_rng(RNG_SEED)
+    points = rng.uniform((x, -1.0, 0.0), (x, 1.0, 2.0), (4000, 3))
+    points[:, 0] += 0.01 * rng.standard_normal(len(points))
+    return points
+
+
+def test_a_wall_becomes_surfaces_and_gives_distances():
+    surfaces = SurfelMap((0.25, 0.6))
+    surfaces.add(wall(2.12))
+    probe = np.array([[2.15, 0.1, 1.1], [2.09, -0.6, 0.4], [5.0, 5.0, 5.0]])
+    found = surfaces.match(probe)
+    order = np.argsort(found.index)
+    assert found.index[order].tolist() == [0, 1]
+    np.testing.assert_allclose(np.abs(found.normals[order]), [[1, 0, 0]] * 2, atol=0.05)
+    signed = found.distances[order] * np.sign(found.normals[order, 0])
+    np.testing.assert_allclose(signed, [0.03, -0.03], atol=0.006)
+    assert (found.variances < 0.01**2).all()
+
+
+def test_points_of_one_line_are_no_surface():
+    surfaces = SurfelMap((0.25,))
+    line = np.linspace(0.0, 0.24, 200)[:, None] * [0.6, 0.8, 0.0]
+    surfaces.add(line + 0.002 * np.random.default_rng(RNG_SEED).standard_normal((200, 3)))
+    assert not len(surfaces.match(line).index)
+
+
+def test_a_full_cell_changes_no_more():
+    surfaces = SurfelMap((4.0,), capacity=1000)
+    surfaces.add(wall())
+    before = surfaces.match(np.array([[2.0, 0.5, 0.5]])).distances
+    surfaces.add(wall(2.3))
+    np.testing.assert_array_equal(surfaces.match(np.array([[2.0, 0.5, 0.5]])).distances, before)
+
+
+def test_far_cells_are_forgotten_and_the_rest_stays():
+    surfaces = SurfelMap((0.25,))
+    surfaces.add(wall(2.12))
+    surfaces.add(wall(52.12))
+    count = len(surfaces)
+    surfaces.forget(np.zeros(3), 10.0)
+    assert 0 < len(surfaces) < count
+    assert len(surfaces.match(np.array([[2.12, 0.1, 1.1], [52.12, 0.1, 1.1]])).index) == 1
+    surfaces.add(wall(52.12))
+    assert len(surfaces) == count
+
+
+def test_sums_of_samples_lead_along_the_motion():
+    motion = Motion(turn=1.0, nod=0.1, speed=1.0)
+    samples = motion.imu(0.0, 0.4)
+    marks = [at(0.05), at(0.35)]
+    felt = track(samples, marks, 20_000_000, np.zeros(3))
+    seen = integrate(felt, 0, np.zeros(3), np.zeros(3), np.zeros(3))
+    turn = motion.rotation(np.array([0.05, 0.35]))
+    found = rotations.log(seen.rotations_wxyz[-1])
+    np.testing.assert_allclose(found, (turn[0].inv() * turn[1]).as_rotvec(), atol=2e-4)
+    back = seen.seen_from(len(seen.stamps) - 1).seen_from(0)
+    np.testing.assert_allclose(back.positions, seen.positions, atol=1e-12)
+    assert not felt.missing.any()
+
+
+def test_gaps_hold_rate_and_speed():
+    samples = np.zeros(101, IMU_SAMPLE)
+    samples["stamp"] = EPOCH + np.arange(101) * 4_000_000
+    samples["angular_velocity"] = [0.0, 0.0, 0.5]
+    samples["linear_acceleration"] = [0.0, 0.0, G]
+    holed = np.delete(samples, np.arange(40, 70))
+    felt = track(holed, [at(0.0), at(0.6)], 50_000_000, np.array([0.0, 0.0, 0.5]))
+    assert felt.missing.any()
+    seen = integrate(felt, 0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, G]))
+    assert rotations.log(seen.rotations_wxyz[-1])[2] == pytest.approx(0.3, abs=1e-6)
+    np.testing.assert_allclose(seen.velocities[-1], [0.0, 0.0, 0.6 * G], atol=1e-6)
+
+
+def test_trajectory_files_keep_nanoseconds():
+    pose = np.eye(4)
+    pose[:3, 3] = [1.0, -2.0, 0.5]
+    trajectory = Trajectory()
+    for index in range(300):
+        trajectory.append(HostNs(1_700_000_000_123_456_789 + index), pose)
+    text = tum(trajectory.poses[:1])
+    assert text.split() == [
+        "1700000000.123456789", "1.000000000", "-2.000000000", "0.500000000",
+        "0.000000000", "0.000000000", "0.000000000", "1.000000000",
+    ]  # fmt: skip
+    rows = np.array(kitti(trajectory.poses).split(), dtype=float)
+    np.testing.assert_array_equal(rows.reshape(-1, 3, 4), np.tile(pose[:3], (300, 1, 1)))
+    assert tum(trajectory.poses[-1:]).startswith("1700000000.123457088 ")
+
+
+def test_the_start_keeps_roll_and_pitch_only():
+    pose = np.eye(4)
+    pose[:3, :3] = rotations.matrices(
+        rotations.multiply(rotations.exp((0.0, 0.0, 1.0)), rotations.exp((0.1, 0.0, 0.0)))
+    )
+    pose[:3, 3] = [3.0, 2.0, 1.0]
+    begun = levelled_start(pose) @ pose
+    np.testing.assert_allclose(begun[:3, 3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        begun[:3, :3], rotations.matrices(rotations.exp((0.1, 0.0, 0.0))), atol=1e-12
+    )
+
+
+def test_base_frame_moves_with_the_arm():
+    T_lidar_base = np.eye(4)
+    T_lidar_base[:3, 3] = [-1.0, 0.0, 0.0]
+    base = BaseFrame(T_lidar_base)
+    np.testing.assert_allclose(base.pose(np.eye(4)), np.eye(4), atol=1e-12)
+    turned = np.eye(4)
+    turned[:3, :3] = rotations.matrices(rotations.exp((0.0, 0.0, np.pi / 2)))
+    np.testing.assert_allclose(base.pose(turned)[:3, 3], [1.0, -1.0, 0.0], atol=1e-12)
+
+
+def test_thinning_keeps_one_point_per_voxel_and_says_which():
+    points = wall()
+    kept = thinned(points, 0.5)
+    assert len(set(kept.tolist())) == len(kept)
+    cells = {tuple(cell) for cell in np.floor(points / 0.5).astype(int).tolist()}
+    assert len(kept) == len(cells)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 11])
+def test_plain_mode_survives_what_aborts_kiss_icp(count):
+    """Without the guards the process ends here, and all tests with it."""
+    run = recording("room", "still", 3.0)
+    whole = next(iter(sweeps(run, "turn")))
+    odometry = PlainOdometry(OdometryConfig(mode="plain"))
+    odometry.register(whole)
+    points = whole.points[:count].copy()
+    points["time"] = 0.1
+    later = Sweep(HostNs(whole.start + 10**9), HostNs(whole.end + 10**9), points, 0, 0)
+    (estimate,) = odometry.register(later)
+    assert (Status.SPARSE in estimate.status) == (count < 10)
+    assert np.isfinite(estimate.T_odom_lidar).all()
+
+
+def test_plain_mode_leaves_out_points_with_their_times():
+    points = np.zeros(100, POINT)
+    points["x"], points["time"] = np.linspace(1, 5, 100), np.linspace(0, 0.2, 100)
+    points["y"][::7] = np.nan
+    odometry = PlainOdometry(OdometryConfig(mode="plain"))
+    (estimate,) = odometry.register(Sweep(at(0), at(0.2), points, 0, 0))
+    assert len(estimate.points) == np.isfinite(points["y"]).sum()
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [
+        ({"surface_sizes": ()}, "surface_sizes"),
+        ({"surface_sizes": (1.0, 0.2)}, "surface_sizes"),
+        ({"min_range": 5.0, "max_range": 1.0}, "min_range"),
+        ({"base_frame": "/base link"}, "base_frame"),
+        ({"odom_frame": ""}, "odom_frame"),
+        ({"base_frame": "odom"}, "odom_frame"),
+        ({"odometry_topic": "my odometry"}, "odometry_topic"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_by_name(values, name):
+    with pytest.raises(SettingError, match=f"parameter '{name}': .*expected"):
+        build(OdometryNodeConfig, values)
+
+
+def test_settings_refuse_what_cannot_be():
+    with pytest.raises(SettingError, match="map_file"):
+        build(OdometryNodeConfig, {"map_file": "map.txt"})
+    with pytest.raises(SettingError, match="did you mean 'base_frame'"):
+        build(OdometryNodeConfig, {"base_fram": "x"})
+    with pytest.raises(SettingError, match="imu_xyz"):
+        build(OdometryNodeConfig, {"imu_xyz": (1.0,)})

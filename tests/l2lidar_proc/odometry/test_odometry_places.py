@@ -1,0 +1,192 @@
+"""The odometry where surfaces are few: open sky, foliage, a long blindness, a direction unseen."""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import HostNs
+from l2lidar_proc.motion.filter import ERRORS, POSITION, TURN, InertialState
+from l2lidar_proc.motion.initialization import opening
+from l2lidar_proc.odometry.alignment import Source, align
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.matcher import xyz
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry_config import OdometryConfig, SurfaceConfig
+from tests.l2lidar_proc.odometry.odometry_places import SEED, shaken, visited
+from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
+from tests.support.odometry_runs import sweeps
+
+
+@pytest.mark.parametrize(
+    ("place", "cut"), [("bushes", "turn"), ("poles", "turn"), ("poles", "38 packets")]
+)
+def test_foliage_and_poles_are_enough(place, cut):
+    run = visited(place)
+    estimates = drive(run, cut)
+    assert len(estimates) == len(list(sweeps(run, cut)))
+    found = errors(run, estimates)
+    assert np.sqrt((found**2).mean()) < 0.012
+    assert found.max() < 0.04
+    assert estimates[-1].is_aligned
+
+
+@pytest.mark.parametrize("cut", ["10 packets", "18 packets"])
+def test_short_sweeps_below_an_open_sky_are_enough(cut):
+    """A hundred points each; half the packets of a turn do not meet what the other half saw."""
+    run = visited("poles")
+    estimates = drive(run, cut)
+    assert len(estimates) == len(list(sweeps(run, cut)))
+    assert all(item.is_aligned for item in estimates)
+    assert errors(run, estimates).max() < 0.03
+
+
+@pytest.mark.parametrize(("place", "cut"), [("bushes", "turn"), ("poles", "half turn")])
+def test_without_an_imu_foliage_and_poles_are_no_worse_than_for_kiss_icp(place, cut):
+    run = visited(place)
+    estimates = drive(run, cut, imu=run.imu[:0])
+    assert all(item.is_aligned for item in estimates)
+    assert errors(run, estimates).max() < 0.25
+
+
+def test_the_cloud_of_a_first_part_of_a_turn_lies_where_it_says():
+    run = recording("room", "drone")
+    some = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.1e9][:8]
+    some[0] = dataclasses.replace(some[0], points=some[0].points[: len(some[0].points) // 2])
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some)
+    assert Status.STARTING in estimates[0].status
+    surfaces = SurfelMap((0.15, 0.3))
+    for item in estimates[1:]:
+        surfaces.add(_placed(item))
+    for item in estimates[:3]:
+        distances = np.abs(surfaces.match(_placed(item)).distances)
+        assert np.percentile(distances, 80) < 0.03
+
+
+def test_in_foliage_it_can_start_in_motion():
+    run = visited("bushes")
+    moving = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.5e9]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, moving)
+    assert len(estimates) == len(moving)
+    assert all(item.is_aligned for item in estimates[5:])
+    assert errors(run, estimates[5:]).max() < 0.06
+
+
+def test_a_turn_that_nobody_measured_is_found_again():
+    """Shaken, the rate at the beginning of a gap says nothing about its end."""
+    run = shaken()
+    seconds = (run.imu["stamp"] - run.imu["stamp"][0]) * 1e-9
+    estimates = drive(run, imu=run.imu[(seconds < 5.0) | (seconds > 5.3)])
+    after = [item for item in estimates if item.stamp > run.imu["stamp"][0] + 6_000_000_000]
+    assert all(item.is_aligned for item in after)
+    before = [item for item in estimates if item.stamp < run.imu["stamp"][0] + 5_000_000_000]
+    assert errors(run, before + after).max() < 0.02
+
+
+def test_a_long_blindness_ends_where_the_sensor_is():
+    """Seconds without points, in which the sensor walks on: none of it may be taken for rest."""
+    run = recording("room", "walk", 9.0)
+    some = list(sweeps(run, "turn"))
+    some[17:18] = [dataclasses.replace(some[30], points=some[30].points[-120:])]
+    del some[18:31]
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some)
+    found = errors(run, [item for item in estimates if item.is_aligned])
+    assert found.max() < 0.02
+    blind = [item for item in estimates if not item.is_aligned]
+    assert blind
+    assert all(item.velocity @ item.velocity > 0.2 for item in blind)
+
+
+def _placed(estimate: OdometryEstimate):
+    """Return the points of an estimate in the odometry frame, shape (N, 3)."""
+    pose = estimate.T_odom_lidar
+    return xyz(estimate.points) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _corridor(rng: np.random.Generator, count: int):
+    """Return points on the two walls, the floor and the ceiling of a corridor along x."""
+    points = rng.uniform((-6.0, -1.0, -1.2), (6.0, 1.0, 1.2), (count, 3))
+    side = rng.integers(0, 4, count)
+    points[side == 0, 1], points[side == 1, 1] = -1.0, 1.0
+    points[side == 2, 2], points[side == 3, 2] = -1.2, 1.2
+    return points + 0.011 * rng.standard_normal((count, 3))
+
+
+def test_noise_does_not_tell_the_place_along_a_corridor():
+    rng = np.random.default_rng(SEED)
+    surfaces = SurfelMap((0.15, 0.3, 0.6, 1.5))
+    for _ in range(12):
+        surfaces.add(_corridor(rng, 4000))
+    zero = np.zeros(3)
+    state = InertialState(
+        HostNs(0), np.eye(3), zero, zero, zero, zero, np.array([0.0, 0.0, -9.80665])
+    )
+    sigma = np.full(ERRORS, 0.01)
+    sigma[POSITION], sigma[TURN] = 0.1, 0.02
+    points = _corridor(rng, 1500)
+    source = Source(points, rng.uniform(-0.1, 0.1, len(points)), np.linalg.norm(points, axis=1))
+    found = align(state, np.diag(sigma**2), source, surfaces, SurfaceConfig(), 100)
+    across = np.sqrt(np.diag(found.covariance)[POSITION])
+    assert across[0] > 0.08
+    assert across[1:].max() < 0.01
+
+
+def test_a_pole_tells_two_directions_and_one_scan_line_none():
+    rng = np.random.default_rng(SEED)
+    surfaces = SurfelMap((0.3,))
+    angle, height = rng.uniform(0.0, 2.0 * np.pi, 120), rng.uniform(0.01, 0.29, 120)
+    pole = np.column_stack([0.15 + 0.03 * np.cos(angle), 0.15 + 0.03 * np.sin(angle), height])
+    for part in np.array_split(pole, 6):
+        surfaces.add(part)
+    line = np.column_stack([np.full(40, 1.05), np.full(40, 0.15), np.linspace(0.01, 0.29, 40)])
+    surfaces.add(line + 0.003 * rng.standard_normal(line.shape))
+    probe = np.array([[0.18, 0.15, 0.1], [1.06, 0.15, 0.1]])
+    assert not len(surfaces.match(probe).index)
+    found = surfaces.match(probe, narrow=True)
+    assert found.index.tolist() == [0, 0]
+    assert np.abs(found.normals[:, 2]).max() < 0.2
+    assert np.linalg.norm(found.distances) == pytest.approx(0.03, abs=0.008)
+    assert (found.scatter > 0.01**2).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("noise", [0.03, 0.25])
+def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise, seed):
+    """Units at rest were measured from 0.03 to 0.35 rad/s."""
+    rng = np.random.default_rng(seed)
+    run = recording("room", "walk")
+    some = run.imu[:230].copy()
+    some["angular_velocity"] += noise * rng.standard_normal((230, 3))
+    some["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
+    assert opening(some, HostNs(int(some["stamp"][100]))).at_rest
+    moving = run.imu[900:1130].copy()
+    moving["angular_velocity"] += noise * rng.standard_normal((230, 3))
+    moving["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
+    assert not opening(moving, HostNs(int(moving["stamp"][100]))).at_rest
+
+
+def test_a_map_begun_again_is_a_new_one_in_the_same_memory():
+    points = [_corridor(np.random.default_rng(seed), 20_000) for seed in range(4)]
+    again, fresh = SurfelMap((0.15, 0.6)), SurfelMap((0.15, 0.6))
+    tracemalloc.start()
+    try:
+        again.add(points[0] + 7.0)
+        again.add(points[1])
+        first, _ = tracemalloc.get_traced_memory()
+        again.clear()
+        before, _ = tracemalloc.get_traced_memory()
+        for part in points[2:]:
+            again.add(part)
+            fresh.add(part)
+        assert before > 0.6 * first
+    finally:
+        tracemalloc.stop()
+    assert len(again) == len(fresh)
+    assert np.array_equal(again.points(), fresh.points())
+    found, wanted = again.match(points[0], narrow=True), fresh.match(points[0], narrow=True)
+    assert np.array_equal(found.distances, wanted.distances)

@@ -1,0 +1,210 @@
+"""A recording goes in, the same recording with deskewed clouds comes out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from l2lidar_node.settings import build
+from l2lidar_node.types import POINT
+from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.recording import bag
+from l2lidar_proc.recording.bag import RecordingError
+from l2lidar_proc.verbs.deskew import deskew_recording, main
+from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz
+from tests.support.deskew_scenarios import Scenario, record
+
+WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+T = TYPES.types
+LENGTH = 0.23
+STARTS = [1.0, 1.5, 2.0, 2.5, 3.0]
+
+
+def header(seconds: float, frame: str):
+    sec, nanosec = divmod(at(seconds), 10**9)
+    return T["std_msgs/msg/Header"](T["builtin_interfaces/msg/Time"](sec, nanosec), frame)
+
+
+def vector(values):
+    return T["geometry_msgs/msg/Vector3"](*(float(v) for v in values))
+
+
+def imu(sample, frame="imu"):
+    seconds = (int(sample["stamp"]) - at(0)) * 1e-9
+    q = T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    none = np.zeros(9)
+    rate, force = vector(sample["angular_velocity"]), vector(sample["linear_acceleration"])
+    return T[bag.IMU](header(seconds, frame), q, none, rate, none, force, none)
+
+
+def odometry(seconds: float):
+    velocity = WALK.velocity(np.array([seconds]))[0]
+    pose = T["geometry_msgs/msg/PoseWithCovariance"](
+        T["geometry_msgs/msg/Pose"](
+            T["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
+            T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        ),
+        np.zeros(36),
+    )
+    twist = T["geometry_msgs/msg/TwistWithCovariance"](
+        T["geometry_msgs/msg/Twist"](vector(velocity), vector((0, 0, 0))), np.zeros(36)
+    )
+    return T[bag.ODOMETRY](header(seconds, "odom"), "lidar", pose, twist)
+
+
+def points_at(start: float):
+    return seen(WALK, start, start + LENGTH, start, count=2000)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "walk"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {
+            "/scan_points": bag.CLOUD, "/imu/data": bag.IMU, "/odometry": bag.ODOMETRY,
+            "/chatter": "std_msgs/msg/String",
+        }  # fmt: skip
+        lines = {t: writer.add_connection(t, kind, typestore=TYPES) for t, kind in topics.items()}
+
+        def write(topic: str, when: float, message) -> None:
+            data = TYPES.serialize_cdr(message, topics[topic])
+            writer.write(lines[topic], at(when), data)
+
+        events = [(t, "/odometry", odometry(t - 0.05)) for t in np.arange(0.2, 3.4, 0.25)]
+        for sample in WALK.imu(0, 3.4):
+            events.append(((int(sample["stamp"]) - at(0)) * 1e-9, "/imu/data", imu(sample)))
+        events.append((0.5, "/chatter", T["std_msgs/msg/String"]("hello")))
+        for when, topic, message in sorted(events, key=lambda event: event[0]):
+            write(topic, when, message)
+    # clouds by the writer under test, which needs a bag of its own
+    source = path.parent / "walk_with_clouds"
+    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as writer:
+        ends = [start + LENGTH for start in STARTS]
+        for connection, recorded, data in bag.messages(reader):
+            while ends and recorded > at(ends[0]):
+                end = ends.pop(0)
+                start = STARTS[len(STARTS) - len(ends) - 1]
+                writer.cloud("/scan_points", at(end), points_at(start)[0], at(start), "lidar")
+            writer.copy(connection, recorded, data)
+    return source
+
+
+def read(path: Path) -> dict[str, list]:
+    found: dict[str, list] = {}
+    with bag.open_bag(path) as reader:
+        for connection, _, data in bag.messages(reader):
+            message = reader.deserialize(data, connection.msgtype)
+            found.setdefault(connection.topic, []).append(message)
+    return found
+
+
+@pytest.mark.parametrize("name", ["out", "out.mcap"])
+def test_clouds_are_deskewed_and_the_rest_is_kept(recording, tmp_path, name):
+    target = tmp_path / name
+    counts, refused = deskew_recording(recording, target, DeskewNodeConfig())
+    assert (counts.sweeps, counts.deskewed) == (5, 5)
+    assert refused == {}
+    assert target.is_file() == name.endswith(".mcap")
+    before, after = read(recording), read(target)
+    for topic, messages in before.items():
+        assert len(after[topic]) == len(messages)
+    assert after["/chatter"][0].data == "hello"
+    for message, start in zip(after["points_deskewed"], STARTS, strict=True):
+        assert bag.stamp_of(message) == at(start)
+        assert message.header.frame_id == "lidar"
+        points = bag.points_of(message)
+        assert "time" not in points.dtype.names
+        raw, truth = points_at(start)
+        assert rms(xyz(points) - truth) < rms(xyz(raw) - truth) / 5
+
+
+def test_the_command_line(recording, tmp_path, capsys):
+    parameters = tmp_path / "p.yaml"
+    parameters.write_text(
+        "deskew_node:\n  ros__parameters:\n    range_max: 6.0\n    organised: true\n"
+    )
+    target = tmp_path / "out"
+    assert main([str(recording), str(target), "--params-file", str(parameters)]) == 0
+    assert "5 clouds: 5 deskewed" in capsys.readouterr().out
+    cloud = read(target)["points_deskewed"][0]
+    assert cloud.width == 300
+    assert not cloud.is_dense
+    assert main([str(recording), str(target)]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main([str(tmp_path / "nothing"), str(tmp_path / "x")]) == 2
+    assert "nothing: there is no such file" in capsys.readouterr().err
+    assert main([str(recording), str(parameters / "x.mcap")]) == 2
+    assert "Not a directory" in capsys.readouterr().err
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(tmp_path)]) == 2
+    assert f"parameter file '{tmp_path}': Is a directory" in capsys.readouterr().err
+    parameters.write_text("deskew_node:\n  ros__parameters:\n    cloud_topic: a b\n")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "parameter 'cloud_topic': 'a b' is not a topic name" in capsys.readouterr().err
+    parameters.write_text("hello")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "expected a node's name" in capsys.readouterr().err
+    parameters.write_text("deskew_node:\n  ros__parameters:\n    range_mxa: 6.0\n")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "range_max" in capsys.readouterr().err
+    parameters.write_text("{")
+    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
+    assert "parameter file" in capsys.readouterr().err
+
+
+def test_without_the_needed_topics_it_says_what_there_is(recording, tmp_path):
+    source = tmp_path / "only"
+    with bag.open_bag(recording) as reader, bag.BagWriter(source, TYPES) as writer:
+        for connection, recorded, data in bag.messages(reader):
+            if connection.msgtype != bag.IMU:
+                writer.copy(connection, recorded, data)
+    with pytest.raises(RecordingError, match="imu_topic"):
+        deskew_recording(source, tmp_path / "x", DeskewNodeConfig())
+
+
+def test_clouds_without_plain_times_are_passed_on_without_them(recording, tmp_path):
+    source = tmp_path / "odd"
+    points = np.zeros(5, dtype=POINT)
+    with bag.open_bag(recording) as reader, bag.BagWriter(source, TYPES) as writer:
+        for connection, recorded, data in bag.messages(reader):
+            if connection.msgtype != bag.CLOUD:
+                writer.copy(connection, recorded, data)
+        writer.cloud("/points", at(3.5), points, at(3.3), "lidar")
+    counts, refused = deskew_recording(source, tmp_path / "x", build(DeskewNodeConfig, {}))
+    assert counts.sweeps == 0
+    assert refused == {"all 5 times are equal": 1}
+    (cloud,) = read(tmp_path / "x")["points_deskewed"]
+    assert "time" not in [item.name for item in cloud.fields]
+
+
+def test_without_a_velocity_our_odometry_finds_it(tmp_path):
+    walk = record(Scenario("walk", "walk", 1.0, world="box", seconds=6.0))
+    shift = at(0) - int(walk.samples["stamp"][0])
+    path = tmp_path / "imu"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        line = writer.add_connection("/imu/data", bag.IMU, typestore=TYPES)
+        for sample in walk.samples.copy():
+            sample["stamp"] += shift
+            data = TYPES.serialize_cdr(imu(sample), bag.IMU)
+            writer.write(line, int(sample["stamp"]), data)
+    source, target = tmp_path / "source", tmp_path / "target"
+    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as writer:
+        waiting = [item.sweep for item in walk.sweeps]
+        for connection, recorded, data in bag.messages(reader):
+            while waiting and recorded > waiting[0].end + shift:
+                sweep = waiting.pop(0)
+                start = sweep.start + shift
+                writer.cloud("/points", recorded, sweep.points, start, "lidar")
+            writer.copy(connection, recorded, data)
+    deskew_recording(source, target, DeskewNodeConfig())
+    clouds = {bag.stamp_of(message): message for message in read(target)["points_deskewed"]}
+    late = [item for item in walk.sweeps[-6:] if item.sweep.start + shift in clouds]
+    assert len(late) >= 5
+    for item in late:
+        points = bag.points_of(clouds[item.sweep.start + shift])
+        assert rms(xyz(points) - item.at_start) < 0.01
+        assert rms(xyz(item.sweep.points) - item.at_start) > 0.1

@@ -1,0 +1,176 @@
+"""Runs the driver against the virtual L2 in simulated time and notes what its clock answers."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.clock import DeviceClock
+from l2lidar_node.config import ClockConfig, DriverConfig
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.emulator.config import (
+    CrystalConfig,
+    DeviceConfig,
+    FaultConfig,
+    IdentityConfig,
+    PowerConfig,
+)
+from l2lidar_node.emulator.unit.device import VirtualL2
+from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import PacketType, WorkMode
+from l2lidar_node.settings import Value, build
+from l2lidar_node.types import DeviceNs, HostNs, Stream
+
+NOTE: Final = np.dtype(
+    [
+        ("type", "<u2"),  # wire.PacketType
+        ("boot", "<u2"),  # restarts of the device before
+        ("seq", "<u4"),
+        ("stamp", "<i8"),  # [ns] device clock
+        ("truth", "<i8"),  # [ns] host clock at the instant the stamp marks
+        ("arrival", "<i8"),  # [ns] host clock
+        ("duration", "<i8"),  # [ns] first to last measurement
+        ("sync", "<i8"),  # [ns] value of the last sync sent before the packet was handled; 0
+        ("published", "<i8"),  # [ns] host clock; 0 for none
+    ]
+)
+"""One packet that reached the clock, in the order in which it did."""
+
+EPOCH_NS: Final = 1_760_000_000 * 10**9
+_TICK_NS: Final = 2_000_000  # how often the driver looks what is due
+_COMMAND_NS: Final = 150_000  # shortest way of a command; the rest is exponential with this mean
+_TYPES: Final = {Stream.IMU: PacketType.IMU, Stream.POINTS: PacketType.POINTS_3D}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One row of the benchmark: a device, a path and a sync mode.
+
+    Attributes
+    ----------
+    ratio : float
+        True seconds per second of the device's clock.
+    sync : str
+        ``off``, ``once`` or ``periodic`` (every 50 ms).
+    crystal, faults : dict
+        Further settings of the virtual L2.
+    imu : bool
+        Whether the IMU is on.
+    latency : bool
+        Whether the driver measures the round trip.
+    seconds : float
+        Length of the run.
+    """
+
+    ratio: float
+    sync: str
+    crystal: dict[str, float] = field(default_factory=dict)
+    faults: dict[str, Value] = field(default_factory=dict)
+    imu: bool = True
+    latency: bool = False
+    seconds: float = 60.0
+
+
+class RecordingClock(DeviceClock):
+    """A clock that notes what it is asked and what it answers."""
+
+    def __init__(self, config: ClockConfig) -> None:
+        super().__init__(config)
+        self.notes: list[tuple[int, int, int, int, int, int, int]] = []
+        self._sync = 0
+
+    def observe(
+        self, stream: Stream, seq: int, stamp: DeviceNs, arrival: HostNs, duration_ns: int = 0
+    ) -> HostNs | None:
+        """Answer as the clock does, and note it."""
+        answer = super().observe(stream, seq, stamp, arrival, duration_ns)
+        self.notes.append(
+            (_TYPES[stream], seq, stamp, arrival, duration_ns, self._sync, answer or 0)
+        )
+        return answer
+
+    def synced(self, value: HostNs, sent: HostNs) -> None:
+        """Take note of a sync, as the clock does."""
+        super().synced(value, sent)
+        self._sync = value
+
+
+class _UnevenScanner(PatternScanner):
+    """The pattern at a mirror whose period varies by 0.1 %, as a motor's does."""
+
+    def __init__(self, seed: int, count: int) -> None:
+        super().__init__()
+        periods = np.random.default_rng([seed, 102]).normal(1.0, 1e-3, count)
+        self._starts = np.cumsum(periods * wire.MIRROR_PERIOD_S)
+
+    def packets(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+        """Return packets and their start times; the angles are those of an even mirror."""
+        payloads, _ = super().packets(first, count)
+        return payloads, np.asarray(self._starts[first : first + count])
+
+
+def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
+    """Return what happened to every packet, shape (N,), dtype NOTE, and the clock at the end."""
+    device = _device(case, seed)
+    values: dict[str, Value] = {
+        "l2_ip": "127.0.0.1",
+        "imu_adjust": False,
+        "enable_l2_host_sync": case.sync != "off",
+        "l2_sync_mode": "once" if case.sync == "off" else case.sync,
+        "enable_latency_measure": case.latency,
+    }
+    driver = Driver(build(DriverConfig, values))
+    clock = RecordingClock(driver.config.clock)
+    driver._clock = clock
+    driver.host_stepped(0, HostNs(EPOCH_NS))  # nobody sets the host's clock, as a session knows
+    rng = np.random.default_rng([seed, 106])
+    commands: list[tuple[int, int, bytes]] = []
+    count = 0
+    for now in range(EPOCH_NS, EPOCH_NS + round(case.seconds * 1e9), _TICK_NS):
+        while commands and commands[0][0] <= now:
+            instant, _, data = heapq.heappop(commands)
+            device.command(data, instant)
+        for arrival, datagram in device.advance(now):
+            driver.receive(datagram, HostNs(arrival))
+        driver.tick(HostNs(now))
+        for data, _ in driver.outbox():
+            latency = _COMMAND_NS + round(rng.exponential(_COMMAND_NS))
+            heapq.heappush(commands, (now + latency, count, data))
+            count += 1
+    return _with_truth(clock, device), clock
+
+
+def _device(case: Case, seed: int) -> VirtualL2:
+    mode = WorkMode(0) if case.imu else WorkMode.IMU_OFF
+    config = DeviceConfig(
+        power=PowerConfig(boot_scale=0.25),
+        identity=IdentityConfig(work_mode=int(mode)),
+        crystal=build(CrystalConfig, {"clock_ratio": case.ratio, **case.crystal}),
+        faults=build(FaultConfig, case.faults),
+        seed=seed,
+    )
+    count = round((case.seconds + 10.0) / wire.MIRROR_PERIOD_S)
+    scanner = _UnevenScanner(seed, count)
+    return VirtualL2(config, scanner, StillInertial(), power_on_ns=EPOCH_NS)
+
+
+def _with_truth(clock: RecordingClock, device: VirtualL2) -> NDArray[np.void]:
+    """Join what the clock saw with the emulator's ledger; stamp and number name a packet."""
+    ledger = device.ledger.packets
+    truth = {
+        (int(row["type"]), int(row["seq"]), int(row["stamp_ns"])): (
+            int(row["boot"]),
+            int(row["start_ns"]),
+        )
+        for row in ledger
+    }
+    notes = np.zeros(len(clock.notes), NOTE)
+    for at, (kind, seq, stamp, arrival, duration, sync, answer) in enumerate(clock.notes):
+        boot, start = truth[kind, seq, stamp]
+        notes[at] = (kind, boot, seq, stamp, start, arrival, duration, sync, answer)
+    return notes

@@ -1,0 +1,142 @@
+"""Records what the virtual L2 sees and feels on a motion, in sweeps, with the truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.driver.geometry import Projector
+from l2lidar_node.emulator.motion.motion import Motion
+from l2lidar_node.emulator.physics import PhysicsConfig, assemble
+from l2lidar_node.protocol import wire
+from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
+
+EPOCH = 1_700_000_000_000_000_000
+BATCH = 50
+CUTS = ("turn", "38 packets", "half turn")
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """A recording.
+
+    Attributes
+    ----------
+    name : str
+    seconds : float
+    points : ndarray, shape (N,), dtype POINT
+        Of all packets; ``time`` means nothing yet.
+    instants : ndarray, shape (N,)
+        Of each point [s].
+    edges : ndarray, shape (P + 1,)
+        Where each packet's points begin.
+    starts : ndarray, shape (P,)
+        Instant of each packet's slot 0 [s].
+    heads : ndarray, shape (P,)
+        Head angle at slot 0 [rad].
+    imu : ndarray, shape (M,), dtype IMU_SAMPLE
+    motion : Motion
+        The truth.
+    """
+
+    name: str
+    seconds: float
+    points: NDArray[np.void]
+    instants: F64
+    edges: NDArray[np.int64]
+    starts: F64
+    heads: F64
+    imu: NDArray[np.void]
+    motion: Motion
+
+
+def record(scene: str, motion: str, seed: int, seconds: float) -> Run:
+    """Return a recording of a built-in motion in a built-in scene."""
+    physics = assemble(PhysicsConfig(world=scene, motion=motion, seed=seed))
+    projector = Projector(wire.PacketType.POINTS_3D)
+    total = int(seconds / physics.scanner.period_s)
+    points, instants, counts, starts, heads = [], [], [], [], []
+    for first in range(0, total, BATCH):
+        packets, times = physics.scanner.packets(first, min(BATCH, total - first))
+        batch = projector.points([packet.tobytes() for packet in packets], times - times[0])
+        points.append(batch.points)
+        instants.append(times[0] + batch.first_s + batch.points["time"].astype(np.float64))
+        counts.append(batch.counts)
+        starts.append(times)
+        heads.append(packets["com_horizontal_angle_start"].astype(np.float64))
+    samples, times = physics.inertial.samples(0, int(seconds * wire.IMU_RATE_HZ))
+    imu = np.zeros(len(samples), IMU_SAMPLE)
+    imu["stamp"] = EPOCH + np.round(times * 1e9).astype(np.int64)
+    imu["orientation_wxyz"] = samples["quaternion_wxyz"] / wire.QUATERNION_NORM
+    imu["angular_velocity"] = samples["angular_velocity"]
+    imu["linear_acceleration"] = samples["linear_acceleration"]
+    return Run(
+        f"{scene} {motion} {seed}",
+        seconds,
+        np.concatenate(points),
+        np.concatenate(instants),
+        np.concatenate(([0], np.cumsum(np.concatenate(counts)))),
+        np.concatenate(starts),
+        np.concatenate(heads),
+        imu,
+        physics.motion,
+    )
+
+
+def sweeps(run: Run, cut: str) -> Iterator[Sweep]:
+    """Yield the sweeps of a recording, cut in one of the ways of :data:`CUTS`."""
+    length = 299 * wire.MIRROR_PERIOD_S / 600.0
+    for first, last in zip(*_bounds(run, cut), strict=True):
+        part = slice(run.edges[first], run.edges[last])
+        if part.stop == part.start:
+            continue
+        points = run.points[part].copy()
+        instants = run.instants[part]
+        points["time"] = instants - instants[0]
+        start = EPOCH + round(instants[0] * 1e9)
+        end = EPOCH + round((run.starts[last - 1] + length) * 1e9)
+        yield Sweep(HostNs(start), HostNs(end), points, last - first, 0)
+
+
+def count(run: Run, cut: str) -> int:
+    """Return how many sweeps a recording has."""
+    return len(_bounds(run, cut)[0])
+
+
+def _bounds(run: Run, cut: str) -> tuple[list[int], list[int]]:
+    if cut == "turn":
+        edges = np.flatnonzero(np.abs(np.diff(run.heads)) > np.pi) + 1
+    elif cut == "half turn":
+        edges = np.flatnonzero(np.diff(run.heads % (2 * np.pi) >= np.pi)) + 1
+    else:
+        edges = np.arange(0, len(run.heads), int(cut.split()[0]))
+    edges = np.unique(np.concatenate(([0], edges)))
+    return edges[:-1].tolist(), edges[1:].tolist()
+
+
+def truth(run: Run, stamps: NDArray[np.int64]) -> tuple[F64, F64]:
+    """Return positions (N, 3) [m] and quaternions w, x, y, z (N, 4) of the cloud frame."""
+    return run.motion.poses(np.asarray((stamps - EPOCH) * 1e-9, dtype=np.float64))
+
+
+def write(run: Run, cut: str, path: Path) -> None:
+    """Write the sweeps for :mod:`benchmarks.odometry_referee`."""
+    cutted = list(sweeps(run, cut))
+    points = np.concatenate([sweep.points for sweep in cutted])
+    T_cloud_imu = np.eye(4)
+    T_cloud_imu[:3, 3] = wire.IMU_POSITION_M
+    np.savez(
+        path,
+        points=np.stack([points[axis] for axis in "xyz"], axis=1),
+        times=points["time"],
+        edges=np.cumsum([0, *(len(sweep.points) for sweep in cutted)]),
+        spans=np.array([(sweep.start, sweep.end) for sweep in cutted], dtype=np.int64),
+        imu=run.imu,
+        T_cloud_imu=T_cloud_imu,
+    )
