@@ -1,6 +1,9 @@
-"""Every RViz layout names classes that exist, topics that are published, and QoS that fits."""
+"""RViz layouts: classes that exist, topics that are published, QoS and docks that fit."""
 
+import math
+import struct
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import yaml
@@ -170,11 +173,130 @@ def test_slam_shows_raw_beside_deskewed_and_where_the_sensor_went():
         if topic_of(display) and display["Enabled"]
     }
     assert shown == {
-        topics.POINTS, topics.POINTS_DESKEWED, topics.LOCAL_MAP, topics.PATH, topics.ODOMETRY
+        topics.REGISTERED_POINTS, topics.POINTS_DESKEWED, topics.POINTS,
+        topics.LOCAL_MAP, topics.PATH, topics.ODOMETRY,
     }  # fmt: skip
+    clouds = [d["Name"] for d in displays("slam.rviz") if d["Class"].endswith("/PointCloud2")]
+    assert clouds[0] == "Registered"
     raw, deskewed = (
         next(d for d in displays("slam.rviz") if d["Name"] == name) for name in ("Raw", "Deskewed")
     )
     assert raw["Color Transformer"] == deskewed["Color Transformer"] == "FlatColor"
     assert raw["Color"] != deskewed["Color"]
     assert any(display["Class"].endswith("/TF") for display in displays("slam.rviz"))
+
+
+class Dock(NamedTuple):
+    """A panel as ``QMainWindow::saveState`` stores it."""
+
+    area: str
+    is_visible: bool
+    size: int
+
+
+class Docks:
+    """Reads ``QMainWindow::saveState`` as Qt 5 and 6 write it, one dock in each area.
+
+    Big-endian: marker 0xff and version; marker 0xfd, number of areas, and for each its side, size,
+    orientation and docks (name, flags, position, size, least and greatest size); the size of the
+    central widget; who owns the four corners; the tool bars.
+    """
+
+    SIDES = ("left", "right", "top", "bottom")
+
+    def __init__(self, state):
+        self._bytes, self._at = bytes.fromhex(state), 0
+        assert self._take(">iiB") == (0xFF, 0, 0xFD)
+        self.docks, self.areas = {}, {}
+        for _ in range(*self._take(">i")):
+            side, width, height = self._take(">iii")
+            self.areas[self.SIDES[side]] = (width, height)
+            marker, orientation, count = self._take(">Bbi")
+            assert (marker, count) == (0xFC, 1)
+            assert orientation == (2 if side < 2 else 1)  # vertical beside, horizontal below
+            (marker,) = self._take(">B")
+            assert marker == 0xFB
+            name, (flags, _, size, _, _) = self._text(), self._take(">Biiii")
+            assert not flags & 2, f"{name} floats"
+            self.docks[name] = Dock(self.SIDES[side], bool(flags & 1), size)
+        self.central = self._take(">ii")
+        self._take(">4i")
+        marker, lines, position, count = self._take(">Biii")
+        assert (marker, lines, position, count) == (0xFC, 1, 2, 1)  # one line of bars, above
+        self.tool_bar = self._text()
+
+    def _take(self, form):
+        found = struct.unpack_from(form, self._bytes, self._at)
+        self._at += struct.calcsize(form)
+        return found
+
+    def _text(self):
+        (length,) = self._take(">i")
+        self._at += length
+        return self._bytes[self._at - length : self._at].decode("utf-16-be")
+
+
+@pytest.mark.parametrize("name", FIXED_FRAMES)
+def test_window_opens_with_the_3d_view_at_most_of_its_width(name):
+    layout = load(name)
+    geometry = layout["Window Geometry"]
+    saved = Docks(geometry["QMainWindow State"])
+    # RViz names a dock after its panel, and restores only docks of those names.
+    assert set(saved.docks) == {panel["Name"] for panel in layout["Panels"]}
+    assert saved.tool_bar == "Tools"
+    assert {name: dock.area for name, dock in saved.docks.items()} == {
+        "Displays": "left", "Views": "right", "Time": "bottom"
+    }  # fmt: skip
+    for panel, dock in saved.docks.items():
+        assert dock.is_visible == (panel == "Displays")
+        assert geometry.get(panel, {"collapsed": False})["collapsed"] == (not dock.is_visible)
+    # What is hidden has a size to come back with.
+    assert saved.areas["right"][0] >= 200
+    assert saved.areas["bottom"][1] >= 40
+    buttons = 2 * 16  # beside the 3D view, to hide the docks
+    assert saved.central[0] - buttons >= 0.7 * geometry["Width"]
+    assert saved.central[0] + saved.areas["left"][0] <= geometry["Width"]
+    assert 0.85 * geometry["Height"] <= saved.central[1] < geometry["Height"]
+
+
+@pytest.mark.parametrize("name", FIXED_FRAMES)
+def test_qt_restores_the_window(name):
+    pytest.importorskip("PySide6.QtWidgets", reason="needs Qt (pip install PySide6-Essentials)")
+    from PySide6 import QtCore, QtWidgets
+
+    geometry = load(name)["Window Geometry"]
+    # Kept by name: where it is collected, so are all widgets.
+    application = QtWidgets.QApplication.instance() or QtWidgets.QApplication(
+        ["test", "-platform", "offscreen"]
+    )
+    window = QtWidgets.QMainWindow()
+    window.setCentralWidget(QtWidgets.QWidget())
+    window.addToolBar("Tools").setObjectName("Tools")
+    window.menuBar().addMenu("File")
+    window.statusBar()
+    docks = {panel["Name"]: QtWidgets.QDockWidget() for panel in load(name)["Panels"]}
+    for panel, dock in docks.items():
+        dock.setObjectName(panel)
+        dock.setWidget(QtWidgets.QWidget())
+        window.addDockWidget(QtCore.Qt.DockWidgetArea.LeftDockWidgetArea, dock)
+    window.show()
+    application.processEvents()
+    window.resize(geometry["Width"], geometry["Height"])
+    state = QtCore.QByteArray.fromHex(geometry["QMainWindow State"].encode())
+    assert window.restoreState(state)
+    application.processEvents()
+    assert [panel for panel, dock in docks.items() if dock.isVisible()] == ["Displays"]
+    assert window.centralWidget().width() - 32 >= 0.7 * geometry["Width"]
+
+
+@pytest.mark.parametrize("name", FIXED_FRAMES)
+def test_names_of_frames_can_be_read(name):
+    (tf,) = (display for display in displays(name) if display["Class"].endswith("/TF"))
+    view = load(name)["Visualization Manager"]["Views"]["Current"]
+    # RViz's camera opens 45 degrees; a name is 0.1 m high at a marker scale of 1.
+    height = load(name)["Window Geometry"]["Height"] * 0.9
+    pixels = 0.1 * tf["Marker Scale"] * height / (2 * view["Distance"] * math.tan(math.pi / 8))
+    assert pixels >= 12
+    assert 0.2 * tf["Marker Scale"] <= 0.1 * view["Distance"], "axes that fill the view"
+    # 17 mm beside the sensor's frame, the IMU's name would be written over that one's.
+    assert tf["Filter (blacklist)"] == "_imu$"
