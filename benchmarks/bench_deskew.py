@@ -21,13 +21,12 @@ from benchmarks.results import Target, at_least, at_most, publish
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
 from l2lidar_proc import rotations
-from l2lidar_proc.config import MotionConfig, ProcConfig
+from l2lidar_proc.config import MotionConfig, OdometryConfig, ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.motion.sweep_trajectory import VELOCITY
 from l2lidar_proc.motion.tracker import MotionTracker
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from tests.support.deskew_scenarios import Recording, Scenario, TrueSweep, record, stamp
 
 F64 = NDArray[np.float64]

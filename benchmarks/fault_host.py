@@ -21,7 +21,7 @@ from l2lidar_node.clock import ClockEvent
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver, Event, Silence
 from l2lidar_node.files import write_whole
-from l2lidar_node.recording.recorder import Recorder
+from l2lidar_node.recording.recording import Recorder
 from l2lidar_node.settings import build
 from l2lidar_node.transport.session import Session
 from l2lidar_node.transport.udp import TransportError, UdpTransport

@@ -189,7 +189,7 @@ _YAML: Final = (
 
 
 def _parameters() -> Check:
-    from l2lidar_node.ros.arguments import ros_arguments
+    from l2lidar_node.ros.program import ros_arguments
 
     path = scratch("yaml")
 

@@ -20,7 +20,7 @@ from benchmarks.load_sender import address
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import health
 from l2lidar_node.driver.driver import Driver, Event
-from l2lidar_node.emulator.link import backlog
+from l2lidar_node.emulator.link.port import unread
 from l2lidar_node.settings import build
 from l2lidar_node.transport.session import Session
 from l2lidar_node.transport.udp import UdpTransport
@@ -38,9 +38,9 @@ def main() -> int:
             latencies.append((time.time_ns() - event.end) / 1e6)
 
     sessions = []
-    for number, port in enumerate(sys.argv[2:], start=first):
+    for number, host_port in enumerate(sys.argv[2:], start=first):
         values = {
-            "l2_ip": address(number), "host_ip": "127.0.0.1", "host_port": int(port),
+            "l2_ip": address(number), "host_ip": "127.0.0.1", "host_port": int(host_port),
             "watchdog_action": "wait", "imu_adjust": False, "enable_l2_host_sync": False,
             "publish_unlocked": True,  # a unit so fast that its clock is not believed counts too
         }  # fmt: skip
@@ -82,7 +82,7 @@ def _take_what_waits(sessions: list[Session]) -> None:
     """Wait until the sessions have taken what their sockets hold, however slow this machine is."""
     for one in sessions:
         network = one.driver.config.network
-        while backlog.unread(network.host_ip, network.host_port) and not one.failure:
+        while unread(network.host_ip, network.host_port) and not one.failure:
             time.sleep(0.05)
     for one in sessions:  # its thread answers when it is through with what it took
         with suppress(CancelledError):

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from operator import itemgetter
 from typing import Final
 
-from l2lidar_node.emulator.link import backlog
+from l2lidar_node.emulator.link.port import unread
 from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
@@ -88,7 +88,7 @@ def main() -> int:
     lasted = (time.time_ns() - begin) / 1e9
     for sock, end in ends:  # the kernel says with the next datagram what it dropped before
         until = time.monotonic() + _ROOM_S
-        while backlog.unread(*end) and time.monotonic() < until:
+        while unread(*end) and time.monotonic() < until:
             time.sleep(0.05)
         sock.sendto(last[1], end)
     told: dict[str, object] = {

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc.config import DeskewConfig, ProcConfig
+from l2lidar_proc.config import DeskewConfig, OdometryConfig, ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.odometry.kiss import PlainKiss
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.plain import PlainOdometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from tests.support import odometry_runs
 from tests.support.odometry_runs import Run
 

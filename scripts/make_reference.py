@@ -12,8 +12,7 @@ from pathlib import Path
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import Setting, markdown_table, settings_of
-from l2lidar_proc.config import DeskewNodeConfig
-from l2lidar_proc.odometry_config import OdometryNodeConfig
+from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"

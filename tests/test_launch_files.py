@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from l2lidar_node.clouds.rings import RINGS
+from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.ros.parameter_files import parameters_for

@@ -11,8 +11,7 @@ import yaml
 from l2lidar_node.config import FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.types import POINT
-from l2lidar_proc.config import DeskewTopics
-from l2lidar_proc.odometry_config import OdometryTopics
+from l2lidar_proc.config import DeskewTopics, OdometryTopics
 
 LAYOUTS = Path(__file__).resolve().parent.parent / "rviz"
 FIXED_FRAMES = {

@@ -54,7 +54,7 @@ def roots(parents):
 
 
 def test_mesh_is_what_its_script_makes(tmp_path):
-    script = runpy.run_path(str(ROOT / "benchmarks" / "make_mesh.py"))
+    script = runpy.run_path(str(ROOT / "scripts" / "make_mesh.py"))
     for name in ("first.stl", "second.stl"):
         script["main"]([str(tmp_path / name)])
         assert (tmp_path / name).read_bytes() == MESH.read_bytes()

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from l2lidar_node.check.findings import Level
 from l2lidar_node.check.requirements import (
     Consumer,
     Input,
+    Level,
     Order,
     Subscription,
     TimeField,
     TimeUnit,
     Use,
 )
+from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
-from l2lidar_node.clouds.rings import RINGS
 
 _F4: Final = ("f4",)
 _FLOATS: Final = ("f4", "f8")

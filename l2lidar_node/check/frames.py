@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from l2lidar_node.check.findings import Finding, Level, not_judged, ok
 from l2lidar_node.check.observation import Observation, Qos
-from l2lidar_node.check.requirements import Consumer, Subscription, Use
+from l2lidar_node.check.requirements import (
+    Consumer,
+    Finding,
+    Level,
+    Subscription,
+    Use,
+    not_judged,
+    ok,
+)
 
 _FRAMES: Final = "frames"
 _QOS: Final = "qos"

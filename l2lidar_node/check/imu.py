@@ -1,4 +1,4 @@
-"""Checks the values of IMU samples: units, norms, covariances."""
+"""Checks of the IMU samples: units, norms, covariances, orientation."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.check.findings import Finding, Level, ok
 from l2lidar_node.check.observation import Observation
-from l2lidar_node.check.requirements import Consumer, Use
+from l2lidar_node.check.requirements import Consumer, Finding, Level, Use, not_judged, ok
 
 F64 = NDArray[np.float64]
 
@@ -130,4 +129,138 @@ def missing(consumer: Consumer) -> Iterator[Finding]:
             f"no IMU samples; {consumer.title} "
             f"{'needs' if consumer.imu is Use.NEEDED else 'can use'} them",
             "set enable_IMU_publishing: true",
+        )
+
+
+_USABLE_NORM: Final = 0.1  # below that LIO-SAM shuts down
+_MAX_ANGLE_DEG: Final = 10.0
+_MOST: Final = 2000
+_WINDOW_S: Final = 0.1
+_TURNED_RAD: Final = 0.05
+
+
+def rotated(wxyz: F64, vectors: F64) -> F64:
+    """Return vectors, (N, 3), turned by unit quaternions, (N, 4)."""
+    w, axis = wxyz[:, :1], wxyz[:, 1:]
+    twice = 2.0 * np.cross(axis, vectors)
+    return np.asarray(vectors + w * twice + np.cross(axis, twice))
+
+
+def unit(wxyz: F64) -> F64:
+    """Return quaternions, (N, 4), of norm 1; those near 0 become the identity."""
+    norms = np.linalg.norm(wxyz, axis=1)
+    units = np.tile([1.0, 0.0, 0.0, 0.0], (len(wxyz), 1))
+    usable = norms > 1e-9
+    units[usable] = wxyz[usable] / norms[usable, None]
+    return units
+
+
+def check_orientation(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
+    """Yield findings on the orientations; there is at least one sample."""
+    imu = seen.imu[np.isfinite(seen.imu["orientation_wxyz"]).all(axis=1)]
+    imu = imu[np.isfinite(imu["linear_acceleration"]).all(axis=1)]
+    imu = imu[np.isfinite(imu["angular_velocity"]).all(axis=1)]
+    if not len(imu):
+        return
+    norms = np.linalg.norm(imu["orientation_wxyz"], axis=1)
+    if (norms < _USABLE_NORM).any():
+        if consumer.orientation is Use.IGNORED:
+            yield ok(_SUBJECT, "orientation", f"none, and {consumer.title} reads none")
+            return
+        yield Finding(
+            consumer.orientation.level,
+            _SUBJECT,
+            "orientation-norm",
+            f"{int((norms < _USABLE_NORM).sum())} of {len(imu)} orientations are (near) 0; "
+            f"{consumer.title} demands unit quaternions"
+            + (" and shuts down" if consumer.orientation is Use.NEEDED else ""),
+            "use the driver's IMU topic, which has the L2's own orientation",
+        )
+        return
+    if np.abs(norms - 1.0).max() > 0.02:
+        yield Finding(
+            Level.WARN,
+            _SUBJECT,
+            "orientation-norm",
+            f"norms of orientations are {norms.min():.3f} to {norms.max():.3f}, not 1",
+            "normalise them; the driver does",
+        )
+    yield _check_gravity(imu[:: max(len(imu) // _MOST, 1)], consumer)
+    yield from _check_rates(imu)
+
+
+def _check_gravity(imu: NDArray[np.void], consumer: Consumer) -> Finding:
+    q, acceleration = unit(imu["orientation_wxyz"]), imu["linear_acceleration"]
+    norms = np.linalg.norm(acceleration, axis=1)
+    calm = np.abs(norms - np.median(norms)) <= 0.1 * np.median(norms)
+    q, acceleration = q[calm & (norms > 0)], acceleration[calm & (norms > 0)]
+    if not len(q):
+        return not_judged(_SUBJECT, "orientation", "there is no acceleration to compare with")
+    angle = _from_vertical(q, acceleration)
+    text = f"gravity by accelerometer and by orientation are {angle:.3g} deg apart"
+    if angle < _MAX_ANGLE_DEG:
+        return ok(_SUBJECT, "orientation", text)
+    variants = {
+        "its numbers are w, x, y, z where x, y, z, w belong": np.roll(q, -1, axis=1),
+        "its numbers are turned about the wrong way (z, w, x, y)": np.roll(q, 1, axis=1),
+        "it is inverted (world to IMU)": q * [1.0, -1.0, -1.0, -1.0],
+    }
+    guess = min(variants, key=lambda name: _from_vertical(variants[name], acceleration))
+    fits = _from_vertical(variants[guess], acceleration) < _MAX_ANGLE_DEG
+    level = Level.ERROR if consumer.orientation is Use.NEEDED else Level.WARN
+    return Finding(
+        level,
+        _SUBJECT,
+        "orientation-gravity",
+        f"{text}; " + (f"it fits if {guess}" if fits else "demanded is IMU to a z-up world"),
+        "use the driver's IMU topic"
+        if fits
+        else "switch the L2 off and on while it stands upright and still",
+    )
+
+
+def _from_vertical(q: F64, acceleration: F64) -> float:
+    """Return the median angle of accelerations from the world's z axis [deg]."""
+    up = rotated(q, acceleration)
+    cosine = up[:, 2] / np.linalg.norm(up, axis=1)
+    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+
+
+def _check_rates(imu: NDArray[np.void]) -> Iterator[Finding]:
+    """Compare how far rates and orientations turn in windows of a tenth of a second."""
+    stamps = imu["stamp"].astype(np.float64) / 1e9
+    steps = np.diff(stamps)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    if period <= 0:
+        return
+    stride = max(round(_WINDOW_S / period), 1)
+    q = unit(imu["orientation_wxyz"])[::stride]
+    sums = np.cumsum(imu["angular_velocity"], axis=0) * period
+    by_rate = np.linalg.norm(np.diff(sums[::stride], axis=0), axis=1)
+    cosine = np.abs(np.sum(q[1:] * q[:-1], axis=1))
+    by_orientation = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
+    turned = (by_orientation > _TURNED_RAD) & (by_orientation < 2.0)
+    if turned.sum() < 5:
+        yield not_judged(_SUBJECT, "gyro-unit", "too little rotation to compare with orientations")
+        return
+    ratio = float(np.median(by_rate[turned] / by_orientation[turned]))
+    text = f"rates turn {ratio:.3g} times as far as orientations"
+    if 0.7 < ratio < 1.4:
+        yield ok(_SUBJECT, "gyro-unit", f"{text}: rad/s")
+    elif 30.0 < ratio < 100.0:
+        yield Finding(
+            Level.ERROR,
+            _SUBJECT,
+            "gyro-unit",
+            f"{text}: they are deg/s, demanded is rad/s",
+            "multiply by pi / 180; the driver publishes rad/s",
+        )
+    else:
+        half = 0.4 < ratio < 0.6
+        yield Finding(
+            Level.WARN,
+            _SUBJECT,
+            "gyro-unit",
+            text + (": stamps run at half speed" if half else ": unit, axes or stamps are wrong"),
+            "set enable_l2_time_correction: true" if half else "use the driver's IMU topic",
         )

@@ -1,16 +1,34 @@
-"""Checks the clouds' fields, sizes and memory."""
+"""Checks of the clouds: fields, memory, values, rings, leveling."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from l2lidar_node.check.findings import Finding, Level, ok
-from l2lidar_node.check.measure import TIME_FIELDS
-from l2lidar_node.check.observation import Cloud, Format, Observation
-from l2lidar_node.check.requirements import Consumer, Input, TimeField, Use
-from l2lidar_node.clouds.fields import Field
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.check.imu import rotated, unit
+from l2lidar_node.check.observation import (
+    COLUMNS,
+    TIME_FIELDS,
+    Cloud,
+    Contents,
+    Format,
+    Observation,
+)
+from l2lidar_node.check.requirements import (
+    Consumer,
+    Finding,
+    Input,
+    Level,
+    TimeField,
+    Use,
+    not_judged,
+    ok,
+)
+from l2lidar_node.clouds.fields import OPTICAL_CENTRE_M, Field
 from l2lidar_node.clouds.layouts import LAYOUTS
 
 _SUBJECT = "cloud"
@@ -49,7 +67,7 @@ def reading(form: Format, consumer: Consumer) -> Reading:
     return Reading(best, None, "")
 
 
-def check(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
+def check_layout(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
     """Yield findings on fields, sizes and memory; there is at least one cloud."""
     form = usual_format(seen)
     others = sum(cloud.format != form for cloud in seen.clouds)
@@ -168,3 +186,218 @@ def _check_memory(seen: Observation, form: Format, consumer: Consumer) -> Iterat
 
 def _has_wrong_row_step(cloud: Cloud) -> bool:
     return cloud.row_step != cloud.width * cloud.format.point_step
+
+
+_FEW: Final = 100
+_MUCH_AT_ORIGIN: Final = 0.01
+_KEPT_WELL: Final = 0.8
+_KEPT_AT_ALL: Final = 0.5
+
+
+def check_values(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
+    """Yield findings on the points."""
+    inside = [cloud.contents for cloud in seen.clouds if cloud.contents is not None]
+    if not inside:
+        return
+    yield from _check_counts(inside, consumer)
+    yield from _check_finite(seen, consumer)
+    if consumer.ring_count:
+        yield from _check_rings(inside, consumer)
+
+
+def _check_counts(inside: list[Contents], consumer: Consumer) -> Iterator[Finding]:
+    counts = np.array([item.count - item.nonfinite for item in inside])
+    few = int((counts < _FEW).sum())
+    if few:
+        least = int(counts.min())
+        aborts = least <= 1 and consumer.name == "kiss_icp"
+        yield Finding(
+            Level.ERROR if aborts or few == len(counts) else Level.WARN,
+            _SUBJECT,
+            "points-few",
+            f"{few} of {len(counts)} clouds have fewer than {_FEW} points, one has {least}"
+            + ("; KISS-ICP aborts the process on those" if aborts else ""),
+            "look whether something covers the sensor, and at range_min, range_max and filters",
+        )
+    else:
+        yield ok(_SUBJECT, "points", f"{np.median(counts):.0f} points per cloud")
+    at_origin = sum(item.at_origin for item in inside) / max(int(counts.sum()), 1)
+    if at_origin > _MUCH_AT_ORIGIN:
+        yield Finding(
+            Level.WARN,
+            _SUBJECT,
+            "points-origin",
+            f"{at_origin:.0%} of the points are at 0, 0, 0: returns that are none",
+            "leave them out: range_min: 0.05",
+        )
+
+
+def _check_finite(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
+    nonfinite = sum(cloud.contents.nonfinite for cloud in seen.clouds if cloud.contents)
+    lying = sum(
+        cloud.is_dense and cloud.contents.nonfinite > 0
+        for cloud in seen.clouds
+        if cloud.contents is not None
+    )
+    sparse = sum(not cloud.is_dense for cloud in seen.clouds)
+    fix = "set organised: false (deskew_node), or leave NaN points out"
+    if lying:
+        yield Finding(
+            Level.ERROR,
+            _SUBJECT,
+            "dense-lie",
+            f"{lying} clouds say is_dense and have NaN or infinite points",
+            fix,
+        )
+    elif sparse and consumer.is_dense is Use.NEEDED:
+        yield Finding(
+            Level.ERROR,
+            _SUBJECT,
+            "not-dense",
+            f"{sparse} clouds are not is_dense; {consumer.title} shuts down on the first",
+            fix,
+        )
+    elif nonfinite:
+        yield Finding(
+            Level.WARN,
+            _SUBJECT,
+            "nonfinite",
+            f"{nonfinite} points are NaN or infinite; not every version of {consumer.title} "
+            "leaves them out",
+            fix,
+        )
+    else:
+        yield ok(_SUBJECT, "dense", "no point is NaN or infinite")
+
+
+def _check_rings(inside: list[Contents], consumer: Consumer) -> Iterator[Finding]:
+    rings = [item.rings for item in inside if item.rings is not None]
+    if not rings:
+        return
+    least = min(item.least for item in rings)
+    greatest = max(item.greatest for item in rings)
+    kept = float(np.median([item.kept for item in rings]))
+    layout = consumer.inputs[0].layout
+    if least == greatest:
+        yield Finding(
+            Level.ERROR,
+            _SUBJECT,
+            "ring-constant",
+            f"every point has ring {least}; {consumer.title} keeps one point for each ring and "
+            "column",
+            f"set point_layout: {layout}, whose rings are bands of elevation",
+        )
+        return
+    if least < 0 or greatest >= consumer.ring_count:
+        yield Finding(
+            Level.ERROR,
+            _SUBJECT,
+            "ring-range",
+            f"rings are {least} to {greatest}; {consumer.title} drops points of rings not within "
+            f"0 to N_SCAN - 1 (N_SCAN: {consumer.ring_count} in config/consumers)",
+            f"set point_layout: {layout}, or N_SCAN: {greatest + 1}",
+        )
+    elif least == 1 and greatest > 1:
+        yield Finding(
+            Level.WARN,
+            _SUBJECT,
+            "ring-from-1",
+            f"rings are 1 to {greatest}; {consumer.title} counts them from 0",
+            f"set point_layout: {layout}",
+        )
+    else:
+        yield ok(_SUBJECT, "ring-range", f"rings are {least} to {greatest}, counted from 0")
+    text = (
+        f"{consumer.title}'s projection (a point for each ring and {360 / COLUMNS:g} deg of "
+        f"azimuth) keeps {kept:.0%} of the points"
+    )
+    if kept < _KEPT_WELL:
+        level = Level.WARN if kept >= _KEPT_AT_ALL else Level.ERROR
+        fix = f"set point_layout: {layout} and imu_adjust: false"
+        yield Finding(level, _SUBJECT, "ring-cells", text, fix)
+    else:
+        yield ok(_SUBJECT, "ring-cells", text)
+
+
+F64 = NDArray[np.float64]
+
+_SUBJECT_LEVELED: Final = "cloud"
+_TILT_DEG: Final = 12.0
+_BELOW_DEG: Final = -8.0  # the wide field of view ends at -6
+_MANY: Final = 0.01
+_FEW_LEVELED: Final = 0.002
+_NEAREST_M: Final = 0.5
+_MOST: Final = 200
+
+
+def check_leveling(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
+    """Yield whether the clouds are levelled, where the consumer deskews by itself.
+
+    An L2 sees nothing below its own horizon. Where it is tilted, points below the cloud's horizon
+    that are above it once they are turned back by the orientation tell that they were turned.
+    """
+    if consumer.time is Use.IGNORED:
+        return
+    verdict, why = _verdict(seen)
+    if verdict is None:
+        yield not_judged(_SUBJECT_LEVELED, "levelled", f"whether imu_adjust is on, {why}")
+    elif verdict:
+        yield Finding(
+            Level.ERROR if consumer.imu is Use.NEEDED else Level.WARN,
+            _SUBJECT_LEVELED,
+            "levelled",
+            f"the clouds are turned into a levelled frame ({why}); {consumer.title} deskews by "
+            "itself and needs them as measured",
+            "set imu_adjust: false",
+        )
+    else:
+        yield ok(_SUBJECT_LEVELED, "levelled", f"clouds are in the sensor's frame ({why})")
+
+
+def _verdict(seen: Observation) -> tuple[bool | None, str]:
+    if seen.is_levelled is not None:
+        return seen.is_levelled, f"imu_adjust is {str(seen.is_levelled).lower()}"
+    imu = seen.imu[np.isfinite(seen.imu["orientation_wxyz"]).all(axis=1)]
+    imu = imu[np.argsort(imu["stamp"], kind="stable")]
+    imu = imu[np.linalg.norm(imu["orientation_wxyz"], axis=1) > 0.1]
+    if not len(imu):
+        return None, "without orientations"
+    raw, back = [], []
+    for cloud in seen.clouds[:: max(len(seen.clouds) // _MOST, 1)]:
+        if cloud.contents is None:
+            continue
+        at = min(int(np.searchsorted(imu["stamp"], cloud.stamp)), len(imu) - 1)
+        q = unit(imu["orientation_wxyz"][at : at + 1].astype(np.float64))
+        up = rotated(q, np.array([[0.0, 0.0, 1.0]]))[0, 2]
+        points = cloud.contents.sample.astype(np.float64)
+        points = points[np.linalg.norm(points, axis=1) > _NEAREST_M]
+        if len(points) < 50 or np.degrees(np.arccos(np.clip(up, -1.0, 1.0))) < _TILT_DEG:
+            continue
+        raw.append(_below(points))
+        back.append(min(_below(_turned_back(points, q, yaw)) for yaw in (False, True)))
+    if not raw:
+        return None, f"the sensor was not tilted by {_TILT_DEG:g} deg or more"
+    below, below_back = float(np.median(raw)), float(np.median(back))
+    if below > _MANY and below_back < _FEW_LEVELED:
+        return True, f"{below:.0%} of the points are below the sensor's horizon, none turned back"
+    if below < _FEW_LEVELED:
+        return False, "no point is below the sensor's horizon"
+    return None, "points are below the sensor's horizon either way"
+
+
+def _below(points: F64) -> float:
+    """Return the share of points that are below what an L2 can see."""
+    level = np.hypot(points[:, 0], points[:, 1])
+    elevation = np.degrees(np.arctan2(points[:, 2] - OPTICAL_CENTRE_M, level))
+    return float((elevation < _BELOW_DEG).mean())
+
+
+def _turned_back(points: F64, q: F64, with_yaw: bool) -> F64:
+    """Return points turned back by an orientation, or by all of it but the yaw."""
+    w, x, y, z = q[0]
+    inverse = q * [1.0, -1.0, -1.0, -1.0]
+    if not with_yaw:
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        turn = np.array([[np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]])
+        points = rotated(np.repeat(turn, len(points), axis=0), points)
+    return rotated(np.repeat(inverse, len(points), axis=0), points)

@@ -1,7 +1,8 @@
-"""A connection to one L2 for a verb: asks, waits, and raises where the device does not do it."""
+"""A connection to one L2 for a verb."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswerError
@@ -9,18 +10,64 @@ from types import TracebackType
 from typing import Final, TypeVar
 
 from l2lidar_node.cli.addresses import local_addresses
-from l2lidar_node.cli.timeout import Patience
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver import health
+from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer
 from l2lidar_node.driver.driver import Driver, Event
-from l2lidar_node.driver.requests import REPEAT_NS, TRIES, Answer
 from l2lidar_node.protocol import commands
 from l2lidar_node.protocol.commands import Command
 from l2lidar_node.protocol.packets import Parameters
 from l2lidar_node.settings import build, values_of
-from l2lidar_node.transport import source
+from l2lidar_node.transport import session
 from l2lidar_node.transport.session import Session, Tap
 from l2lidar_node.types import HostNs
+
+_PAUSE_S: Final = 0.3  # nobody oversleeps by that much without one
+_MOMENT_S: Final = 0.2  # in which what came during a pause is taken
+
+
+def rest(seconds: float) -> None:
+    """Sleep; where the machine paused meanwhile, a moment longer.
+
+    Or what came during the pause would not have been taken yet, and looks as if it were missing.
+    """
+    while True:
+        begun = time.monotonic()
+        time.sleep(seconds)
+        if time.monotonic() - begun < seconds + _PAUSE_S:
+            return
+        seconds = _MOMENT_S
+
+
+class Patience:
+    """Seconds to wait for something.
+
+    While the machine pauses nothing is heard: that counts for twice what was asked at the most.
+
+    Parameters
+    ----------
+    seconds : float
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._left_s = seconds
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time has passed."""
+        return self._left_s <= 0.0
+
+    def pause(self, seconds: float) -> None:
+        """Rest, but not beyond the end."""
+        asked = max(min(seconds, self._left_s), 0.0)
+        begun = time.monotonic()
+        rest(asked)
+        self.count(max(time.monotonic() - begun, asked), asked)
+
+    def count(self, passed: float, asked: float) -> None:
+        """Take off what a wait took that was to take so long [s]."""
+        self._left_s -= min(passed, 2.0 * asked)
+
 
 T = TypeVar("T")
 
@@ -72,7 +119,9 @@ class Device:
         self._on_event = on_event
         self._answers: dict[int, Future[Answer]] = {}
         self._blocks: list[Parameters] = []
-        self._session = Session(Driver(self.config), source.opened(network), self._handle, tap)
+        self._session = Session(
+            Driver(self.config), session.open_transport(network), self._handle, tap
+        )
 
     def __enter__(self) -> Device:
         """Begin to listen."""

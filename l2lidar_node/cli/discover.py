@@ -14,10 +14,8 @@ import typer
 from rich.table import Table
 
 from l2lidar_node.cli.addresses import hardware_address, local_addresses
-from l2lidar_node.cli.console import out, print_json, say
-from l2lidar_node.cli.device import DeviceError
-from l2lidar_node.cli.options import JsonOption
-from l2lidar_node.cli.timeout import Patience
+from l2lidar_node.cli.console import JsonOption, out, print_json, say
+from l2lidar_node.cli.device import DeviceError, Patience
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import Parameters, Version, decode

@@ -7,12 +7,11 @@ from typing import Any, Final
 import typer
 
 from l2lidar_node.cli.addresses import hardware_address
-from l2lidar_node.cli.console import facts, out, print_json, say
+from l2lidar_node.cli.console import JsonOption, facts, out, print_json, say, with_network
 from l2lidar_node.cli.device import Device, DeviceError
-from l2lidar_node.cli.options import JsonOption, with_network
 from l2lidar_node.cli.stored import parameter_fields, work_mode_text
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.recording.recorder import endpoints
+from l2lidar_node.recording.recording import endpoints
 
 _LISTEN_S: Final = 2.0
 

@@ -49,7 +49,7 @@ def odometry(
     The trajectory in TUM format is what evo reads. Of a capture, sweeps of a full turn are used.
     """
     from l2lidar_node.ros.parameter_files import settings_for
-    from l2lidar_proc.odometry_config import OdometryNodeConfig
+    from l2lidar_proc.config import OdometryNodeConfig
     from l2lidar_proc.recording.bag import RecordingError
     from l2lidar_proc.verbs import odometry
 

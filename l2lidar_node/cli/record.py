@@ -12,15 +12,13 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
-from l2lidar_node.cli.console import out, say
+from l2lidar_node.cli.console import out, say, with_network
 from l2lidar_node.cli.device import Device, DeviceError
-from l2lidar_node.cli.options import with_network
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.bag import BagWriter
 from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recorder import Recorder
-from l2lidar_node.recording.recording import Recording
+from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
 from l2lidar_node.types import Stream

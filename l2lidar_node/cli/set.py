@@ -10,10 +10,9 @@ from typing import Annotated, Final, TypeVar
 import typer
 
 from l2lidar_node.cli.addresses import hardware_address
-from l2lidar_node.cli.console import change, out, say
+from l2lidar_node.cli.console import YesOption, change, out, say, with_network
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.get import addresses_in_use
-from l2lidar_node.cli.options import YesOption, with_network
 from l2lidar_node.cli.stored import (
     needs_restart,
     parameter_fields,
@@ -22,7 +21,7 @@ from l2lidar_node.cli.stored import (
 )
 from l2lidar_node.cli.stored import work_mode as parsed_mode
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver.requests import TRIES
+from l2lidar_node.driver.device import TRIES
 from l2lidar_node.protocol import commands
 from l2lidar_node.protocol.commands import Command
 from l2lidar_node.protocol.wire import WorkMode

@@ -9,9 +9,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from l2lidar_node.cli.console import say
+from l2lidar_node.cli.console import say, with_network
 from l2lidar_node.cli.device import Device, DeviceError
-from l2lidar_node.cli.options import with_network
 from l2lidar_node.clock import ClockEvent, ClockEventKind
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event

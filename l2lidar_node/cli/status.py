@@ -11,11 +11,17 @@ from typing import Annotated, Any
 import typer
 from rich.live import Live
 
-from l2lidar_node.cli.console import as_data, facts, judgement, out, print_json
-from l2lidar_node.cli.device import Device, DeviceError
-from l2lidar_node.cli.options import JsonOption, with_network
+from l2lidar_node.cli.console import (
+    JsonOption,
+    as_data,
+    facts,
+    judgement,
+    out,
+    print_json,
+    with_network,
+)
+from l2lidar_node.cli.device import Device, DeviceError, Patience, rest
 from l2lidar_node.cli.stored import work_mode_text
-from l2lidar_node.cli.timeout import Patience, rest
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver import health
 from l2lidar_node.driver.driver import Driver

@@ -11,9 +11,8 @@ import typer
 from rich.progress import track
 from rich.table import Table
 
-from l2lidar_node.cli.console import out, print_json, say
+from l2lidar_node.cli.console import JsonOption, out, print_json, say, with_network
 from l2lidar_node.cli.device import Device, DeviceError
-from l2lidar_node.cli.options import JsonOption, with_network
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.clock.envelope import supporting_line
 from l2lidar_node.config import NetworkConfig

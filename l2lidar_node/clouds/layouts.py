@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.clouds.rings import rings
+from l2lidar_node.clouds.fields import rings
 from l2lidar_node.types import POINT, HostNs
 
 

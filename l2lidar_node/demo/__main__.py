@@ -12,7 +12,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
-from l2lidar_node.demo.observer import Observer, TopicRecord
+from l2lidar_node.demo.observer import Observer, TopicRecord, TopicRecorder
 from l2lidar_node.demo.processes import (
     ProgramError,
     Programs,
@@ -20,7 +20,6 @@ from l2lidar_node.demo.processes import (
     free_udp_ports,
     isolate_ros,
 )
-from l2lidar_node.demo.recorder import TopicRecorder
 from l2lidar_node.demo.report import report
 from l2lidar_node.programs import INTERRUPTED, interruptible
 

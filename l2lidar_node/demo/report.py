@@ -1,18 +1,84 @@
-"""Tells what was seen in the demo, how right it was, and where the pictures are."""
+"""Reports what the demo saw, how accurate it was, and where the pictures are."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from scipy.spatial.transform import Rotation
 
-from l2lidar_node.demo import accuracy, picture
+from l2lidar_node.demo import picture
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.emulator.truth.results import Results
 from l2lidar_node.protocol.wire import PacketType
+
+F8 = NDArray[np.float64]
+
+
+class TrackError(NamedTuple):
+    """How far an estimated track is from the true one.
+
+    Attributes
+    ----------
+    ate_m : float
+        Root mean square of the distances after the best rigid alignment [m].
+    worst_m : float
+        Largest of them [m].
+    length_m : float
+        Length of the true track between the first and the last estimate [m].
+    estimated, true : ndarray, shape (N, 3)
+        Both tracks in the world [m], the estimated one aligned.
+    """
+
+    ate_m: float
+    worst_m: float
+    length_m: float
+    estimated: F8
+    true: F8
+
+
+def track_error(truth: Results, stamps: list[int], positions: F8) -> TrackError:
+    """Return the error of estimated positions.
+
+    Parameters
+    ----------
+    truth : Results
+    stamps : list of int
+        Instants of the estimates [ns].
+    positions : ndarray, shape (N, 3)
+        In any frame that is fixed to the world [m]; N at least 3.
+    """
+    poses = truth.trajectory()
+    origin = int(stamps[0])
+    instants = np.array([stamp - origin for stamp in stamps], np.float64)
+    known = (poses["stamp"] - origin).astype(np.float64)
+    true = np.stack(
+        [np.interp(instants, known, poses["position"][:, axis]) for axis in range(3)], axis=1
+    )
+    middle, true_middle = positions.mean(axis=0), true.mean(axis=0)
+    turn, _ = Rotation.align_vectors(true - true_middle, positions - middle)
+    aligned = turn.apply(positions - middle) + true_middle
+    error = np.linalg.norm(aligned - true, axis=1)
+    length = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
+    return TrackError(float(np.sqrt(np.mean(error**2))), float(error.max()), length, aligned, true)
+
+
+def stamp_errors_ms(truth: Results, packet_type: PacketType, stamps: list[int]) -> F8:
+    """Return how far stamps are from the nearest true instant of a packet of a type [ms].
+
+    Packets are 4 ms and more apart, so the nearest is the right one for any error below 2 ms.
+    """
+    starts = np.sort(truth.packets["start_ns"][truth.packets["type"] == packet_type])
+    wanted = np.array(stamps, np.int64)
+    after = np.clip(np.searchsorted(starts, wanted), 1, len(starts) - 1)
+    errors = np.stack([wanted - starts[after - 1], wanted - starts[after]])
+    nearest = np.abs(errors).argmin(axis=0)
+    return np.asarray(errors[nearest, np.arange(len(wanted))] / 1e6)
+
 
 _SPACING_MS: Final = {"/points": 229.8, "/imu/data": 4.0}  # a cloud per turn of the head
 _TOLERANCE: Final = 0.02
@@ -43,7 +109,7 @@ def report(console: Console, observer: Observer, folder: Path, with_odometry: bo
         )
     if len(observer.imu.stamps) > 1:
         spacing = observer.imu.intervals_ms
-        errors = accuracy.stamp_errors_ms(truth, PacketType.IMU, observer.imu.stamps)
+        errors = stamp_errors_ms(truth, PacketType.IMU, observer.imu.stamps)
         console.print(
             f"IMU stamps {spacing.mean():.4f} ms apart (standard deviation {spacing.std():.4f}), "
             f"off the truth by {np.median(errors):.3f} ms, p99 {np.percentile(errors, 99):.3f} ms"
@@ -80,7 +146,7 @@ def _odometry(console: Console, observer: Observer, truth: Results, folder: Path
     if len(observer.positions) < _MIN_POSES:
         return [f"/odometry: {len(observer.positions)} poses, expected {_MIN_POSES} and more"]
     positions = np.array(observer.positions)
-    track = accuracy.track_error(truth, observer.odometry.stamps, positions)
+    track = track_error(truth, observer.odometry.stamps, positions)
     text = (
         f"odometry: {1e3 * track.ate_m:.1f} mm RMS off the truth "
         f"(at most {1e3 * track.worst_m:.1f} mm) over {track.length_m:.1f} m"

@@ -6,7 +6,7 @@ import dataclasses
 from collections import Counter
 from dataclasses import dataclass, field
 
-from l2lidar_node.driver.sequence import SequenceCounts
+from l2lidar_node.driver.reorder import SequenceCounts
 from l2lidar_node.types import Stream
 
 

@@ -15,12 +15,9 @@ from typing import Final, NamedTuple
 from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.counters import Counters
-from l2lidar_node.driver.device import DeviceState, Watchdog
-from l2lidar_node.driver.gravity import GravityMonitor
-from l2lidar_node.driver.orientation import Levelling
-from l2lidar_node.driver.queries import Queries
+from l2lidar_node.driver.device import Answer, DeviceState, Queries, Requests, Watchdog
+from l2lidar_node.driver.orientation import GravityMonitor, Levelling
 from l2lidar_node.driver.reorder import Intake, Released
-from l2lidar_node.driver.requests import Answer, Requests
 from l2lidar_node.driver.sweep import MAX_GAP_NS, SweepAssembler
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.commands import Command

@@ -16,7 +16,7 @@ from l2lidar_node.clock import ClockEventKind, ClockStatus
 from l2lidar_node.driver.counters import Counters
 from l2lidar_node.driver.device import DeviceState
 from l2lidar_node.driver.driver import Driver
-from l2lidar_node.driver.gravity import GRAVITY, GravityReport
+from l2lidar_node.driver.orientation import GRAVITY, GravityReport
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import HostNs, Stream, Transport
 

@@ -1,4 +1,4 @@
-"""Knows the rotation into a levelled frame from the sensor's own orientation, one per packet.
+"""The onboard orientation: gravity alignment of points, and a check against gravity.
 
 This is what upstream's ``imu_adjust`` does. It is no motion compensation: it turns each packet as
 a whole, knows no translation, and its result is level with gravity instead of fixed to the sensor.
@@ -7,7 +7,9 @@ The companion package deskews properly and needs this off.
 
 from __future__ import annotations
 
+import math
 import struct
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -108,3 +110,57 @@ def _without_yaw(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
     rows = [[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]
     return np.asarray(np.array(rows).transpose(2, 0, 1) @ rotations)
+
+
+GRAVITY: Final = 9.80665  # [m/s^2]
+
+
+@dataclass(frozen=True, slots=True)
+class GravityReport:
+    """What one period's samples say.
+
+    Attributes
+    ----------
+    samples : int
+    norm : float
+        Length of the mean specific force [m/s^2]; about 9.8 unless the sensor is thrown about.
+    tilt_deg : float
+        Angle between the mean specific force and up by the onboard orientation [deg].
+    """
+
+    samples: int
+    norm: float
+    tilt_deg: float
+
+
+class GravityMonitor:
+    """Averages samples; cheap enough for every one of them."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._x = self._y = self._z = 0.0
+        self._last: ImuSample | None = None
+
+    def add(self, sample: ImuSample) -> None:
+        """Take one sample."""
+        x, y, z = sample.linear_acceleration
+        self._count += 1
+        self._x += x
+        self._y += y
+        self._z += z
+        self._last = sample
+
+    def take(self) -> GravityReport | None:
+        """Return the report of the samples since the last call; None without any."""
+        if self._last is None or not self._count:
+            return None
+        mean = (self._x / self._count, self._y / self._count, self._z / self._count)
+        norm = math.sqrt(sum(component * component for component in mean))
+        w, x, y, z = self._last.orientation_wxyz
+        up = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+        cosine = sum(a * b for a, b in zip(mean, up, strict=True)) / norm if norm else 0.0
+        tilt = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        report = GravityReport(self._count, norm, tilt)
+        self._count = 0
+        self._x = self._y = self._z = 0.0
+        return report

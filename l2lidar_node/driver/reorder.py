@@ -1,14 +1,226 @@
-"""Puts the measurements of both streams into order and tells when none need be waited for."""
+"""Reorder buffers: sequence numbers of one stream, time order of both."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from l2lidar_node.driver.device import SILENCE_NS
-from l2lidar_node.driver.sequence import SequenceCounts, SequenceOrder
 from l2lidar_node.protocol.packets import ImuPacket, PointPacket
 from l2lidar_node.types import HostNs, Stream
+
+T = TypeVar("T")
+
+FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
+_UNKNOWN: Final = 0
+_NUMBERS: Final = 1 << 32
+_LATE_REACH: Final = 64  # numbers this far behind are late ones, not a wrap
+
+
+@dataclass(slots=True)
+class SequenceCounts:
+    """What the sequence numbers of one stream said so far.
+
+    Attributes
+    ----------
+    lost : int
+        Numbers that never came; of a silence longer than a turn of the numbers, what is beyond it.
+    duplicates : int
+        Packets that came again.
+    late : int
+        Packets that came after their place had been given up; they are dropped.
+    reordered : int
+        Packets that came after a later one and were put back into their place.
+    restarts : int
+        Times the numbers began anew.
+    """
+
+    lost: int = 0
+    duplicates: int = 0
+    late: int = 0
+    reordered: int = 0
+    restarts: int = 0
+
+
+class SequenceOrder(Generic[T]):
+    """Releases packets in the order of their numbers.
+
+    A packet that is next in line is released at once. One that is early waits for the missing ones
+    until more than ``window`` packets wait; then the missing ones are given up as lost.
+
+    Parameters
+    ----------
+    window : int
+        How many early packets may wait; 0 releases everything at once.
+
+    Attributes
+    ----------
+    counts : SequenceCounts
+    waiting : dict
+        What waits by its number, the longest first; only to be read.
+
+    Notes
+    -----
+    Numbers wrap. The modulus is not documented (0..1024 has been seen), so it is learned: a number
+    beyond it says that it is larger, and the next wrap says where; two wraps in a row from the
+    same smaller number settle that one.
+    """
+
+    def __init__(self, window: int) -> None:
+        self.counts = SequenceCounts()
+        self._window = window
+        self._reach = 2 * window + _LATE_REACH
+        self._modulus = FIRST_MODULUS
+        self._next: int | None = None
+        self.waiting: dict[int, T] = {}
+        self._given_up: set[int] = set()  # of the numbers within reach: tells late from duplicate
+        self._last_wrap = _UNKNOWN
+
+    @property
+    def oldest(self) -> T | None:
+        """What has been waiting the longest; None if nothing waits."""
+        return next(iter(self.waiting.values()), None)
+
+    def is_earlier(self, seq: int, than: int) -> bool:
+        """Tell whether a number comes a little before another one that came lately."""
+        return self._next is not None and self._ahead(seq) < self._ahead(than)
+
+    def follows(self, seq: int) -> bool:
+        """Take the next number while nothing waits; return whether it was that.
+
+        It is as if it had been pushed and released at once.
+        """
+        if seq != self._next or self.waiting:
+            return False
+        self._next = seq + 1 if seq + 1 != self._modulus else 0
+        self._given_up.discard(seq)
+        return True
+
+    def push(self, seq: int, item: T) -> list[tuple[int, T]]:
+        """Return what can be released now, each with how many are missing just before it."""
+        if self.follows(seq):
+            return [(0, item)]
+        self._unlearn(seq)
+        if self._next is None:
+            self._next = self._after(seq)
+            return [(0, item)]
+        ahead = self._ahead(seq)
+        if ahead < 0:
+            self._count_behind(seq)
+            return []
+        if seq in self.waiting:
+            self.counts.duplicates += 1
+            return []
+        if any(self._ahead(other) > ahead for other in self.waiting):
+            self.counts.reordered += 1
+        self.waiting[seq] = item
+        released = self._run(0)
+        while len(self.waiting) > self._window:
+            released += self.give_up()
+        return released
+
+    def resume(self, seq: int, item: T) -> list[tuple[int, T]]:
+        """Release everything that waits and then this packet, the first after a long silence.
+
+        It is late for nothing, so its number only tells how many are missing at the least.
+        """
+        released = self.flush()
+        self._unlearn(seq)
+        missing = 0 if self._next is None else seq - self._next
+        missing = missing % self._modulus if self._modulus != _UNKNOWN else max(missing, 0)
+        self.counts.lost += missing
+        self._given_up = self._numbers_before(seq, missing)
+        self._next = self._after(seq)
+        return [*released, (missing, item)]
+
+    def give_up(self) -> list[tuple[int, T]]:
+        """Release the first packets that wait, counting the numbers before them as lost."""
+        if not self.waiting or self._next is None:
+            return []
+        first = min(self.waiting, key=self._ahead)
+        missing = self._ahead(first)
+        if first < self._next:
+            missing = self._wrapped(first, missing)
+        self.counts.lost += missing
+        self._given_up |= self._numbers_before(first, missing)
+        self._next = first
+        self._given_up = {n for n in self._given_up if -self._reach <= self._ahead(n) < 0}
+        return self._run(missing)
+
+    def flush(self) -> list[tuple[int, T]]:
+        """Release everything that waits, counting the numbers in between as lost."""
+        released: list[tuple[int, T]] = []
+        while self.waiting:
+            released += self.give_up()
+        return released
+
+    def restart(self) -> list[tuple[int, T]]:
+        """Release everything that waits and take the next number, whatever it is, as the first."""
+        released = self.flush()
+        if self._next is not None:
+            self.counts.restarts += 1
+        self._next = None
+        self._given_up.clear()
+        return released
+
+    def _after(self, seq: int) -> int:
+        return seq + 1 if seq + 1 != self._modulus else 0
+
+    def _ahead(self, seq: int) -> int:
+        """Return how many numbers lie between the next one and this one; negative if behind."""
+        assert self._next is not None
+        if self._modulus != _UNKNOWN:
+            ahead = (seq - self._next) % self._modulus
+            behind = self._modulus - ahead
+            return -behind if behind <= min(self._reach, self._modulus // 2) else ahead
+        if seq >= self._next - self._reach:
+            return seq - self._next
+        # It wrapped, nobody knows where: after the largest number seen, as far as can be told.
+        largest = max((n for n in self.waiting if n >= self._next), default=self._next - 1)
+        return largest + 1 - self._next + seq
+
+    def _numbers_before(self, seq: int, count: int) -> set[int]:
+        """Return so many numbers before one, those within reach."""
+        numbers = range(seq - min(count, self._reach), seq)
+        return {number % (self._modulus or _NUMBERS) for number in numbers}
+
+    def _count_behind(self, seq: int) -> None:
+        if seq in self._given_up:
+            self._given_up.discard(seq)
+            self.counts.lost -= 1
+            self.counts.late += 1
+        else:
+            self.counts.duplicates += 1
+
+    def _run(self, missing: int) -> list[tuple[int, T]]:
+        released: list[tuple[int, T]] = []
+        while self._next in self.waiting:
+            seq = self._next
+            released.append((missing, self.waiting.pop(seq)))
+            self._given_up.discard(seq)
+            missing = 0
+            self._next = self._after(seq)
+        return released
+
+    def _unlearn(self, seq: int) -> None:
+        """Take note of a number that shows the modulus to be too small."""
+        if self._modulus != _UNKNOWN and seq >= self._modulus:
+            if self._next == 0:
+                self._next = self._modulus
+            self._modulus = _UNKNOWN
+
+    def _wrapped(self, first: int, missing: int) -> int:
+        """Learn from a wrap to ``first``; return how many of the missing numbers do exist."""
+        assert self._next is not None
+        if self._modulus == _UNKNOWN:
+            self._modulus = self._next + missing - first
+        elif first == 0 and missing and self._next != self._last_wrap:
+            self._last_wrap = self._next
+        elif first == 0 and missing:
+            self._modulus = self._next
+            return 0
+        return missing
+
 
 REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlier one
 RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this began anew

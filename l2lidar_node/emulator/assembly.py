@@ -16,7 +16,7 @@ from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.firmware import version_payload
 from l2lidar_node.emulator.unit.flash import Flash
 from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
-from l2lidar_node.emulator.unit.sources import VIEW, PointSource
+from l2lidar_node.emulator.unit.stream import VIEW, PointSource
 from l2lidar_node.protocol.wire import WorkMode
 
 WORLDLESS: Final = ("pattern", "none")

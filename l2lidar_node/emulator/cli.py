@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import math
 import os
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
-from l2lidar_node.emulator import assembly, report
+from l2lidar_node.emulator import assembly
+from l2lidar_node.emulator.assembly import WORLDLESS
 from l2lidar_node.emulator.config import (
     AddressConfig,
     CrystalConfig,
@@ -24,8 +27,7 @@ from l2lidar_node.emulator.config import (
     IdentityConfig,
     PowerConfig,
 )
-from l2lidar_node.emulator.link.port import PortError
-from l2lidar_node.emulator.options import group, with_options
+from l2lidar_node.emulator.link.port import Port, PortError
 from l2lidar_node.emulator.physics import PhysicsConfig
 from l2lidar_node.emulator.ray_cast_worker import Studio, StudioError
 from l2lidar_node.emulator.server import MAX_SPEED, Server
@@ -36,7 +38,169 @@ from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.files import write_whole
 from l2lidar_node.programs import interruptible
-from l2lidar_node.settings import Setting, Value, settings_of, values_of
+from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.settings import Setting, SettingError, Value, build, settings_of, values_of
+
+G = TypeVar("G")
+
+_NUMBERS: Final = {int: "whole number", float: "number"}
+_METAVARS: Final = {int: "N", float: "X", str: "TEXT", bool: None}
+
+Panels = Mapping[str, Sequence[Setting]]
+"""Settings by the heading under which the help shows them."""
+
+
+def with_options(command: Callable[..., None], panels: Panels) -> Callable[..., None]:
+    """Return a command that also takes an option per setting.
+
+    Parameters
+    ----------
+    command : callable
+        Takes its own annotated parameters and ``settings``, a dict from the name of a setting to
+        the value that was given; settings that were not are not in it.
+    panels : mapping
+
+    Returns
+    -------
+    callable
+        For :meth:`typer.Typer.command`.
+    """
+    parameters = [
+        item.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for item in inspect.signature(command, eval_str=True).parameters.values()
+        if item.name != "settings"
+    ]
+    made = {f"setting_{item.name}": item for items in panels.values() for item in items}
+    parameters += [
+        inspect.Parameter(
+            f"setting_{item.name}",
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None,
+            annotation=_option(item, panel),
+        )
+        for panel, items in panels.items()
+        for item in items
+    ]
+
+    def run(**arguments: Any) -> None:
+        texts = {name: arguments.pop(name) for name in made}
+        settings = {
+            item.name: _value(item, texts[name])
+            for name, item in made.items()
+            if texts[name] is not None
+        }
+        command(**arguments, settings=settings)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
+    run.__annotations__ = {item.name: item.annotation for item in parameters}
+    run.__doc__ = command.__doc__
+    return run
+
+
+def group(kind: type[G], given: Mapping[str, Value]) -> G:
+    """Return a group of settings made from those of the given values that belong to it."""
+    own = {item.name for item in settings_of(kind)}
+    return build(kind, {name: value for name, value in given.items() if name in own})
+
+
+def flag(item: Setting) -> str:
+    """Return the option of a setting."""
+    return f"--{item.name.replace('_', '-')}"
+
+
+def _value(item: Setting, given: bool | str) -> Value:
+    try:
+        if isinstance(given, bool):
+            return item.check(given)
+        if item.item is None:
+            return item.check(item.type(given))
+        parts = [part for part in given.split(",") if part.strip()]
+        return item.check([item.item(part) for part in parts])
+    except SettingError as error:
+        text = str(error).removeprefix(f"parameter '{item.name}': ")
+    except ValueError:
+        kind = "list of numbers such as 1.5,4" if item.item else _NUMBERS[item.type]
+        text = f"{given!r} is no {kind}"
+        if item.range_text:
+            text += f", expected {item.range_text}"
+    raise typer.BadParameter(text, param_hint=f"'{flag(item)}'")
+
+
+def _option(item: Setting, panel: str) -> Any:
+    # Numbers come as text: what is wrong with one is said in one place, by the setting.
+    kind: Any = bool if item.type is bool else str
+    names = [f"{flag(item)}/--no-{flag(item)[2:]}"] if kind is bool else [flag(item)]
+    metavar = "|".join(item.choices) or ("A,B,..." if item.item else _METAVARS[item.type])
+    facts = [f"{item.doc[0].upper()}{item.doc[1:]}."]
+    if item.unit and not item.range_text.endswith(item.unit):
+        facts.append(f"In {item.unit}.")
+    if item.range_text and not item.choices:
+        facts.append(f"{item.range_text[0].upper()}{item.range_text[1:]}.")
+    facts.append(f"Default: {_text(item.default)}")
+    return Annotated[
+        kind | None,
+        typer.Option(
+            *names,
+            help=" ".join(facts),
+            rich_help_panel=panel,
+            show_default=False,
+            metavar=metavar,
+        ),
+    ]
+
+
+def _text(value: Value) -> str:
+    if isinstance(value, tuple):
+        return ",".join(_text(item) for item in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return str(value) if value != "" else "none"
+
+
+def beginning(
+    config: DeviceConfig, physics: PhysicsConfig, flash: Flash, port: Port
+) -> Iterator[str]:
+    """Yield the lines for the start: what is emulated, where it sends and what will go wrong."""
+    power, identity = config.power, config.identity
+    world = physics.world
+    sight = world if world in WORLDLESS else f"{world}, {physics.motion}, {physics.mount}"
+    yield (
+        f"virtual {identity.product}, firmware {identity.firmware}, work mode {flash.work_mode}, "
+        f"clock 1/{config.crystal.clock_ratio:g}: {sight}"
+    )
+    yield (
+        f"{port.name}, IMU after {power.imu_s * power.boot_scale:g} s, "
+        f"points after {power.points_s * power.boot_scale:g} s"
+    )
+    usual = values_of(FaultConfig())
+    faults = [
+        f"{name} {value}"
+        for name, value in values_of(config.faults).items()
+        if value != usual[name]
+    ]
+    if faults:
+        yield f"faults: {', '.join(faults)}"
+
+
+def end(device: VirtualL2, server: Server) -> Iterator[str]:
+    """Yield the lines for the end: what was sent and heard, how punctually, what went wrong."""
+    seconds = max(device.now_ns - device.power_on_ns, 0) * 1e-9
+    sent = ", ".join(f"{count} {kind.name}" for kind, count in sorted(device.sent.items()))
+    heard = ", ".join(
+        f"{count} {PacketType(kind).name}" for kind, count in sorted(device.received.items())
+    )
+    yield f"sent in {seconds:.1f} s: {sent or 'nothing'}; heard: {heard or 'nothing'}"
+    late = server.lateness
+    if late.count:
+        p50, p99 = late.quantile_ns(0.5) * 1e-6, late.quantile_ns(0.99) * 1e-6
+        yield f"lateness: p50 {p50:.2f} ms, p99 {p99:.2f} ms, max {late.max_ns * 1e-6:.2f} ms"
+    counts = device.ledger.counts
+    if counts:
+        happened = ", ".join(f"{count} {fault.name}" for fault, count in counts.items())
+        yield f"faults that happened: {happened}"
+    if server.unsent:
+        yield f"{server.unsent} datagrams found no way out"
+
 
 _LEAD_NS: Final = 100_000_000  # from ready to power-on, so that the first packets are in time
 _NICENESS: Final = -10
@@ -161,11 +325,11 @@ def emulate(
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: server.stop())
         _hurry()
-        _say(*report.beginning(config, physics, stored, port))
+        _say(*beginning(config, physics, stored, port))
         try:
             server.run(duration)
         finally:
-            _say(*report.end(device, server))
+            _say(*end(device, server))
             if truth is not None:
                 values = {**values_of(physics), **values_of(config), "speed": speed}
                 _write_truth(truth, device, studio, values)

@@ -9,10 +9,38 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from l2lidar_node.emulator.latency import Lateness
 from l2lidar_node.emulator.link.port import Port
 from l2lidar_node.emulator.unit.device import VirtualL2
 from l2lidar_node.emulator.unit.flash import Flash
+
+_BIN_NS: Final = 10_000
+_BINS: Final = 10_000  # up to 100 ms
+
+
+class Lateness:
+    """Distribution of delays with a resolution of 10 us up to 100 ms, and the exact maximum."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (_BINS + 1)
+        self.count = 0
+        self.max_ns = 0
+
+    def add(self, late_ns: int) -> None:
+        """Count one delay; a negative one counts as none."""
+        late_ns = max(late_ns, 0)
+        self._counts[min(late_ns // _BIN_NS, _BINS)] += 1
+        self.count += 1
+        self.max_ns = max(self.max_ns, late_ns)
+
+    def quantile_ns(self, share: float) -> int:
+        """Return a delay that at least this share of all did not exceed; 0 without any."""
+        seen = 0
+        for number, count in enumerate(self._counts):
+            seen += count
+            if count and seen >= share * self.count:
+                return self.max_ns if number == _BINS else min((number + 1) * _BIN_NS, self.max_ns)
+        return 0
+
 
 _LONGEST_WAIT_S: Final = 0.05  # to notice a stop or a held-back packet
 _CHUNK_NS: Final = 20_000_000  # of the unit's time between two looks at the receiver

@@ -17,7 +17,7 @@ from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.metadata import metadata
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.ros.program import StartError
-from l2lidar_node.transport.loop import Loop
+from l2lidar_node.transport.session import Loop
 from l2lidar_node.types import HostNs
 
 PERIOD_S = 1.0

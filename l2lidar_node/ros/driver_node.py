@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as NoAnswerError
+from pathlib import Path
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -17,15 +20,86 @@ from tf2_msgs.msg import TFMessage
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.clouds import layouts
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer
 from l2lidar_node.driver.driver import Driver, Event, Silence
-from l2lidar_node.driver.requests import REPEAT_NS, TRIES, Answer
 from l2lidar_node.protocol.packets import Parameters, Version
-from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform
+from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.recording import Recorder, Recording, free_name
+from l2lidar_node.recording.replay import Playback
+from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher
-from l2lidar_node.ros.driver_source import open_loop
 from l2lidar_node.ros.parameters import ParameterSet
-from l2lidar_node.ros.program import run
+from l2lidar_node.ros.program import StartError, run
+from l2lidar_node.transport import session
+from l2lidar_node.transport.session import Loop, Session
+from l2lidar_node.transport.udp import TransportError
 from l2lidar_node.types import HostNs, ImuSample, Sweep
+
+_CLOCK_DEPTH = 10
+
+
+def open_loop(node: Node, config: DriverConfig, on_event: Callable[[Event], None]) -> Loop:
+    """Return the loop that the settings ask for, not started yet; says in the log what it is.
+
+    Raises
+    ------
+    StartError
+        If a socket, device or file cannot be opened; the message says what to do.
+    """
+    if config.files.replay_file:
+        return _playback(node, config, on_event)
+    recorder = None
+    if config.files.record_file:
+        path = free_name(Path(config.files.record_file).expanduser())
+        try:
+            recorder = Recorder(path, config.network, node.get_logger().error)
+        except OSError as error:
+            raise StartError(f"cannot record to {path}: {error.strerror}") from None
+        node.get_logger().info(f"recording to {path}")
+    try:
+        transport = session.open_transport(config.network)
+    except TransportError as error:
+        raise StartError(str(error.strerror)) from None
+    node.get_logger().info(session.describe_transport(config.network))
+    return Session(Driver(config), transport, on_event, recorder)
+
+
+def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None]) -> Playback:
+    path = Path(config.files.replay_file).expanduser()
+    try:
+        recording = Recording(path.open("rb"), config.network.l2_ip)
+    except OSError as error:
+        raise StartError(f"cannot replay {path}: {error.strerror}") from None
+    except CaptureError as error:
+        raise StartError(f"cannot replay {path}: {error}") from None
+    logger = node.get_logger()
+    rate = config.files.replay_rate
+    logger.info(
+        f"replaying what the L2 at {recording.device} sent, from {path}, "
+        + (f"{rate:g} times as fast" if rate else "as fast as possible")
+    )
+    clock = node.create_publisher(Clock, "/clock", _CLOCK_DEPTH)
+
+    def on_time(now: HostNs) -> None:
+        if config.files.replay_clock and node.context.ok():
+            clock.publish(Clock(clock=to_time(now)))
+
+    def on_lap(shift_ns: int | None) -> None:
+        cut = ", which is cut off" if recording.is_cut_off else ""
+        if playback.damage:
+            logger.error(f"{path} cannot be read any further: {playback.damage}")
+        if shift_ns is not None:
+            seconds = shift_ns / 1e9
+            logger.info(
+                f"again from the beginning of {path}{cut}; stamps are {seconds:.3f} s later"
+            )
+        else:
+            logger.info(f"end of {path}{cut}")
+            rclpy.try_shutdown(context=node.context)
+
+    playback = Playback(recording, config, on_event, on_time, on_lap)
+    return playback
+
 
 _ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 5.0  # however busy the machine is
 _NO_DEVICE = "a recording is replayed, there is no device to command"

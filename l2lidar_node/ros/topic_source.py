@@ -16,8 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
-from l2lidar_node.check.observation import Gathering, Observation, Qos
-from l2lidar_node.check.topics import SourceError, Topics, choose
+from l2lidar_node.check.observation import Gathering, Observation, Qos, SourceError, Topics, choose
 
 _DISCOVERY_S: Final = 6.0
 _LOOK_S: Final = 0.1

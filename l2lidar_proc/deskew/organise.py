@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc.deskew.outliers import slot_time
+from l2lidar_proc.deskew.filters import slot_time
 
 SLOTS: Final = 300  # of a packet
 

@@ -16,8 +16,8 @@ from l2lidar_proc.cloud import without_time
 from l2lidar_proc.config import ProcConfig
 from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.deskew.filters import FilterError
 from l2lidar_proc.deskew.organise import organise
-from l2lidar_proc.deskew.outliers import FilterError
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
 from l2lidar_proc.motion.sweep_trajectory import Path

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_proc import rotations
+from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
     ERRORS,
@@ -26,7 +27,6 @@ from l2lidar_proc.motion.filter import (
     corrected,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry_config import SurfaceConfig
 
 F64 = NDArray[np.float64]
 

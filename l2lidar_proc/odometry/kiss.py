@@ -15,7 +15,7 @@ from kiss_icp.threshold import get_threshold_estimator
 from kiss_icp.voxelization import voxel_down_sample
 from numpy.typing import NDArray
 
-from l2lidar_proc.odometry_config import OdometryConfig
+from l2lidar_proc.config import OdometryConfig
 
 F64 = NDArray[np.float64]
 

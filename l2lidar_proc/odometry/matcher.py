@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import Sweep
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.filter import POSITION, TURN, InertialState, corrected
 from l2lidar_proc.odometry.alignment import Alignment, Source, align
 from l2lidar_proc.odometry.estimate import AlignmentQuality, weakest
@@ -16,7 +17,6 @@ from l2lidar_proc.odometry.kiss import KissMatcher, thinned
 from l2lidar_proc.odometry.relocalization import is_turned, likely_places
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.sweep_motion import SweepMotion
-from l2lidar_proc.odometry_config import OdometryConfig
 
 F64 = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion import initialization
 from l2lidar_proc.motion.filter import InertialState, at_origin, interrupted, same_bias, slowed
 from l2lidar_proc.motion.imu_buffer import Samples
@@ -21,7 +22,6 @@ from l2lidar_proc.odometry.report import estimate_of, gaps_in
 from l2lidar_proc.odometry.sweep_joining import cropped, joined
 from l2lidar_proc.odometry.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.zero_velocity import PATIENCE_NS, Standstill, free_to_differ
-from l2lidar_proc.odometry_config import OdometryConfig
 
 F64 = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.plain import PlainOdometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.recording.trajectory import Trajectory
 
 _MS: Final = 1_000_000

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion import initialization
 from l2lidar_proc.motion.filter import GYRO_BIAS, VELOCITY, InertialState, Noise, loosened
 from l2lidar_proc.motion.imu_buffer import ImuWindow, Samples
 from l2lidar_proc.odometry import sweep_motion, zero_velocity
 from l2lidar_proc.odometry.sweep_motion import SweepMotion
-from l2lidar_proc.odometry_config import OdometryConfig
 
 F64 = NDArray[np.float64]
 

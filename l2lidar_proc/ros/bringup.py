@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from l2lidar_node.ros.bringup import Parameters, Part, companion
-from l2lidar_proc.config import DeskewNodeConfig
-from l2lidar_proc.odometry_config import OdometryNodeConfig
+from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
 
 
 def deskew(wanted: str = "", values: Parameters | None = None) -> Part:

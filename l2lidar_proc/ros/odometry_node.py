@@ -24,12 +24,12 @@ from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError, to_sweep
+from l2lidar_proc.config import OdometryNodeConfig
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
-from l2lidar_proc.odometry_config import OdometryNodeConfig
 from l2lidar_proc.recording import map_file, trajectory
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.samples import to_sample

@@ -19,12 +19,11 @@ from l2lidar_node.programs import interruptible
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.settings import SettingError
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
-from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.frames import FrameTree
 from l2lidar_proc.motion.velocity import carried_over
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
 

@@ -25,12 +25,12 @@ from l2lidar_node.programs import interruptible
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.types import Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
+from l2lidar_proc.config import OdometryNodeConfig
 from l2lidar_proc.motion.frames import FrameTree
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
-from l2lidar_proc.odometry_config import OdometryNodeConfig
 from l2lidar_proc.recording import bag, map_file
 from l2lidar_proc.recording.trajectory import StampedPoses, kitti, tum
 

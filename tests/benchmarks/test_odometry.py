@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import bench_odometry, odometry_pages, odometry_referee
 from benchmarks.odometry_methods import OURS, PLAIN, REFEREES, Found
 from benchmarks.odometry_plan import SLOW, Plan, Rows
-from l2lidar_node.clouds.rings import rings
+from l2lidar_node.clouds.fields import rings
 from tests.support import odometry_runs
 
 PLAN = Plan(

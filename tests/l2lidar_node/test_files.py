@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.emulator.motion.motion import from_tum
-from l2lidar_node.emulator.truth import results, truth
+from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.truth.packet_log import Ledger
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.recording.bag import BagFile
@@ -76,7 +76,7 @@ WRITERS = [
     pytest.param(lambda folder: map_file.save(folder / "m.ply", POINTS), marks=needs_open3d),
     pytest.param(lambda folder: map_file.save(folder / "m.pcd", POINTS), marks=needs_open3d),
     pytest.param(_way, marks=needs_open3d),
-    lambda folder: truth.write_tum(
+    lambda folder: results.write_tum(
         folder / "t.tum", from_tum(_a_way(folder)), np.linspace(0.0, 1.0, 5)
     ),
     lambda folder: results.write_ledger(folder, Ledger(), {}),

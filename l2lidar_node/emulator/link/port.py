@@ -3,16 +3,54 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import os
 import select
 import socket
 import termios
 import time
 import tty
+from pathlib import Path
 from typing import Final, Protocol
 
-from l2lidar_node.emulator.link import backlog
 from l2lidar_node.emulator.unit.flash import Network
+
+_TABLES: Final = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
+
+
+def unread(ip: str, port: int) -> int | None:
+    """Return the bytes that wait in the receiver's socket, with the system's own overhead.
+
+    Parameters
+    ----------
+    ip : str
+        IPv4 address that is sent to.
+    port : int
+
+    Returns
+    -------
+    int or None
+        None when no socket of this machine listens there, or the system does not tell.
+    """
+    wanted = f":{port:04X}"
+    address = f"{int.from_bytes(ipaddress.IPv4Address(ip).packed, 'little'):08X}"
+    found: int | None = None
+    for table in _TABLES:
+        try:
+            lines = table.read_text(encoding="ascii").splitlines()[1:]
+        except OSError:
+            continue
+        for line in lines:
+            fields = line.split()
+            local = fields[1]
+            if not local.endswith(wanted):
+                continue
+            host = local[: -len(wanted)]
+            if host.endswith(address) or not host.strip("0"):
+                waiting = int(fields[4].split(":")[1], 16)
+                found = waiting if found is None else max(found, waiting)
+    return found
+
 
 _READ: Final = 65536
 _SEND_BUFFER: Final = 1 << 20
@@ -152,7 +190,7 @@ class UdpPort:
         if self._unchecked < _CHECK_EVERY:
             return True
         deadline = time.monotonic() + timeout_s
-        while (backlog.unread(*self._host) or 0) > _FULL:
+        while (unread(*self._host) or 0) > _FULL:
             if time.monotonic() > deadline:
                 return False
             time.sleep(_LOOK_AGAIN_S)

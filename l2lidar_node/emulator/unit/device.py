@@ -9,22 +9,21 @@ from typing import Final, NamedTuple
 
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.link.datagram import Datagram
-from l2lidar_node.emulator.link.faults import Dice, is_silent, stages
-from l2lidar_node.emulator.link.path import Path
+from l2lidar_node.emulator.link.faults import Dice, Path, is_silent, stages
 from l2lidar_node.emulator.truth.packet_log import Fault, Ledger
-from l2lidar_node.emulator.unit.firmware import Firmware
+from l2lidar_node.emulator.unit.firmware import Firmware, Inbox, Received
 from l2lidar_node.emulator.unit.flash import Flash, Network
-from l2lidar_node.emulator.unit.inbox import Inbox, Received
-from l2lidar_node.emulator.unit.outbox import Outbox, Reply
-from l2lidar_node.emulator.unit.sources import (
+from l2lidar_node.emulator.unit.stream import (
     VIEW,
     Feed,
     InertialSource,
+    MeasurementStream,
+    Outbox,
     PointSource,
+    Reply,
     imu_feed,
     point_feeds,
 )
-from l2lidar_node.emulator.unit.stream import MeasurementStream
 from l2lidar_node.protocol.wire import AckStatus, PacketType, WorkMode
 
 _S: Final = 1_000_000_000

@@ -1,20 +1,158 @@
-"""The unit's control program: obeys commands, keeps settings, clock and power, reboots."""
+"""The unit's control program: power, command inbox, settings, clock, reboots."""
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Final
+from enum import Enum
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig
+from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
 from l2lidar_node.emulator.unit.clock import UnitClock
 from l2lidar_node.emulator.unit.flash import Flash, Network, mac_text, parameters_payload
-from l2lidar_node.emulator.unit.inbox import Received
-from l2lidar_node.emulator.unit.power import Power, Readiness
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import AckStatus, Command, PacketType, UserCommand, WorkMode
 from l2lidar_node.settings import SettingError
+
+
+class Readiness(Enum):
+    """How far the unit has come since it booted."""
+
+    DEAF = "deaf"  # no link yet
+    BOOTING = "booting"  # hears commands, has produced nothing yet
+    SPINNING_UP = (
+        "spinning up"  # sends IMU packets or waits for a start, no point packet produced yet
+    )
+    INITIALISED = "initialised"  # has produced a point packet since it booted
+
+
+class Power:
+    """Knows since when the unit is on and from when on each stream flows.
+
+    Attributes
+    ----------
+    imu_from_ns, points_from_ns : int or None
+        True instant from which on the stream flows; None in standby.
+    """
+
+    def __init__(self, config: PowerConfig, now_ns: int, waits: bool = False) -> None:
+        self._config = config
+        self.boot(now_ns, waits)
+
+    def boot(self, now_ns: int, waits: bool) -> None:
+        """Switch on at a true instant; one that waits stays in standby until a start command."""
+        config = self._config
+        self._link_ns = now_ns + self._ns(config.link_s)
+        self._awake_ns = now_ns + self._ns(config.imu_s)
+        self._initialised_ns: int | None = None
+        self.imu_from_ns: int | None = None if waits else self._awake_ns
+        self.points_from_ns: int | None = None if waits else now_ns + self._ns(config.points_s)
+
+    def start(self, now_ns: int) -> None:
+        """Leave standby; without effect on a unit that runs or spins up already."""
+        if self.is_standby and self._config.wakes:
+            self.imu_from_ns = max(now_ns + self._ns(self._config.wake_imu_s), self._awake_ns)
+            self.points_from_ns = max(
+                now_ns + self._ns(self._config.wake_points_s), self._awake_ns
+            )
+
+    def stop(self, now_ns: int) -> None:
+        """Go to standby: both streams end."""
+        self._note(now_ns)
+        self.imu_from_ns = self.points_from_ns = None
+
+    @property
+    def is_standby(self) -> bool:
+        """Whether the motors stand still on request."""
+        return self.points_from_ns is None
+
+    def readiness(self, now_ns: int) -> Readiness:
+        """Return how far the unit has come at a true instant."""
+        self._note(now_ns)
+        if now_ns < self._link_ns:
+            return Readiness.DEAF
+        if now_ns < self._awake_ns:
+            return Readiness.BOOTING
+        return Readiness.SPINNING_UP if self._initialised_ns is None else Readiness.INITIALISED
+
+    def _note(self, now_ns: int) -> None:
+        if (
+            self._initialised_ns is None
+            and self.points_from_ns is not None
+            and now_ns >= self.points_from_ns
+        ):
+            self._initialised_ns = self.points_from_ns
+
+    def _ns(self, seconds: float) -> int:
+        return round(seconds * self._config.boot_scale * 1e9)
+
+
+_MAX_COMMAND: Final = 256  # the longest packet a host sends is 196 bytes
+
+
+class Received(NamedTuple):
+    """A packet from the host.
+
+    Attributes
+    ----------
+    packet_type : int
+        As in its header.
+    payload : bytes
+        Empty unless the status is OK.
+    status : AckStatus
+        OK, CRC_ERROR or HEADER_ERROR.
+    """
+
+    packet_type: int
+    payload: bytes
+    status: AckStatus
+
+
+class Inbox:
+    """Collects bytes until they make up packets; tail words but the end mark are ignored."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> Iterator[Received]:
+        """Yield the packets that these bytes complete; keep the rest, at most 256 bytes."""
+        self._buffer += data
+        while True:
+            start = self._buffer.find(wire.MAGIC)
+            if start < 0:
+                self._buffer = self._buffer[-len(wire.MAGIC) + 1 :]
+                return
+            self._buffer = self._buffer[start:]
+            if len(self._buffer) < wire.HEADER.size:
+                return
+            _, packet_type, size = wire.HEADER.unpack_from(self._buffer)
+            if not wire.OVERHEAD < size <= _MAX_COMMAND:
+                self._buffer = self._buffer[1:]
+                yield Received(packet_type, b"", AckStatus.HEADER_ERROR)
+                continue
+            if len(self._buffer) < size:
+                return
+            yield self._take(packet_type, size)
+
+    def _take(self, packet_type: int, size: int) -> Received:
+        payload = self._buffer[wire.HEADER.size : size - wire.TAIL.size]
+        crc, _, _, end = wire.TAIL.unpack_from(self._buffer, size - wire.TAIL.size)
+        if end != wire.TAIL_END:
+            self._buffer = self._buffer[1:]
+            return Received(packet_type, b"", AckStatus.HEADER_ERROR)
+        if crc != zlib.crc32(payload):
+            # A wrong size makes a wrong CRC too: this payload may hold the next command.
+            self._buffer = self._buffer[1:]
+            return Received(packet_type, b"", AckStatus.CRC_ERROR)
+        self._buffer = self._buffer[size:]
+        expected = wire.FRAME_SIZES.get(packet_type)
+        if expected != size:
+            return Received(packet_type, b"", AckStatus.HEADER_ERROR)
+        return Received(packet_type, payload, AckStatus.OK)
+
 
 _LIVE: Final = WorkMode.WIDE_FOV | WorkMode.IMU_OFF
 _VERSION: Final = {

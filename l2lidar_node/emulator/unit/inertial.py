@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from l2lidar_node.emulator.motion.motion import STANDARD_GRAVITY, Motion, rpy_quaternions
 from l2lidar_node.emulator.motion.spline import quaternion_product
 from l2lidar_node.emulator.rng import Stream, generator
-from l2lidar_node.emulator.unit.head import mean_angle
+from l2lidar_node.emulator.unit.scanner import mean_angle
 from l2lidar_node.emulator.unit.units import UNITS, Unit
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import setting

@@ -1,4 +1,4 @@
-"""Measures the world as the L2 does: where each slot looks and what the packet says."""
+"""The scanner: turns the head, casts the rays of each slot, fills the packets."""
 
 from __future__ import annotations
 
@@ -10,11 +10,89 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.motion.spline import rotation_matrices
-from l2lidar_node.emulator.unit import head, returns
+from l2lidar_node.emulator.rng import Stream, generator
+from l2lidar_node.emulator.unit import returns
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.units import UNITS, Unit
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.protocol import wire
+
+# measured on a real unit: advance from packet to packet has a once-per-turn sinusoid and a rest
+ADVANCE_WAVE_RAD: Final = np.deg2rad(0.20)
+ADVANCE_REST_RAD: Final = np.deg2rad(0.087)
+PERIOD_JITTER: Final = 1e-3
+
+_TURN = 2.0 * np.pi
+
+
+def mean_angle(t_s: NDArray[np.float64], unit: Unit, seed: int) -> NDArray[np.float64]:
+    """Return the head's angle without wobble [rad], not wrapped; the seed says where it starts."""
+    start = generator(seed, Stream.HEAD, 0).uniform(0.0, _TURN)
+    return np.asarray(start + _TURN / unit.head_period_s * t_s)
+
+
+def set_angles(
+    packets: NDArray[np.void],
+    times: NDArray[np.float64],
+    unit: Unit,
+    wobble: float,
+    seed: int,
+    first: int,
+) -> None:
+    """Fill in the head's angle at slot 0 and its step per slot.
+
+    The step is that of the reported head period, as on real units, where it does not follow the
+    wobble.
+
+    Parameters
+    ----------
+    packets : ndarray, shape (P,), dtype wire.POINTS_3D_PAYLOAD
+        ``state`` and ``time_increment`` are filled in already.
+    times : ndarray, shape (P,)
+        Instants of slot 0 [s].
+    wobble : float
+        1 = as measured, 0 = the head turns evenly.
+    """
+    mean = mean_angle(times, unit, seed)
+    advance = _TURN * unit.packet_period_s / unit.head_period_s
+    wave = ADVANCE_WAVE_RAD / (2.0 * np.sin(advance / 2.0)) * np.sin(mean)
+    rest = ADVANCE_REST_RAD / np.sqrt(2.0) * _per_packet(seed, Stream.HEAD, first, len(packets))
+    angle = np.mod(mean + wobble * (wave + rest), _TURN).astype(np.float32)
+    # rounding to float32 may reach a full turn
+    packets["com_horizontal_angle_start"] = np.where(angle < np.float32(_TURN), angle, 0.0)
+    turn_s = packets["state"]["com_rotation_period"] * 1e-6
+    packets["com_horizontal_angle_step"] = (
+        _TURN * packets["time_increment"].astype(np.float64) / turn_s
+    )
+
+
+def set_state(
+    packets: NDArray[np.void],
+    numbers: NDArray[np.int64],
+    times: NDArray[np.float64],
+    unit: Unit,
+    seed: int,
+) -> None:
+    """Fill in the state block: periods as measured, slowly warming up, voltages with a ripple."""
+    state = packets["state"]
+    ripple = _per_packet(seed, Stream.STATE, int(numbers[0]) if len(numbers) else 0, len(packets))
+    warm = 1.0 - np.exp(-np.maximum(times, 0.0) / 600.0)
+    state["sys_rotation_period"] = unit.mirror_period_us
+    jitter = np.clip(PERIOD_JITTER * ripple, -3.0 * PERIOD_JITTER, 3.0 * PERIOD_JITTER)
+    state["com_rotation_period"] = np.round(unit.head_period_s * 1e6 * (1.0 + jitter))
+    state["apd_temperature"] = np.round(36.0 + 8.0 * warm + 0.02 * ripple, 1)
+    state["imu_temperature"] = np.round(48.0 + 13.0 * warm + 0.02 * ripple, 1)
+    state["apd_voltage"] = 154.16 + 0.6 * (warm - 1.0) + 0.02 * ripple
+    state["laser_voltage"] = 51.38 + 0.01 * ripple
+
+
+def _per_packet(seed: int, stream: Stream, first: int, count: int) -> NDArray[np.float64]:
+    """Return one standard normal number per packet, shape (count,)."""
+    # number 0 of the head's stream is the starting angle
+    return np.array(
+        [generator(seed, stream, k + 1).standard_normal() for k in range(first, first + count)]
+    )
+
 
 RAY: Final = np.dtype(
     [
@@ -147,7 +225,7 @@ class Scanner:
         packets["point_num"] = wire.POINTS_PER_3D_PACKET
         packets["scan_period"] = self.period_s
         _set_fan(packets, self.period_s, wide_fov)
-        head.set_angles(packets, times, self.unit, self.noise.head_wobble, self.seed, first)
+        set_angles(packets, times, self.unit, self.noise.head_wobble, self.seed, first)
         return self._measure(first, packets, times)
 
     def scan_2d(self, first: int, count: int, *, wide_fov: bool = False) -> Scan:
@@ -176,7 +254,7 @@ class Scanner:
         packets["calibration"] = self.unit.calibration_record
         packets["range_min"] = self.unit.range_min
         packets["range_max"] = self.unit.range_max
-        head.set_state(packets, numbers, times, self.unit, self.seed)
+        set_state(packets, numbers, times, self.unit, self.seed)
 
     def _measure(self, first: int, packets: NDArray[np.void], times: NDArray[np.float64]) -> Scan:
         """Cast the rays that the packets' own float32 fields describe and fill in the returns."""

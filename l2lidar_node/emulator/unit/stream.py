@@ -1,16 +1,110 @@
-"""One stream of measurements: knows which packet is due next and makes frames of them."""
+"""Streams of measurements: where they come from, when they are due, how they leave."""
 
 from __future__ import annotations
 
 import zlib
-from typing import Final, NamedTuple
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.unit.sources import Feed
+from l2lidar_node.emulator.link.datagram import Datagram, Piece
+from l2lidar_node.emulator.truth.packet_log import PACKET, Ledger
+from l2lidar_node.emulator.unit.clock import UnitClock
+from l2lidar_node.emulator.unit.pattern import PatternScanner
 from l2lidar_node.protocol import wire
-from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.protocol.wire import PacketType, WorkMode
+
+VIEW: Final = WorkMode.WIDE_FOV | WorkMode.MODE_2D
+"""Bits of the work mode on which it depends what points there are."""
+
+_POINTS_BLOCK: Final = 50  # 232 ms
+_FLAT_BLOCK: Final = 10  # 200 ms
+_IMU_BLOCK: Final = 50  # 200 ms
+
+
+class Source(Protocol):
+    """Measurements by index; the same index always means the same measurement."""
+
+    def __call__(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+        """Return payloads and the true instants of their stamps.
+
+        Parameters
+        ----------
+        first, count : int
+            Which measurements.
+
+        Returns
+        -------
+        payloads : ndarray, shape (count,)
+            Dtype of the packet's payload; ``info`` is left for the unit to fill in.
+        t_s : ndarray, shape (count,), float64
+            True seconds since power-on, strictly ascending with the index.
+        """
+        ...
+
+
+class PointSource(Protocol):
+    """Makes point packets; ``packets`` is a :class:`Source`."""
+
+    def packets(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+        """Return payloads and the true instants [s] of their first slots."""
+        ...
+
+
+class InertialSource(Protocol):
+    """Makes IMU packets; ``samples`` is a :class:`Source`."""
+
+    def samples(self, first: int, count: int) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+        """Return payloads and their true sample times [s]."""
+        ...
+
+
+class Feed(NamedTuple):
+    """Where a stream's measurements come from.
+
+    Attributes
+    ----------
+    packet_type : PacketType
+    source : Source
+    block : int
+        Measurements asked for at a time; requests always start at a multiple of it.
+    """
+
+    packet_type: PacketType
+    source: Source
+    block: int
+
+
+def imu_feed(inertial: InertialSource) -> Feed:
+    """Return the feed of the IMU."""
+    return Feed(PacketType.IMU, inertial.samples, _IMU_BLOCK)
+
+
+def point_feeds(
+    scanner: PointSource, others: Mapping[WorkMode, PointSource]
+) -> dict[WorkMode, Feed]:
+    """Return the feed of points for each combination of the :data:`VIEW` bits.
+
+    Parameters
+    ----------
+    scanner : PointSource
+        3D, 180 degrees.
+    others : mapping from WorkMode to PointSource
+        The other combinations; a plain pattern stands in for what is missing.
+    """
+    sources = {WorkMode(0): scanner, **others}
+    feeds = {}
+    for bits in range(int(VIEW) + 1):
+        mode = WorkMode(bits)
+        flat = bool(mode & WorkMode.MODE_2D)
+        source = sources.get(mode) or PatternScanner(bool(mode & WorkMode.WIDE_FOV), flat)
+        packet_type = PacketType.POINTS_2D if flat else PacketType.POINTS_3D
+        feeds[mode] = Feed(packet_type, source.packets, _FLAT_BLOCK if flat else _POINTS_BLOCK)
+    return feeds
+
 
 SEQ_MODULUS: Final = 1025  # what units show
 
@@ -159,3 +253,91 @@ def _frames(packet_type: PacketType, payloads: NDArray[np.void]) -> NDArray[np.v
     frames["payload"]["info"]["payload_size"] = payloads.dtype.itemsize
     frames["end"] = np.frombuffer(wire.TAIL_END, np.uint8)
     return frames
+
+
+_Batch = tuple[NDArray[np.void], list[bytes]]  # rows of the ledger and their frames
+
+
+class Reply(NamedTuple):
+    """An answer that leaves the unit at a true instant."""
+
+    leaves_ns: int
+    packet_type: PacketType
+    payload: bytes
+
+
+class Outbox:
+    """Makes datagrams of what is due, one packet each.
+
+    Parameters
+    ----------
+    clock : UnitClock
+        Makes the stamps.
+    ledger : Ledger
+        Learns of every packet.
+
+    Attributes
+    ----------
+    sent : Counter
+        Packets so far by type, over restarts.
+    """
+
+    def __init__(self, clock: UnitClock, ledger: Ledger) -> None:
+        self._clock = clock
+        self._ledger = ledger
+        self._seq: Counter[PacketType] = Counter()
+        self._boots = 0
+        self.sent: Counter[PacketType] = Counter()
+
+    def restart(self) -> None:
+        """Begin with sequence number 0 again."""
+        self._seq.clear()
+        self._boots += 1
+
+    def send(
+        self, measured: Sequence[tuple[PacketType, Due]], replies: Sequence[Reply]
+    ) -> list[Datagram]:
+        """Return the datagrams of measurements and answers in the order of leaving."""
+        batches = [self._measured(*item) for item in measured]
+        batches += [self._replied(item) for item in replies]
+        if not batches:
+            return []
+        packets, frames = batches[0] if len(batches) == 1 else _merged(batches)
+        first = self._ledger.book(packets)
+        times = packets["left_ns"].tolist()
+        return [
+            Datagram(time_ns, frame, (Piece(row, 0, len(frame), len(frame)),))
+            for row, (time_ns, frame) in enumerate(zip(times, frames, strict=True), first)
+        ]
+
+    def _measured(self, packet_type: PacketType, due: Due) -> _Batch:
+        packets = self._packets(packet_type, len(due.frames))
+        packets["seq"] = (self._seq[packet_type] + np.arange(len(packets))) % SEQ_MODULUS
+        self._seq[packet_type] += len(packets)
+        packets["index"] = due.numbers
+        packets["stamp_ns"] = self._clock.stamps(due.start_ns)
+        packets["start_ns"] = due.start_ns
+        packets["left_ns"] = due.left_ns
+        return packets, finish(due, packet_type, packets["seq"], packets["stamp_ns"])
+
+    def _replied(self, reply: Reply) -> _Batch:
+        packets = self._packets(reply.packet_type, 1)
+        packets["start_ns"] = packets["left_ns"] = reply.leaves_ns
+        packets["index"] = -1
+        return packets, [wire.encode_frame(reply.packet_type, reply.payload)]
+
+    def _packets(self, packet_type: PacketType, count: int) -> NDArray[np.void]:
+        packets = np.zeros(count, PACKET)
+        packets["type"] = packet_type
+        packets["boot"] = self._boots
+        packets["ordinal"] = self.sent[packet_type] + np.arange(count)
+        packets["arrived_ns"] = -1
+        self.sent[packet_type] += count
+        return packets
+
+
+def _merged(batches: Sequence[_Batch]) -> _Batch:
+    packets = np.concatenate([batch for batch, _ in batches])
+    frames = [frame for _, batch in batches for frame in batch]
+    order = np.argsort(packets["left_ns"], kind="stable")
+    return packets[order], [frames[at] for at in order.tolist()]

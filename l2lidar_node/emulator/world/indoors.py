@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.world.scene import Builder, Opening, Scene
-from l2lidar_node.emulator.world.shapes import box, cone, ellipsoid, placed
+from l2lidar_node.emulator.world.scene import Builder, Opening, Scene, box, cone, ellipsoid, placed
 
 _PLASTER, _WOOD, _DARK_WOOD, _CLOTH, _GLASS, _METAL = 0.75, 0.45, 0.25, 0.3, 0.06, 0.55
 

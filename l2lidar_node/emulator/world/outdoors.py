@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.world.scene import Builder, Scene
-from l2lidar_node.emulator.world.shapes import box, cone, ellipsoid, placed, quad, terrain
+from l2lidar_node.emulator.world.scene import (
+    Builder,
+    Scene,
+    box,
+    cone,
+    ellipsoid,
+    placed,
+    quad,
+    terrain,
+)
 
 _GRASS, _LEAVES, _BARK, _BRICK, _PAINT, _GLASS = 0.35, 0.5, 0.25, 0.5, 0.6, 0.05
 

@@ -1,4 +1,7 @@
-"""Holds a scene: triangles with reflectivity, and where among them there is room to move."""
+"""Scenes: triangles with reflectivity, the shapes they are built of, and room to move.
+
+Every function returns an array of shape (T, 3, 3): T triangles, three corners each, x y z [m].
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,100 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.world import shapes
+Triangles = NDArray[np.float64]
+
+_CUBE_FACES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+
+
+def quad(
+    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
+) -> Triangles:
+    """Return the two triangles of a quadrilateral with corners in order, each of shape (3,)."""
+    return np.array([[a, b, c], [a, c, d]], dtype=np.float64)
+
+
+def box(
+    low: tuple[float, float, float], high: tuple[float, float, float], yaw: float = 0.0
+) -> Triangles:
+    """Return a box by opposite corners, turned by ``yaw`` [rad] about its own vertical axis."""
+    corners = np.array(
+        [
+            [x, y, z]
+            for z in (low[2], high[2])
+            for y in (low[1], high[1])
+            for x in (low[0], high[0])
+        ]
+    )
+    if yaw:
+        centre = corners.mean(axis=0)
+        c, s = np.cos(yaw), np.sin(yaw)
+        corners = (corners - centre) @ np.array(
+            [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+        ) + centre
+    return np.concatenate([quad(*corners[list(face)]) for face in _CUBE_FACES])
+
+
+def grid(points: NDArray[np.float64]) -> Triangles:
+    """Return the triangles of a mesh of points, shape (M, N, 3)."""
+    a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
+    return np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2).reshape(
+        -1, 3, 3
+    )
+
+
+def terrain(
+    height: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+    low: tuple[float, float],
+    high: tuple[float, float],
+    step: float,
+) -> Triangles:
+    """Return the ground of height z(x, y) over a rectangle, sampled every ``step`` [m]."""
+    x = np.linspace(low[0], high[0], round((high[0] - low[0]) / step) + 1)
+    y = np.linspace(low[1], high[1], round((high[1] - low[1]) / step) + 1)
+    xx, yy = np.meshgrid(x, y, indexing="ij")
+    return grid(np.stack([xx, yy, height(xx, yy)], axis=-1))
+
+
+def cone(
+    base: tuple[float, float, float],
+    radius: float,
+    top_radius: float,
+    height: float,
+    sides: int = 16,
+) -> Triangles:
+    """Return the side of an upright cylinder or truncated cone standing on the point ``base``."""
+    angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    lower, upper = ring * radius + base, ring * top_radius + base
+    upper[:, 2] += height
+    return grid(np.stack([lower, upper], axis=1))
+
+
+def ellipsoid(
+    centre: tuple[float, float, float],
+    radii: tuple[float, float, float],
+    roughness: float = 0.0,
+    sides: int = 14,
+) -> Triangles:
+    """Return an ellipsoid whose radius varies by the fraction ``roughness`` in a fixed pattern."""
+    longitude = np.linspace(0.0, 2.0 * np.pi, sides + 1)
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
+    lon, lat = np.meshgrid(longitude, latitude, indexing="ij")
+    ripple = 1.0 + roughness * np.sin(3.0 * lon + centre[0]) * np.cos(lat) * np.sin(
+        4.0 * lat + centre[1]
+    )
+    unit = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+    return grid(unit * ripple[..., None] * np.asarray(radii) + np.asarray(centre))
+
+
+def placed(triangles: Triangles, position: tuple[float, float, float], yaw: float) -> Triangles:
+    """Return triangles turned by ``yaw`` [rad] about the vertical axis, then moved."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    moved: Triangles = triangles @ np.array(
+        [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+    ) + np.asarray(position)
+    return moved
+
 
 Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 Point = tuple[float, float]
@@ -90,9 +186,7 @@ class Builder:
         def panel(
             u0: float, u1: float, z0: float, z1: float, depth: float = 0.0
         ) -> NDArray[np.float64]:
-            return shapes.quad(
-                at(u0, z0, depth), at(u1, z0, depth), at(u1, z1, depth), at(u0, z1, depth)
-            )
+            return quad(at(u0, z0, depth), at(u1, z0, depth), at(u1, z1, depth), at(u0, z1, depth))
 
         edges = [0.0, *(edge for hole in openings for edge in (hole.start, hole.end)), length]
         for u0, u1 in zip(edges[::2], edges[1::2], strict=True):
@@ -108,9 +202,7 @@ class Builder:
             ):
                 self.add(
                     reflectivity,
-                    shapes.quad(
-                        at(*corner), at(*other), at(*other, hole.depth), at(*corner, hole.depth)
-                    ),
+                    quad(at(*corner), at(*other), at(*other, hole.depth), at(*corner, hole.depth)),
                 )
             self.add(hole.reflectivity, panel(u0, u1, z0, z1, hole.depth))
 

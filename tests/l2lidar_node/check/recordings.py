@@ -14,10 +14,9 @@ from rosbags import interfaces
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from l2lidar_node.check.attitude import rotated
 from l2lidar_node.check.consumers import CONSUMERS
-from l2lidar_node.check.observation import Gathering, Observation, Qos
-from l2lidar_node.check.topics import CLOUD, IMU, TRANSFORMS
+from l2lidar_node.check.imu import rotated
+from l2lidar_node.check.observation import CLOUD, IMU, TRANSFORMS, Gathering, Observation, Qos
 from l2lidar_node.clouds import fields
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.types import Sweep

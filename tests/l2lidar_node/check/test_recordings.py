@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from l2lidar_node.check.consumers import CONSUMERS
-from l2lidar_node.check.topics import CLOUD, IMU, SourceError, Topics, choose
+from l2lidar_node.check.observation import CLOUD, IMU, SourceError, Topics, choose
 from l2lidar_node.cli import main
 from tests.l2lidar_node.check.recordings import Recording, copied, good
 

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2lidar_node.check.consumers import CONSUMERS
-from l2lidar_node.check.findings import Level, worst
 from l2lidar_node.check.observation import Gathering
-from l2lidar_node.check.verdict import judge
+from l2lidar_node.check.report import judge
+from l2lidar_node.check.requirements import Level, worst
 from l2lidar_node.clouds.fields import DATATYPES, points_of
 from tests.l2lidar_node.check import recordings
 

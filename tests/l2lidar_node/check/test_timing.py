@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from l2lidar_node.check.consumers import CONSUMERS
-from l2lidar_node.check.observation import Gathering, Observation
+from l2lidar_node.check.observation import Gathering, Observation, kept_share
 from l2lidar_node.check.points import reading
-from l2lidar_node.check.projection import kept_share
+from l2lidar_node.check.report import judge
 from l2lidar_node.check.requirements import TimeField, TimeUnit
 from l2lidar_node.check.timing import Timing, timing
-from l2lidar_node.check.verdict import judge
 from l2lidar_node.clouds.layouts import LAYOUTS
 from tests.l2lidar_node.check import recordings
 

@@ -11,8 +11,8 @@ import pytest
 
 import l2lidar_node.check
 from l2lidar_node.check.consumers import CONSUMERS
-from l2lidar_node.check.findings import Finding, Level, worst
-from l2lidar_node.check.verdict import judge
+from l2lidar_node.check.report import judge
+from l2lidar_node.check.requirements import Finding, Level, worst
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import build, settings_of
 from l2lidar_proc.config import DeskewNodeConfig

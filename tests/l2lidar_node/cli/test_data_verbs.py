@@ -22,8 +22,7 @@ from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
-from l2lidar_node.recording.recorder import Recorder, endpoints, free_name
-from l2lidar_node.recording.recording import Received, Recording
+from l2lidar_node.recording.recording import Received, Recorder, Recording, endpoints, free_name
 from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
 from l2lidar_node.transport.session import Session

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.clock import ClockEvent, ClockEventKind, DeviceClock
 from l2lidar_node.config import ClockConfig
-from l2lidar_node.driver.sequence import SequenceOrder
+from l2lidar_node.driver.reorder import SequenceOrder
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 from tests.support.clock_truth import EVENT, IMU, POINTS, STEP, STREAMS, SYNC, Scenario, simulate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.driver.gravity import GRAVITY, GravityMonitor, GravityReport
+from l2lidar_node.driver.orientation import GRAVITY, GravityMonitor, GravityReport
 from l2lidar_node.types import HostNs, ImuSample
 
 UP = (0.0, 0.0, GRAVITY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from l2lidar_node.driver.requests import MAX_PENDING, REPEAT_NS, TRIES, Requests
+from l2lidar_node.driver.device import MAX_PENDING, REPEAT_NS, TRIES, Requests
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.commands import Command
 from l2lidar_node.protocol.packets import Ack

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2lidar_node.driver.sequence import SequenceCounts, SequenceOrder
+from l2lidar_node.driver.reorder import SequenceCounts, SequenceOrder
 
 WINDOW = 8
 

@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig
-from l2lidar_node.emulator.link.damage import HOSTILE_SIZES
 from l2lidar_node.emulator.link.datagram import Datagram, Piece
-from l2lidar_node.emulator.link.path import Path
+from l2lidar_node.emulator.link.faults import HOSTILE_SIZES, Path
 from l2lidar_node.emulator.truth.packet_log import Fault, Ledger
 from l2lidar_node.emulator.unit.flash import Flash
 from l2lidar_node.protocol import wire

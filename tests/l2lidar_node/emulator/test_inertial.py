@@ -152,7 +152,7 @@ def test_the_gyro_has_lines_at_the_heads_frequency_and_its_double(
 
 
 def test_the_gyros_line_has_a_fixed_phase_to_the_head() -> None:
-    from l2lidar_node.emulator.unit.head import mean_angle
+    from l2lidar_node.emulator.unit.scanner import mean_angle
 
     noise = ImuNoise(gyro_line=0.1, gyro_noise=0.0)
     phases = []

@@ -20,7 +20,7 @@ from l2lidar_node.emulator.motion.motion import (
     rpy_quaternions,
 )
 from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product, rotation_matrices
-from l2lidar_node.emulator.truth import truth
+from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 
@@ -312,7 +312,7 @@ def test_the_true_trajectory_is_written_in_host_time(tmp_path: Path) -> None:
     origin = 1_750_000_000_000_000_001
     path = tmp_path / "truth.tum"
 
-    truth.write_tum(path, motion, t, origin)
+    results.write_tum(path, motion, t, origin)
 
     read = tum.load(path)
     np.testing.assert_array_equal(read["stamp"], origin + np.round(t * 1e9).astype(np.int64))

@@ -9,12 +9,12 @@ import pytest
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.truth.truth import into_cloud
+from l2lidar_node.emulator.truth.results import into_cloud
 from l2lidar_node.emulator.unit.returns import RangeNoise, noise_sigma
 from l2lidar_node.emulator.unit.scanner import TWO_D_PERIOD_S, Scan, Scanner
 from l2lidar_node.emulator.unit.units import UNITS
 from l2lidar_node.emulator.world import scenes
-from l2lidar_node.emulator.world.shapes import box
+from l2lidar_node.emulator.world.scene import box
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.protocol import wire
 

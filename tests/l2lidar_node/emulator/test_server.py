@@ -15,10 +15,9 @@ import pytest
 
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.config import AddressConfig, DeviceConfig, FaultConfig, IdentityConfig
-from l2lidar_node.emulator.latency import Lateness
-from l2lidar_node.emulator.link import backlog
+from l2lidar_node.emulator.link import port
 from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort
-from l2lidar_node.emulator.server import MAX_SPEED, Server
+from l2lidar_node.emulator.server import MAX_SPEED, Lateness, Server
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.flash import Flash, Network, network_payload
 from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
@@ -147,7 +146,7 @@ def test_as_fast_as_the_receiver_takes_it_nothing_is_lost(host):
 def test_a_stop_ends_even_a_race_that_nobody_reads(host):
     device = unit(config_for(host.port))
     with running(device, UdpPort(device.network), speed=MAX_SPEED):
-        assert backlog.unread("127.0.0.1", host.port) is not None
+        assert port.unread("127.0.0.1", host.port) is not None
         host.read()
 
 
@@ -200,7 +199,7 @@ def test_nobody_listening_is_no_reason_to_fail():
     Server(device, port, 50.0).run(2.0)
     port.close()
     assert device.sent[wire.PacketType.IMU] == 500
-    assert backlog.unread("127.0.0.1", unused) is None
+    assert port.unread("127.0.0.1", unused) is None
 
 
 def test_an_address_in_use_or_elsewhere_is_named(host):
@@ -212,16 +211,16 @@ def test_an_address_in_use_or_elsewhere_is_named(host):
 
 
 def test_the_backlog_is_what_the_receiver_has_not_read(host):
-    assert backlog.unread("127.0.0.1", host.port) == 0
+    assert port.unread("127.0.0.1", host.port) == 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(5):
             sender.sendto(bytes(1000), ("127.0.0.1", host.port))
-    waiting = backlog.unread("127.0.0.1", host.port)
+    waiting = port.unread("127.0.0.1", host.port)
     assert waiting is not None
     assert waiting >= 5000
     for _ in range(5):
         host.socket.recv(2000)
-    assert backlog.unread("127.0.0.1", host.port) == 0
+    assert port.unread("127.0.0.1", host.port) == 0
 
 
 def serial_unit() -> VirtualL2:

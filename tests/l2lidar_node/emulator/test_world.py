@@ -9,7 +9,7 @@ import pytest
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.world import scenes
-from l2lidar_node.emulator.world.shapes import box, cone, ellipsoid, placed
+from l2lidar_node.emulator.world.scene import box, cone, ellipsoid, placed
 from l2lidar_node.emulator.world.world import World
 
 pytest.importorskip("open3d")

@@ -9,8 +9,8 @@ import threading
 import pytest
 
 from l2lidar_node.driver.driver import Event
-from l2lidar_node.recording.playback import Playback
 from l2lidar_node.recording.recording import Recording
+from l2lidar_node.recording.replay import Playback
 from l2lidar_node.settings import change
 from l2lidar_node.types import ImuSample, Sweep
 from tests.l2lidar_node.driver.virtual_host import essence, live_run

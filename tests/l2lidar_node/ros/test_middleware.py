@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from l2lidar_node.ros import middleware
+from l2lidar_node.ros import program
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).parents[3]
@@ -24,7 +24,7 @@ COUNT = 6
 
 SPEAKER = f"""
 import sys, time
-from l2lidar_node.ros.arguments import start_rclpy
+from l2lidar_node.ros.program import start_rclpy
 start_rclpy(["speaker"])
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -120,18 +120,18 @@ def test_what_others_have_configured_counts(
         for other in NAMES:
             monkeypatch.delenv(other, raising=False)
         monkeypatch.setenv(name, "theirs")
-        middleware.make_room()
+        program.make_room()
         assert {os.environ.get(other) for other in NAMES} == {"theirs", None}
         monkeypatch.delenv(name)
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").touch()
-    middleware.make_room()
+    program.make_room()
     assert not any(name in os.environ for name in NAMES)
 
 
 def test_the_profile_gives_room_for_a_second_of_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in NAMES:
         monkeypatch.setenv(name, "")
-    middleware.make_room()
+    program.make_room()
     profile = ElementTree.parse(os.environ[NAMES[0]])
     (size,) = (int(item.text or 0) for item in profile.iter() if item.tag.endswith("segment_size"))
     assert size > 6 * 365_000

@@ -3,7 +3,7 @@ import yaml
 
 from l2lidar_node.ros.parameter_files import parameter_file, parameters_for, settings_for
 from l2lidar_node.settings import SettingError
-from l2lidar_proc.odometry_config import OdometryTopics
+from l2lidar_proc.config import OdometryTopics
 
 FILE = """
 /**:

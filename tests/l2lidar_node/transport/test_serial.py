@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import pytest
 
 from l2lidar_node.config import DriverConfig, NetworkConfig
+from l2lidar_node.driver.device import Answer
 from l2lidar_node.driver.driver import Driver, Event
-from l2lidar_node.driver.requests import Answer
 from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
 from l2lidar_node.emulator.link.port import SerialPort
 from l2lidar_node.emulator.server import Server
@@ -27,8 +27,7 @@ from l2lidar_node.recording import replay
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.settings import build
 from l2lidar_node.transport.serial import SerialTransport
-from l2lidar_node.transport.session import Session
-from l2lidar_node.transport.source import described, opened
+from l2lidar_node.transport.session import Session, describe_transport, open_transport
 from l2lidar_node.transport.udp import TransportError
 from l2lidar_node.types import Datagram, Stream, Sweep
 from tests.l2lidar_node.driver.virtual_host import MemoryTap, essence
@@ -167,11 +166,13 @@ def test_what_cannot_be_opened_is_explained(path, words):
 
 def test_settings_choose_the_transport(line):
     network = NetworkConfig(serial_port=line.name)
-    transport = opened(network)
+    transport = open_transport(network)
     assert isinstance(transport, SerialTransport)
     transport.close()
-    assert described(network) == f"listening on {line.name}"
-    assert described(NetworkConfig()).startswith("listening on 192.168.1.2:6201 for the L2 at")
+    assert describe_transport(network) == f"listening on {line.name}"
+    assert describe_transport(NetworkConfig()).startswith(
+        "listening on 192.168.1.2:6201 for the L2 at"
+    )
 
 
 def answers_to(event: Event, ticket: int) -> bool:

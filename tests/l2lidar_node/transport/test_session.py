@@ -12,9 +12,9 @@ import pytest
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.demo.processes import free_udp_ports
-from l2lidar_node.driver import requests
+from l2lidar_node.driver import device as device_module
+from l2lidar_node.driver.device import TRIES, Answer
 from l2lidar_node.driver.driver import Driver, Event
-from l2lidar_node.driver.requests import TRIES, Answer
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.settings import build as configure
 from l2lidar_node.transport.session import Session
@@ -72,7 +72,7 @@ class Running:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the driver wait for an answer however long this test takes to give it."""
-    monkeypatch.setattr(requests, "REPEAT_NS", 10**12)
+    monkeypatch.setattr(device_module, "REPEAT_NS", 10**12)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import POINT
 from l2lidar_proc.config import FILTERS, FilterConfig
 from l2lidar_proc.deskew import filters
-from l2lidar_proc.deskew.outliers import FilterError, slot_time
+from l2lidar_proc.deskew.filters import FilterError, slot_time
 
 RNG = np.random.default_rng(8)
 SLOT = 7.73e-6

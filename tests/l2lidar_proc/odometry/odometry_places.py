@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.motion.motion import rpy_quaternions
-from l2lidar_node.emulator.world import scenes, shapes
+from l2lidar_node.emulator.world import scene, scenes
 from tests.support.odometry_runs import Run, record
 
 SEED = 6
@@ -40,8 +40,8 @@ def poles() -> NDArray[np.float64]:
     parts = []
     for angle in np.linspace(0.0, 2.0 * np.pi, 12)[:-1]:
         x, y = source.uniform(5.0, 9.0) * np.array([np.cos(angle), np.sin(angle)])
-        parts.append(shapes.cone((x, y, 0.0), 0.12, 0.1, 4.0))
-        parts.append(shapes.ellipsoid((x, y, 4.0), (0.9, 0.8, 1.0), 0.3))
+        parts.append(scene.cone((x, y, 0.0), 0.12, 0.1, 4.0))
+        parts.append(scene.ellipsoid((x, y, 4.0), (0.9, 0.8, 1.0), 0.3))
     return np.concatenate(parts)
 
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import Sweep
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from tests.support.odometry_runs import Run, record, sweeps, truth
 
 T_CLOUD_IMU = np.eye(4)

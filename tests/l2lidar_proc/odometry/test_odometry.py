@@ -10,9 +10,9 @@ import pytest
 
 from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
 from tests.support.odometry_runs import sweeps, truth
 

@@ -8,13 +8,13 @@ import pytest
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc import rotations
+from l2lidar_proc.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.motion.preintegration import integrate, track
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.kiss import thinned
 from l2lidar_proc.odometry.plain import PlainOdometry
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry_config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.recording.trajectory import Trajectory, kitti, levelled_start, tum
 from tests.l2lidar_proc.motion.analytic import EPOCH, G, Motion, at
 from tests.l2lidar_proc.odometry.odometry_world import recording

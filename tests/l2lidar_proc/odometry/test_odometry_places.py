@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import HostNs
+from l2lidar_proc.config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.motion.filter import ERRORS, POSITION, TURN, InertialState
 from l2lidar_proc.motion.initialization import opening
 from l2lidar_proc.odometry.alignment import Source, align
@@ -16,7 +17,6 @@ from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry_config import OdometryConfig, SurfaceConfig
 from tests.l2lidar_proc.odometry.odometry_places import SEED, shaken, visited
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
 from tests.support.odometry_runs import sweeps

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.odometry.plain import PlainOdometry
-from l2lidar_proc.odometry_config import OdometryConfig
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 
