@@ -1,32 +1,112 @@
 """Starts the driver, deskew and odometry, and RViz where asked for."""
 
 from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
 
-from l2lidar_node.ros.bringup import driver, for_deskew, rviz, start
-from l2lidar_node.ros.launch_arguments import (
-    BOOL,
-    CUTS,
-    DRIVER_ARGUMENTS,
-    RVIZ_ARGUMENTS,
-    Argument,
-    arguments,
+from l2lidar_node.ros.launching import (
+    DRIVER_REMAPPINGS,
+    RESPAWN_DELAY_S,
+    file_given,
+    parameters_given,
+    required,
 )
-from l2lidar_proc.ros.bringup import deskew, odometry
 
 
-def generate_launch_description() -> LaunchDescription:
+def launch_setup(context):
+    """Return deskew, and odometry where it is asked for."""
+    given = context.launch_configurations
+    file = file_given(context, "proc_params_file")
+    is_respawned = given["respawn"] == "true"
+    common = {"use_sim_time": True} if given["use_sim_time"] == "true" else {}
+    nodes = {"deskew_node": common}
+    if given["odometry"] == "true":
+        frames = parameters_given(context, ["odom_frame", "base_frame"])
+        nodes["odometry_node"] = {**common, **frames}
+    return [
+        Node(
+            package="l2lidar_node",
+            executable=name,
+            name=name,
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[file, *([parameters] if parameters else [])],
+            remappings=DRIVER_REMAPPINGS,
+            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+            output="screen",
+            respawn=is_respawned,
+            respawn_delay=RESPAWN_DELAY_S,
+            on_exit=required(is_respawned),
+        )
+        for name, parameters in nodes.items()
+    ]
+
+
+def generate_launch_description():
     """Return driver, deskew, odometry and RViz."""
+    share = FindPackageShare("l2lidar_node")
     return LaunchDescription(
         [
-            *arguments(*DRIVER_ARGUMENTS, "proc_params_file"),
-            *arguments(*RVIZ_ARGUMENTS, rviz_config="rviz/slam.rviz"),
-            Argument("turn", "where a cloud ends", CUTS).declare("sweep_cut"),
-            Argument("true", "whether to start the odometry node", BOOL).declare("odometry"),
-            start(
-                driver(lambda given: for_deskew(given["sweep_cut"])),
-                deskew(),
-                odometry("odometry"),
-                rviz(),
+            DeclareLaunchArgument(
+                "sweep_cut",
+                default_value="turn",
+                choices=["packets", "turn", "half_turn", "duration"],
+                description="where a cloud ends",
             ),
+            DeclareLaunchArgument(
+                "odometry",
+                default_value="true",
+                choices=["true", "false"],
+                description="whether to start the odometry node",
+            ),
+            DeclareLaunchArgument(
+                "proc_params_file",
+                default_value=PathJoinSubstitution([share, "config", "l2lidar_proc.yaml"]),
+                description="parameters of deskew and odometry",
+            ),
+            DeclareLaunchArgument(
+                "odom_frame",
+                default_value="",
+                description="frame in which poses are given; empty for what proc_params_file says",
+            ),
+            DeclareLaunchArgument(
+                "base_frame",
+                default_value="",
+                description="frame whose pose is given, tied to the cloud's by /tf_static; empty "
+                "for what proc_params_file says",
+            ),
+            DeclareLaunchArgument(
+                "use_sim_time",
+                default_value="false",
+                choices=["true", "false"],
+                description="whether time comes from /clock, as in a replay",
+            ),
+            DeclareLaunchArgument(
+                "rviz",
+                default_value="false",
+                choices=["true", "false"],
+                description="whether to start RViz",
+            ),
+            DeclareLaunchArgument(
+                "rviz_config",
+                default_value=PathJoinSubstitution([share, "rviz", "slam.rviz"]),
+                description="RViz layout",
+            ),
+            # First: where there is no rviz2, nothing has been started yet.
+            IncludeLaunchDescription(
+                PathJoinSubstitution([share, "launch", "rviz.launch.py"]),
+                condition=IfCondition(LaunchConfiguration("rviz")),
+            ),
+            # Deskew needs the IMU, and points in the sensor's own frame.
+            IncludeLaunchDescription(
+                PathJoinSubstitution([share, "launch", "l2lidar.launch.py"]),
+                launch_arguments={
+                    "imu_adjust": "false",
+                    "enable_IMU_publishing": "true",
+                }.items(),
+            ),
+            OpaqueFunction(function=launch_setup),
         ]
     )

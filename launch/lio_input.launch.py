@@ -1,32 +1,41 @@
-"""Starts the driver as a named LiDAR-inertial odometry wants its input."""
+"""Starts the driver with the parameters that a named LiDAR-inertial odometry needs."""
 
 from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
 
-from l2lidar_node.ros.bringup import driver, rviz, start
-from l2lidar_node.ros.launch_arguments import (
-    DRIVER_ARGUMENTS,
-    RVIZ_ARGUMENTS,
-    Argument,
-    arguments,
-    share,
-)
-
-CONSUMERS = ("lio_sam", "fast_lio", "point_lio", "rko_lio", "glim", "kiss_icp")
+CONSUMERS = ["lio_sam", "fast_lio", "point_lio", "rko_lio", "glim", "kiss_icp"]
 
 
-def generate_launch_description() -> LaunchDescription:
+def generate_launch_description():
     """Return the driver with ``config/consumers/<consumer>/driver.yaml`` over its parameters."""
+    share = FindPackageShare("l2lidar_node")
+    consumer = LaunchConfiguration("consumer")
     return LaunchDescription(
         [
-            Argument(None, "what the clouds are for", CONSUMERS).declare("consumer"),
-            *arguments(*DRIVER_ARGUMENTS, *RVIZ_ARGUMENTS),
-            start(
-                driver(
-                    files=lambda given: [
-                        share(f"config/consumers/{given['consumer']}/driver.yaml")
-                    ]
-                ),
-                rviz(),
+            DeclareLaunchArgument(
+                "consumer", choices=CONSUMERS, description="what the clouds are for"
+            ),
+            DeclareLaunchArgument(
+                "rviz",
+                default_value="false",
+                choices=["true", "false"],
+                description="whether to start RViz",
+            ),
+            # First: where there is no rviz2, nothing has been started yet.
+            IncludeLaunchDescription(
+                PathJoinSubstitution([share, "launch", "rviz.launch.py"]),
+                condition=IfCondition(LaunchConfiguration("rviz")),
+            ),
+            IncludeLaunchDescription(
+                PathJoinSubstitution([share, "launch", "l2lidar.launch.py"]),
+                launch_arguments={
+                    "override_params_file": PathJoinSubstitution(
+                        [share, "config", "consumers", consumer, "driver.yaml"]
+                    )
+                }.items(),
             ),
         ]
     )

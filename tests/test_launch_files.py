@@ -2,8 +2,14 @@
 
 import ast
 import importlib.util
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import yaml
@@ -11,44 +17,50 @@ import yaml
 from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.ros import topics
-from l2lidar_node.ros.parameter_files import parameters_for
-from l2lidar_node.settings import build
+from l2lidar_node.ros.parameter_files import parameters_by_node, parameters_for
+from l2lidar_node.settings import build, settings_of
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.py"))
-PARTS = [
-    ROOT / "l2lidar_node" / "ros" / "bringup.py",
-    ROOT / "l2lidar_node" / "ros" / "launch_arguments.py",
-    ROOT / "l2lidar_proc" / "ros" / "bringup.py",
-]
+XML_FILES = sorted((ROOT / "launch").glob("*.xml"))
+HELPERS = ROOT / "l2lidar_node" / "ros" / "launching.py"
 CONSUMERS = ROOT / "config" / "consumers"
 NETWORK = {"l2_ip", "l2_port", "host_ip", "host_port"}
 DRIVER = NETWORK | {
-    "namespace", "name", "params_file", "emulator", "emulator_options", "respawn", "log_level"
+    "namespace", "name", "l2_name", "params_file", "override_params_file", "serial_port",
+    "imu_adjust", "enable_IMU_publishing", "sweep_cut", "point_layout", "qos_reliability",
+    "record_file", "emulator", "emulator_options", "respawn", "log_level",
 }  # fmt: skip
-RVIZ = {"rviz", "rviz_config"}
+RVIZ = {"namespace", "rviz_config", "fixed_frame", "use_sim_time"}
+WITH_RVIZ = DRIVER | RVIZ | {"rviz"}
 # Arguments by launch file; what each starts is in STARTS.
 ARGUMENTS = {
-    "l2lidar": DRIVER | {"l2_name"},
-    "l2lidar_with_rviz": DRIVER | RVIZ | {"l2_name"},
-    "deskew_odometry": DRIVER | RVIZ | {"l2_name", "proc_params_file", "sweep_cut", "odometry"},
-    "lio_input": DRIVER | RVIZ | {"l2_name", "consumer"},
+    "l2lidar": DRIVER,
+    "rviz": RVIZ,
+    "l2lidar_with_rviz": WITH_RVIZ,
+    "deskew_odometry": WITH_RVIZ
+    | {"proc_params_file", "odometry", "odom_frame", "base_frame", "use_sim_time"},
+    "lio_input": WITH_RVIZ | {"consumer"},
     "replay": RVIZ
-    | {"file", "rate", "loop", "deskew_odometry", "namespace", "name", "l2_name", "l2_ip"}
+    | {"file", "rate", "loop", "deskew_odometry", "name", "l2_name", "l2_ip", "rviz"}
     | {"log_level", "params_file", "proc_params_file"},
-    "l2_top_mount_example": DRIVER | RVIZ,
-    "l2_forward_mount_example": DRIVER | RVIZ,
+    "l2_top_mount_example": WITH_RVIZ,
+    "l2_forward_mount_example": WITH_RVIZ,
+    "multi": {"sensors_file", "deskew_odometry", "emulator"},
 }
 STARTS = {
     "l2lidar": ["l2lidar_node"],
-    "l2lidar_with_rviz": ["l2lidar_node", "rviz2"],
+    "rviz": ["rviz2"],
+    "l2lidar_with_rviz": ["rviz2", "l2lidar_node"],
     "deskew_odometry": ["l2lidar_node", "deskew_node", "odometry_node"],
     "lio_input": ["l2lidar_node"],
     "replay": ["l2lidar_node", "deskew_node", "odometry_node"],
-    "l2_top_mount_example": ["robot_state_publisher", "l2lidar_node", "rviz2"],
-    "l2_forward_mount_example": ["robot_state_publisher", "l2lidar_node", "rviz2"],
+    "l2_top_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
+    "l2_forward_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
+    "multi": ["l2lidar_node", "l2lidar_node"],
 }
 NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": str(ROOT / "README.md")}}
+OURS = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node"}
 
 # The folder launch/ of this repository looks like an empty package: ask for more of the real one.
 try:
@@ -80,31 +92,63 @@ def test_launch_files_are_those_known():
     assert {name_of(path) for path in LAUNCH_FILES} == set(ARGUMENTS)
 
 
-@pytest.mark.parametrize("path", LAUNCH_FILES + PARTS, ids=name_of)
+@pytest.mark.parametrize("path", [*LAUNCH_FILES, HELPERS], ids=name_of)
 def test_file_compiles(path):
     compile(path.read_text(), path.name, "exec")
 
 
-@pytest.mark.parametrize("path", LAUNCH_FILES + PARTS, ids=name_of)
+@pytest.mark.parametrize("path", LAUNCH_FILES, ids=name_of)
 def test_every_shared_file_named_exists(path):
     for text in strings(path):
-        if re.fullmatch(r"(config|rviz|urdf)/[\w/.]+", text):
-            assert (ROOT / text).exists(), text
-        elif text.endswith(".urdf"):
-            assert (ROOT / "urdf" / "examples" / text).is_file(), text
+        if re.fullmatch(r"[\w.]+\.(launch\.py|rviz|urdf|yaml|xml)", text):
+            assert list(ROOT.glob(f"launch/{text}")) or list(ROOT.glob(f"[cru]*/**/{text}")), text
 
 
 def test_every_executable_started_is_installed():
     started = {
-        node.args[0].value
-        for path in LAUNCH_FILES + PARTS
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call)
-        and getattr(node.func, "id", "") in {"_node", "companion", "ExecutableInPackage"}
-        and isinstance(node.args[0], ast.Constant)
-    }
-    assert started == {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node"}
+        text for path in LAUNCH_FILES for text in strings(path) if text in OURS
+    }  # l2lidar_node is the package as well
+    assert started == OURS
     assert started <= executables()
+
+
+def test_driver_arguments_are_parameters_of_the_driver():
+    known = {item.name for item in settings_of(DriverConfig)}
+    (tree,) = (ast.parse(path.read_text()) for path in LAUNCH_FILES if name_of(path) == "l2lidar")
+    passed = {
+        target.id: set(ast.literal_eval(node.value))
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+    }
+    assert passed["TEXT"] | passed["TYPED"] <= known
+    assert passed["LOOPBACK"] <= NETWORK
+    assert {"serial_port", "point_layout", "qos_reliability", "record_file"} <= passed["TEXT"]
+
+
+@pytest.mark.parametrize("path", XML_FILES, ids=lambda path: path.name)
+def test_xml_names_what_exists(path):
+    launch = ElementTree.parse(path).getroot()
+    assert launch.tag == "launch"
+    declared = {argument.get("name") for argument in launch.iter("arg")}
+    text = path.read_text()
+    assert set(re.findall(r"\$\(var (\w+)\)", text)) <= declared
+    for shared in re.findall(r"\$\(find-pkg-share l2lidar_node\)/([\w/.]+)", text):
+        assert (ROOT / shared).is_file(), shared
+    for node in launch.iter("node"):
+        assert node.get("pkg") == "l2lidar_node"
+        assert node.get("exec") in executables()
+        remapped = {item.get("from"): item.get("to") for item in node.iter("remap")}
+        assert remapped == {topic: topic[1:] for topic in topics.DRIVER_TOPICS}
+
+
+def test_example_of_several_sensors_is_what_drivers_take():
+    path = ROOT / "config" / "multi.yaml"
+    sensors = [name for name in parameters_by_node(path) if name.endswith("/l2lidar_node")]
+    assert sensors == ["/front/l2lidar_node", "/rear/l2lidar_node"]
+    built = [build(DriverConfig, parameters_for(path, "any", name)) for name in sensors]
+    assert len({config.network.host_port for config in built}) == len(built)
+    assert len({config.frames.cloud for config in built}) == len(built)
 
 
 @pytest.mark.parametrize(
@@ -163,59 +207,100 @@ def test_rings_of_the_consumers_are_those_of_the_driver():
         assert other["preprocess.scan_line"] == min(RINGS, 128)
 
 
+class Started:
+    """A node as a launch file would start it."""
+
+    def __init__(self, action, context):
+        from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+
+        self.action = action
+        self.given = dict(context.launch_configurations)
+        action._perform_substitutions(context)
+        self.name = action.node_name
+        program = normalize_to_list_of_substitutions(action.node_executable)
+        self.executable = perform_substitutions(context, program)
+        self.remappings = action.expanded_remapping_rules
+        self.files = [Path(path) for path, _ in action._Node__expanded_parameter_arguments or ()]
+        self.words = [
+            "".join(part.perform(context) for part in word)
+            for word in action.cmd[1:]
+            if not any(type(part).__name__ == "LocalSubstitution" for part in word)
+        ]
+
+    @property
+    def parameters(self):
+        """What the node takes from its files, as ROS reads them."""
+        values = {}
+        for path in self.files:
+            values.update(parameters_for(path, "no stock name", self.name))
+        return values
+
+
 class Launched:
     """A launch file with its actions made, but nothing started."""
 
-    def __init__(self, name, log_dir, **given):
-        from launch import LaunchContext
-        from launch.actions import DeclareLaunchArgument, OpaqueFunction
+    def __init__(self, path, given):
+        from launch import LaunchContext, LaunchDescription
+        from launch.actions import IncludeLaunchDescription
+        from launch.launch_description_sources import AnyLaunchDescriptionSource
 
-        from l2lidar_node.ros import launch_arguments
-
-        path = ROOT / "launch" / f"{name}.launch.py"
-        spec = importlib.util.spec_from_file_location(f"launched_{name}", path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        self.log_dir = log_dir
         self.context = LaunchContext()
+        self.context._set_asyncio_loop(None)
         self.context.launch_configurations.update(given)
-        self.declared, self.actions = {}, []
-        assert launch_arguments.share("config") == str(ROOT / "config")
-        for entity in module.generate_launch_description().entities:
-            if isinstance(entity, DeclareLaunchArgument):
-                self.declared[entity.name] = entity
-                entity.visit(self.context)
-            else:  # one makes all: what fails then leaves nothing behind that was started
-                assert isinstance(entity, OpaqueFunction)
-                assert not self.actions
-                self.actions = entity.visit(self.context)
+        self.declared, self.nodes, self.processes, self.said = {}, [], [], []
+        source = AnyLaunchDescriptionSource(str(path))
+        description = source.get_launch_description(self.context)
+        assert isinstance(description, LaunchDescription)
+        self.declared = {item.name: item for item in description.get_launch_arguments()}
+        self._walk(IncludeLaunchDescription(source, launch_arguments=given.items()))
 
-    def text(self, substitutions):
-        from launch.utilities import perform_substitutions
-
-        return perform_substitutions(self.context, substitutions)
-
-    @property
-    def nodes(self):
+    def _walk(self, entity):
+        from launch.actions import ExecuteProcess, LogInfo
         from launch_ros.actions import Node
 
-        return {node.node_executable: node for node in self.actions if isinstance(node, Node)}
+        condition = getattr(entity, "condition", None)
+        if condition is not None and not condition.evaluate(self.context):
+            return
+        if isinstance(entity, Node):
+            self.nodes.append(Started(entity, self.context))
+        elif isinstance(entity, ExecuteProcess):
+            self.processes.append(
+                ["".join(part.perform(self.context) for part in word) for word in entity.cmd]
+            )
+        elif isinstance(entity, LogInfo):
+            self.said.append("".join(part.perform(self.context) for part in entity.msg))
+        else:
+            for below in entity.visit(self.context) or ():
+                self._walk(below)
 
-    def parameters(self, full_name):
-        return parameters_for(self.log_dir / f"{full_name}.yaml", "any", "/any")
+    def node(self, executable):
+        (found,) = (item for item in self.nodes if item.executable == executable)
+        return found
+
+    @property
+    def executables(self):
+        return [item.executable for item in self.nodes]
 
 
 @pytest.fixture
 def launched(tmp_path, monkeypatch):
-    from launch.logging import launch_config
-
-    from l2lidar_node.ros import launch_arguments
-
-    monkeypatch.setattr(launch_arguments, "get_package_share_directory", lambda name: str(ROOT))
-    monkeypatch.setattr(launch_config, "_log_dir", str(tmp_path))
+    """Read a launch file in a prefix that has this package and those that it starts."""
+    index = tmp_path / "prefix" / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    others = ("rviz2", "robot_state_publisher")
+    for package, programs in {"l2lidar_node": OURS, **{name: {name} for name in others}}.items():
+        (index / package).touch()
+        folder = tmp_path / "prefix" / "lib" / package
+        folder.mkdir(parents=True)
+        for program in programs:
+            (folder / program).symlink_to(sys.executable)
+    (tmp_path / "prefix" / "share" / "l2lidar_node").symlink_to(ROOT)
+    known = os.environ.get("AMENT_PREFIX_PATH", "")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'prefix'}:{known}")
 
     def run(name, **given):
-        return Launched(name, tmp_path, **{**NEEDED.get(name, {}), **given})
+        path = ROOT / "launch" / (name if "." in name else f"{name}.launch.py")
+        return Launched(path, {**NEEDED.get(name, {}), **given})
 
     return run
 
@@ -234,165 +319,178 @@ def test_arguments_are_described_and_have_a_default(launched, name):
 @needs_launch
 @pytest.mark.parametrize("name", STARTS)
 def test_starts_what_it_says(launched, name):
-    assert list(launched(name).nodes) == STARTS[name]
+    assert launched(name).executables == STARTS[name]
 
 
 @needs_launch
-@pytest.mark.parametrize("name", STARTS)
+@pytest.mark.parametrize("name", [name for name in STARTS if "l2lidar_node" in STARTS[name]])
 def test_driver_gets_parameters_it_takes(launched, name):
-    build(DriverConfig, launched(name).parameters("l2lidar_node"))
+    for node in launched(name).nodes:
+        if node.executable == "l2lidar_node":
+            build(DriverConfig, node.parameters)
 
 
 @needs_launch
-@pytest.mark.parametrize("name", [name for name in STARTS if "emulator" in ARGUMENTS[name]])
-def test_emulator_is_on_loopback_and_ends_the_launch(launched, name):
-    from launch.actions import ExecuteProcess
-    from launch_ros.actions import Node
-
+@pytest.mark.parametrize(
+    "name", [name for name in STARTS if "emulator" in DRIVER & ARGUMENTS[name]]
+)
+def test_emulator_is_on_loopback_and_ready_at_once(launched, name):
+    if name == "multi":
+        return
     made = launched(name, emulator="true", l2_ip="10.0.0.1", host_port="7001")
-    (process,) = (
-        action
-        for action in made.actions
-        if isinstance(action, ExecuteProcess) and not isinstance(action, Node)
-    )
-    words = [made.text(part) for part in process.cmd[1:]]
-    assert words == ["--lidar-port", "6101", "--host-port", "7001"]
-    values = made.parameters("l2lidar_node")
+    ((program, *words),) = made.processes
+    assert Path(program).name == "l2lidar_emulator"
+    assert words == ["--lidar-port", "6101", "--host-port", "7001", "--ready"]
+    values = made.node("l2lidar_node").parameters
     assert {key: values[key] for key in NETWORK} == {
         "l2_ip": "127.0.0.1", "l2_port": 6101, "host_ip": "127.0.0.1", "host_port": 7001
+    }  # fmt: skip
+    assert not made.said
+
+
+@needs_launch
+def test_emulator_options_are_split_as_a_shell_does_and_spin_up_is_announced(launched):
+    made = launched("l2lidar", emulator="true", emulator_options="--world 'my world.ply'")
+    assert made.processes[0][-2:] == ["--world", "my world.ply"]
+    assert "points come after 25 s" in made.said[0]
+
+
+@needs_launch
+def test_arguments_go_over_the_parameter_file_and_what_is_empty_does_not(launched, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("/l2lidar_node: {ros__parameters: {l2_ip: 10.1.1.1, host_ip: 10.1.1.2}}")
+    made = launched("l2_top_mount_example", params_file=str(file), l2_ip="10.42.0.62")
+    values = made.node("l2lidar_node").parameters
+    assert values == {"l2_ip": "10.42.0.62", "host_ip": "10.1.1.2", "imu_adjust": False}
+    made = launched(
+        "l2lidar",
+        params_file=str(file),
+        serial_port="/dev/ttyACM0",
+        point_layout="velodyne",
+        qos_reliability="reliable",
+        record_file="run.pcap",
+    )
+    assert made.node("l2lidar_node").parameters == {
+        "l2_ip": "10.1.1.1", "host_ip": "10.1.1.2", "serial_port": "/dev/ttyACM0",
+        "point_layout": "velodyne", "qos_reliability": "reliable", "record_file": "run.pcap",
     }  # fmt: skip
 
 
 @needs_launch
-def test_emulator_options_are_split_as_a_shell_does(launched):
-    made = launched("l2lidar", emulator="true", emulator_options="--scene 'my world.ply' --ready")
-    (process,) = (action for action in made.actions if action not in made.nodes.values())
-    assert [made.text(part) for part in process.cmd[-3:]] == ["--scene", "my world.ply", "--ready"]
-
-
-@needs_launch
-def test_network_arguments_go_over_the_parameter_file(launched, tmp_path):
+def test_files_keyed_by_full_name_work_in_a_pushed_namespace(launched, tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text("l2lidar_node: {ros__parameters: {l2_ip: 10.1.1.1, host_ip: 10.1.1.2}}")
-    made = launched("l2_top_mount_example", params_file=str(file), l2_ip="10.42.0.62")
-    values = made.parameters("l2lidar_node")
-    assert values == {"l2_ip": "10.42.0.62", "host_ip": "10.1.1.2"}
+    file.write_text("/robot/front/l2lidar_node: {ros__parameters: {l2_ip: 10.1.1.1}}")
+    outer = tmp_path / "robot.launch.py"
+    outer.write_text(
+        "from launch import LaunchDescription\n"
+        "from launch.actions import GroupAction, IncludeLaunchDescription\n"
+        "from launch_ros.actions import PushRosNamespace\n"
+        "def generate_launch_description():\n"
+        "    return LaunchDescription([GroupAction([PushRosNamespace('robot'),\n"
+        f"        IncludeLaunchDescription({str(ROOT / 'launch' / 'l2lidar.launch.py')!r},\n"
+        "            launch_arguments={'namespace': 'front', 'host_port': '7001',\n"
+        f"                'params_file': {str(file)!r}}}.items())])])\n"
+    )
+    node = Launched(outer, {}).node("l2lidar_node")
+    assert node.name == "/robot/front/l2lidar_node"
+    assert node.parameters == {"l2_ip": "10.1.1.1", "host_port": 7001}
 
 
 @needs_launch
-def test_wrong_port_and_missing_file_are_refused(launched):
-    with pytest.raises(ValueError, match="l2_port:=abc"):
-        launched("l2lidar", l2_port="abc")
-    with pytest.raises(ValueError, match=r"absent\.yaml"):
+def test_missing_files_and_wrong_words_are_refused(launched):
+    with pytest.raises(FileNotFoundError, match=r"params_file:=absent\.yaml: there is no such"):
         launched("l2lidar", params_file="absent.yaml")
-    with pytest.raises(ValueError, match=r"file:=absent\.pcap: there is no such file"):
+    with pytest.raises(FileNotFoundError, match="override_params_file:=absent"):
+        launched("l2lidar", override_params_file="absent")
+    with pytest.raises(FileNotFoundError, match=r"file:=absent\.pcap: there is no such file"):
         launched("replay", file="absent.pcap")
-    with pytest.raises(ValueError, match="rate:=fast is not a number"):
+    with pytest.raises(RuntimeError, match="rate:=fast is not a number"):
         launched("replay", rate="fast")
-    with pytest.raises(ValueError, match="rviz_config:=absent: there is no such file"):
+    with pytest.raises(FileNotFoundError, match="rviz_config:=absent: there is no such file"):
         launched("l2lidar_with_rviz", rviz_config="absent")
-    with pytest.raises(ValueError, match="l2_port and host_port are both 6101"):
-        launched("l2lidar", emulator="true", host_port="6101")
-    with pytest.raises(ValueError, match="emulator_options:='open: "):
-        launched("l2lidar", emulator="true", emulator_options="'open")
+    with pytest.raises(RuntimeError, match="Valid options"):
+        launched("lio_input", consumer="orb_slam")
+    with pytest.raises(RuntimeError, match="names no driver; expected sections headed"):
+        launched("multi", sensors_file=str(ROOT / "config" / "l2lidar_node.yaml"))
 
 
 @needs_launch
-def test_what_the_driver_would_refuse_is_not_started_again_and_again(launched, tmp_path):
-    with pytest.raises(ValueError, match="parameter 'l2_port': 99999 is out of range"):
-        launched("l2lidar", l2_port="99999")
-    file = tmp_path / "mine.yaml"
-    file.write_text("l2lidar_node: {ros__parameters: {robot_x: 0.1, watchdog_action: nap}}")
-    with pytest.raises(ValueError, match="parameter 'watchdog_action': 'nap' is not known"):
-        launched("l2lidar", params_file=str(file))
-
-
-@needs_launch
-@pytest.mark.parametrize("name", ["deskew_odometry", "replay"])
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("deskew_node: {ros__parameters: {voxel_size: -1.0}}",
-         "/a/deskew_node: parameter 'voxel_size': -1.0 is out of range"),
-        ("odometry_node: {ros__parameters: {mode: magic}}",
-         "/a/odometry_node: parameter 'mode': 'magic' is not known"),
-        ("/**: {ros__parameters: {imu_xyz: 3}}",
-         "/a/deskew_node: parameter 'imu_xyz': 3 is of type int, expected list"),
-    ],
-)  # fmt: skip
-def test_what_a_companion_would_refuse_is_not_started(launched, tmp_path, name, text, message):
-    file = tmp_path / "mine.yaml"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        launched(name, proc_params_file=str(file), namespace="a")
-
-
-@needs_launch
-def test_a_node_that_is_not_to_be_started_again_ends_the_launch():
-    from launch import LaunchContext
-    from launch.events.process import ProcessExited
-
-    from l2lidar_node.ros.bringup import _ended
-
-    def ended(is_respawned, code):
-        event = ProcessExited(
-            action=None, name="deskew_node-2", cmd=[], cwd=None, env=None, pid=1, returncode=code
-        )
-        _ended(is_respawned, event, LaunchContext())
-
-    for code in (0, 1, -9):
-        ended(True, code)
-    ended(False, 0)
-    for is_respawned, code in ((True, 2), (False, 2), (False, 1), (False, -11)):
-        with pytest.raises(RuntimeError, match=f"deskew_node-2 ended with exit code {code}"):
-            ended(is_respawned, code)
-
-
-@needs_launch
-def test_a_virtual_l2_that_fails_fails_the_launch():
+def test_a_required_node_that_fails_ends_the_launch():
     from launch import LaunchContext
     from launch.actions import Shutdown
     from launch.events.process import ProcessExited
 
-    from l2lidar_node.ros.bringup import _emulated
+    from l2lidar_node.ros.launching import required
 
-    def ended(code):
+    def ended(code, *settings):
         event = ProcessExited(
-            action=None, name="", cmd=[], cwd=None, env=None, pid=1, returncode=code
+            action=None, name="deskew_node-2", cmd=[], cwd=None, env=None, pid=1, returncode=code
         )
-        return _emulated(event, LaunchContext())
+        return required(*settings)(event, LaunchContext())
 
-    assert isinstance(ended(0), Shutdown)
-    assert isinstance(ended(-2), Shutdown)
-    with pytest.raises(RuntimeError, match="exit code 2"):
-        ended(2)
+    for code in (0, 1, -9):
+        assert ended(code, True) is None
+    assert isinstance(ended(0, False), Shutdown)
+    assert ended(0, False, False) is None
+    for settings, code in (((True,), 2), ((False,), 2), ((False,), 1), ((False, False), -11)):
+        with pytest.raises(RuntimeError, match=f"deskew_node-2 ended with exit code {code}"):
+            ended(code, *settings)
 
 
 @needs_launch
-def test_two_sensors_share_no_name(launched, tmp_path):
+def test_two_sensors_share_no_name(launched):
     for namespace in ("front", "rear/deep"):
         made = launched("l2lidar", namespace=namespace, l2_name=f"{namespace[:4]}_l2")
-        node = made.nodes["l2lidar_node"]
-        node._perform_substitutions(made.context)
-        assert node.node_name == f"/{namespace}/l2lidar_node"
-        assert node.expanded_remapping_rules == [
-            (topic, topic.removeprefix("/")) for topic in topics.DRIVER_TOPICS
-        ]
-        values = made.parameters(f"{namespace.replace('/', '.')}.l2lidar_node")
-        assert values["l2_name"] == f"{namespace[:4]}_l2"
+        node = made.node("l2lidar_node")
+        assert node.name == f"/{namespace}/l2lidar_node"
+        assert node.remappings == [(name, name.removeprefix("/")) for name in topics.DRIVER_TOPICS]
+        assert node.parameters["l2_name"] == f"{namespace[:4]}_l2"
+
+
+@needs_launch
+def test_one_file_starts_several_sensors(launched):
+    made = launched("multi")
+    assert [node.name for node in made.nodes] == ["/front/l2lidar_node", "/rear/l2lidar_node"]
+    configs = [build(DriverConfig, node.parameters) for node in made.nodes]
+    assert [config.network.l2_ip for config in configs] == ["192.168.1.62", "192.168.1.63"]
+    assert [config.network.host_port for config in configs] == [6201, 6202]
+    assert [config.frames.cloud for config in configs] == ["front_link", "rear_link"]
+    made = launched("multi", emulator="true", deskew_odometry="true")
+    ports = [
+        (config.network.l2_port, config.network.host_port)
+        for config in (
+            build(DriverConfig, node.parameters)
+            for node in made.nodes
+            if node.executable == "l2lidar_node"
+        )
+    ]
+    assert len({port for pair in ports for port in pair}) == 4
+    assert len(made.processes) == 2
+    odoms = [
+        node.parameters["odom_frame"] for node in made.nodes if node.executable == "odometry_node"
+    ]
+    assert odoms == ["front_odom", "rear_odom"]
 
 
 @needs_launch
 def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched):
-    made = launched("deskew_odometry")
-    values = made.parameters("l2lidar_node")
+    values = launched("deskew_odometry").node("l2lidar_node").parameters
     assert values["imu_adjust"] is False
     assert values["enable_IMU_publishing"] is True
     assert values["sweep_cut"] == "turn"
-    assert launched("deskew_odometry", sweep_cut="half_turn").parameters("l2lidar_node")[
-        "sweep_cut"
-    ] == "half_turn"  # fmt: skip
-    assert "odometry_node" not in launched("deskew_odometry", odometry="false").nodes
+    other = launched("deskew_odometry", sweep_cut="half_turn")
+    assert other.node("l2lidar_node").parameters["sweep_cut"] == "half_turn"
+    assert "odometry_node" not in launched("deskew_odometry", odometry="false").executables
+    framed = launched("deskew_odometry", base_frame="base_link").node("odometry_node")
+    assert framed.parameters["base_frame"] == "base_link"
+
+
+@needs_launch
+@pytest.mark.parametrize("name", [name for name in STARTS if "rviz2" in STARTS[name]][1:])
+def test_rviz_gets_points_that_tf_can_turn(launched, name):
+    """TF applies the mount; points that are level already would be turned twice."""
+    assert launched(name).node("l2lidar_node").parameters["imu_adjust"] is False
+    assert launched(name, imu_adjust="true").node("l2lidar_node").parameters["imu_adjust"] is True
 
 
 @needs_launch
@@ -400,40 +498,36 @@ def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched):
     "consumer", sorted(path.name for path in CONSUMERS.iterdir() if path.is_dir())
 )
 def test_consumer_goes_over_the_parameter_file(launched, consumer):
-    values = launched("lio_input", consumer=consumer).parameters("l2lidar_node")
+    values = launched("lio_input", consumer=consumer).node("l2lidar_node").parameters
     assert consumer_driver(consumer).items() <= values.items()
 
 
 @needs_launch
 def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched):
     made = launched("replay", rate="2", rviz="true")
-    values = made.parameters("l2lidar_node")
+    values = made.node("l2lidar_node").parameters
     assert (values["replay_file"], values["replay_rate"]) == (NEEDED["replay"]["file"], 2.0)
     assert values["replay_loop"] is False
     assert values["imu_adjust"] is False
     assert "use_sim_time" not in values, "the driver makes that time"
-    assert made.parameters("deskew_node")["use_sim_time"] is True
-    assert made.parameters("odometry_node")["use_sim_time"] is True
+    for name in ("deskew_node", "odometry_node", "rviz2"):
+        assert made.node(name).parameters["use_sim_time"] is True
     made = launched("replay", deskew_odometry="false", loop="true")
-    assert list(made.nodes) == ["l2lidar_node"]
-    assert made.parameters("l2lidar_node")["imu_adjust"] is True
-    assert made.parameters("l2lidar_node")["replay_loop"] is True
-
-
-@needs_launch
-def test_odometry_is_not_taken_back_to_the_start_of_a_recording(launched):
-    with pytest.raises(ValueError, match="deskew_odometry:=false"):
+    assert made.executables == ["l2lidar_node"]
+    assert made.node("l2lidar_node").parameters["imu_adjust"] is True
+    assert made.node("l2lidar_node").parameters["replay_loop"] is True
+    with pytest.raises(RuntimeError, match="deskew_odometry:=false"):
         launched("replay", loop="true")
 
 
 @needs_launch
 def test_only_a_driver_of_a_real_sensor_is_started_again(launched):
+    from launch.utilities.type_utils import perform_typed_substitution
+
     def respawns(name, **given):
         made = launched(name, **given)
-        node = made.nodes["l2lidar_node"]
+        node = made.node("l2lidar_node").action
         return perform_typed_substitution(made.context, node._ExecuteLocal__respawn, bool)
-
-    from launch.utilities.type_utils import perform_typed_substitution
 
     assert respawns("l2lidar")
     assert not respawns("l2lidar", respawn="false")
@@ -441,26 +535,96 @@ def test_only_a_driver_of_a_real_sensor_is_started_again(launched):
 
 
 @needs_launch
-def test_unknown_consumer_is_refused(launched):
-    with pytest.raises(RuntimeError, match="Valid options"):
-        launched("lio_input", consumer="orb_slam")
-
-
-@needs_launch
 @pytest.mark.parametrize("name", [name for name in STARTS if "rviz" in ARGUMENTS[name]])
-def test_rviz_only_where_asked_for_and_with_a_layout(launched, name):
-    assert "rviz2" not in launched(name, rviz="false").nodes
+def test_rviz_only_where_asked_for_and_before_what_would_be_left_behind(launched, name):
+    assert "rviz2" not in launched(name, rviz="false").executables
     made = launched(name, rviz="true", namespace="front")
-    node = made.nodes["rviz2"]
-    words = [made.text(part) for part in node.cmd[1:5]]
-    assert words[:1] == ["-d"]
-    assert Path(words[1]).is_file()
-    node._perform_substitutions(made.context)
-    assert ("/points", "points") in node.expanded_remapping_rules
+    node = made.node("rviz2")
+    assert node.words[:1] == ["-d"]
+    assert Path(node.words[1]).is_file()
+    assert ("/points", "points") in node.remappings
+    # launch leaves behind what it started in the same instant in which something is not there.
+    last_of_others = max(made.executables.index(name) for name in set(made.executables) - OURS)
+    assert last_of_others < min(
+        made.executables.index(name) for name in OURS & set(made.executables)
+    )
 
 
 @needs_launch
 def test_rviz_follows_the_name_of_the_sensor(launched):
-    made = launched("l2lidar_with_rviz", l2_name="rear")
-    words = [made.text(part) for part in made.nodes["rviz2"].cmd[1:5]]
-    assert words[2:] == ["-f", "rear_link"]
+    words = launched("l2lidar_with_rviz", l2_name="rear").node("rviz2").words
+    assert words[2:4] == ["-f", "rear_link"]
+    assert "-f" not in launched("l2lidar_with_rviz").node("rviz2").words
+
+
+@needs_launch
+def test_xml_starts_the_driver_with_the_same_parameters(launched):
+    node = launched("l2lidar.launch.xml", namespace="front").node("l2lidar_node")
+    other = launched("l2lidar", namespace="front").node("l2lidar_node")
+    assert (node.name, node.parameters) == (other.name, other.parameters)
+    assert node.remappings == other.remappings
+
+
+@needs_launch
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["l2_port:=99999"], 1, "parameter 'l2_port': 99999 is out of range"),
+        (["emulator:=true", "emulator_options:=--nonsense"], 1, "No such option: --nonsense"),
+        (["l2_ip:=127.0.0.1", "host_ip:=127.0.0.1"], 0, "listening on 127.0.0.1"),
+    ],
+    ids=["refused parameter", "emulator fails", "interrupted"],
+)
+def test_launch_ends_with_its_parts_and_leaves_none_behind(tmp_path, words, code, text):
+    """Run the real thing: what fails ends the launch with an exit code, and nothing lives on."""
+    script = (
+        "import sys\n"
+        "from launch import LaunchDescription, LaunchService\n"
+        "from launch.actions import IncludeLaunchDescription\n"
+        "path, *given = sys.argv[1:]\n"
+        "service = LaunchService()\n"
+        "service.include_launch_description(LaunchDescription([IncludeLaunchDescription(path,\n"
+        "    launch_arguments=[tuple(word.split(':=')) for word in given])]))\n"
+        "sys.exit(service.run())\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, str(ROOT / "launch" / "l2lidar.launch.py"),
+         "host_port:=47611", *words],
+        env={**os.environ, "ROS_LOG_DIR": str(tmp_path), "ROS_LOCALHOST_ONLY": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+    )  # fmt: skip
+    said = ""
+    try:
+        for line in process.stdout:
+            said += line
+            if not code and text in line:
+                process.send_signal(signal.SIGINT)
+        assert process.wait(60) == code, said
+    finally:
+        still = _session_of(process.pid)
+        for pid in still:
+            os.kill(pid, signal.SIGKILL)
+    assert text in said
+    assert not still, said
+
+
+def _session_of(leader):
+    """Return the processes of a session that still run, after at most ten seconds."""
+    deadline = time.monotonic() + 10.0
+    while True:
+        found = [
+            int(path.parent.name)
+            for path in Path("/proc").glob("[0-9]*/stat")
+            if _session(path) == leader
+        ]
+        if not found or time.monotonic() > deadline:
+            return found
+        time.sleep(0.1)
+
+
+def _session(path):
+    try:
+        state, _, _, session = path.read_text().rpartition(")")[2].split()[:4]
+    except OSError:
+        return None  # it has ended meanwhile
+    return None if state == "Z" else int(session)

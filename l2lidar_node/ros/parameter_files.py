@@ -18,14 +18,9 @@ class _Loader(yaml.SafeLoader):
     """YAML as ROS reads it: 2e-07 is a number, which for PyYAML it is only with a point in it."""
 
 
-class _Dumper(yaml.SafeDumper):
-    """YAML as ROS reads it: the text "2e-07" is quoted."""
-
-
-for _side in (_Loader, _Dumper):
-    _side.add_implicit_resolver(
-        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+"), list("-+0123456789")
-    )
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+"), list("-+0123456789")
+)
 
 
 def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any]:
@@ -53,16 +48,8 @@ def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any
     ValueError
         If the file does not exist, or is not a mapping of node names to ``ros__parameters``.
     """
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise ValueError(f"parameter file '{path}': {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:
-        # The last three are PyYAML's on dates that are none, `!!int` alone, endless brackets.
-        reason = " ".join(str(error).split())
-        raise ValueError(f"parameter file '{path}': is not YAML: {reason}") from None
     values: dict[str, Any] = {}
-    for heading, section in _sections(content, "", path):
+    for heading, section in _sections(_content(path), "", path):
         if heading == f"/{stock_name}" or _pattern(heading).fullmatch(full_name):
             values.update(_flat(section))
     return values
@@ -89,10 +76,29 @@ def settings_for(path: Path | None, name: str, group: type[G]) -> G:
     return build(group, values)
 
 
-def parameter_file(values: Mapping[str, Any]) -> str:
-    """Return the text of a parameter file that gives values to any node that reads it."""
-    content = {"/**": {"ros__parameters": dict(values)}}
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False)
+def parameters_by_node(path: Path | str) -> dict[str, dict[str, Any]]:
+    """Return the parameters of every section of a file by its heading, for example ``/front/l2``.
+
+    Raises
+    ------
+    ValueError
+        As :func:`parameters_for`.
+    """
+    return {
+        heading: _flat(section)
+        for heading, section in _sections(_content(Path(path)), "", Path(path))
+    }
+
+
+def _content(path: Path) -> object:
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except OSError as error:
+        raise ValueError(f"parameter file '{path}': {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:
+        # The last three are PyYAML's on dates that are none, `!!int` alone, endless brackets.
+        reason = " ".join(str(error).split())
+        raise ValueError(f"parameter file '{path}': is not YAML: {reason}") from None
 
 
 def _sections(content: object, above: str, path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:

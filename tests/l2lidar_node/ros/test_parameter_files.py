@@ -1,7 +1,6 @@
 import pytest
-import yaml
 
-from l2lidar_node.ros.parameter_files import parameter_file, parameters_for, settings_for
+from l2lidar_node.ros.parameter_files import parameters_by_node, parameters_for, settings_for
 from l2lidar_node.settings import SettingError
 from l2lidar_proc.config import OdometryTopics
 
@@ -105,15 +104,12 @@ def test_numbers_are_read_as_ros_reads_them(tmp_path):
     assert values == {"a": 2e-7, "b": 4.9e-9, "c": -1000.0, "d": "2e-07", "e": 0.5}
 
 
-def test_written_file_applies_to_every_node_and_keeps_types(tmp_path):
-    values = {"a": True, "b": 1, "c": 1e-7, "d": "1.0", "e": "", "f": [0.5], "g.h": "on"}
-    values["i"] = "2e-07"
-    file = tmp_path / "written.yaml"
-    file.write_text(parameter_file(values))
-    again = parameters_for(file, "any", "/some/where")
-    assert again == values
-    assert [type(value) for value in again.values()] == [type(value) for value in values.values()]
-    assert yaml.safe_load(file.read_text()).keys() == {"/**"}
+def test_sections_are_told_apart_by_their_headings(tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {a: 1}}\nfront: {lidar: {ros__parameters: {b: {c: 2}}}}"
+    )
+    assert parameters_by_node(file) == {"/**": {"a": 1}, "/front/lidar": {"b.c": 2}}
 
 
 def test_a_file_for_a_node_serves_without_ros(tmp_path):
