@@ -1,4 +1,4 @@
-"""Measures how true the driver's stamps are, against the virtual L2's own ledger.
+"""Measures how true the driver's stamps are, against the virtual L2's own packet log.
 
 ``make bench-clock`` prints the table and writes ``out/bench/clock.json``; ``--docs`` renews the
 table in ``docs/clock.md`` too. The same packets also go through upstream's rule and through

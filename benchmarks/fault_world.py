@@ -75,14 +75,14 @@ class World:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.host_port, self.lidar_port = free_udp_ports(2)
-        self.ledgers: list[Path] = []
+        self.packet_logs: list[Path] = []
         self.said: dict[int, str] = {}  # first line by process number
         self._running: list[subprocess.Popen[str]] = []
 
     def unit(self, *options: str) -> subprocess.Popen[str]:
         """Start a virtual L2 and wait until it sends."""
-        truth = self.folder / f"truth_{len(self.ledgers)}"
-        self.ledgers.append(truth)
+        truth = self.folder / f"truth_{len(self.packet_logs)}"
+        self.packet_logs.append(truth)
         return self._start(
             "l2lidar_node.emulator", *_UNIT, "--truth", str(truth),
             "--host-port", str(self.host_port), "--lidar-port", str(self.lidar_port), *options,
@@ -160,7 +160,7 @@ class World:
         """Compare a driver's notes with the truth; recovery counts from ``since`` [s, wall]."""
         facts = self.facts(host)
         notes = np.load(self.folder / f"{host}.npy")
-        packets = np.concatenate([Results(folder).packets for folder in self.ledgers])
+        packets = np.concatenate([Results(folder).packets for folder in self.packet_logs])
         packets = packets[np.isin(packets["type"], (102, 104))]
         packets = packets[np.argsort(packets["left_ns"], kind="stable")]
         rows = _rows(packets, notes)
@@ -247,12 +247,12 @@ def address(world: World) -> Finding:
     strange = world.unit("--lidar-ip", "127.0.0.2")
     _pause(2.0)
     world.end(strange)
-    foreign_ledger = world.ledgers.pop()
+    foreign_packet_log = world.packet_logs.pop()
     since = time.time()
     world.unit()
     _pause(3.0)
     finding = _ended(world, host, "address changes for 2 s", since)
-    sent = len(Results(foreign_ledger).packets)
+    sent = len(Results(foreign_packet_log).packets)
     foreign = world.facts()["foreign"]
     finding.good &= 0 < foreign <= sent
     finding.remark = f"{foreign} datagrams of the other address counted, none used"

@@ -134,7 +134,7 @@ QUERY_NS: Final = 1_000_000_000  # interval of version, parameter and latency re
 _FIRST_ID: Final = 100
 
 
-class Queries:
+class QuerySchedule:
     """What is asked of a device without anybody's wish.
 
     Parameters
@@ -176,7 +176,7 @@ class Answer:
     Attributes
     ----------
     ticket : int
-        What :meth:`Requests.add` returned.
+        What :meth:`CommandClient.add` returned.
     command : Command
     ok : bool
         Whether the device acknowledged it without objection.
@@ -201,7 +201,7 @@ class _Pending:
     tries_left: int
 
 
-class Requests:
+class CommandClient:
     """The commands that wait for their ACK; at most :data:`MAX_PENDING`, the oldest give way."""
 
     def __init__(self) -> None:

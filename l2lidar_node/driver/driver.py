@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.counters import Counters
-from l2lidar_node.driver.device import Answer, DeviceState, Queries, Requests, Watchdog
-from l2lidar_node.driver.orientation import GravityMonitor, Levelling
-from l2lidar_node.driver.reorder import Intake, Released
+from l2lidar_node.driver.device import Answer, CommandClient, DeviceState, QuerySchedule, Watchdog
+from l2lidar_node.driver.orientation import GravityAlignment, GravityMonitor
+from l2lidar_node.driver.reorder import Released, ReorderBuffer
 from l2lidar_node.driver.sweep import MAX_GAP_NS, SweepAssembler
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.commands import Command
@@ -74,15 +74,15 @@ class Driver:
         self.round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
         self._config = config
         self._framer = Framer()
-        self._intake = Intake(config.sweep.reorder_window)
-        self.counters.sequence = self._intake.counts
+        self._reorder_buffer = ReorderBuffer(config.sweep.reorder_window)
+        self.counters.sequence = self._reorder_buffer.counts
         self._clock = DeviceClock(config.clock)
-        self._levelling = Levelling(config.imu.roll_pitch_only)
+        self._gravity_alignment = GravityAlignment(config.imu.roll_pitch_only)
         self._assembler = SweepAssembler(config.sweep, self._level())
-        self._requests = Requests()
+        self._requests = CommandClient()
         self._watchdog = Watchdog(config.watchdog)
         self._outbox: list[Outgoing] = []
-        self._queries = Queries(config.clock.enable_latency_measure)
+        self._queries = QuerySchedule(config.clock.enable_latency_measure)
 
     @property
     def config(self) -> DriverConfig:
@@ -102,7 +102,7 @@ class Driver:
         counters = self.counters
         counters.datagrams += 1
         counters.octets += len(data)
-        events = [] if self._intake.is_flowing(arrival) else self.settle(arrival)
+        events = [] if self._reorder_buffer.is_flowing(arrival) else self.settle(arrival)
         for item in self._framer.feed(data):
             if isinstance(item, FrameError):
                 counters.faults[item.fault.value] += 1
@@ -137,7 +137,7 @@ class Driver:
         Packets that waited :data:`~l2lidar_node.driver.reorder.REORDER_NS` for an earlier one, and
         the sweep of a stream of points that paused for :data:`MAX_GAP_NS`.
         """
-        events = self._released(self._intake.settle(until))
+        events = self._released(self._reorder_buffer.settle(until))
         if self._has_stalled(until):
             events += self._finished(self._assembler.flush())
         return events
@@ -152,7 +152,7 @@ class Driver:
 
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would do anything."""
-        return self._intake.is_overdue(until) or self._has_stalled(until)
+        return self._reorder_buffer.is_overdue(until) or self._has_stalled(until)
 
     def outbox(self) -> list[Outgoing]:
         """Return the frames to send now, in order, once."""
@@ -178,14 +178,14 @@ class Driver:
             self._requests.add(command, at, tries=1)
         elif command.is_start:
             self._watchdog.started(at)
-            self._intake.forget()
+            self._reorder_buffer.forget()
         elif command.is_standby:
             self._watchdog.stopped(at)
             return self.flush()
         elif command.is_reset:
             self._watchdog.started(at)
             events = self.flush()
-            self._intake.forget()
+            self._reorder_buffer.forget()
             self._forget_device()
             return events
         return []
@@ -206,13 +206,13 @@ class Driver:
 
     def flush(self) -> list[Event]:
         """Return everything that is still being collected."""
-        events = self._released(self._intake.flush())
+        events = self._released(self._reorder_buffer.flush())
         return events + self._finished(self._assembler.flush())
 
     def configure(self, config: DriverConfig) -> None:
         """Use other live settings from the next packet on."""
         self._config = config
-        self._levelling.roll_pitch_only = config.imu.roll_pitch_only
+        self._gravity_alignment.roll_pitch_only = config.imu.roll_pitch_only
         self._assembler.configure(config.sweep, self._level())
         self._clock.configure(config.clock)
 
@@ -228,13 +228,13 @@ class Driver:
         """Return the seconds until points can be expected."""
         return self._watchdog.spin_up_left_s(now)
 
-    def _level(self) -> Levelling | None:
-        return self._levelling if self._config.imu.adjust else None
+    def _level(self) -> GravityAlignment | None:
+        return self._gravity_alignment if self._config.imu.adjust else None
 
     def _handle(self, packet: Packet, arrival: HostNs) -> list[Event]:
         if isinstance(packet, ImuPacket):
             self._watchdog.heard(_IMU, arrival)
-            if self._intake.follows(_IMU, packet, arrival):
+            if self._reorder_buffer.follows(_IMU, packet, arrival):
                 return self._imu(packet, arrival)
             return self._reordered(_IMU, packet, arrival)
         if isinstance(packet, PointPacket):
@@ -242,7 +242,7 @@ class Driver:
             if (packet.packet_type == _POINTS_3D) != self._config.sweep.frame3d:
                 self.counters.ignored_points += 1
                 return []
-            if self._intake.follows(_POINTS, packet, arrival):
+            if self._reorder_buffer.follows(_POINTS, packet, arrival):
                 return self._points(packet, arrival)
             return self._reordered(_POINTS, packet, arrival)
         if isinstance(packet, Ack):
@@ -261,10 +261,10 @@ class Driver:
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
     ) -> list[Event]:
         events: list[Event] = []
-        if self._intake.begins_anew(stream, packet, arrival):
-            events = self._released(self._intake.restart(stream))
+        if self._reorder_buffer.begins_anew(stream, packet, arrival):
+            events = self._released(self._reorder_buffer.restart(stream))
             self._forget_device()
-        return events + self._released(self._intake.push(stream, packet, arrival))
+        return events + self._released(self._reorder_buffer.push(stream, packet, arrival))
 
     def _released(self, released: Released) -> list[Event]:
         events: list[Event] = []
@@ -283,7 +283,7 @@ class Driver:
         sample = ImuSample(stamp, *packet[2:])
         self.counters.samples += 1
         self.last_imu = sample
-        self._levelling.add(sample)
+        self._gravity_alignment.add(sample)
         self.gravity.add(sample)
         return [sample]
 
@@ -325,7 +325,7 @@ class Driver:
         return [answer]
 
     def _has_stalled(self, until: HostNs) -> bool:
-        return self._assembler.is_collecting and self._intake.pause_ns(until) > MAX_GAP_NS
+        return self._assembler.is_collecting and self._reorder_buffer.pause_ns(until) > MAX_GAP_NS
 
     def _send_due(self, now: HostNs) -> list[Event]:
         due = [commands.sync_time(now)] if self._clock.sync_due(now) else []
@@ -341,6 +341,6 @@ class Driver:
 
     def _forget_device(self) -> None:
         """Ask again who the device is: it may have another version or work mode after a reboot."""
-        self._levelling.clear()
+        self._gravity_alignment.clear()
         self.version = None
         self.parameters = None

@@ -204,7 +204,7 @@ def _clock(
         "ratio": f"{status.ratio:.7f}",
         "offset [s]": f"{status.offset_ns / 1e9:.6f}",
         "residual [ms]": f"{status.residual_ns / 1e6:.3f}",
-        "lateness [ms]": f"{status.late_ns / 1e6:.3f}",
+        "latency [ms]": f"{status.late_ns / 1e6:.3f}",
         "path delay [ms]": f"{status.path_delay_ns / 1e6:.3f}",
         "epochs": str(status.epochs),
         "packets without stamp": str(sum(new.unlocked.values())),

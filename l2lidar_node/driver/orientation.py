@@ -24,7 +24,7 @@ _SAMPLE: Final = np.dtype([("stamp", "<i8"), ("wxyz", "<f8", (4,))])
 _PACKED: Final = struct.Struct("<q4d")  # the same
 
 
-class Levelling:
+class GravityAlignment:
     """Remembers the latest orientations and makes rotations of them.
 
     Its length is how many it remembers.

@@ -249,7 +249,7 @@ class _Lane:
     fallen: int = 0  # packets in a row whose stamps fell
 
 
-class Intake:
+class ReorderBuffer:
     """The packets of both streams on their way from arrival to use.
 
     Parameters

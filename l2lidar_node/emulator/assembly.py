@@ -10,8 +10,8 @@ from typing import Final
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.link.port import Port, SerialPort, UdpPort
 from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.ray_cast_worker import Studio
-from l2lidar_node.emulator.truth.packet_log import Ledger
+from l2lidar_node.emulator.ray_cast_worker import RayCastWorker
+from l2lidar_node.emulator.truth.packet_log import PacketLog
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.firmware import version_payload
 from l2lidar_node.emulator.unit.flash import Flash
@@ -84,7 +84,7 @@ def seen_from(config: DeviceConfig, physics: PhysicsConfig) -> PhysicsConfig:
 def unit(
     config: DeviceConfig,
     flash: Flash,
-    studio: Studio | None,
+    ray_cast_worker: RayCastWorker | None,
     *,
     power_on_ns: int,
     link: Link = Link.ETHERNET,
@@ -97,7 +97,7 @@ def unit(
     ----------
     config : DeviceConfig
     flash : Flash
-    studio : Studio or None
+    ray_cast_worker : RayCastWorker or None
         What measures; without one a pattern does.
     power_on_ns : int
         True instant of power-on.
@@ -108,18 +108,18 @@ def unit(
         Keep the whole truth in memory instead of the latest of it.
     """
     sources: dict[WorkMode, PointSource] = {
-        mode: studio.points(mode) if studio else _pattern(mode, empty)
+        mode: ray_cast_worker.points(mode) if ray_cast_worker else _pattern(mode, empty)
         for mode in map(WorkMode, range(int(VIEW) + 1))
     }
     return VirtualL2(
         config,
         sources.pop(WorkMode(0)),
-        studio.inertial() if studio else StillInertial(),
+        ray_cast_worker.inertial() if ray_cast_worker else StillInertial(),
         power_on_ns=power_on_ns,
         flash=flash,
         link=link,
         modes=sources,
-        ledger=Ledger(None if remember else _REMEMBERED),
+        packet_log=PacketLog(None if remember else _REMEMBERED),
     )
 
 

@@ -29,9 +29,9 @@ from l2lidar_node.emulator.config import (
 )
 from l2lidar_node.emulator.link.port import Port, PortError
 from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.ray_cast_worker import Studio, StudioError
+from l2lidar_node.emulator.ray_cast_worker import RayCastError, RayCastWorker
 from l2lidar_node.emulator.server import MAX_SPEED, Server
-from l2lidar_node.emulator.truth.results import write_ledger
+from l2lidar_node.emulator.truth.results import write_packet_log
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.flash import Flash
 from l2lidar_node.emulator.unit.inertial import ImuNoise
@@ -190,11 +190,11 @@ def end(device: VirtualL2, server: Server) -> Iterator[str]:
         f"{count} {PacketType(kind).name}" for kind, count in sorted(device.received.items())
     )
     yield f"sent in {seconds:.1f} s: {sent or 'nothing'}; heard: {heard or 'nothing'}"
-    late = server.lateness
+    late = server.latency
     if late.count:
         p50, p99 = late.quantile_ns(0.5) * 1e-6, late.quantile_ns(0.99) * 1e-6
-        yield f"lateness: p50 {p50:.2f} ms, p99 {p99:.2f} ms, max {late.max_ns * 1e-6:.2f} ms"
-    counts = device.ledger.counts
+        yield f"latency: p50 {p50:.2f} ms, p99 {p99:.2f} ms, max {late.max_ns * 1e-6:.2f} ms"
+    counts = device.packet_log.counts
     if counts:
         happened = ", ".join(f"{count} {fault.name}" for fault, count in counts.items())
         yield f"faults that happened: {happened}"
@@ -309,13 +309,15 @@ def emulate(
     with ExitStack() as stack:
         port = assembly.opened(stored, config, serial)
         stack.callback(port.close)
-        studio = None
+        ray_cast_worker = None
         if physics.world not in assembly.WORLDLESS:
-            studio = stack.enter_context(Studio(physics, truth if truth_points else None))
+            ray_cast_worker = stack.enter_context(
+                RayCastWorker(physics, truth if truth_points else None)
+            )
         device = assembly.unit(
             config,
             stored,
-            studio,
+            ray_cast_worker,
             power_on_ns=time.time_ns() + _LEAD_NS,
             link=Link.ETHERNET if serial is None else Link.SERIAL,
             empty=physics.world == "none",
@@ -332,7 +334,7 @@ def emulate(
             _say(*end(device, server))
             if truth is not None:
                 values = {**values_of(physics), **values_of(config), "speed": speed}
-                _write_truth(truth, device, studio, values)
+                _write_truth(truth, device, ray_cast_worker, values)
 
 
 def _pace(text: str) -> float:
@@ -361,13 +363,16 @@ def _make_folder(folder: Path) -> None:
 
 
 def _write_truth(
-    folder: Path, device: VirtualL2, studio: Studio | None, values: dict[str, Value]
+    folder: Path,
+    device: VirtualL2,
+    ray_cast_worker: RayCastWorker | None,
+    values: dict[str, Value],
 ) -> None:
     run = {"power_on_ns": device.power_on_ns, "settings": values}
-    write_ledger(folder, device.ledger, run)
-    if studio is not None:
+    write_packet_log(folder, device.packet_log, run)
+    if ray_cast_worker is not None:
         lasted_s = max(device.now_ns - device.power_on_ns, 0) * 1e-9
-        studio.write_trajectory(folder, lasted_s, device.power_on_ns)
+        ray_cast_worker.write_trajectory(folder, lasted_s, device.power_on_ns)
     _say(f"truth in {folder}")
 
 
@@ -406,7 +411,7 @@ def main() -> None:
         text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         typer.echo(f"l2lidar_emulator: {text}", err=True)
         sys.exit(1)
-    except (PortError, StudioError) as error:
+    except (PortError, RayCastError) as error:
         typer.echo(f"l2lidar_emulator: {error}", err=True)
         sys.exit(1)
     except ImportError as error:

@@ -31,11 +31,11 @@ Block = tuple[NDArray[np.void], NDArray[np.float64]]
 _Key = tuple[str | WorkMode, int, int]
 
 
-class StudioError(RuntimeError):
+class RayCastError(RuntimeError):
     """The measuring process was killed."""
 
 
-class Studio:
+class RayCastWorker:
     """A process that measures; its sources are those of a :class:`VirtualL2`.
 
     Parameters
@@ -63,7 +63,7 @@ class Studio:
             prepared.result()
         except BrokenProcessPool:  # open3d's readers crash on some damaged files
             self._end()
-            raise StudioError(
+            raise RayCastError(
                 f"world '{config.world}': the process that reads it crashed; a mesh file that is "
                 "damaged or cut off does that"
             ) from None
@@ -71,8 +71,8 @@ class Studio:
             self._end()
             raise
 
-    def __enter__(self) -> Studio:
-        """Return the studio itself."""
+    def __enter__(self) -> RayCastWorker:
+        """Return the ray-cast worker itself."""
         return self
 
     def __exit__(
@@ -96,13 +96,13 @@ class Studio:
                 worker.kill()
         self._pool.shutdown()
 
-    def points(self, mode: WorkMode) -> StudioScanner:
+    def points(self, mode: WorkMode) -> WorkerScanner:
         """Return the source of point packets in a work mode (field of view, 2D or 3D)."""
-        return StudioScanner(self._block, mode)
+        return WorkerScanner(self._block, mode)
 
-    def inertial(self) -> StudioInertial:
+    def inertial(self) -> WorkerInertial:
         """Return the source of IMU packets."""
-        return StudioInertial(self._block)
+        return WorkerInertial(self._block)
 
     def write_trajectory(self, folder: Path, duration_s: float, origin_ns: int) -> None:
         """Write the poses of the cloud frame in the world; see :mod:`results`."""
@@ -119,11 +119,11 @@ class Studio:
                     self._futures[key] = self._pool.submit(_measure, *key)
             return self._futures.pop(wanted[0]).result()
         except BrokenProcessPool:
-            raise StudioError("the measuring process has come to an end") from None
+            raise RayCastError("the measuring process has come to an end") from None
 
 
-class StudioScanner:
-    """Point packets from the studio; a PointSource."""
+class WorkerScanner:
+    """Point packets from the ray-cast worker; a PointSource."""
 
     def __init__(self, block: Callable[[str | WorkMode, int, int], Block], mode: WorkMode) -> None:
         self._block = block
@@ -134,8 +134,8 @@ class StudioScanner:
         return self._block(self._mode, first, count)
 
 
-class StudioInertial:
-    """IMU packets from the studio; an InertialSource."""
+class WorkerInertial:
+    """IMU packets from the ray-cast worker; an InertialSource."""
 
     def __init__(self, block: Callable[[str | WorkMode, int, int], Block]) -> None:
         self._block = block

@@ -17,7 +17,7 @@ _BIN_NS: Final = 10_000
 _BINS: Final = 10_000  # up to 100 ms
 
 
-class Lateness:
+class Latency:
     """Distribution of delays with a resolution of 10 us up to 100 ms, and the exact maximum."""
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Server:
 
     Attributes
     ----------
-    lateness : Lateness
+    latency : Latency
         How long after its instant each datagram was sent, at the unit's time scale.
     unsent : int
         Datagrams that the port could not take.
@@ -74,7 +74,7 @@ class Server:
         speed: float = 1.0,
         on_flash: Callable[[Flash], None] | None = None,
     ) -> None:
-        self.lateness = Lateness()
+        self.latency = Latency()
         self.unsent = 0
         self._device = device
         self._port = port
@@ -130,7 +130,7 @@ class Server:
             until_ns = min(now(), end_ns)
             for time_ns, data in self._device.advance(until_ns):
                 self.unsent += not self._port.send(data)
-                self.lateness.add(now() - time_ns)
+                self.latency.add(now() - time_ns)
             if is_spoken_to:  # what was due before goes out as it was, if late
                 self._listen(until_ns)
 

@@ -57,13 +57,13 @@ def _observe(
     topics = _found(node, asked, needs_imu)
     gathering = Gathering()
     ear = _Ear(node, topics, gathering)
-    levelling = _Levelling(node, topics.cloud)
+    gravity_alignment = _Levelling(node, topics.cloud)
     ear.listen(seconds)
     return (
         gathering.observation(
             cloud_qos=_offers(node, topics.cloud),
             imu_qos=_offers(node, topics.imu),
-            is_levelled=levelling.answer,
+            is_levelled=gravity_alignment.answer,
         ),
         topics,
     )

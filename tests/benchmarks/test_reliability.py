@@ -10,7 +10,7 @@ import pytest
 from benchmarks import fault_world, faults, interrupts, load_scale
 from benchmarks.fuzz_campaign import campaign
 from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.ray_cast_worker import Studio, StudioError
+from l2lidar_node.emulator.ray_cast_worker import RayCastError, RayCastWorker
 from tests.support.fault_runs import SINGLE, FaultCase, random_case, run
 
 SHORT = [
@@ -121,8 +121,8 @@ def test_a_mesh_that_crashes_its_reader_is_refused_with_a_sentence(tmp_path: Pat
         "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
         "0 0 0\n1 0 0\n0 1 0 1 2\n3 0 1 3\n"
     )
-    with pytest.raises((StudioError, ValueError), match=r"cut_off\.ply"):
-        Studio(PhysicsConfig(world=str(path)))
+    with pytest.raises((RayCastError, ValueError), match=r"cut_off\.ply"):
+        RayCastWorker(PhysicsConfig(world=str(path)))
 
 
 def test_every_packet_is_received_or_counted_as_dropped() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from l2lidar_node.emulator.motion.motion import from_tum
 from l2lidar_node.emulator.truth import results
-from l2lidar_node.emulator.truth.packet_log import Ledger
+from l2lidar_node.emulator.truth.packet_log import PacketLog
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.recording.bag import BagFile
 from l2lidar_proc.recording import map_file
@@ -79,7 +79,7 @@ WRITERS = [
     lambda folder: results.write_tum(
         folder / "t.tum", from_tum(_a_way(folder)), np.linspace(0.0, 1.0, 5)
     ),
-    lambda folder: results.write_ledger(folder, Ledger(), {}),
+    lambda folder: results.write_packet_log(folder, PacketLog(), {}),
 ]
 
 

@@ -160,14 +160,14 @@ def _device(case: Case, seed: int) -> VirtualL2:
 
 
 def _with_truth(clock: RecordingClock, device: VirtualL2) -> NDArray[np.void]:
-    """Join what the clock saw with the emulator's ledger; stamp and number name a packet."""
-    ledger = device.ledger.packets
+    """Join what the clock saw with the emulator's packet log; stamp and number name a packet."""
+    packet_log = device.packet_log.packets
     truth = {
         (int(row["type"]), int(row["seq"]), int(row["stamp_ns"])): (
             int(row["boot"]),
             int(row["start_ns"]),
         )
-        for row in ledger
+        for row in packet_log
     }
     notes = np.zeros(len(clock.notes), NOTE)
     for at, (kind, seq, stamp, arrival, duration, sync, answer) in enumerate(clock.notes):

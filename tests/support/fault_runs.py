@@ -60,7 +60,7 @@ class FaultCase(NamedTuple):
 
 @dataclass(slots=True)
 class Verdict:
-    """What the driver made of a run, judged by the emulator's ledger.
+    """What the driver made of a run, judged by the emulator's packet log.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Verdict:
 
 
 class _Placed(NamedTuple):
-    """A packet that the clock was asked about, with its row of the ledger."""
+    """A packet that the clock was asked about, with its row of the packet log."""
 
     row: int
     published: int  # [ns] true time line; 0 for none
@@ -183,8 +183,8 @@ def shift_ns(case: FaultCase, instant: int) -> int:
 
 
 def _placed(case: FaultCase, device: VirtualL2, clock: RecordingClock) -> list[_Placed]:
-    """Join what the clock was asked with the ledger; type, number, stamp and age name a packet."""
-    packets = device.ledger.packets
+    """Join the clock's queries with the packet log by type, number, stamp and age."""
+    packets = device.packet_log.packets
     rows: dict[tuple[int, int, int], list[int]] = {}
     for row, (kind, seq, stamp) in enumerate(packets[["type", "seq", "stamp_ns"]].tolist()):
         rows.setdefault((kind, seq, stamp), []).append(row)
@@ -206,7 +206,7 @@ def _placed(case: FaultCase, device: VirtualL2, clock: RecordingClock) -> list[_
 
 
 def _judge_packets(verdict: Verdict, device: VirtualL2, placed: list[_Placed]) -> None:
-    packets = device.ledger.packets
+    packets = device.packet_log.packets
     measured = np.isin(packets["type"], (102, 103, 104))
     published = np.zeros(len(packets), np.int64)
     asked = np.zeros(len(packets), bool)
@@ -253,7 +253,7 @@ def _judge_sweeps(
 ) -> None:
     """Compare every sweep with the points of the packets it must consist of, bit by bit."""
     kind = PacketType.POINTS_2D if case.flat else PacketType.POINTS_3D
-    packets = device.ledger.packets
+    packets = device.packet_log.packets
     rows = [row for row, answer, _ in placed if answer and packets["type"][row] == kind]
     payloads, _ = PatternScanner(flat=case.flat).packets(
         0, int(packets["index"].max(initial=0)) + 1

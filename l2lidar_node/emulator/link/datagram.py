@@ -16,7 +16,7 @@ class Piece(NamedTuple):
     Attributes
     ----------
     row : int
-        Row of the packet in the ledger, or :data:`JUNK`.
+        Row of the packet in the packet log, or :data:`JUNK`.
     start, stop : int
         Which bytes of the packet these are.
     size : int

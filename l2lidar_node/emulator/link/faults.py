@@ -11,7 +11,7 @@ import numpy as np
 
 from l2lidar_node.emulator.config import FaultConfig
 from l2lidar_node.emulator.link.datagram import JUNK, Datagram, Piece
-from l2lidar_node.emulator.truth.packet_log import Fault, Ledger
+from l2lidar_node.emulator.truth.packet_log import Fault, PacketLog
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 
@@ -155,7 +155,7 @@ class Dice:
     origin_ns : int
         True instant from which those times count.
     seed : int
-    ledger : Ledger
+    packet_log : PacketLog
         Where strikes are logged.
     """
 
@@ -166,7 +166,7 @@ class Dice:
         config: FaultConfig,
         origin_ns: int,
         seed: int,
-        ledger: Ledger,
+        packet_log: PacketLog,
     ) -> None:
         name = zlib.crc32((fault.name or "").encode())
         self._chance = np.random.default_rng([seed, name, 0])
@@ -175,7 +175,7 @@ class Dice:
         self._rate = rate
         self._from_ns = origin_ns + round(config.fault_from_s * _S)
         self._until_ns = origin_ns + round(config.fault_until_s * _S)
-        self._ledger = ledger
+        self._packet_log = packet_log
 
     def is_on(self, time_ns: int) -> bool:
         """Whether random faults may happen at a true instant."""
@@ -187,7 +187,7 @@ class Dice:
 
     def note(self, datagram: Datagram) -> None:
         """Log that the fault struck a datagram."""
-        self._ledger.note(datagram.time_ns, self._fault, datagram)
+        self._packet_log.note(datagram.time_ns, self._fault, datagram)
 
 
 def damage(dice: Dice, do: Damage) -> Stage:
@@ -357,14 +357,14 @@ def overtake(dice: Dice, late_ns: int) -> Stage:
     return stage
 
 
-def silence(ledger: Ledger, is_silent: Callable[[int], bool]) -> Stage:
+def silence(packet_log: PacketLog, is_silent: Callable[[int], bool]) -> Stage:
     """Return a stage that swallows everything while the cable is pulled."""
 
     def stage(datagrams: Sequence[Datagram], now_ns: int) -> list[Datagram]:
         out: list[Datagram] = []
         for datagram in datagrams:
             if is_silent(datagram.time_ns):
-                ledger.note(datagram.time_ns, Fault.SILENCE, datagram)
+                packet_log.note(datagram.time_ns, Fault.SILENCE, datagram)
             else:
                 out.append(datagram)
         return out
@@ -372,14 +372,14 @@ def silence(ledger: Ledger, is_silent: Callable[[int], bool]) -> Stage:
     return stage
 
 
-def stages(config: FaultConfig, origin_ns: int, seed: int, ledger: Ledger) -> list[Stage]:
+def stages(config: FaultConfig, origin_ns: int, seed: int, packet_log: PacketLog) -> list[Stage]:
     """Return the stages that a configuration asks for, in the order in which datagrams pass them.
 
     Damage comes before joining and cutting, loss after it, and whatever changes times last.
     """
 
     def dice(fault: Fault, rate: float = 1.0) -> Dice:
-        return Dice(fault, rate, config, origin_ns, seed, ledger)
+        return Dice(fault, rate, config, origin_ns, seed, packet_log)
 
     out: list[Stage] = []
     rates = {
@@ -400,7 +400,7 @@ def stages(config: FaultConfig, origin_ns: int, seed: int, ledger: Ledger) -> li
     if config.loss:
         out.append(lose(dice(Fault.LOSS, config.loss)))
     if config.silence_at:
-        out.append(silence(ledger, lambda time_ns: is_silent(config, time_ns - origin_ns)))
+        out.append(silence(packet_log, lambda time_ns: is_silent(config, time_ns - origin_ns)))
     if config.duplicate:
         out.append(duplicate(dice(Fault.DUPLICATE, config.duplicate)))
     if config.jitter != "none":
@@ -427,13 +427,13 @@ class Path:
     ----------
     stages : sequence of Stage
         Passed in this order.
-    ledger : Ledger
+    packet_log : PacketLog
         Learns what reaches the host.
     """
 
-    def __init__(self, stages: Sequence[Stage], ledger: Ledger) -> None:
+    def __init__(self, stages: Sequence[Stage], packet_log: PacketLog) -> None:
         self._stages = stages
-        self._ledger = ledger
+        self._packet_log = packet_log
         self._waiting: list[tuple[int, int, Datagram]] = []
         self._count = 0
 
@@ -458,5 +458,5 @@ class Path:
         out: list[Datagram] = []
         while self._waiting and self._waiting[0][0] <= now_ns:
             out.append(heapq.heappop(self._waiting)[2])
-        self._ledger.arrived(out)
+        self._packet_log.arrived(out)
         return out

@@ -65,7 +65,7 @@ class FaultEvent(NamedTuple):
     ordinal: int
 
 
-class Ledger:
+class PacketLog:
     """Books every packet when it leaves the unit and again when it reaches the host.
 
     A packet has arrived when its bytes reached the host undamaged, one after the other and with

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.motion.spline import rotation_matrices
-from l2lidar_node.emulator.truth.packet_log import Fault, FaultEvent, Ledger
+from l2lidar_node.emulator.truth.packet_log import Fault, FaultEvent, PacketLog
 from l2lidar_node.emulator.unit.scanner import Scan
 from l2lidar_node.files import write_whole
 from l2lidar_node.protocol.wire import WorkMode
@@ -91,7 +91,7 @@ class Results:
 
     Attributes
     ----------
-    packets : ndarray, shape (N,), dtype ledger.PACKET
+    packets : ndarray, shape (N,), dtype PACKET
         Every packet in the order of leaving.
     faults : list of FaultEvent
         In order.
@@ -157,14 +157,14 @@ class Results:
         return np.asarray(self._blocks[key][index - starts[block]])
 
 
-def write_ledger(folder: Path, ledger: Ledger, run: Mapping[str, object]) -> None:
+def write_packet_log(folder: Path, packet_log: PacketLog, run: Mapping[str, object]) -> None:
     """Write packets, faults and the facts of the run; each file is complete or absent."""
     folder.mkdir(parents=True, exist_ok=True)
-    _write_array(folder / _PACKETS, ledger.packets)
+    _write_array(folder / _PACKETS, packet_log.packets)
     text = io.StringIO(newline="")
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("time_ns", "fault", "type", "ordinal"))
-    table.writerows((e.time_ns, e.fault.name, e.packet_type, e.ordinal) for e in ledger.events)
+    table.writerows((e.time_ns, e.fault.name, e.packet_type, e.ordinal) for e in packet_log.events)
     write_whole(folder / _FAULTS, text.getvalue().encode())
     write_whole(folder / _RUN, (json.dumps(run, indent=2) + "\n").encode())
 

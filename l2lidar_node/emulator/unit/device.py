@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.link.datagram import Datagram
 from l2lidar_node.emulator.link.faults import Dice, Path, is_silent, stages
-from l2lidar_node.emulator.truth.packet_log import Fault, Ledger
+from l2lidar_node.emulator.truth.packet_log import Fault, PacketLog
 from l2lidar_node.emulator.unit.firmware import Firmware, Inbox, Received
 from l2lidar_node.emulator.unit.flash import Flash, Network
 from l2lidar_node.emulator.unit.stream import (
@@ -67,12 +67,12 @@ class VirtualL2:
         Where the host is plugged in.
     modes : mapping from WorkMode to PointSource, optional
         Sources for ``WIDE_FOV``, ``MODE_2D`` and both together; a plain pattern where left out.
-    ledger : Ledger, optional
+    packet_log : PacketLog, optional
         Where the truth is booked.
 
     Attributes
     ----------
-    ledger : Ledger
+    packet_log : PacketLog
     received : Counter
         Packets heard from the host by type.
     """
@@ -87,10 +87,10 @@ class VirtualL2:
         flash: Flash | None = None,
         link: Link = Link.ETHERNET,
         modes: Mapping[WorkMode, PointSource] | None = None,
-        ledger: Ledger | None = None,
+        packet_log: PacketLog | None = None,
     ) -> None:
         self.config = config
-        self.ledger = Ledger() if ledger is None else ledger
+        self.packet_log = PacketLog() if packet_log is None else packet_log
         self.received: Counter[int] = Counter()
         self._origin_ns = self._now_ns = power_on_ns
         self._firmware = Firmware(
@@ -99,7 +99,7 @@ class VirtualL2:
         self._link = link
         self._inbox = Inbox()
         self._path = Path(
-            stages(config.faults, power_on_ns, config.seed, self.ledger), self.ledger
+            stages(config.faults, power_on_ns, config.seed, self.packet_log), self.packet_log
         )
         self._deaf = Dice(
             Fault.COMMAND_LOSS,
@@ -107,12 +107,12 @@ class VirtualL2:
             config.faults,
             power_on_ns,
             config.seed,
-            self.ledger,
+            self.packet_log,
         )
         self._points = point_feeds(scanner, modes or {})
         self._imu = imu_feed(inertial)
         self._events = self._scheduled()
-        self._outbox = Outbox(self._firmware.clock, self.ledger)
+        self._outbox = Outbox(self._firmware.clock, self.packet_log)
         self._replies: list[Reply] = []
         self._streams: dict[str, MeasurementStream] = {}
         self._tuned: dict[str, tuple[Feed, int] | None] = {}
@@ -204,7 +204,7 @@ class VirtualL2:
         while self._events and self._events[0].time_ns <= now_ns:
             event = self._events.pop(0)
             self._produce(event.time_ns)
-            self.ledger.note(event.time_ns, event.fault)
+            self.packet_log.note(event.time_ns, event.fault)
             event.happen(event.time_ns)
             self._retune(event.time_ns)
         self._produce(now_ns)

@@ -18,7 +18,7 @@ from l2lidar_node.protocol.wire import AckStatus, Command, PacketType, UserComma
 from l2lidar_node.settings import SettingError
 
 
-class Readiness(Enum):
+class PowerState(Enum):
     """How far the unit has come since it booted."""
 
     DEAF = "deaf"  # no link yet
@@ -69,14 +69,14 @@ class Power:
         """Whether the motors stand still on request."""
         return self.points_from_ns is None
 
-    def readiness(self, now_ns: int) -> Readiness:
+    def power_state(self, now_ns: int) -> PowerState:
         """Return how far the unit has come at a true instant."""
         self._note(now_ns)
         if now_ns < self._link_ns:
-            return Readiness.DEAF
+            return PowerState.DEAF
         if now_ns < self._awake_ns:
-            return Readiness.BOOTING
-        return Readiness.SPINNING_UP if self._initialised_ns is None else Readiness.INITIALISED
+            return PowerState.BOOTING
+        return PowerState.SPINNING_UP if self._initialised_ns is None else PowerState.INITIALISED
 
     def _note(self, now_ns: int) -> None:
         if (
@@ -226,7 +226,7 @@ class Firmware:
         CRC_ERROR; an unknown type or command number, or a size that does not fit the type,
         HEADER_ERROR; a value that the command cannot take, BLOCK_ERROR.
         """
-        if self.power.readiness(now_ns) is Readiness.DEAF:
+        if self.power.power_state(now_ns) is PowerState.DEAF:
             return []
         packet_type, payload, status = received
         if status is not AckStatus.OK:
@@ -244,10 +244,10 @@ class Firmware:
             self.reboot(now_ns)
             return []
         if key in _VERSION:
-            readiness = self.power.readiness(now_ns)
-            if readiness is Readiness.BOOTING:
+            power_state = self.power.power_state(now_ns)
+            if power_state is PowerState.BOOTING:
                 return []
-            if readiness is Readiness.SPINNING_UP:
+            if power_state is PowerState.SPINNING_UP:
                 status = AckStatus.NOT_READY
             else:
                 data.append((PacketType.VERSION, self._identity))

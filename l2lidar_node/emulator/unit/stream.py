@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.emulator.link.datagram import Datagram, Piece
-from l2lidar_node.emulator.truth.packet_log import PACKET, Ledger
+from l2lidar_node.emulator.truth.packet_log import PACKET, PacketLog
 from l2lidar_node.emulator.unit.clock import UnitClock
 from l2lidar_node.emulator.unit.pattern import PatternScanner
 from l2lidar_node.protocol import wire
@@ -255,7 +255,7 @@ def _frames(packet_type: PacketType, payloads: NDArray[np.void]) -> NDArray[np.v
     return frames
 
 
-_Batch = tuple[NDArray[np.void], list[bytes]]  # rows of the ledger and their frames
+_Batch = tuple[NDArray[np.void], list[bytes]]  # rows of the packet log and their frames
 
 
 class Reply(NamedTuple):
@@ -273,7 +273,7 @@ class Outbox:
     ----------
     clock : UnitClock
         Makes the stamps.
-    ledger : Ledger
+    packet_log : PacketLog
         Learns of every packet.
 
     Attributes
@@ -282,9 +282,9 @@ class Outbox:
         Packets so far by type, over restarts.
     """
 
-    def __init__(self, clock: UnitClock, ledger: Ledger) -> None:
+    def __init__(self, clock: UnitClock, packet_log: PacketLog) -> None:
         self._clock = clock
-        self._ledger = ledger
+        self._packet_log = packet_log
         self._seq: Counter[PacketType] = Counter()
         self._boots = 0
         self.sent: Counter[PacketType] = Counter()
@@ -303,7 +303,7 @@ class Outbox:
         if not batches:
             return []
         packets, frames = batches[0] if len(batches) == 1 else _merged(batches)
-        first = self._ledger.book(packets)
+        first = self._packet_log.book(packets)
         times = packets["left_ns"].tolist()
         return [
             Datagram(time_ns, frame, (Piece(row, 0, len(frame), len(frame)),))

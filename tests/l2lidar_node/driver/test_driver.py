@@ -234,7 +234,7 @@ def test_an_empty_sweep_is_counted_and_not_published():
     assert run.driver.counters.empty_sweeps == run.driver.counters.sweeps == 1
 
 
-def test_levelling_turns_the_cloud(played, datagrams):
+def test_gravity_alignment_turns_the_cloud(played, datagrams):
     tilt = Rotation.from_euler("ZYX", [30, 20, -10], degrees=True)
     x, y, z, w = tilt.as_quat()
     tilted = build.capture(2.0, imu_fields={"quaternion_wxyz": np.array([w, x, y, z]) * 0.9983})
@@ -247,7 +247,7 @@ def test_levelling_turns_the_cloud(played, datagrams):
     assert run.driver.counters.unlevelled == 0
 
 
-def test_levelling_without_imu_publishes_nothing_and_says_so(datagrams):
+def test_gravity_alignment_without_imu_publishes_nothing_and_says_so(datagrams):
     run = Run(imu_adjust=True).play(item for item in datagrams if len(item.data) == 1044)
     assert run.of(Sweep) == []
     counters = run.driver.counters

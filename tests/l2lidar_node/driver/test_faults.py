@@ -1,4 +1,4 @@
-"""The whole driver against every fault of the virtual L2, whose ledger knows what arrived."""
+"""The whole driver against every fault of the virtual L2, whose packet log knows what arrived."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_the_loss_counted_is_the_loss(outcome, stream):
     types = (104,) if stream is Stream.IMU else (102, 103)
     numbers = [
         (int(row["stamp_ns"]), int(row["seq"]))
-        for row in outcome.device.ledger.packets
+        for row in outcome.device.packet_log.packets
         if row["type"] in types
     ]
     known = {(stamp, seq) for kind, seq, stamp in outcome.decoded if kind in types}

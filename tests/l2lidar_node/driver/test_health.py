@@ -185,7 +185,7 @@ def test_a_covered_sensor():
     assert message == "hardly any returns: is the sensor covered?"
 
 
-def test_levelling_without_imu():
+def test_gravity_alignment_without_imu():
     watched = streaming(keep=lambda item: not is_imu(item), imu_adjust=True)
     assert watched.verdict("points") == (
         Level.WARN, "imu_adjust drops points for want of IMU data",

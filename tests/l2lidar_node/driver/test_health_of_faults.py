@@ -108,6 +108,6 @@ def test_work_modes_that_do_not_fit(mode, level, message):
     assert message in check.message
 
 
-def test_levelling_without_imu():
+def test_gravity_alignment_without_imu():
     checks = judged(mode=WorkMode.IMU_OFF, settings={"imu_adjust": True})
     assert checks["points"].level is WARN

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2lidar_node.driver.geometry import PointBatch, Projector
-from l2lidar_node.driver.orientation import MAX_AGE_NS, Levelling
+from l2lidar_node.driver.orientation import MAX_AGE_NS, GravityAlignment
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import HostNs, ImuSample
 from tests.support import build
@@ -17,7 +17,7 @@ PERIOD = build.PERIOD_NS
 
 
 def measure(
-    level: Levelling | None, packets: int = 3, times_ns: list[int] | None = None, **fields
+    level: GravityAlignment | None, packets: int = 3, times_ns: list[int] | None = None, **fields
 ) -> PointBatch:
     """Return the points of some packets, levelled or as the sensor sees them."""
     starts = times_ns or [START + n * PERIOD for n in range(packets)]
@@ -34,8 +34,8 @@ def sample(stamp: int, rotation: Rotation) -> ImuSample:
     return ImuSample(HostNs(stamp), (w, x, y, z), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
 
 
-def levelling(*samples: ImuSample, roll_pitch_only: bool = False) -> Levelling:
-    result = Levelling(roll_pitch_only)
+def gravity_alignment(*samples: ImuSample, roll_pitch_only: bool = False) -> GravityAlignment:
+    result = GravityAlignment(roll_pitch_only)
     for item in samples:
         result.add(item)
     return result
@@ -58,7 +58,7 @@ ORIENTATIONS = [
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 def test_points_are_turned_from_the_sensor_into_the_world(orientation):
     points = measure(None).points
-    level = levelling(*(sample(START + n * PERIOD, orientation) for n in range(3)))
+    level = gravity_alignment(*(sample(START + n * PERIOD, orientation) for n in range(3)))
     turned = measure(level).points
     np.testing.assert_allclose(xyz(turned), orientation.apply(xyz(points)), atol=1e-6)
     for name in ("intensity", "range", "time"):
@@ -69,7 +69,7 @@ def test_points_are_turned_from_the_sensor_into_the_world(orientation):
 @pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (30, 0), (0, -40), (25, 170), (-60, 15)])
 def test_without_the_yaw_only_roll_and_pitch_are_left(yaw, pitch, roll):
     orientation = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
-    level = levelling(sample(START, orientation), roll_pitch_only=True)
+    level = gravity_alignment(sample(START, orientation), roll_pitch_only=True)
     expected = Rotation.from_euler("ZYX", [0, pitch, roll], degrees=True)
     np.testing.assert_allclose(
         xyz(measure(level).points), expected.apply(xyz(measure(None).points)), atol=1e-6
@@ -80,13 +80,17 @@ def test_without_the_yaw_only_roll_and_pitch_are_left(yaw, pitch, roll):
 def test_what_is_straight_up_in_the_world_is_on_the_z_axis(only):
     orientation = Rotation.from_euler("ZYX", [40, 25, -30], degrees=True)
     up_in_sensor = orientation.inv().apply([0.0, 0.0, 1.0])
-    (rotation,) = levelling(sample(START, orientation), roll_pitch_only=only)([HostNs(START)])
+    (rotation,) = gravity_alignment(sample(START, orientation), roll_pitch_only=only)(
+        [HostNs(START)]
+    )
     np.testing.assert_allclose(rotation @ up_in_sensor, [0, 0, 1], atol=1e-12)
 
 
 def test_every_packet_has_its_own_orientation():
     turns = [Rotation.from_euler("z", angle, degrees=True) for angle in (0, 20, 40)]
-    level = levelling(*(sample(START + n * PERIOD + 100, turn) for n, turn in enumerate(turns)))
+    level = gravity_alignment(
+        *(sample(START + n * PERIOD + 100, turn) for n, turn in enumerate(turns))
+    )
     points, turned = xyz(measure(None).points), xyz(measure(level).points)
     for index, turn in enumerate(turns):
         part = slice(300 * index, 300 * (index + 1))
@@ -97,14 +101,14 @@ def test_every_packet_has_its_own_orientation():
 def test_the_nearest_orientation_is_used(offset):
     tilted = Rotation.from_euler("x", 30, degrees=True)
     others = {-3_000_000: Rotation.identity(), 1_000_000: tilted, 5_000_000: Rotation.identity()}
-    level = levelling(*(sample(START + at, turn) for at, turn in others.items()))
+    level = gravity_alignment(*(sample(START + at, turn) for at, turn in others.items()))
     (rotation,) = level([HostNs(START + offset)])
     nearest = min(others, key=lambda at: abs(at - offset))
     np.testing.assert_allclose(rotation, others[nearest].as_matrix(), atol=1e-12)
 
 
 def test_without_imu_there_is_nothing_to_turn_by():
-    batch = measure(levelling(), 2)
+    batch = measure(gravity_alignment(), 2)
     assert len(batch.points) == 0
     assert batch.counts.tolist() == [0, 0]
     assert batch.left_out == 600
@@ -113,12 +117,12 @@ def test_without_imu_there_is_nothing_to_turn_by():
 @pytest.mark.parametrize(("age", "kept"), [(MAX_AGE_NS, True), (MAX_AGE_NS + 1, False)])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_an_orientation_may_be_so_old_and_no_older(age, sign, kept):
-    level = levelling(sample(START + sign * age, Rotation.identity()))
+    level = gravity_alignment(sample(START + sign * age, Rotation.identity()))
     assert (len(measure(level, 1).points) == 300) is kept
 
 
 def test_packets_without_orientation_are_left_out_and_times_begin_at_the_first_kept():
-    level = levelling(sample(START + 185_000_000, Rotation.identity()))
+    level = gravity_alignment(sample(START + 185_000_000, Rotation.identity()))
     times = [START, START + 100_000_000, START + 200_000_000]
     batch = measure(level, times_ns=times, ranges=[2000, 0] * 150)
     assert batch.counts.tolist() == [0, 0, 150]
@@ -130,7 +134,7 @@ def test_packets_without_orientation_are_left_out_and_times_begin_at_the_first_k
 
 
 def test_old_samples_are_forgotten_and_clear_forgets_all():
-    level = levelling(
+    level = gravity_alignment(
         *(sample(START - n * 4_000_000, Rotation.identity()) for n in range(100, 0, -1))
     )
     level([HostNs(START)])
@@ -140,7 +144,7 @@ def test_old_samples_are_forgotten_and_clear_forgets_all():
 
 
 def test_memory_is_bounded_while_nobody_asks():
-    level = Levelling(False)
+    level = GravityAlignment(False)
     item = sample(START, Rotation.identity())
     for number in range(40_000):
         level.add(item._replace(stamp=HostNs(START + number * 4_000_000)))

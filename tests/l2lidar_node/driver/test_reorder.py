@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2lidar_node.driver.reorder import REORDER_NS, Intake, Released
+from l2lidar_node.driver.reorder import REORDER_NS, Released, ReorderBuffer
 from l2lidar_node.protocol.framing import Frame
 from l2lidar_node.protocol.packets import ImuPacket, PointPacket, decode
 from l2lidar_node.protocol.wire import PacketType
@@ -23,7 +23,7 @@ class Arriving:
     """An intake that IMU packets arrive at, 4 ms apart, the device's clock running with them."""
 
     def __init__(self, uptime_s: float = 10.0):
-        self.intake = Intake(8)
+        self.reorder_buffer = ReorderBuffer(8)
         self.clock_ns = round(uptime_s * S)  # what the device's clock shows for number 0
         self.now = build.EPOCH_NS
         self.restarts = 0
@@ -37,13 +37,13 @@ class Arriving:
     def take(self, packet: ImuPacket, by_the_long_way: bool = False) -> list[int]:
         """Return the numbers a packet releases."""
         self.now += PERIOD
-        if not by_the_long_way and self.intake.follows(IMU, packet, HostNs(self.now)):
+        if not by_the_long_way and self.reorder_buffer.follows(IMU, packet, HostNs(self.now)):
             return [packet.seq]
         released: Released = []
-        if self.intake.begins_anew(IMU, packet, HostNs(self.now)):
+        if self.reorder_buffer.begins_anew(IMU, packet, HostNs(self.now)):
             self.restarts += 1
-            released += self.intake.restart(IMU)
-        released += self.intake.push(IMU, packet, HostNs(self.now))
+            released += self.reorder_buffer.restart(IMU)
+        released += self.reorder_buffer.push(IMU, packet, HostNs(self.now))
         return [timed.packet.seq for _, timed in released]
 
     def run(self, *numbers: int) -> list[int]:
@@ -51,7 +51,7 @@ class Arriving:
 
     @property
     def counts(self):
-        return self.intake.counts[IMU]
+        return self.reorder_buffer.counts[IMU]
 
 
 def points(seq: int) -> PointPacket:
@@ -65,7 +65,7 @@ def test_packets_keep_their_own_arrival():
     arriving.run(0)
     waited = arriving.now + PERIOD
     assert arriving.run(2) == []
-    released = arriving.intake.push(IMU, arriving.packet(1), HostNs(arriving.now + PERIOD))
+    released = arriving.reorder_buffer.push(IMU, arriving.packet(1), HostNs(arriving.now + PERIOD))
     assert [(missing, timed.packet.seq) for missing, timed in released] == [(0, 1), (0, 2)]
     assert [timed.arrival for _, timed in released] == [waited + PERIOD, waited]
 
@@ -74,8 +74,8 @@ def test_streams_do_not_disturb_each_other():
     arriving = Arriving()
     assert arriving.run(7) == [7]
     other = points(500)
-    assert not arriving.intake.begins_anew(Stream.POINTS, other, HostNs(arriving.now))
-    assert len(arriving.intake.push(Stream.POINTS, other, HostNs(arriving.now))) == 1
+    assert not arriving.reorder_buffer.begins_anew(Stream.POINTS, other, HostNs(arriving.now))
+    assert len(arriving.reorder_buffer.push(Stream.POINTS, other, HostNs(arriving.now))) == 1
     assert arriving.run(8) == [8]
 
 
@@ -83,37 +83,37 @@ def test_what_waits_is_overdue_after_so_long():
     arriving = Arriving()
     arriving.run(0, 2, 4)
     first, second = (HostNs(arriving.now - PERIOD + REORDER_NS + after) for after in (0, PERIOD))
-    assert not arriving.intake.is_overdue(first)
-    assert arriving.intake.settle(first) == []
-    assert arriving.intake.is_overdue(HostNs(first + 1))
-    (released,) = arriving.intake.settle(HostNs(first + 1))
+    assert not arriving.reorder_buffer.is_overdue(first)
+    assert arriving.reorder_buffer.settle(first) == []
+    assert arriving.reorder_buffer.is_overdue(HostNs(first + 1))
+    (released,) = arriving.reorder_buffer.settle(HostNs(first + 1))
     assert released[1].packet.seq == 2
-    assert arriving.intake.settle(second) == []
-    assert len(arriving.intake.settle(HostNs(second + 1))) == 1
-    assert not arriving.intake.is_overdue(HostNs(second + S))
+    assert arriving.reorder_buffer.settle(second) == []
+    assert len(arriving.reorder_buffer.settle(HostNs(second + 1))) == 1
+    assert not arriving.reorder_buffer.is_overdue(HostNs(second + S))
 
 
 def test_a_pause_is_one_of_the_points():
     arriving = Arriving()
     arriving.run(0)
-    assert arriving.intake.pause_ns(HostNs(arriving.now + 5)) == 0
-    arriving.intake.push(Stream.POINTS, points(500), HostNs(arriving.now + 2))
+    assert arriving.reorder_buffer.pause_ns(HostNs(arriving.now + 5)) == 0
+    arriving.reorder_buffer.push(Stream.POINTS, points(500), HostNs(arriving.now + 2))
     arriving.run(1)
-    assert arriving.intake.pause_ns(HostNs(arriving.now + 5)) == 3 + PERIOD
+    assert arriving.reorder_buffer.pause_ns(HostNs(arriving.now + 5)) == 3 + PERIOD
 
 
 def test_nothing_can_be_overdue_while_it_flows():
     arriving = Arriving()
-    intake = arriving.intake
-    assert not intake.is_flowing(HostNs(arriving.now))
-    intake.push(Stream.POINTS, points(500), HostNs(arriving.now))
+    reorder_buffer = arriving.reorder_buffer
+    assert not reorder_buffer.is_flowing(HostNs(arriving.now))
+    reorder_buffer.push(Stream.POINTS, points(500), HostNs(arriving.now))
     arriving.run(0, 1)
-    assert intake.is_flowing(HostNs(arriving.now))
-    assert not intake.is_flowing(HostNs(arriving.now + REORDER_NS))
+    assert reorder_buffer.is_flowing(HostNs(arriving.now))
+    assert not reorder_buffer.is_flowing(HostNs(arriving.now + REORDER_NS))
     arriving.run(3)
-    assert not intake.is_flowing(HostNs(arriving.now))
+    assert not reorder_buffer.is_flowing(HostNs(arriving.now))
     arriving.run(2)
-    assert intake.is_flowing(HostNs(arriving.now))
+    assert reorder_buffer.is_flowing(HostNs(arriving.now))
 
 
 @given(
@@ -211,7 +211,7 @@ def test_after_a_silence_numbers_go_on_where_they_are():
 def test_what_is_forgotten_is_not_missed():
     arriving = Arriving()
     arriving.run(*range(100))
-    arriving.intake.forget()
+    arriving.reorder_buffer.forget()
     assert arriving.run(600, 601) == [600, 601]
     assert arriving.counts.lost == 0
 
@@ -219,5 +219,5 @@ def test_what_is_forgotten_is_not_missed():
 def test_flush_releases_what_waits():
     arriving = Arriving()
     arriving.run(0, 2, 5)
-    assert [timed.packet.seq for _, timed in arriving.intake.flush()] == [2, 5]
-    assert arriving.intake.flush() == []
+    assert [timed.packet.seq for _, timed in arriving.reorder_buffer.flush()] == [2, 5]
+    assert arriving.reorder_buffer.flush() == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from l2lidar_node.driver.device import MAX_PENDING, REPEAT_NS, TRIES, Requests
+from l2lidar_node.driver.device import MAX_PENDING, REPEAT_NS, TRIES, CommandClient
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.commands import Command
 from l2lidar_node.protocol.packets import Ack
@@ -25,7 +25,7 @@ def echo(command: Command, status: int = AckStatus.OK) -> Ack:
 
 
 def test_an_ack_answers_with_the_ticket_and_the_round_trip():
-    requests = Requests()
+    requests = CommandClient()
     ticket = requests.add(commands.start(), NOW)
     answer = requests.answer(echo(commands.start()), after(700_000))
     assert answer is not None
@@ -44,7 +44,7 @@ def test_an_ack_answers_with_the_ticket_and_the_round_trip():
     ],
 )
 def test_a_refusal_says_why(status, text):
-    requests = Requests()
+    requests = CommandClient()
     requests.add(commands.start(), NOW)
     answer = requests.answer(echo(commands.start(), status), after(1))
     assert answer is not None
@@ -53,14 +53,14 @@ def test_a_refusal_says_why(status, text):
 
 
 def test_an_ack_of_something_else_answers_nothing():
-    requests = Requests()
+    requests = CommandClient()
     requests.add(commands.start(), NOW)
     assert requests.answer(Ack(wire.PacketType.TIME_SYNC, 0, 0, 1), NOW) is None
     assert requests.expire(NOW) == ([], [])
 
 
 def test_an_unanswered_command_is_repeated_and_then_given_up():
-    requests = Requests()
+    requests = CommandClient()
     ticket = requests.add(commands.start(), NOW)
     assert requests.expire(after(REPEAT_NS - 1)) == ([], [])
     for number in range(1, TRIES):
@@ -74,7 +74,7 @@ def test_an_unanswered_command_is_repeated_and_then_given_up():
 
 
 def test_the_round_trip_counts_from_the_last_repeat():
-    requests = Requests()
+    requests = CommandClient()
     requests.add(commands.start(), NOW)
     requests.expire(after(REPEAT_NS))
     answer = requests.answer(echo(commands.start()), after(REPEAT_NS + 5))
@@ -84,7 +84,7 @@ def test_the_round_trip_counts_from_the_last_repeat():
 
 def test_a_later_command_of_the_kind_stops_the_repeats_of_the_earlier_one():
     """Otherwise a start that nobody acknowledged would undo the stop that followed."""
-    requests = Requests()
+    requests = CommandClient()
     first = requests.add(commands.start(), NOW)
     second = requests.add(commands.standby(), after(10))
     repeats, answers = requests.expire(after(REPEAT_NS + 10))
@@ -96,7 +96,7 @@ def test_a_later_command_of_the_kind_stops_the_repeats_of_the_earlier_one():
 
 
 def test_an_exact_echo_is_preferred_to_the_oldest():
-    requests = Requests()
+    requests = CommandClient()
     first = requests.add(commands.start(), NOW)
     second = requests.add(commands.standby(), NOW)
     tickets = []
@@ -108,7 +108,7 @@ def test_an_exact_echo_is_preferred_to_the_oldest():
 
 
 def test_an_echo_with_a_wrong_value_answers_the_oldest():
-    requests = Requests()
+    requests = CommandClient()
     first = requests.add(commands.start(), NOW)
     requests.add(commands.standby(), NOW)
     answer = requests.answer(Ack(wire.PacketType.USER_COMMAND, UserCommand.STANDBY, 99, 1), NOW)
@@ -117,7 +117,7 @@ def test_an_echo_with_a_wrong_value_answers_the_oldest():
 
 
 def test_a_single_try_is_not_repeated():
-    requests = Requests()
+    requests = CommandClient()
     requests.add(commands.latency(101), NOW, tries=1)
     repeats, (answer,) = requests.expire(after(REPEAT_NS))
     assert repeats == []
@@ -125,14 +125,14 @@ def test_a_single_try_is_not_repeated():
 
 
 def test_a_host_clock_set_back_does_not_freeze_a_command():
-    requests = Requests()
+    requests = CommandClient()
     requests.add(commands.start(), NOW)
     assert requests.expire(after(-3_600_000_000_000)) == ([commands.start()], [])
 
 
 @pytest.mark.parametrize("count", [1, 31, 40, 60, 63, 64])
 def test_so_many_may_wait_at_once(count):
-    requests = Requests()
+    requests = CommandClient()
     tickets = [requests.add(commands.latency(number), NOW) for number in range(count)]
     for number, ticket in enumerate(tickets):
         answer = requests.answer(echo(commands.latency(number)), NOW)
@@ -141,7 +141,7 @@ def test_so_many_may_wait_at_once(count):
 
 
 def test_too_many_are_given_up_oldest_first_and_said_so():
-    requests = Requests()
+    requests = CommandClient()
     tickets = [requests.add(commands.latency(n), NOW) for n in range(MAX_PENDING + 3)]
     repeats, answers = requests.expire(after(1))
     assert repeats == []

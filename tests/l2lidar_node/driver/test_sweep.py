@@ -309,7 +309,7 @@ def test_a_sweep_without_points_is_a_sweep():
     assert sweep.start == START
 
 
-def test_levelling_sees_every_packets_start_and_turns_its_points():
+def test_gravity_alignment_sees_every_packets_start_and_turns_its_points():
     seen: list[list[int]] = []
 
     def level(starts: list[HostNs]) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from l2lidar_node.emulator.config import DeviceConfig, PowerConfig
-from l2lidar_node.emulator.truth.packet_log import Ledger
+from l2lidar_node.emulator.truth.packet_log import PacketLog
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.flash import Flash
 from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
@@ -85,9 +85,9 @@ def identities(datagrams: Iterable[tuple[int, bytes]]) -> Counter[tuple[int, int
 
 
 def booked(device: VirtualL2) -> Counter[tuple[int, int, int]]:
-    """Return how often the ledger says which packet arrived."""
+    """Return how often the packet log says which packet arrived."""
     counts: Counter[tuple[int, int, int]] = Counter()
-    for row in device.ledger.packets:
+    for row in device.packet_log.packets:
         if row["copies"]:
             counts[(int(row["type"]), int(row["seq"]), int(row["stamp_ns"]))] += int(row["copies"])
     return counts
@@ -112,7 +112,7 @@ class Bench:
         flash: Flash | None = None,
         link: Link = Link.ETHERNET,
         power_on_ns: int = 0,
-        ledger: Ledger | None = None,
+        packet_log: PacketLog | None = None,
         **groups: object,
     ) -> None:
         config = dataclasses.replace(config or DeviceConfig(power=READY), **groups)
@@ -123,7 +123,7 @@ class Bench:
             flash=flash,
             link=link,
             power_on_ns=power_on_ns,
-            ledger=ledger,
+            packet_log=packet_log,
         )
         self.now = power_on_ns
         self.log: list[tuple[int, bytes]] = []

@@ -107,7 +107,7 @@ def test_a_bounded_run_says_what_it_is_and_what_it_did(host):
     assert lines[2] == "faults: loss 0.1"
     assert "POINTS_3D" in lines[3]
     assert "heard: nothing" in lines[3]
-    assert lines[4].startswith("lateness: p50 ")
+    assert lines[4].startswith("latency: p50 ")
     assert lines[5].startswith("faults that happened: ")
     assert read(host.recv(2000))[0].packet_type == wire.PacketType.IMU
 
@@ -282,7 +282,7 @@ def test_a_pseudo_terminal_is_named_and_carries_packets():
 
 @needs_rays
 def test_the_truth_of_a_run(host, tmp_path):
-    """What arrives at the socket, the ledger, the trajectory and the exact points agree."""
+    """What arrives at the socket, the packet log, the trajectory and the exact points agree."""
     folder = tmp_path / "truth"
     process = started(
         "--world", "box", "--motion", "spin", "--rest-s", "0.2", "--ready", "--lidar-port", "0",

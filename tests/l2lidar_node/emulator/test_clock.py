@@ -89,7 +89,7 @@ def test_stamps_on_the_wire_are_the_clock_at_the_true_instant():
     datagrams = bench.run(20.0)
     wire_stamps = {identity(read(data)[0]) for _, data in datagrams}
     clock = UnitClock(bench.device.config.crystal, 1_700_000_000 * S + 123)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     expected = clock.stamps(packets["start_ns"])
     assert (packets["stamp_ns"] == expected).all()
     assert wire_stamps == {
@@ -100,7 +100,7 @@ def test_stamps_on_the_wire_are_the_clock_at_the_true_instant():
 def test_points_and_imu_share_the_clock():
     bench = Bench()
     bench.run(30.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     slopes = [
         np.polyfit(rows["start_ns"].astype(float), rows["stamp_ns"].astype(float), 1)[0]
         for rows in (packets[packets["type"] == 102], packets[packets["type"] == 104])
@@ -114,7 +114,7 @@ def test_a_sync_takes_effect_when_it_arrives_and_not_on_what_is_measured_already
     value = 1_800_000_000 * S + 999_999_999
     bench.device.command(command(106, *divmod(value, S)), bench.now)
     bench.run(1.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     measured = packets[packets["type"] != 101]
     before = measured["start_ns"] < 9.998 * S
     late = before & (measured["left_ns"] > 9.998 * S)
@@ -131,7 +131,7 @@ def test_repeated_syncs_step_by_half_of_what_passed_between():
         bench.run(0.05)
         bench.device.command(command(106, *divmod(bench.now, S)), bench.now)
     bench.run(0.05)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     measured = packets[(packets["type"] == 104) & (packets["start_ns"] > 1_800_000_001 * S)]
     behind = measured["start_ns"] - measured["stamp_ns"]
     assert behind.min() >= 0
@@ -143,7 +143,7 @@ def test_the_clock_restarts_at_0_at_every_boot_and_drift_goes_on():
     crystal = CrystalConfig(clock_ratio=1.0, clock_drift_ppm_per_h=36_000.0)
     bench = Bench(DeviceConfig(power=PowerConfig(boot_scale=0.0), faults=faults, crystal=crystal))
     bench.run(21.0)
-    packets = bench.device.ledger.of_type(104)
+    packets = bench.device.packet_log.of_type(104)
     for boot in range(3):
         rows = packets[packets["boot"] == boot]
         assert rows["seq"][0] == 0
@@ -160,14 +160,14 @@ def test_clock_step_and_foreign_sync():
     origin = 1_800_000_000 * S
     bench = Bench(DeviceConfig(power=READY, faults=faults), power_on_ns=origin)
     bench.run(5.0)
-    rows = bench.device.ledger.of_type(104)
+    rows = bench.device.packet_log.of_type(104)
     t = (rows["start_ns"] - origin) / S
     stepped = rows["stamp_ns"] - np.floor(t * S / 1.99866)
     assert np.abs(stepped[t < 2.0]).max() <= 1
     assert np.abs(stepped[(t >= 2.0) & (t < 4.0)] + 50 * MS).max() <= 1
     foreign = rows[t >= 4.0][0]
     assert foreign["stamp_ns"] == origin + 4 * S + 5 * S
-    assert [event.fault.name for event in bench.device.ledger.events] == [
+    assert [event.fault.name for event in bench.device.packet_log.events] == [
         "CLOCK_STEP",
         "FOREIGN_SYNC",
     ]

@@ -161,7 +161,7 @@ def test_parameters_can_be_replaced_and_reset():
 def test_power_on_timeline():
     bench = Bench(DeviceConfig(), power_on_ns=7 * S)
     bench.run(30.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     imu, points = packets[packets["type"] == 104], packets[packets["type"] == 102]
     assert imu["start_ns"][0] == 7 * S + 4 * S
     assert 0 <= points["start_ns"][0] - (7 + 25) * S < 4_639_000
@@ -171,7 +171,7 @@ def test_power_on_timeline():
 def test_the_timeline_can_be_compressed(scale):
     bench = Bench(DeviceConfig(power=PowerConfig(boot_scale=scale)))
     bench.run(3.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     assert packets["start_ns"][packets["type"] == 104][0] == round(4 * scale * S)
     assert 0 <= packets["start_ns"][packets["type"] == 102][0] - 25 * scale * S < 4_639_000
 
@@ -182,14 +182,14 @@ def test_rates_and_sequence_numbers():
     assert count[104] == 60 * 250
     assert count[102] == int((60 - 0.00246) / 0.004639) + 1
     for packet_type in (102, 104):
-        seq = bench.device.ledger.of_type(packet_type)["seq"]
+        seq = bench.device.packet_log.of_type(packet_type)["seq"]
         assert (seq == np.arange(len(seq)) % 1025).all()
 
 
 def test_a_points_packet_is_stamped_at_its_first_slot_and_leaves_after_its_last():
     bench = Bench(delays=DelayConfig(points_delay_us=200.0, imu_delay_us=100.0))
     times = {identity(read(data)[0]): time for time, data in bench.run(1.0)}
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     assert len(times) == len(packets)
     for row in packets:
         key = int(row["type"]), int(row["seq"]), int(row["stamp_ns"])
@@ -221,7 +221,7 @@ def test_standby_stops_both_streams_and_start_brings_the_imu_back_first():
     began = bench.now
     assert acks(bench.ask(client("start"))) == [(100, 2, 0, OK)]
     bench.run(20.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     new = packets[packets["start_ns"] > began]
     imu, points = new[new["type"] == 104], new[new["type"] == 102]
     assert 0 <= imu["start_ns"][0] - (began + S) < 4_000_000
@@ -257,7 +257,7 @@ def test_reset_is_a_reboot():
     assert bench.ask(client("reset")) == []
     began = bench.now - MS
     bench.run(10.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     new = packets[packets["boot"] == 1]
     assert (packets["boot"][packets["start_ns"] < began] == 0).all()
     first = new[0]
@@ -410,7 +410,7 @@ def test_it_does_not_matter_how_often_one_looks():
     while (due := fine.device.next_ns) is not None and due <= whole.now:
         fine.log += fine.device.advance(due)
     assert fine.log == whole.log
-    assert (fine.device.ledger.packets == whole.device.ledger.packets).all()
+    assert (fine.device.packet_log.packets == whole.device.packet_log.packets).all()
 
 
 def test_next_is_when_the_next_datagram_leaves():

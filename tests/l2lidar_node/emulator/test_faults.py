@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig
 from l2lidar_node.emulator.link.datagram import Datagram, Piece
 from l2lidar_node.emulator.link.faults import HOSTILE_SIZES, Path
-from l2lidar_node.emulator.truth.packet_log import Fault, Ledger
+from l2lidar_node.emulator.truth.packet_log import Fault, PacketLog
 from l2lidar_node.emulator.unit.flash import Flash
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
@@ -53,19 +53,19 @@ def bench_with(seed: int = 3, mode: WorkMode = PLAIN, **faults: object) -> Bench
 
 
 def struck(bench: Bench, fault: Fault) -> np.ndarray:
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     return packets[(packets["faults"] & int(fault)) != 0]
 
 
 def test_without_faults_every_packet_is_its_own_datagram_in_time():
     bench = bench_with()
     datagrams = bench.run(5.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     assert len(datagrams) == len(packets)
     assert [time for time, _ in datagrams] == packets["left_ns"].tolist()
     assert (packets["copies"] == 1).all()
     assert (packets["arrived_ns"] == packets["left_ns"]).all()
-    assert bench.device.ledger.events == ()
+    assert bench.device.packet_log.events == ()
 
 
 def test_a_rate_of_zero_is_byte_identical_to_no_fault():
@@ -75,12 +75,12 @@ def test_a_rate_of_zero_is_byte_identical_to_no_fault():
 
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("mode", [PLAIN, WorkMode.MODE_2D])
-def test_the_ledger_knows_what_a_good_reader_gets(name, mode):
+def test_the_packet_log_knows_what_a_good_reader_gets(name, mode):
     bench = bench_with(mode=mode, **EVERY[name])
     datagrams = bench.run(6.0)
     assert identities(datagrams) == booked(bench.device)
-    packets = bench.device.ledger.packets
-    assert {event.fault.name.lower() for event in bench.device.ledger.events} <= {name}
+    packets = bench.device.packet_log.packets
+    assert {event.fault.name.lower() for event in bench.device.packet_log.events} <= {name}
     if name in DESTRUCTIVE:
         lost = packets["copies"] == 0
         assert lost.any()
@@ -105,7 +105,7 @@ def test_the_ledger_knows_what_a_good_reader_gets(name, mode):
     st.sampled_from([PLAIN, WorkMode.MODE_2D]),
     st.integers(0, 1000),
 )
-def test_the_ledger_is_right_for_any_mixture(rates, timed, mode, seed):
+def test_the_packet_log_is_right_for_any_mixture(rates, timed, mode, seed):
     bench = bench_with(seed, mode, **rates, **timed, burst_every_s=0.1)
     bench.run(0.4)
     bench.ask(command(100, 4, 9))
@@ -147,16 +147,16 @@ def test_one_fault_strikes_alike_with_and_without_another():
 def test_the_rate_is_met(name):
     bench = bench_with(**{name: 0.1})
     bench.run(20.0)
-    count = bench.device.ledger.counts[Fault[name.upper()]]
-    of = len(bench.device.ledger.of_type(102)) if name == "hostile_count" else None
-    of = of or len(bench.device.ledger.packets)
+    count = bench.device.packet_log.counts[Fault[name.upper()]]
+    of = len(bench.device.packet_log.of_type(102)) if name == "hostile_count" else None
+    of = of or len(bench.device.packet_log.packets)
     assert 0.08 < count / of < 0.12
 
 
 def test_random_faults_keep_to_their_window():
     bench = bench_with(loss=0.5, nan=0.5, reorder=0.5, fault_from_s=1.0, fault_until_s=2.0)
     bench.run(3.0)
-    times = np.array([event.time_ns for event in bench.device.ledger.events]) / S
+    times = np.array([event.time_ns for event in bench.device.packet_log.events]) / S
     assert len(times) > 100
     assert times.min() >= 1.0
     assert times.max() < 2.0
@@ -203,7 +203,7 @@ def test_hostile_counts_have_a_right_crc(mode, room):
 def test_nan_has_a_right_crc_and_reaches_every_vital_float():
     bench = bench_with(nan=0.9)
     frames = read(b"".join(data for _, data in bench.run(10.0)))
-    assert len(frames) == len(bench.device.ledger.packets)
+    assert len(frames) == len(bench.device.packet_log.packets)
     ill = [frame for frame in frames if not is_sane(frame)]
     assert 0.87 < len(ill) / len(frames) < 0.93
     reached = set()
@@ -234,7 +234,7 @@ def test_coalescing_fills_datagrams_up_to_the_limit():
     sizes = {len(data) for _, data in datagrams}
     assert {160, 1124, 1044, 80} <= sizes
     assert max(sizes) <= 1472
-    assert len(datagrams) < 0.7 * len(bench.device.ledger.packets)
+    assert len(datagrams) < 0.7 * len(bench.device.packet_log.packets)
     plain = bench_with().run(5.0)
     joined = b"".join(data for _, data in datagrams)
     assert b"".join(data for _, data in plain).startswith(joined)
@@ -245,7 +245,7 @@ def test_nothing_waits_for_company_for_ever():
     bench.run(1.0)
     bench.ask(command(100, 2, 1))
     bench.run(1.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     assert (packets["copies"] == 1).all()
 
 
@@ -265,7 +265,7 @@ def test_duplicates_come_twice_with_nothing_between():
 def test_a_reordered_packet_is_late_and_the_others_are_not():
     bench = bench_with(reorder=0.05, reorder_ms=10.0)
     bench.run(10.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     late = packets["arrived_ns"] - packets["left_ns"]
     hit = (packets["faults"] != 0) & (packets["copies"] > 0)
     assert set(late[hit]) == {10 * MS}
@@ -282,7 +282,7 @@ def test_jitter_has_the_stated_distribution_and_keeps_the_order(kind, median, p9
     times = [time for time, _ in bench.run(60.0)]
     assert times == sorted(times)
     bench.run(1.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     packets = packets[packets["copies"] > 0]
     late = (packets["arrived_ns"] - packets["left_ns"]) / MS
     assert (np.diff(packets["arrived_ns"]) >= 0).all()
@@ -296,7 +296,7 @@ def test_jitter_has_the_stated_distribution_and_keeps_the_order(kind, median, p9
 def test_bursts_withhold_and_let_go_at_once():
     bench = bench_with(burst_ms=100.0, burst_every_s=1.0)
     bench.run(5.5)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     phase = packets["left_ns"] % S
     held = phase < 100 * MS
     assert (packets["arrived_ns"][held] % S == 100 * MS).all()
@@ -309,7 +309,7 @@ def test_silence_is_a_pulled_cable_in_both_directions():
     bench.run(1.2)
     assert bench.ask(command(100, 4, 9)) == []
     bench.run(1.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     gone = packets[packets["copies"] == 0]
     assert gone["left_ns"].min() >= S
     assert gone["left_ns"].max() < 1.5 * S
@@ -323,8 +323,8 @@ def test_a_reboot_by_itself():
     bench = bench_with(reboot_at=(1.0, 2.0))
     bench.run(3.0)
     assert bench.device.boots == 2
-    assert [event.time_ns for event in bench.device.ledger.events] == [S, 2 * S]
-    boots = bench.device.ledger.of_type(102)["boot"]
+    assert [event.time_ns for event in bench.device.packet_log.events] == [S, 2 * S]
+    boots = bench.device.packet_log.of_type(102)["boot"]
     assert set(boots) == {0, 1, 2}
 
 
@@ -332,42 +332,43 @@ def test_lost_commands_have_no_effect():
     bench = bench_with(command_loss=1.0)
     assert bench.ask(command(100, 2, 1)) == []
     assert bench.count(1.0)[104] in (249, 250)
-    assert bench.device.ledger.counts[Fault.COMMAND_LOSS] == 1
+    assert bench.device.packet_log.counts[Fault.COMMAND_LOSS] == 1
 
 
 def test_fault_events_name_the_packet():
     bench = bench_with(loss=0.1)
     bench.run(3.0)
-    packets = bench.device.ledger.packets
+    packets = bench.device.packet_log.packets
     gone = packets[packets["copies"] == 0]
     events = [
-        (event.packet_type, event.ordinal, event.time_ns) for event in bench.device.ledger.events
+        (event.packet_type, event.ordinal, event.time_ns)
+        for event in bench.device.packet_log.events
     ]
     assert events == [(int(r["type"]), int(r["ordinal"]), int(r["left_ns"])) for r in gone]
 
 
 def test_a_short_memory_is_bounded_and_still_right():
     config = DeviceConfig(power=READY, faults=FaultConfig(split=0.5, reorder=0.1))
-    full, small = Bench(config), Bench(config, ledger=Ledger(keep=100))
+    full, small = Bench(config), Bench(config, packet_log=PacketLog(keep=100))
     for _ in range(100):
         assert small.run(0.1) == full.run(0.1)
-    ledger = small.device.ledger
-    assert len(ledger.packets) <= 400
-    assert len(ledger.events) <= 1000
-    assert (ledger.packets[-100:] == full.device.ledger.packets[-100:]).all()
-    assert ledger.counts == full.device.ledger.counts
+    packet_log = small.device.packet_log
+    assert len(packet_log.packets) <= 400
+    assert len(packet_log.events) <= 1000
+    assert (packet_log.packets[-100:] == full.device.packet_log.packets[-100:]).all()
+    assert packet_log.counts == full.device.packet_log.counts
 
 
 def test_pieces_that_do_not_follow_each_other_make_no_packet():
-    ledger = Ledger()
-    rows = np.zeros(2, ledger.packets.dtype)
-    assert ledger.book(rows) == 0
-    path = Path([], ledger)
+    packet_log = PacketLog()
+    rows = np.zeros(2, packet_log.packets.dtype)
+    assert packet_log.book(rows) == 0
+    path = Path([], packet_log)
     first = Datagram(1, b"abcd", (Piece(0, 0, 4, 4),)).cut(2)
     other = Datagram(1, b"xy", (Piece(1, 0, 2, 2),))
     path.send([first[0], other, first[1]], 1)
     assert [item.data for item in path.arrivals(1)] == [b"ab", b"xy", b"cd"]
-    assert ledger.packets["copies"].tolist() == [0, 1]
+    assert packet_log.packets["copies"].tolist() == [0, 1]
 
 
 @given(st.binary(min_size=1, max_size=5000), st.lists(st.integers(1, 4999), max_size=5))

@@ -17,7 +17,7 @@ from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.config import AddressConfig, DeviceConfig, FaultConfig, IdentityConfig
 from l2lidar_node.emulator.link import port
 from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort
-from l2lidar_node.emulator.server import MAX_SPEED, Lateness, Server
+from l2lidar_node.emulator.server import MAX_SPEED, Latency, Server
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.flash import Flash, Network, network_payload
 from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
@@ -122,7 +122,7 @@ def test_the_stamps_lie_on_the_hosts_clock(host):
         for _ in range(50):
             host.wait_for(wire.PacketType.IMU)
     after = time.time_ns()
-    packets = device.ledger.packets
+    packets = device.packet_log.packets
     assert before <= packets["start_ns"][0]
     assert packets["left_ns"][-1] <= after
 
@@ -157,7 +157,7 @@ def test_a_duration_is_in_the_units_time(host):
     server.run(4.0)
     port.close()
     assert device.sent[wire.PacketType.IMU] == 1000
-    assert server.lateness.count == sum(device.sent.values())
+    assert server.latency.count == sum(device.sent.values())
 
 
 def test_it_moves_to_a_new_address_at_the_reset(host):
@@ -301,8 +301,8 @@ def test_faults_reach_the_socket(host):
         assert max(len(host.read()) for _ in range(20)) > 1
 
 
-def test_lateness_is_counted_in_bounded_memory():
-    late = Lateness()
+def test_latency_is_counted_in_bounded_memory():
+    late = Latency()
     assert late.quantile_ns(0.5) == 0
     for k in range(1000):
         late.add(k * 1000)

@@ -60,7 +60,7 @@ def test_the_publishers_parameter_and_qos_are_asked_for(results) -> None:
     assert "imu_adjust is true" in said
 
 
-def test_only_the_levelling_is_wrong_for_lio_sam(results) -> None:
+def test_only_the_gravity_alignment_is_wrong_for_lio_sam(results) -> None:
     code, data = results["lio_sam"]
     assert code == 1
     assert errors(data) == {"levelled"}
