@@ -1,5 +1,6 @@
 # The two commands of a newcomer are `make demo` and `make test`; both make .venv first.
-PYTHON := .venv/bin/python
+# PYTHON is left to the user: it names the interpreter that setup makes .venv with.
+RUN := .venv/bin/python
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
@@ -7,7 +8,7 @@ BENCH_ARGS ?=
 BENCHES := $(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
+.PHONY: help setup demo test test-noble check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -17,41 +18,44 @@ setup: ## install what is needed into .venv; every other target does this first
 	@scripts/setup.sh
 
 demo: setup ## stream a virtual L2 through the driver (DEMO_ARGS="--help" for more)
-	@$(PYTHON) -m l2lidar_node.demo $(DEMO_ARGS)
+	@$(RUN) -m l2lidar_node.demo $(DEMO_ARGS)
 
 test: check pytest ## the whole gate: lint, format, types, imports, tests
+
+test-noble: ## the tests with the versions of Ubuntu 24.04, on Python 3.11 and 3.12 where found
+	@scripts/test_noble.sh $(PYTEST_ARGS)
 
 check: lint types imports ## the gate without the tests
 
 lint: setup
-	$(PYTHON) -m ruff check .
-	$(PYTHON) -m ruff format --check .
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
 
 types: setup
-	$(PYTHON) -m mypy
+	$(RUN) -m mypy
 
 imports: setup
 	.venv/bin/lint-imports
 
 pytest: setup
-	$(PYTHON) -m pytest $(PYTEST_ARGS)
+	$(RUN) -m pytest $(PYTEST_ARGS)
 
 format: setup ## put every Python file into the project's format
-	$(PYTHON) -m ruff check --fix-only .
-	$(PYTHON) -m ruff format .
+	$(RUN) -m ruff check --fix-only .
+	$(RUN) -m ruff format .
 
 $(BENCHES:%=bench-%): bench-%: setup
-	$(PYTHON) -m benchmarks.bench_$* $(BENCH_ARGS)
+	$(RUN) -m benchmarks.bench_$* $(BENCH_ARGS)
 
 faults: setup ## every fault the virtual L2 can make, and what the driver says to it
-	$(PYTHON) -m benchmarks.faults $(BENCH_ARGS)
+	$(RUN) -m benchmarks.faults $(BENCH_ARGS)
 
 soak: setup ## a long run, watched for growth, loss and drift
-	$(PYTHON) -m benchmarks.soak $(BENCH_ARGS)
+	$(RUN) -m benchmarks.soak $(BENCH_ARGS)
 
 fuzz: setup ## hostile input for everything that reads input from outside
-	$(PYTHON) -m benchmarks.fuzz $(BENCH_ARGS)
+	$(RUN) -m benchmarks.fuzz $(BENCH_ARGS)
 
 clean: ## remove .venv and everything built, measured or cached
-	rm -rf .venv build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf .venv .venv-noble-* build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 		.import_linter_cache

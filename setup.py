@@ -42,8 +42,8 @@ setup(
     python_requires=">=3.11,<3.13",
     # The lower bounds let the packages of Ubuntu 24.04 do, which a sourced ROS 2 brings along.
     install_requires=[
-        "numpy>=1.26",
-        "scipy>=1.11",
+        "numpy>=1.26.4",
+        "scipy>=1.11.4",
         "filterpy>=1.4.5",
         "kiss-icp>=1.3,<2",
         # One library: its -cpu build is a quarter of the size and exists for one platform only.
@@ -51,10 +51,10 @@ setup(
         "open3d>=0.19; sys_platform != 'linux' or platform_machine != 'x86_64'",
         "dpkt>=1.9.8",
         "rosbags>=0.10.6",
-        "PyYAML>=6.0",
-        "typer>=0.12",
+        "PyYAML>=6.0.1",
+        "typer>=0.9",
         "rich>=13.7",
-        "matplotlib>=3.8",
+        "matplotlib>=3.6.3",
     ],
     extras_require={
         "bench": ["evo>=1.31"],

@@ -1,14 +1,17 @@
 #!/usr/bin/env bash
 # Makes .venv, which everything else runs in: system packages, ROS 2, the Python dependencies, this project.
-# Safe to repeat: a step whose inputs have not changed is skipped. See "Install" in README.md.
+# Safe to repeat: a step whose inputs have not changed is skipped. See docs/install.md.
+# Usage: [PYTHON=/path/to/python3.12] setup.sh [VENV [CONSTRAINTS]]
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
-venv=$root/.venv
+venv=$root/${1:-.venv}
+constraints=${2:-}
 stamps=$venv/.setup
 python=$venv/bin/python
 ros=${ROS_DISTRO:-}
+[ -z "$constraints" ] || export PIP_CONSTRAINT=$root/$constraints
 
 say() { echo "setup: $*"; }
 die() {
@@ -81,11 +84,30 @@ is_complete() {
     is_suitable "$1" && has_venv "$1" && if [ -n "$ros" ]; then has_ros "$1"; else has_headers "$1"; fi
 }
 
+# Prints the interpreter that PYTHON asks for or asked for when .venv was made, or nothing. Once made with it,
+# .venv is not made anew by a later command that leaves PYTHON out.
+chosen_python() {
+    local stored
+    if [ -n "${PYTHON:-}" ]; then
+        if ! is_suitable "$PYTHON"; then
+            die "PYTHON is '$PYTHON', which is not a Python 3.11 or 3.12 that runs here." \
+                "Set it to the path of one, or leave it out to have one looked for."
+        fi
+        command -v "$PYTHON"
+    elif stored=$(cat "$stamps/python" 2>/dev/null) && is_suitable "$stored"; then
+        echo "$stored"
+    fi
+}
+
 # Prints the first interpreter that has all it takes, else the first of a right version, else nothing.
 find_python() {
     local candidate will_do
+    if [ -n "$chosen" ]; then
+        echo "$chosen"
+        return
+    fi
     for will_do in is_complete is_suitable; do
-        for candidate in ${PYTHON:-} /usr/bin/python3 python3 python3.12 python3.11; do
+        for candidate in /usr/bin/python3 python3 python3.12 python3.11; do
             if candidate=$(command -v "$candidate") && "$will_do" "$candidate"; then
                 echo "$candidate"
                 return
@@ -139,7 +161,7 @@ make_venv() {
             "Source that ROS 2 ('source /opt/ros/$ros/setup.bash') or unset ROS_DISTRO to do without it."
         options=(--system-site-packages)
     fi
-    say "making .venv with $found"
+    say "making ${venv##*/} with $found"
     rm -rf "$venv"
     "$found" -m venv "${options[@]}" "$venv" || die "$found could not make a virtual environment."
 }
@@ -164,22 +186,24 @@ PYTHON
 
 main() {
     local files made ros_made installed
+    chosen=$(chosen_python)
     files=()
-    made=$(digest "$root" "$ros" "${PYTHON:-}")
-    files=(requirements/*.txt scripts/tf2_msgs.sh scripts/tf2_msgs/*.* scripts/tf2_msgs/msg/*)
+    made=$(digest "$root" "$ros" "$chosen")
+    files=(requirements/{build,ros-jazzy,tf2-msgs-build}.txt ${constraints:+"$constraints"} scripts/tf2_msgs.sh scripts/tf2_msgs/*.* scripts/tf2_msgs/msg/*)
     ros_made=$(digest "$made")
     files=(setup.py setup.cfg package.xml)
     installed=$(digest "$ros_made")
 
     if is_done installed "$installed"; then
         is_healthy && return
-        say ".venv is damaged; making it anew"
+        say "${venv##*/} is damaged; making it anew"
         rm -rf "$venv"
     fi
     if ! is_done made "$made" || ! "$python" -m pip --version >/dev/null 2>&1; then
         check_ros
         install_system
         make_venv
+        [ -z "$chosen" ] || mark python "$chosen"
         mark made "$made"
     fi
     if ! is_done ros "$ros_made"; then
@@ -189,7 +213,7 @@ main() {
     fi
     say "installing the Python packages this project needs (the first time: some minutes)"
     pip_install --no-build-isolation --editable '.[bench,dev,view]'
-    is_healthy || die "something is still missing from .venv; run 'make clean', then the command again."
+    is_healthy || die "something is still missing from ${venv##*/}; run 'make clean', then the command again."
     mark installed "$installed"
     say "done"
 }
