@@ -78,5 +78,10 @@ setup(
             "odometry_node = l2lidar_proc.programs:odometry_node",
             "l2lidar = l2lidar_node.programs:l2lidar",
         ],
+        # Verbs that a package adds to the command l2lidar.
+        "l2lidar.verbs": [
+            "deskew = l2lidar_proc.verbs:DESKEW",
+            "odometry = l2lidar_proc.verbs:ODOMETRY",
+        ],
     },
 )

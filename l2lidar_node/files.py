@@ -8,6 +8,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
+def free_name(path: Path) -> Path:
+    """Return the path, or if there is such a file the first free one with ``-1``, ``-2`` added."""
+    number = 0
+    free = path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return free
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """Give a name of the same suffix to write to; at the end the file replaces ``path``.

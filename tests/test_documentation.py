@@ -21,7 +21,7 @@ RUN_BY = {
     r"l2lidar (discover|info|set work-mode).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/recording/test_bag_readers.py",
-    r"python -m l2lidar_proc.verbs.deskew .*": "tests/l2lidar_proc/verbs/test_deskew.py",
+    r"l2lidar deskew .*": "tests/l2lidar_proc/verbs/test_deskew.py",
     r"l2lidar check .*\.mcap .*": "tests/l2lidar_node/check/test_recordings.py",
     r"l2lidar check /.*": "tests/l2lidar_node/ros/test_topic_source.py",
     r"l2lidar view.*": "tests/l2lidar_node/ros/test_viewer.py",

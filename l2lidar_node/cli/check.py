@@ -25,8 +25,8 @@ from l2lidar_node.check.observation import (
 from l2lidar_node.check.report import as_data, judge, verdict
 from l2lidar_node.check.requirements import Consumer, Finding, Level, Use, worst
 from l2lidar_node.cli.console import JsonOption, out, print_json
-from l2lidar_node.cli.set import UsageError
-from l2lidar_proc.recording import bag
+from l2lidar_node.command_line import UsageError
+from l2lidar_node.recording import bag
 
 if TYPE_CHECKING:
     from l2lidar_node.check.observation import Observation

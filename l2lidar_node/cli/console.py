@@ -6,18 +6,20 @@ import functools
 import inspect
 import json
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver.health import Check, Level
 from l2lidar_node.settings import Setting, build, settings_of
 
+if TYPE_CHECKING:
+    from l2lidar_node.driver.health import Check
+
 out: Final = Console(highlight=False)
-_COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red", Level.STALE: "dim"}
+_COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "dim"}
 
 
 def say(text: str) -> None:
@@ -46,7 +48,7 @@ def judgement(checks: Iterable[Check]) -> Table:
     for heading in ("", "level", "message", "figures"):
         table.add_column(heading, overflow="fold")
     for check in checks:
-        colour = _COLOURS[check.level]
+        colour = _COLOURS[check.level.name]
         figures = "  ".join(f"{name} [bold]{value}[/]" for name, value in _plain(check.values))
         table.add_row(check.name, f"[{colour}]{check.level.name}[/]", check.message, figures)
     return table

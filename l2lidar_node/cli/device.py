@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Final, TypeVar
 
 from l2lidar_node.cli.addresses import local_addresses
+from l2lidar_node.command_line import CommandError
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver import health
 from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer
@@ -76,7 +77,7 @@ _LOOK_S: Final = 0.02
 _BUSY_S: Final = 10.0  # that the thread which gives up after ANSWER_S may be late
 
 
-class DeviceError(RuntimeError):
+class DeviceError(CommandError):
     """The device is not there or does not do what it was asked; the message says so."""
 
 

@@ -2,73 +2,167 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from typing import Final
+from typing import Annotated, Any, Final
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from l2lidar_node.cli import get, set
-from l2lidar_node.cli.check import check
-from l2lidar_node.cli.device import DeviceError
-from l2lidar_node.cli.discover import discover
-from l2lidar_node.cli.odometry import odometry
-from l2lidar_node.cli.record import convert, record
-from l2lidar_node.cli.replay import replay
-from l2lidar_node.cli.set import UsageError
-from l2lidar_node.cli.standby import reset, start, stop
-from l2lidar_node.cli.status import info, monitor
-from l2lidar_node.cli.sync_check import sync_check
-from l2lidar_node.cli.view import view
+from l2lidar_node import __version__
+from l2lidar_node.command_line import DATA, UNIT, CommandError, Verb, registered_verbs
 from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import SettingError
-from l2lidar_node.transport.udp import TransportError
 
-_UNIT: Final = "The unit"
-_DATA: Final = "Its data"
+_CLI: Final = "l2lidar_node.cli"
+VERBS: Final = (
+    Verb(
+        "discover",
+        f"{_CLI}.discover:discover",
+        UNIT,
+        "Find units: listen on all interfaces, and ask for versions at the usual address.",
+    ),
+    Verb(
+        "info",
+        f"{_CLI}.status:info",
+        UNIT,
+        "Say what the unit is: versions, work mode, calibration, geometry, state.",
+    ),
+    Verb(
+        "monitor",
+        f"{_CLI}.status:monitor",
+        UNIT,
+        "Watch the unit live: one line per aspect, as on /diagnostics.",
+    ),
+    Verb(
+        "start",
+        f"{_CLI}.standby:start",
+        UNIT,
+        "Leave standby: the head turns, points come after 12 to 45 s.",
+    ),
+    Verb(
+        "stop",
+        f"{_CLI}.standby:stop",
+        UNIT,
+        "Go into standby: the motors stop, points and IMU with them.",
+    ),
+    Verb(
+        "reset",
+        f"{_CLI}.standby:reset",
+        UNIT,
+        "Reboot the unit: stored settings come into force, points are back in about 25 s.",
+    ),
+    Verb("get", f"{_CLI}.get:app", UNIT, "Say what is set in the unit."),
+    Verb(
+        "set",
+        f"{_CLI}.set:app",
+        UNIT,
+        "Change what the unit stores in its flash memory: shown before, asked for, verified.",
+    ),
+    Verb(
+        "sync-check",
+        f"{_CLI}.sync_check:sync_check",
+        UNIT,
+        "Compare the unit's clock with this host's; leaves the clock alone.",
+    ),
+    Verb(
+        "record",
+        f"{_CLI}.record:record",
+        DATA,
+        "Record a unit: every packet as a capture, or clouds and IMU as a bag.",
+    ),
+    Verb(
+        "replay",
+        f"{_CLI}.replay:replay",
+        DATA,
+        "Send the datagrams of a capture to a driver, at the pace they were captured.",
+    ),
+    Verb(
+        "convert",
+        f"{_CLI}.record:convert",
+        DATA,
+        "Turn a capture into a ROS 2 bag, with the stamps the driver gives.",
+    ),
+    Verb(
+        "check",
+        f"{_CLI}.check:check",
+        DATA,
+        "Judge whether an odometry or mapping package can work with topics or a recording.",
+    ),
+    Verb(
+        "view",
+        f"{_CLI}.view:view",
+        DATA,
+        "Look at clouds raw and deskewed, path, map, IMU and health, in rerun.",
+    ),
+    Verb("demo", "l2lidar_node.demo.__main__:demo", DATA, "Show everything with a virtual L2."),
+)
+
+
+class _Verbs(TyperGroup):
+    """The list of verbs; the one that is run is imported, the others are not."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._known = {verb.name: verb for verb in [*VERBS, *registered_verbs()]}
+        # In the help, the verbs of one panel stand together.
+        for verb in sorted(self._known.values(), key=lambda verb: verb.panel != UNIT):
+            self.commands[verb.name] = TyperCommand(
+                verb.name, help=verb.help, rich_help_panel=verb.panel
+            )
+
+    def resolve_command(self, context: Any, arguments: list[str]) -> Any:
+        """Return the verb itself, imported now."""
+        name, command, rest = super().resolve_command(context, arguments)
+        if command is not None and command.name in self._known:
+            command = self._known[command.name].load()
+        return name, command, rest
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"l2lidar {__version__}")
+        raise typer.Exit
 
 
 def app() -> typer.Typer:
     """Return the command line."""
     made = typer.Typer(
+        cls=_Verbs,
         help="Work with a Unitree L2 without ROS: find it, look at it, set it, record it.",
         epilog="Exit codes: 0 done; 1 the unit, the network or a file stands in the way; 2 usage; "
         "130 interrupted.",
-        add_completion=False,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    for verb in (discover, info, monitor, start, stop, reset):
-        made.command(rich_help_panel=_UNIT)(verb)
-    made.add_typer(get.app, name="get", rich_help_panel=_UNIT)
-    made.add_typer(set.app, name="set", rich_help_panel=_UNIT)
-    made.command("sync-check", rich_help_panel=_UNIT)(sync_check)
-    for verb in (record, replay, convert, check, odometry, view):
-        made.command(rich_help_panel=_DATA)(verb)
-    made.command(
-        rich_help_panel=_DATA,
-        add_help_option=False,
-        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
-    )(demo)
+
+    @made.callback()
+    def l2lidar(
+        version: Annotated[
+            bool,
+            typer.Option(
+                "--version", help="Show the version and exit.", callback=_show_version,
+                is_eager=True,
+            ),
+        ] = False,
+    ) -> None:  # fmt: skip
+        del version
+
     return made
-
-
-def demo(context: typer.Context) -> None:
-    """Show everything with a virtual L2; all options go to the demo."""
-    sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-m", "l2lidar_node.demo", *context.args])
 
 
 def main() -> int:
     """Run the command line; return the exit code."""
     try:
         app()(prog_name="l2lidar")
-    except (UsageError, SettingError) as error:
+    except CommandError as error:
+        return _failed(str(error), error.exit_code)
+    except SettingError as error:
         return _failed(str(error), 2)
-    except (DeviceError, TransportError) as error:
-        return _failed(getattr(error, "strerror", None) or str(error), 1)
+    except OSError as error:
+        words = error.strerror or str(error)
+        return _failed(f"{error.filename}: {words}" if error.filename else words, 1)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     return 0

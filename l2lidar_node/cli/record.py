@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 from rich.live import Live
 from rich.text import Text
 
 from l2lidar_node.cli.console import out, say, with_network
-from l2lidar_node.cli.device import Device, DeviceError
+from l2lidar_node.cli.device import Device
+from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.files import free_name
 from l2lidar_node.recording.bag import BagWriter
 from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Recorder, Recording
@@ -23,7 +25,7 @@ from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
 from l2lidar_node.types import Stream
 
-CAPTURES: Final = (".pcap", ".cap")
+_CAPTURES: Final = (".pcap", ".cap")
 _LOOK_S: Final = 0.25
 _HEAR_S: Final = 5.0
 
@@ -56,9 +58,9 @@ def record(
     be replayed bit for bit by the driver's parameter replay_file. A bag keeps clouds, IMU samples
     and the static transform. The unit's clock is set once, as the driver does.
     """
+    is_capture = _is_capture(file)
     if file.exists():
-        raise typer.BadParameter(f"{file} exists already", param_hint="'FILE'")
-    failures: list[str] = []
+        raise UsageError(f"{file} exists already; choose another name, or remove it")
     settings = {
         "enable_l2_host_sync": True,
         "enable_latency_measure": True,
@@ -66,27 +68,63 @@ def record(
         "sweep_cut": sweep_cut,
         "point_layout": point_layout,
     }
-    with ExitStack() as stack:
-        recorder = bag = None
-        try:
-            if file.suffix in CAPTURES:
-                recorder = Recorder(file, network, failures.append)
-            else:
-                config = build(DriverConfig, settings)
-                bag = stack.enter_context(BagWriter(file, config))
-        except OSError as error:
-            raise DeviceError(f"cannot write {file}: {error.strerror}") from None
+    if is_capture:
+        _record_capture(network, file, duration, settings)
+    else:
+        _record_bag(network, file, duration, settings)
 
-        def keep(event: Event) -> None:
-            if bag is not None:
+
+def _record_capture(
+    network: NetworkConfig, file: Path, duration: float, settings: dict[str, Any]
+) -> None:
+    failures: list[str] = []
+    try:
+        recorder = Recorder(file, network, failures.append)
+    except OSError as error:
+        raise CommandError(f"cannot write {file}: {error.strerror}") from None
+    try:
+        with Device(network, tap=recorder, **settings) as device:
+            _watch(device, failures, duration, lambda: _size(recorder))
+        _raise_first(failures)
+    except BaseException as error:
+        recorder.close()
+        if not recorder.datagrams:
+            file.unlink()
+        elif isinstance(error, CommandError):
+            left = file.rename(free_name(file.with_name(f"{file.stem}.unfinished{file.suffix}")))
+            raise CommandError(f"{error}; what came until then is in {left}") from None
+        raise
+    say(f"{file}: {_size(recorder)}")
+
+
+def _record_bag(
+    network: NetworkConfig, file: Path, duration: float, settings: dict[str, Any]
+) -> None:
+    failures: list[str] = []
+    bag = BagWriter(file, build(DriverConfig, settings), keep_unfinished=True)
+
+    def keep(event: Event) -> None:
+        if not failures:
+            try:
                 bag.add(event)
+            except OSError as error:
+                failures.append(f"recording to {file} ended: {error.strerror}")
 
-        device = stack.enter_context(Device(network, keep, recorder, **settings))
-        _watch(device, recorder, failures, duration)
+    try:
+        with bag:
+            with Device(network, keep, **settings) as device:
+                _watch(device, failures, duration, lambda: "")
+            _raise_first(failures)
+    except (CommandError, OSError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        left = f"; what came until then is in {bag.unfinished}" if bag.unfinished else ""
+        raise CommandError(f"{reason or error}{left}") from None
+    say(f"{file}: {bag.clouds} clouds, {bag.samples} IMU samples")
+
+
+def _raise_first(failures: list[str]) -> None:
     if failures:
-        raise DeviceError(failures[0])
-    what = f"{bag.clouds} clouds, {bag.samples} IMU samples" if bag else _size(recorder)
-    say(f"{file}: {what}")
+        raise CommandError(failures[0])
 
 
 def convert(
@@ -100,9 +138,14 @@ def convert(
         str, typer.Option(help="Whose packets, if the capture holds those of several units.")
     ] = "",
 ) -> None:
-    """Turn a capture into a ROS 2 bag, with the stamps the driver gives."""
+    """Turn a capture into a ROS 2 bag, with the stamps the driver gives.
+
+    Interrupted, or stopped by an error, it leaves nothing behind.
+    """
+    if _is_capture(bag):
+        raise UsageError(f"'{bag}' is named like a capture; a bag is FILE.mcap, or a folder")
     if bag.exists():
-        raise typer.BadParameter(f"{bag} exists already", param_hint="'BAG'")
+        raise UsageError(f"{bag} exists already; choose another name, or remove it")
     values = {"imu_adjust": False, "sweep_cut": sweep_cut, "point_layout": point_layout}
     config = build(DriverConfig, values)
     try:
@@ -112,16 +155,33 @@ def convert(
                 for event in events(recording, config):
                     writer.add(event)
     except OSError as error:
-        raise DeviceError(f"{error.filename or capture}: {error.strerror}") from None
+        raise CommandError(f"{error.filename or bag}: {error.strerror}") from None
     except CaptureError as error:
-        raise DeviceError(f"{capture}: {error}") from None
+        raise CommandError(f"{capture}: {error}") from None
     cut = "; the capture is cut off at its end" if recording.is_cut_off else ""
     say(f"{bag}: {writer.clouds} clouds, {writer.samples} IMU samples{cut}")
 
 
-def _watch(
-    device: Device, recorder: Recorder | None, failures: list[str], duration: float
-) -> None:
+def _is_capture(file: Path) -> bool:
+    """Tell from a name whether it is one of a capture, rather than of a bag.
+
+    Raises
+    ------
+    UsageError
+        If it is neither.
+    """
+    if file.suffix in _CAPTURES:
+        return True
+    if file.suffix in ("", ".mcap"):
+        return False
+    raise UsageError(
+        f"'{file}' ends in '{file.suffix}'; expected FILE.pcap for raw packets, FILE.mcap for a "
+        "bag in one file, or a name without an ending for a rosbag2 folder"
+    )
+
+
+def _watch(device: Device, failures: list[str], duration: float, size: Callable[[], str]) -> None:
+    """Show how it goes until the end, a failure or Ctrl-C."""
     begun = time.monotonic()
     try:
         if device.wait_for(_is_heard, min(_HEAR_S, duration)) is None:
@@ -130,10 +190,8 @@ def _watch(
             while (passed := time.monotonic() - begun) < duration and not failures:
                 time.sleep(min(_LOOK_S, duration - passed))
                 frames, lost = device.ask(_counts)
-                size = f", {_size(recorder)}" if recorder else ""
-                live.update(
-                    Text(f"{passed:.0f} s, {frames} packets, {lost} lost{size}"), refresh=True
-                )
+                text = f"{passed:.0f} s, {frames} packets, {lost} lost, {size()}"
+                live.update(Text(text.rstrip(", ")), refresh=True)
     except KeyboardInterrupt:
         pass
     if not device.ask(_is_heard):
@@ -149,5 +207,5 @@ def _counts(driver: Driver) -> tuple[int, int]:
     return counters.frames.total(), sum(counters.sequence[stream].lost for stream in Stream)
 
 
-def _size(recorder: Recorder | None) -> str:
-    return f"{recorder.octets / 1e6:.1f} MB" if recorder else ""
+def _size(recorder: Recorder) -> str:
+    return f"{recorder.octets / 1e6:.1f} MB"

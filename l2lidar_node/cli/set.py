@@ -20,6 +20,7 @@ from l2lidar_node.cli.stored import (
     work_mode_text,
 )
 from l2lidar_node.cli.stored import work_mode as parsed_mode
+from l2lidar_node.command_line import UsageError, for_typer
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver.device import TRIES
 from l2lidar_node.protocol import commands
@@ -36,11 +37,8 @@ app = typer.Typer(
 )
 
 
-class UsageError(ValueError):
-    """A value that no unit can have; the message says which and why."""
-
-
 @app.command("work-mode", context_settings={"ignore_unknown_options": True})  # -imu_off is none
+@for_typer
 @with_network
 def work_mode(
     network: NetworkConfig,
@@ -81,6 +79,7 @@ def work_mode(
 
 
 @app.command()
+@for_typer
 @with_network
 def parameters(
     network: NetworkConfig,
@@ -116,6 +115,7 @@ def parameters(
 
 
 @app.command("network")
+@for_typer
 @with_network
 def network_(
     network: NetworkConfig,
@@ -172,6 +172,7 @@ def network_(
 
 
 @app.command()
+@for_typer
 @with_network
 def mac(
     network: NetworkConfig,

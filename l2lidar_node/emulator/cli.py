@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
+from l2lidar_node.command_line import for_typer
 from l2lidar_node.emulator import assembly
 from l2lidar_node.emulator.assembly import WORLDLESS
 from l2lidar_node.emulator.config import (
@@ -94,7 +95,7 @@ def with_options(command: Callable[..., None], panels: Panels) -> Callable[..., 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {item.name: item.annotation for item in parameters}
     run.__doc__ = command.__doc__
-    return run
+    return for_typer(run)
 
 
 def group(kind: type[G], given: Mapping[str, Value]) -> G:

@@ -1,14 +1,16 @@
-"""Writes what a driver hands out into a bag, as its node would publish it; needs no ROS."""
+"""Bags without ROS: reads any, and writes what a driver hands out as its node publishes it."""
 
 from __future__ import annotations
 
 import errno
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Connection,
     Qos,
@@ -24,26 +26,61 @@ from rosbags.typesys import Stores, get_typestore
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Event
+from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 
 _NS: Final = 1_000_000_000
-_CLOUD: Final = "sensor_msgs/msg/PointCloud2"
-_IMU: Final = "sensor_msgs/msg/Imu"
-_TF: Final = "tf2_msgs/msg/TFMessage"
+CLOUD: Final = "sensor_msgs/msg/PointCloud2"
+IMU: Final = "sensor_msgs/msg/Imu"
+TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 _DATATYPES: Final = {
     "i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8,
 }  # fmt: skip
 """Numbers of ``sensor_msgs/PointField`` by the kind and size of a NumPy type."""
 
 
+class RecordingError(ValueError):
+    """A recording that cannot be used; the message says which and why."""
+
+
+def open_bag(path: Path) -> AnyReader:
+    """Return a reader of a rosbag2 folder or an MCAP file; use it in a ``with``."""
+    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+
+
+def unreadable(path: Path, error: Exception) -> RecordingError:
+    """Return what to say of a recording that its reader failed on."""
+    if not path.exists():
+        return RecordingError(f"{path}: there is no such file or folder")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        return RecordingError(f"{path} is no rosbag2 folder: it has no metadata.yaml")
+    words = " ".join(str(error).split()) or type(error).__name__
+    return RecordingError(f"{path} cannot be read as a recording: {words}")
+
+
+def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield every message of a bag in the order it was recorded, with that instant [ns]."""
+    yield from reader.messages()
+
+
 class BagFile:
     """A bag that serialised messages are written into; use it in a ``with``.
+
+    It gets its name when it is finished. Until then it grows in a folder beside it that ends in
+    ``.unfinished``; what a killed run left there neither blocks the next one nor is lost.
 
     Parameters
     ----------
     path : Path
         A new MCAP file where the name ends in ``.mcap``, else a new rosbag2 folder.
+    keep_unfinished : bool
+        Whether an exception leaves what was written until then, rather than removing it.
+
+    Attributes
+    ----------
+    unfinished : Path or None
+        What an exception left.
 
     Raises
     ------
@@ -51,18 +88,19 @@ class BagFile:
         If there is something of that name.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, keep_unfinished: bool = False) -> None:
         if path.exists():
             raise FileExistsError(errno.EEXIST, "it exists already", str(path))
+        self.unfinished: Path | None = None
         self._path = path
-        # rosbags writes folders: for a single file, what is in one is taken out at the end.
-        self._folder = path.with_suffix(".unfinished") if path.suffix == ".mcap" else path
-        if self._folder.exists():
-            left = f"'{self._folder}' was cut off; remove it if it is of no use"
-            raise FileExistsError(errno.EEXIST, left, str(path))
+        self._is_file = path.suffix == ".mcap"
+        name = path.stem if self._is_file else path.name
+        self._scratch = free_name(path.with_name(f"{name}.unfinished"))
+        self._folder = self._scratch / name
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
         self._is_used = False
+        self._keeps = keep_unfinished
         self.store = get_typestore(Stores.ROS2_JAZZY)
 
     def __enter__(self) -> BagFile:
@@ -76,15 +114,23 @@ class BagFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish the file; after an exception it does not get its name, or goes if empty."""
-        self._writer.close()
-        if kind is not None:
-            if not self._is_used:
-                shutil.rmtree(self._folder)
-        elif self._folder != self._path:
-            (content,) = self._folder.glob("*.mcap")
-            content.replace(self._path)
-            shutil.rmtree(self._folder)
+        """Finish the file and give it its name; see ``keep_unfinished`` for exceptions."""
+        is_closed = False
+        try:
+            self._writer.close()
+            is_closed = True
+        finally:
+            if kind is not None or not is_closed:
+                if self._is_used and self._keeps:
+                    self.unfinished = self._content()
+                else:
+                    shutil.rmtree(self._scratch)
+        if kind is None:
+            self._content().replace(self._path)
+            shutil.rmtree(self._scratch)
+
+    def _content(self) -> Path:
+        return self._folder / f"{self._folder.name}.mcap" if self._is_file else self._folder
 
     def connect(self, topic: str, kind: str, depth: int, reliable: bool, latched: bool) -> None:
         """Announce a topic, its message type such as ``sensor_msgs/msg/Imu`` and its QoS."""
@@ -101,15 +147,93 @@ class BagFile:
         self._writer.write(self._connections[topic], now, data)
 
 
+class Messages:
+    """Makes the messages that the driver's node would publish, as values of rosbags.
+
+    Parameters
+    ----------
+    config : DriverConfig
+        Frames, point layout and covariances.
+    """
+
+    def __init__(self, config: DriverConfig) -> None:
+        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self._config = config
+        self._layout = LAYOUTS[config.topics.point_layout]
+        self._types: Any = self.store.types
+
+    def transforms(self, now: HostNs) -> Any:
+        """Return the static transform from cloud to IMU frame, as a TFMessage."""
+        types = self._types
+        frames = self._config.frames
+        transform = types["geometry_msgs/msg/TransformStamped"](
+            header=self._header(now, frames.cloud),
+            child_frame_id=frames.imu,
+            transform=types["geometry_msgs/msg/Transform"](
+                translation=types["geometry_msgs/msg/Vector3"](*wire.IMU_POSITION_M),
+                rotation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            ),
+        )
+        return types[TRANSFORMS](transforms=[transform])
+
+    def cloud(self, sweep: Sweep) -> Any:
+        """Return a sweep as a PointCloud2."""
+        points = self._layout.convert(sweep.points, sweep.start)
+        fields = [
+            self._types["sensor_msgs/msg/PointField"](
+                name=name,
+                offset=offset,
+                datatype=_DATATYPES[f"{item.base.kind}{item.base.itemsize}"],
+                count=int(np.prod(item.shape)),
+            )
+            for name, (item, offset, *_) in (points.dtype.fields or {}).items()
+        ]
+        return self._types[CLOUD](
+            header=self._header(sweep.start, self._config.frames.cloud),
+            height=1,
+            width=len(points),
+            fields=fields,
+            is_bigendian=False,
+            point_step=points.dtype.itemsize,
+            row_step=points.nbytes,
+            data=np.frombuffer(points.tobytes(), np.uint8),
+            is_dense=True,
+        )
+
+    def imu(self, sample: ImuSample) -> Any:
+        """Return a sample as an Imu."""
+        w, x, y, z = sample.orientation_wxyz
+        imu = self._config.imu
+        vector = self._types["geometry_msgs/msg/Vector3"]
+        return self._types[IMU](
+            header=self._header(sample.stamp, self._config.frames.imu),
+            orientation=self._types["geometry_msgs/msg/Quaternion"](x, y, z, w),
+            orientation_covariance=_diagonal(imu.roll_covar, imu.pitch_covar, imu.yaw_covar),
+            angular_velocity=vector(*sample.angular_velocity),
+            angular_velocity_covariance=_diagonal(
+                imu.gyro_x_covar, imu.gyro_y_covar, imu.gyro_z_covar
+            ),
+            linear_acceleration=vector(*sample.linear_acceleration),
+            linear_acceleration_covariance=_diagonal(
+                imu.accel_x_covar, imu.accel_y_covar, imu.accel_z_covar
+            ),
+        )
+
+    def _header(self, stamp: HostNs, frame: str) -> Any:
+        time = self._types["builtin_interfaces/msg/Time"](*divmod(int(stamp), _NS))
+        return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+
+
 class BagWriter:
     """A bag of clouds, IMU samples and the static transform; use it in a ``with``.
 
     Parameters
     ----------
     path : Path
-        See :class:`BagFile`.
     config : DriverConfig
         Topics, frames, point layout and covariances.
+    keep_unfinished : bool
+        See :class:`BagFile`.
 
     Attributes
     ----------
@@ -117,14 +241,17 @@ class BagWriter:
         What has been written.
     """
 
-    def __init__(self, path: Path, config: DriverConfig) -> None:
+    def __init__(self, path: Path, config: DriverConfig, *, keep_unfinished: bool = False) -> None:
         self.clouds = 0
         self.samples = 0
-        self._file = BagFile(path)
+        self._file = BagFile(path, keep_unfinished=keep_unfinished)
         self._config = config
-        self._layout = LAYOUTS[config.topics.point_layout]
-        self._store = self._file.store
-        self._types: Any = self._store.types
+        self._messages = Messages(config)
+
+    @property
+    def unfinished(self) -> Path | None:
+        """What an exception left; see :class:`BagFile`."""
+        return self._file.unfinished
 
     def __enter__(self) -> BagWriter:
         """Make the file."""
@@ -132,12 +259,12 @@ class BagWriter:
         topics = self._config.topics
         reliable = topics.qos_reliability == "reliable"
         for topic, kind, depth in (
-            (topics.point_cloud_topic_id, _CLOUD, 10),
-            (topics.imu_topic_id, _IMU, 1000),
+            (topics.point_cloud_topic_id, CLOUD, 10),
+            (topics.imu_topic_id, IMU, 1000),
         ):
             self._file.connect(topic, kind, depth, reliable, latched=False)
         if self._config.frames.publish_tf:
-            self._file.connect("/tf_static", _TF, 1, reliable=True, latched=True)
+            self._file.connect("/tf_static", TRANSFORMS, 1, reliable=True, latched=True)
         return self
 
     def __exit__(
@@ -157,77 +284,21 @@ class BagWriter:
         if isinstance(event, Sweep):
             self._begin(event.start)
             topic = self._config.topics.point_cloud_topic_id
-            self._write(topic, _CLOUD, event.end, self._cloud(event))
+            self._write(topic, CLOUD, event.end, self._messages.cloud(event))
             self.clouds += 1
         elif isinstance(event, ImuSample):
             self._begin(event.stamp)
             topic = self._config.topics.imu_topic_id
-            self._write(topic, _IMU, event.stamp, self._imu(event))
+            self._write(topic, IMU, event.stamp, self._messages.imu(event))
             self.samples += 1
 
     def _begin(self, now: HostNs) -> None:
         """Write the static transform before everything else."""
-        if self.clouds or self.samples or not self._config.frames.publish_tf:
-            return
-        types = self._types
-        frames = self._config.frames
-        transform = types["geometry_msgs/msg/TransformStamped"](
-            header=self._header(now, frames.cloud),
-            child_frame_id=frames.imu,
-            transform=types["geometry_msgs/msg/Transform"](
-                translation=types["geometry_msgs/msg/Vector3"](*wire.IMU_POSITION_M),
-                rotation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-            ),
-        )
-        self._write("/tf_static", _TF, now, types[_TF](transforms=[transform]))
-
-    def _cloud(self, sweep: Sweep) -> Any:
-        points = self._layout.convert(sweep.points, sweep.start)
-        fields = [
-            self._types["sensor_msgs/msg/PointField"](
-                name=name,
-                offset=offset,
-                datatype=_DATATYPES[f"{item.base.kind}{item.base.itemsize}"],
-                count=int(np.prod(item.shape)),
-            )
-            for name, (item, offset, *_) in (points.dtype.fields or {}).items()
-        ]
-        return self._types[_CLOUD](
-            header=self._header(sweep.start, self._config.frames.cloud),
-            height=1,
-            width=len(points),
-            fields=fields,
-            is_bigendian=False,
-            point_step=points.dtype.itemsize,
-            row_step=points.nbytes,
-            data=np.frombuffer(points.tobytes(), np.uint8),
-            is_dense=True,
-        )
-
-    def _imu(self, sample: ImuSample) -> Any:
-        w, x, y, z = sample.orientation_wxyz
-        imu = self._config.imu
-        vector = self._types["geometry_msgs/msg/Vector3"]
-        return self._types[_IMU](
-            header=self._header(sample.stamp, self._config.frames.imu),
-            orientation=self._types["geometry_msgs/msg/Quaternion"](x, y, z, w),
-            orientation_covariance=_diagonal(imu.roll_covar, imu.pitch_covar, imu.yaw_covar),
-            angular_velocity=vector(*sample.angular_velocity),
-            angular_velocity_covariance=_diagonal(
-                imu.gyro_x_covar, imu.gyro_y_covar, imu.gyro_z_covar
-            ),
-            linear_acceleration=vector(*sample.linear_acceleration),
-            linear_acceleration_covariance=_diagonal(
-                imu.accel_x_covar, imu.accel_y_covar, imu.accel_z_covar
-            ),
-        )
-
-    def _header(self, stamp: HostNs, frame: str) -> Any:
-        time = self._types["builtin_interfaces/msg/Time"](*divmod(int(stamp), _NS))
-        return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+        if not (self.clouds or self.samples) and self._config.frames.publish_tf:
+            self._write("/tf_static", TRANSFORMS, now, self._messages.transforms(now))
 
     def _write(self, topic: str, kind: str, now: HostNs, message: Any) -> None:
-        self._file.write(topic, now, self._store.serialize_cdr(message, kind))
+        self._file.write(topic, now, self._messages.store.serialize_cdr(message, kind))
 
 
 def _diagonal(*variances: float) -> Any:

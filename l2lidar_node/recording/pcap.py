@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from l2lidar_node.types import HostNs
+
+SUFFIXES: Final = (".pcap", ".pcapng", ".cap")
+"""Endings of names that captures have."""
 
 _NS: Final = 1_000_000_000
 _MICRO: Final = 0xA1B2C3D4
 _NANO: Final = 0xA1B23C4D
 _MAX_PACKET: Final = 1 << 18
-_MAX_BLOCK: Final = 1 << 26  # other benchmarks put names and keys into blocks of their own
+_MAX_BLOCK: Final = 1 << 26  # other programs put names and keys into blocks of their own
 
 _SECTION: Final = 0x0A0D0D0A
 _ORDER: Final = 0x1A2B3C4D
@@ -37,6 +41,14 @@ def is_capture(start: bytes) -> bool:
         return False
     numbers = {struct.unpack_from(f"{order}I", start)[0] for order in "<>"}
     return bool(numbers & {_MICRO, _NANO, _SECTION})
+
+
+def is_capture_file(path: Path) -> bool:
+    """Tell whether a file is a capture, or is called one: then its reader says what it lacks."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return is_capture(stream.read(4)) or path.suffix in SUFFIXES
 
 
 class RawPacket(NamedTuple):

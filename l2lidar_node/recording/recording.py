@@ -256,6 +256,8 @@ class Recorder:
     ----------
     octets : int
         Size of the file so far.
+    datagrams : int
+        How many have come from the device.
 
     Raises
     ------
@@ -269,6 +271,7 @@ class Recorder:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.octets = 0
+        self.datagrams = 0
         self._on_error = on_error
         self._file = path.open("xb", buffering=_BUFFER)
         self._is_open = True
@@ -279,6 +282,7 @@ class Recorder:
 
     def received(self, data: bytes, arrival: HostNs) -> None:
         """Write bytes that came from the device."""
+        self.datagrams += 1
         self._write(lambda: self._writer.received(data, arrival), arrival)
 
     def sent(self, frame: bytes, at: HostNs) -> None:
@@ -320,16 +324,6 @@ class Recorder:
 
     def _fail(self, error: OSError) -> None:
         self._on_error(f"recording to {self.path} ended: {error.strerror}")
-
-
-def free_name(path: Path) -> Path:
-    """Return the path, or if there is such a file the first free one with ``-1``, ``-2`` added."""
-    number = 0
-    free = path
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
-    return free
 
 
 def endpoints(network: NetworkConfig) -> tuple[Endpoint, Endpoint]:

@@ -14,9 +14,22 @@ from l2lidar_node.recording.recording import Entry, Received, Recording, Sent, S
 from l2lidar_node.transport.session import Loop
 from l2lidar_node.types import Datagram, HostNs, ImuSample, Sweep
 
+_END_NS: Final = 2**31 * 1_000_000_000  # seconds of ROS 2 stamps are signed 32-bit numbers
+
 
 def feed(driver: Driver, entry: Entry) -> list[Event]:
-    """Return what an entry of a recording makes a driver hand out."""
+    """Return what an entry of a recording makes a driver hand out.
+
+    Raises
+    ------
+    CaptureError
+        If its time is beyond what a ROS 2 stamp can hold.
+    """
+    if entry.time >= _END_NS:
+        raise CaptureError(
+            f"its times reach {entry.time // 1_000_000_000} s after 1970; ROS 2 stamps end at "
+            f"{_END_NS // 1_000_000_000} s, in January 2038. Was the clock of that machine set?"
+        )
     if isinstance(entry, Received):
         return driver.receive(entry.data, entry.time)
     if isinstance(entry, Sent):
@@ -39,6 +52,29 @@ def events(recording: Recording, config: DriverConfig) -> Iterator[Event]:
     for entry in recording:
         yield from feed(driver, entry)
     yield from driver.flush()
+
+
+def measurements(
+    recording: Recording, config: DriverConfig
+) -> Iterator[tuple[HostNs, Sweep | ImuSample]]:
+    """Yield sweeps and IMU samples, each with the time at which a driver could hand it out.
+
+    Parameters
+    ----------
+    recording : Recording
+    config : DriverConfig
+        See :func:`events`.
+    """
+    driver = Driver(config)
+    now = recording.start
+    for entry in recording:
+        now = entry.time
+        for event in feed(driver, entry):
+            if isinstance(event, Sweep | ImuSample):
+                yield now, event
+    for event in driver.flush():
+        if isinstance(event, Sweep | ImuSample):
+            yield now, event
 
 
 def shifted(event: Event, by_ns: int) -> Event:

@@ -22,9 +22,10 @@ from l2lidar_node.clouds import layouts
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer
 from l2lidar_node.driver.driver import Driver, Event, Silence
+from l2lidar_node.files import free_name
 from l2lidar_node.protocol.packets import Parameters, Version
 from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Recorder, Recording, free_name
+from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import Playback
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher

@@ -10,13 +10,23 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from l2lidar_node.clouds import fields
+from l2lidar_node.recording.bag import (
+    RecordingError as RecordingError,
+)
+from l2lidar_node.recording.bag import (
+    messages as messages,
+)
+from l2lidar_node.recording.bag import (
+    open_bag as open_bag,
+)
+from l2lidar_node.recording.bag import (
+    unreadable as unreadable,
+)
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.rotations import F64, normalised, transform
 
@@ -27,10 +37,6 @@ TWIST: Final = "geometry_msgs/msg/TwistStamped"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 
 _NUMBERS: Final = {code: number for number, code in fields.DATATYPES.items()}
-
-
-class RecordingError(ValueError):
-    """A recording that cannot be used; the message says which and why."""
 
 
 def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:
@@ -58,26 +64,6 @@ def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str
         return found[0]
     listed = ", ".join(found) or "none"
     raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
-
-
-def open_bag(path: Path) -> AnyReader:
-    """Return a reader of a rosbag2 folder or an MCAP file; use it in a ``with``."""
-    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-
-
-def unreadable(path: Path, error: Exception) -> RecordingError:
-    """Return what to say of a recording that its reader failed on."""
-    if not path.exists():
-        return RecordingError(f"{path}: there is no such file or folder")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        return RecordingError(f"{path} is no rosbag2 folder: it has no metadata.yaml")
-    words = " ".join(str(error).split()) or type(error).__name__
-    return RecordingError(f"{path} cannot be read as a recording: {words}")
-
-
-def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield every message of a bag in the order it was recorded, with that instant [ns]."""
-    yield from reader.messages()
 
 
 def stamp_of(message: Any) -> HostNs:

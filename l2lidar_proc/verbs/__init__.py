@@ -1,1 +1,18 @@
-"""Command line verbs of the companion."""
+"""Verbs that this package adds to the ``l2lidar`` command, by the entry points of setup.py."""
+
+from typing import Final
+
+from l2lidar_node.command_line import DATA, Verb
+
+DESKEW: Final = Verb(
+    "deskew",
+    "l2lidar_proc.verbs.deskew:deskew",
+    DATA,
+    "Deskew and filter the clouds of a recording into another one, as deskew_node does live.",
+)
+ODOMETRY: Final = Verb(
+    "odometry",
+    "l2lidar_proc.verbs.odometry:odometry",
+    DATA,
+    "Estimate the trajectory of a recording, as odometry_node does live; with map and plot.",
+)

@@ -1,23 +1,16 @@
-"""Deskews and filters the clouds of a recording with the same code as the node, without ROS.
-
-``python -m l2lidar_proc.verbs.deskew IN OUT``: IN and OUT are rosbag2 folders or MCAP files.
-Everything that is in IN is in OUT, and the deskewed clouds besides. Where IN has no velocity, this
-package's odometry estimates it on the way.
-"""
+"""`l2lidar deskew`: the clouds of a recording, deskewed with the same code as the node."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
+import typer
 from rosbags.highlevel import AnyReaderError
 
-from l2lidar_node.programs import interruptible
+from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.ros.parameter_files import settings_for
-from l2lidar_node.settings import SettingError
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
@@ -54,7 +47,8 @@ class _Deskewer:
         self.refused: dict[str, int] = {}
         self._unit = config.proc.deskew.time_unit
         self._uses_tf = config.topics.use_tf
-        self._output = config.topics.output_topic
+        # A bag names topics in full; relative to the node they are below the root here.
+        self._output = "/" + config.topics.output_topic.lstrip("/")
         self._topics = topics
         self._writer = writer
         self._odometry: Odometry | None = None
@@ -182,30 +176,37 @@ def _topics(config: DeskewNodeConfig, kinds: dict[str, str]) -> Topics:
     )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run from a command line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="l2lidar_proc.verbs.deskew", description=__doc__)
-    parser.add_argument("source", type=Path, help="rosbag2 folder or MCAP file")
-    parser.add_argument("target", type=Path, help="what to write; MCAP file or rosbag2 folder")
-    parser.add_argument("--params-file", type=Path, help="parameter file, as for the node")
-    given = parser.parse_args(arguments)
+def deskew(
+    source: Annotated[Path, typer.Argument(help="rosbag2 folder or MCAP file.")],
+    target: Annotated[Path, typer.Argument(help="What to write: FILE.mcap, or a folder.")],
+    params_file: Annotated[
+        Path | None, typer.Option(help="Parameter file, as for deskew_node.")
+    ] = None,
+) -> None:
+    """Deskew and filter the clouds of a recording, as deskew_node does live.
+
+    Everything of the recording is in the new one too. Where it has no velocity, this package's
+    odometry estimates one on the way.
+    """
+    if target.suffix not in ("", ".mcap"):
+        raise UsageError(
+            f"'{target}' ends in '{target.suffix}'; expected FILE.mcap, or a name without an "
+            "ending for a rosbag2 folder"
+        )
     try:
-        config = settings_for(given.params_file, "deskew_node", DeskewNodeConfig)
-        counts, refused = deskew_recording(given.source, given.target, config)
-    except (SettingError, RecordingError, FileExistsError, ValueError) as error:
-        print(error, file=sys.stderr)
-        return 2
+        config = settings_for(params_file, "deskew_node", DeskewNodeConfig)
+        counts, refused = deskew_recording(source, target, config)
+    except FileExistsError as error:
+        raise UsageError(str(error)) from None
     except OSError as error:
-        print(f"{error.filename or given.target}: {error.strerror}", file=sys.stderr)
-        return 2
-    print(
-        f"{counts.sweeps} clouds: {counts.deskewed} deskewed, {counts.still} at rest, "
+        raise CommandError(f"{error.filename or target}: {error.strerror}") from None
+    except RecordingError as error:
+        raise CommandError(str(error)) from None
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    typer.echo(
+        f"{target}: {counts.sweeps} clouds: {counts.deskewed} deskewed, {counts.still} at rest, "
         f"{counts.passed_on} passed on for want of IMU samples"
     )
     for reason, count in refused.items():
-        print(f"{count} not deskewed: {reason}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(interruptible(main))
+        typer.echo(f"{count} not deskewed: {reason}")

@@ -1,29 +1,28 @@
-"""Estimates the sensor's way through a recording, with the same code as the node, without ROS.
-
-``python -m l2lidar_proc.verbs.odometry BAG OUT``: BAG is a rosbag2 folder or an MCAP file with
-clouds as measured and IMU samples; the folder OUT gets ``trajectory.tum``, ``trajectory.kitti``,
-``map.ply`` and ``trajectory.png``. The poses are those of the cloud frame, or of the base frame
-where one is set.
-"""
+"""`l2lidar odometry`: the trajectory of a recording, by the same code as the node."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
+from rich.progress import Progress as Bar
 from rosbags.highlevel import AnyReaderError
 
+from l2lidar_node.command_line import CommandError, UsageError
+from l2lidar_node.config import DriverConfig
 from l2lidar_node.files import whole, write_whole
-from l2lidar_node.programs import interruptible
+from l2lidar_node.recording.pcap import CaptureError, is_capture_file
+from l2lidar_node.recording.recording import Recording
+from l2lidar_node.recording.replay import measurements
 from l2lidar_node.ros.parameter_files import settings_for
-from l2lidar_node.types import Sweep
+from l2lidar_node.settings import build
+from l2lidar_node.types import IMU_SAMPLE, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig
 from l2lidar_proc.motion.frames import FrameTree
@@ -32,9 +31,12 @@ from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag, map_file
+from l2lidar_proc.recording.bag import RecordingError
 from l2lidar_proc.recording.trajectory import StampedPoses, kitti, tum
 
 _END_NS: Final = 2**62
+_FILES: Final = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
+_CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
 
 Progress = Callable[[float], None]
 """Told the share of the recording that is done, 0 to 1."""
@@ -118,6 +120,44 @@ def run_events(events: Iterator[Event], config: OdometryNodeConfig) -> OdometryR
     for event in events:
         runner.take(event)
     return runner.finish()
+
+
+def run_capture(
+    source: Path,
+    config: OdometryNodeConfig,
+    progress: Progress = lambda share: None,
+    l2_ip: str = "",
+) -> OdometryRun:
+    """Return what the odometry makes of a capture, cut into sweeps of a full turn.
+
+    Parameters
+    ----------
+    source : Path
+        pcap or pcapng file.
+    config : OdometryNodeConfig
+    progress : callable
+        Told how far it is.
+    l2_ip : str
+        Whose packets; empty if the capture holds those of one unit.
+
+    Raises
+    ------
+    CaptureError
+        If the capture cannot be read.
+    """
+    size = max(source.stat().st_size, 1)
+    with source.open("rb") as stream:
+        recording = Recording(stream, l2_ip)
+
+        def taken() -> Iterator[Event]:
+            for now, event in measurements(recording, build(DriverConfig, _CAPTURE)):
+                if isinstance(event, Sweep):
+                    progress(recording.position / size)
+                    yield now, event
+                else:
+                    yield now, np.array([tuple(event)], IMU_SAMPLE)
+
+        return run_events(taken(), config)
 
 
 def run_bag(
@@ -213,8 +253,7 @@ class _Listener:
 def write(run: OdometryRun, folder: Path) -> list[Path]:
     """Write trajectory, map and plot of a run into a folder; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
-    paths = [folder / name for name in names]
+    paths = [folder / name for name in _FILES]
     write_whole(paths[0], tum(run.poses))
     write_whole(paths[1], kitti(run.poses))
     if len(run.map_points):
@@ -239,28 +278,60 @@ def _plot(run: OdometryRun, path: Path) -> None:
         figure.savefig(part)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run from a command line; return the exit code."""
-    from rich.progress import Progress as Bar
+def odometry(
+    source: Annotated[
+        Path,
+        typer.Argument(help="rosbag2 folder, MCAP file, or capture (pcap).", exists=True),
+    ],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder for trajectory (TUM and KITTI), map and plot.")
+    ] = Path("out/odometry"),
+    params_file: Annotated[
+        Path | None, typer.Option(help="Parameter file, as for odometry_node.", exists=True)
+    ] = None,
+    l2_ip: Annotated[
+        str, typer.Option(help="Whose packets, if a capture holds those of several units.")
+    ] = "",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")
+    ] = False,
+) -> None:
+    """Estimate the trajectory of the sensor through a recording, as odometry_node does live.
 
-    parser = argparse.ArgumentParser(prog="l2lidar_proc.verbs.odometry", description=__doc__)
-    parser.add_argument("source", type=Path, help="rosbag2 folder or MCAP file")
-    parser.add_argument("target", type=Path, help="folder to write to")
-    parser.add_argument("--params-file", type=Path, help="parameter file, as for the node")
-    given = parser.parse_args(arguments)
+    The trajectory in TUM format is what evo reads. The poses are those of the cloud frame, or of
+    the base frame where one is set. A capture is cut into sweeps of a full turn.
+    """
+    taken = [folder / name for name in _FILES if (folder / name).exists()]
+    if taken and not overwrite:
+        raise UsageError(
+            f"{taken[0]} is there already, of an earlier run; name another folder or add "
+            "--overwrite"
+        )
     try:
-        config = settings_for(given.params_file, "odometry_node", OdometryNodeConfig)
+        config = settings_for(params_file, "odometry_node", OdometryNodeConfig)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # or a long run would end with nowhere to write
         with Bar() as bar:
             task = bar.add_task("odometry", total=1.0)
-            run = run_bag(given.source, config, lambda share: bar.update(task, completed=share))
-            bar.update(task, completed=1.0)
-        files = write(run, given.target)
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    print(*run.report, *(f"wrote {path}" for path in files), sep="\n")
-    return 0
 
+            def progress(share: float) -> None:
+                bar.update(task, completed=share)
 
-if __name__ == "__main__":
-    sys.exit(interruptible(main))
+            if is_capture_file(source):
+                run = run_capture(source, config, progress, l2_ip)
+            else:
+                run = run_bag(source, config, progress)
+            progress(1.0)
+        files = write(run, folder)
+    except RecordingError as error:
+        raise CommandError(str(error)) from None
+    except CaptureError as error:
+        raise CommandError(f"{source}: {error}") from None
+    except OSError as error:
+        raise CommandError(f"{error.filename or source}: {error.strerror}") from None
+    for line in [*run.report, *(f"wrote {path}" for path in files)]:
+        typer.echo(line)
+    if not len(run.poses):
+        raise CommandError("no pose was found: are there clouds with times, and IMU samples?")

@@ -7,11 +7,13 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from l2lidar_node.emulator.motion.motion import from_tum
 from l2lidar_node.emulator.truth import results
@@ -107,7 +109,8 @@ def test_a_writer_that_is_ended_in_the_middle_leaves_the_old_file(
 def test_a_map_is_whole_whenever_its_writer_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     code = (
-        "import sys, numpy as np; from pathlib import Path; from l2lidar_proc import map_file\n"
+        "import sys, numpy as np; from pathlib import Path\n"
+        "from l2lidar_proc.recording import map_file\n"
         "points = np.random.default_rng(1).random((100_000, 3))\n"
         "while True: map_file.save(Path(sys.argv[1]), points); print('.', flush=True)"
     )
@@ -124,23 +127,33 @@ def test_a_map_is_whole_whenever_its_writer_is_killed(tmp_path: Path) -> None:
     assert len(sizes) == 1
 
 
-def test_what_a_killed_recording_left_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["run.mcap", "run"])
+def test_what_a_killed_recording_left_does_not_block_the_next(tmp_path: Path, name: str) -> None:
     (tmp_path / "run.unfinished").mkdir()
-    with pytest.raises(FileExistsError, match=r"run\.unfinished.*cut off"):
-        BagFile(tmp_path / "run.mcap")
+    with BagFile(tmp_path / name) as bag:
+        bag.connect("/numbers", "std_msgs/msg/Header", 1, reliable=True, latched=False)
+        bag.write("/numbers", 1, bytes(16))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, "run.unfinished"])
+    with AnyReader([tmp_path / name]) as reader:
+        assert reader.message_count == 1
 
 
-def test_a_bag_that_is_cut_off_does_not_get_its_name(tmp_path: Path) -> None:
-    def cut_off(path: Path, data: bytes) -> None:
-        with BagFile(path) as bag:
+@pytest.mark.parametrize("name", ["run.mcap", "run"])
+def test_a_bag_that_is_cut_off_does_not_get_its_name(tmp_path: Path, name: str) -> None:
+    def cut_off(data: bytes, keep: bool) -> Path | None:
+        bag = BagFile(tmp_path / name, keep_unfinished=keep)
+        with suppress(PowerCutError), bag:
             bag.connect("/numbers", "std_msgs/msg/Header", 1, reliable=True, latched=False)
             if data:
                 bag.write("/numbers", 1, data)
             raise PowerCutError
+        return bag.unfinished
 
-    with pytest.raises(PowerCutError):
-        cut_off(tmp_path / "empty.mcap", b"")
+    assert cut_off(b"", keep=True) is None
+    assert cut_off(bytes(16), keep=False) is None
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(PowerCutError):
-        cut_off(tmp_path / "half.mcap", bytes(16))
-    assert [path.name for path in tmp_path.iterdir()] == ["half.unfinished"]
+    left = cut_off(bytes(16), keep=True)
+    assert left is not None
+    assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
+    with AnyReader([left]) as reader:
+        assert reader.message_count == 1

@@ -20,9 +20,17 @@ from rosbags.highlevel import AnyReader
 
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
+from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
-from l2lidar_node.recording.recording import Received, Recorder, Recording, endpoints, free_name
+from l2lidar_node.recording.capture import Endpoint
+from l2lidar_node.recording.recording import (
+    Received,
+    Recorder,
+    Recording,
+    RecordingWriter,
+    endpoints,
+)
 from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
 from l2lidar_node.transport.session import Session
@@ -185,6 +193,22 @@ def test_record_without_a_unit_fails(run: Run, tmp_path: Path) -> None:
     )  # fmt: skip
     assert outcome.code == 1
     assert "nothing was heard" in outcome.err
+    outcome = run(
+        "record", str(tmp_path / "a.mcap"), "--l2-ip", "127.0.0.1", "--l2-port", "9",
+        "--host-port", str(free_port()), "--duration", "0.3",
+    )  # fmt: skip
+    assert outcome.code == 1
+    assert list(tmp_path.iterdir()) == []  # nothing that would be in the way of another try
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.pcapng", "run.2024"])
+def test_a_name_with_an_unknown_ending_is_refused(run: Run, tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.pcap").touch()
+    for verb in (["record"], ["convert", str(tmp_path / "a.pcap")]):
+        outcome = run(*verb, str(tmp_path / name))
+        assert outcome.code == 2
+        assert f"ends in '{Path(name).suffix}'" in outcome.err
+        assert "FILE.mcap" in outcome.err
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
@@ -278,6 +302,11 @@ def test_odometry_of_a_capture(run: Run, unit: Unit, tmp_path: Path) -> None:
     poses = np.loadtxt(tmp_path / "out" / "trajectory.tum", ndmin=2)
     assert len(poses) >= 3
     assert abs(poses[:, 1:4]).max() < 0.2  # it has not moved
+    again = run("odometry", str(tmp_path / "run.pcap"), str(tmp_path / "out"))
+    assert again.code == 2
+    assert "trajectory.tum is there already" in again.err
+    again = run("odometry", str(tmp_path / "run.pcap"), str(tmp_path / "out"), "--overwrite")
+    assert (again.code, again.err) == (0, "")
 
 
 def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
@@ -454,3 +483,37 @@ def test_ctrl_c_ends_a_loop(run: Run, capture) -> None:
     assert (process.returncode, err) == (0, "")
     assert "datagrams sent" in out
     assert data[: len(entries)] == data[len(entries) : 2 * len(entries)]
+
+
+def repeated(entries: list[Received], path: Path, times: int, first: int | None = None) -> None:
+    """Write a capture of the entries several times over, each time later."""
+    length = entries[-1].time - entries[0].time + 5_000_000
+    shift = 0 if first is None else first - entries[0].time
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, Endpoint("127.0.0.1", 1), Endpoint("127.0.0.1", 2))
+        for lap in range(times):
+            for entry in entries:
+                writer.received(entry.data, HostNs(entry.time + shift + lap * length))
+
+
+def test_an_interrupted_convert_leaves_nothing(capture, tmp_path: Path) -> None:
+    path = tmp_path / "long.pcap"
+    repeated(capture[1], path, 100)
+    process = started("convert", str(path), str(tmp_path / "run.mcap"))
+    bag = tmp_path / "run.unfinished" / "run" / "run.mcap"
+    wait_until(lambda: bag.exists() and bag.stat().st_size > 100_000, process)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 130
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["long.pcap", "run.pcap"]
+
+
+def test_times_that_no_stamp_can_hold_are_explained(run: Run, capture, tmp_path: Path) -> None:
+    path = tmp_path / "late.pcap"
+    repeated(capture[1], path, 1, first=2**31 * 10**9 - 500_000_000)
+    outcome = run("convert", str(path), str(tmp_path / "late.mcap"))
+    assert outcome.code == 1
+    assert "2038" in outcome.err
+    assert not (tmp_path / "late.mcap").exists()
+    data, _ = replayed(run, path, "--rate", "0")
+    assert data == [entry.data for entry in capture[1]]  # it carries no stamps

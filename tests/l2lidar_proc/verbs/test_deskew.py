@@ -14,7 +14,7 @@ from l2lidar_node.types import POINT
 from l2lidar_proc.config import DeskewNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
-from l2lidar_proc.verbs.deskew import deskew_recording, main
+from l2lidar_proc.verbs.deskew import deskew_recording
 from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz
 from tests.support.deskew_scenarios import Scenario, record
 
@@ -114,7 +114,7 @@ def test_clouds_are_deskewed_and_the_rest_is_kept(recording, tmp_path, name):
     for topic, messages in before.items():
         assert len(after[topic]) == len(messages)
     assert after["/chatter"][0].data == "hello"
-    for message, start in zip(after["points_deskewed"], STARTS, strict=True):
+    for message, start in zip(after["/points_deskewed"], STARTS, strict=True):
         assert bag.stamp_of(message) == at(start)
         assert message.header.frame_id == "lidar"
         points = bag.points_of(message)
@@ -123,37 +123,52 @@ def test_clouds_are_deskewed_and_the_rest_is_kept(recording, tmp_path, name):
         assert rms(xyz(points) - truth) < rms(xyz(raw) - truth) / 5
 
 
-def test_the_command_line(recording, tmp_path, capsys):
+def test_the_command_line(run, recording, tmp_path):
     parameters = tmp_path / "p.yaml"
     parameters.write_text(
         "deskew_node:\n  ros__parameters:\n    range_max: 6.0\n    organised: true\n"
     )
     target = tmp_path / "out"
-    assert main([str(recording), str(target), "--params-file", str(parameters)]) == 0
-    assert "5 clouds: 5 deskewed" in capsys.readouterr().out
-    cloud = read(target)["points_deskewed"][0]
+    done = run("deskew", str(recording), str(target), "--params-file", str(parameters))
+    assert (done.code, done.err) == (0, "")
+    assert "5 clouds: 5 deskewed" in done.out
+    cloud = read(target)["/points_deskewed"][0]
     assert cloud.width == 300
     assert not cloud.is_dense
-    assert main([str(recording), str(target)]) == 2
-    assert "exists" in capsys.readouterr().err
-    assert main([str(tmp_path / "nothing"), str(tmp_path / "x")]) == 2
-    assert "nothing: there is no such file" in capsys.readouterr().err
-    assert main([str(recording), str(parameters / "x.mcap")]) == 2
-    assert "Not a directory" in capsys.readouterr().err
-    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(tmp_path)]) == 2
-    assert f"parameter file '{tmp_path}': Is a directory" in capsys.readouterr().err
-    parameters.write_text("deskew_node:\n  ros__parameters:\n    cloud_topic: a b\n")
-    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
-    assert "parameter 'cloud_topic': 'a b' is not a topic name" in capsys.readouterr().err
-    parameters.write_text("hello")
-    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
-    assert "expected a node's name" in capsys.readouterr().err
-    parameters.write_text("deskew_node:\n  ros__parameters:\n    range_mxa: 6.0\n")
-    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
-    assert "range_max" in capsys.readouterr().err
-    parameters.write_text("{")
-    assert main([str(recording), str(tmp_path / "y"), "--params-file", str(parameters)]) == 2
-    assert "parameter file" in capsys.readouterr().err
+
+
+def test_the_command_line_refuses_what_is_in_the_way(run, recording, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "file").touch()
+    for source, target, code, words in (
+        (recording, tmp_path / "out", 2, "exists"),
+        (tmp_path / "nothing", tmp_path / "x", 1, "nothing: there is no such file"),
+        (recording, tmp_path / "file/x.mcap", 1, "Not a directory"),
+        (recording, tmp_path / "x.bag", 2, "ends in '.bag'"),
+    ):
+        done = run("deskew", str(source), str(target))
+        assert done.code == code
+        assert words in done.err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("deskew_node: {ros__parameters: {cloud_topic: a b}}", "'cloud_topic': 'a b' is not a"),
+        ("hello", "expected a node's name"),
+        ("deskew_node: {ros__parameters: {range_mxa: 6.0}}", "range_max"),
+        ("{", "parameter file"),
+    ],
+)
+def test_a_wrong_parameter_file_is_explained(run, recording, tmp_path, text, words):
+    parameters = tmp_path / "p.yaml"
+    parameters.write_text(text)
+    done = run("deskew", str(recording), str(tmp_path / "y"), "--params-file", str(parameters))
+    assert done.code == 2
+    assert words in done.err
+    done = run("deskew", str(recording), str(tmp_path / "y"), "--params-file", str(tmp_path))
+    assert done.code == 2
+    assert f"parameter file '{tmp_path}': Is a directory" in done.err
 
 
 def test_without_the_needed_topics_it_says_what_there_is(recording, tmp_path):
@@ -177,7 +192,7 @@ def test_clouds_without_plain_times_are_passed_on_without_them(recording, tmp_pa
     counts, refused = deskew_recording(source, tmp_path / "x", build(DeskewNodeConfig, {}))
     assert counts.sweeps == 0
     assert refused == {"all 5 times are equal": 1}
-    (cloud,) = read(tmp_path / "x")["points_deskewed"]
+    (cloud,) = read(tmp_path / "x")["/points_deskewed"]
     assert "time" not in [item.name for item in cloud.fields]
 
 
@@ -201,7 +216,7 @@ def test_without_a_velocity_our_odometry_finds_it(tmp_path):
                 writer.cloud("/points", recorded, sweep.points, start, "lidar")
             writer.copy(connection, recorded, data)
     deskew_recording(source, target, DeskewNodeConfig())
-    clouds = {bag.stamp_of(message): message for message in read(target)["points_deskewed"]}
+    clouds = {bag.stamp_of(message): message for message in read(target)["/points_deskewed"]}
     late = [item for item in walk.sweeps[-6:] if item.sweep.start + shift in clouds]
     assert len(late) >= 5
     for item in late:

@@ -12,7 +12,7 @@ from l2lidar_node.types import Sweep
 from l2lidar_proc.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
-from l2lidar_proc.verbs.odometry import main, run_bag, run_events
+from l2lidar_proc.verbs.odometry import run_bag, run_events
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps, truth
 
@@ -51,12 +51,13 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
     return some
 
 
-def test_bag_in_trajectory_map_and_plot_out(tmp_path, capsys):
+def test_bag_in_trajectory_map_and_plot_out(run, tmp_path):
     from evo.tools import file_interface
 
     some = write_bag(tmp_path / "run.mcap", 14)
-    assert main([str(tmp_path / "run.mcap"), str(tmp_path / "out")]) == 0
-    assert "14 poses from 14 sweeps" in capsys.readouterr().out
+    done = run("odometry", str(tmp_path / "run.mcap"), str(tmp_path / "out"))
+    assert (done.code, done.err) == (0, "")
+    assert "14 poses from 14 sweeps" in done.out
     found = file_interface.read_tum_trajectory_file(tmp_path / "out" / "trajectory.tum")
     assert found.num_poses == 14
     stamps = np.array([(one.start + one.end) // 2 for one in some])
@@ -79,7 +80,7 @@ def test_events_give_what_the_bag_gives(tmp_path):
     np.testing.assert_allclose(direct.poses["pose"][-1], from_bag.poses["pose"][-1], atol=2e-3)
 
 
-def test_what_is_not_a_recording_is_refused(tmp_path, capsys):
+def test_what_is_not_a_recording_is_refused(tmp_path):
     with pytest.raises(RecordingError, match="nothing: there is no such file"):
         run_bag(tmp_path / "nothing", OdometryNodeConfig())
     with pytest.raises(RecordingError, match=r"no rosbag2 folder: it has no metadata\.yaml"):
@@ -87,5 +88,3 @@ def test_what_is_not_a_recording_is_refused(tmp_path, capsys):
     (tmp_path / "words.mcap").write_text("words")
     with pytest.raises(RecordingError, match=r"words\.mcap cannot be read as a recording: "):
         run_bag(tmp_path / "words.mcap", OdometryNodeConfig())
-    assert main([str(tmp_path / "nothing"), str(tmp_path / "out")]) == 2
-    assert "nothing" in capsys.readouterr().err
