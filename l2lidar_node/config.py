@@ -22,16 +22,22 @@ class NetworkConfig:
     """Addresses of the device and of this host."""
 
     l2_ip: str = setting(
-        wire.LIDAR_IP, "IPv4 address of the L2; datagrams from others are refused"
+        wire.LIDAR_IP, "IPv4 address of the L2; datagrams from other senders are dropped"
     )
     l2_port: int = setting(wire.LIDAR_PORT, "UDP port of the L2", lo=1, hi=65535)
-    host_ip: str = setting(wire.HOST_IP, "IPv4 address of this host to listen on; 0.0.0.0 for all")
+    host_ip: str = setting(
+        wire.HOST_IP, "IPv4 address of this host to listen on; 0.0.0.0 listens on all"
+    )
     host_port: int = setting(wire.HOST_PORT, "UDP port to listen on", lo=1, hi=65535)
     serial_port: str = setting(
         "", "serial device of the L2, used instead of the network, for example /dev/ttyACM0"
     )
     receive_buffer_bytes: int = setting(
-        4_194_304, "socket receive buffer to ask the kernel for", unit="B", lo=4096, hi=1 << 30
+        4_194_304,
+        "size of the socket receive buffer to request from the kernel",
+        unit="B",
+        lo=4096,
+        hi=1 << 30,
     )
 
     def __post_init__(self) -> None:
@@ -51,32 +57,39 @@ class NetworkConfig:
 class ClockConfig:
     """How device stamps become host stamps."""
 
-    enable_l2_time_correction: bool = setting(True, "scale device stamps to true time")
-    enable_l2_host_sync: bool = setting(True, "set the device's clock from the host's")
-    l2_sync_rate_ms: int = setting(50, "interval of host syncs", unit="ms", lo=10, hi=600_000)
+    enable_l2_time_correction: bool = setting(True, "correct the scale of device stamps")
+    enable_l2_host_sync: bool = setting(
+        True, "set the clock of the device from the clock of the host"
+    )
+    l2_sync_rate_ms: int = setting(
+        50, "interval between host syncs, with l2_sync_mode periodic", unit="ms", lo=10, hi=600_000
+    )
     time_scale_num: int = setting(
-        2, "numerator of the first guess of the clock ratio", name="timeScaleNum", lo=1, hi=10**9
+        2, "numerator of the initial clock ratio", name="timeScaleNum", lo=1, hi=10**9
     )
     time_scale_denom: int = setting(
         1,
-        "denominator of the first guess of the clock ratio",
+        "denominator of the initial clock ratio",
         name="timeScaleDenom",
         lo=1,
         hi=10**9,
     )
     use_system_time: bool = setting(
-        False, "stamp with the time of arrival instead", name="UseSystemTimeTS", live=True
+        False,
+        "stamp with the arrival time instead of the device time",
+        name="UseSystemTimeTS",
+        live=True,
     )
     enable_latency_measure: bool = setting(
-        False, "measure the round trip once a second and take half of it off every stamp"
+        False, "measure the round trip once a second and subtract half of it from every stamp"
     )
     l2_sync_mode: str = setting(
         "once",
-        "with enable_l2_host_sync: set the device's clock once, or every l2_sync_rate_ms",
+        "with enable_l2_host_sync: sync the device once, or every l2_sync_rate_ms",
         choices=("once", "periodic"),
     )
     publish_unlocked: bool = setting(
-        False, "publish with the time of arrival until the clock is locked, instead of nothing"
+        False, "publish with arrival times until the clock has locked, instead of nothing"
     )
 
     def __post_init__(self) -> None:
@@ -96,39 +109,62 @@ class SweepConfig:
 
     frame3d: bool = setting(True, "publish 3D packets; false publishes 2D packets")
     packets: int = setting(
-        38, "packets in a cloud when cut by packets; 0 publishes every packet",
-        name="aggregateNframes", lo=0, hi=4000, live=True,
-    )  # fmt: skip
+        38,
+        "packets per cloud with sweep_cut packets; 0 publishes every packet",
+        name="aggregateNframes",
+        lo=0,
+        hi=4000,
+        live=True,
+    )
     cut: str = setting(
         "packets",
-        "where a cloud ends: after a number of packets, a turn or half a turn of the head, or a "
-        "duration (2D packets know no angle: a duration instead)",
-        name="sweep_cut", choices=("packets", "turn", "half_turn", "duration"), live=True,
-    )  # fmt: skip
-    duration_ms: int = setting(
-        230, "length of a cloud when cut by duration",
-        name="sweep_duration_ms", unit="ms", lo=5, hi=20_000, live=True,
-    )  # fmt: skip
-    override_range_calibration: bool = setting(
-        False, "use calRangeScale and calRangeBias instead of the unit's own",
-        name="EnableCalRangeOVR", live=True,
-    )  # fmt: skip
-    range_scale: float = setting(
-        0.000978, "range scale override", name="calRangeScale", unit="m/count",
-        lo=0.00025, hi=0.002, live=True,
-    )  # fmt: skip
-    range_bias: float = setting(
-        -365.625, "range bias override", name="calRangeBias", unit="counts", lo=-1000.0, hi=0.0,
+        "what ends a cloud: a number of packets, a full or half turn of the head, or a duration; "
+        "2D packets carry no head angle and are cut by duration",
+        name="sweep_cut",
+        choices=("packets", "turn", "half_turn", "duration"),
         live=True,
-    )  # fmt: skip
+    )
+    duration_ms: int = setting(
+        230,
+        "length of a cloud with sweep_cut duration",
+        name="sweep_duration_ms",
+        unit="ms",
+        lo=5,
+        hi=20_000,
+        live=True,
+    )
+    override_range_calibration: bool = setting(
+        False,
+        "use calRangeScale and calRangeBias instead of the values the unit reports",
+        name="EnableCalRangeOVR",
+        live=True,
+    )
+    range_scale: float = setting(
+        0.000978,
+        "range scale to use with EnableCalRangeOVR",
+        name="calRangeScale",
+        unit="m/count",
+        lo=0.00025,
+        hi=0.002,
+        live=True,
+    )
+    range_bias: float = setting(
+        -365.625,
+        "range bias to use with EnableCalRangeOVR",
+        name="calRangeBias",
+        unit="counts",
+        lo=-1000.0,
+        hi=0.0,
+        live=True,
+    )
     range_min: float = setting(
-        0.0, "nearest range to publish", unit="m", lo=0.0, hi=100.0, live=True
+        0.0, "shortest range that is published", unit="m", lo=0.0, hi=100.0, live=True
     )
     range_max: float = setting(
-        100.0, "farthest range to publish", unit="m", lo=0.0, hi=100.0, live=True
+        100.0, "longest range that is published", unit="m", lo=0.0, hi=100.0, live=True
     )
     reorder_window: int = setting(
-        8, "packets that may wait for a missing earlier one", unit="packets", lo=0, hi=256
+        8, "packets held back while an earlier one is missing", unit="packets", lo=0, hi=256
     )
 
     def __post_init__(self) -> None:
@@ -146,24 +182,32 @@ class ImuConfig:
 
     enable_publishing: bool = setting(False, "publish IMU data", name="enable_IMU_publishing")
     adjust: bool = setting(
-        True, "turn points into a levelled frame with the onboard orientation", name="imu_adjust",
+        True,
+        "rotate points into a level frame with the onboard orientation",
+        name="imu_adjust",
         live=True,
-    )  # fmt: skip
+    )
     roll_pitch_only: bool = setting(
-        True, "leave the yaw out of imu_adjust", name="imuRollPitchOnly", live=True
+        True, "use roll and pitch only for imu_adjust", name="imuRollPitchOnly", live=True
     )
     accel_x_covar: float = setting(
-        0.01, "variance of acceleration x", unit="(m/s^2)^2", lo=0.0, hi=1e6
+        0.01, "variance of the acceleration along x", unit="(m/s^2)^2", lo=0.0, hi=1e6
     )
     accel_y_covar: float = setting(
-        0.01, "variance of acceleration y", unit="(m/s^2)^2", lo=0.0, hi=1e6
+        0.01, "variance of the acceleration along y", unit="(m/s^2)^2", lo=0.0, hi=1e6
     )
     accel_z_covar: float = setting(
-        0.01, "variance of acceleration z", unit="(m/s^2)^2", lo=0.0, hi=1e6
+        0.01, "variance of the acceleration along z", unit="(m/s^2)^2", lo=0.0, hi=1e6
     )
-    gyro_x_covar: float = setting(2.5e-5, "variance of rate x", unit="(rad/s)^2", lo=0.0, hi=1e6)
-    gyro_y_covar: float = setting(2.5e-5, "variance of rate y", unit="(rad/s)^2", lo=0.0, hi=1e6)
-    gyro_z_covar: float = setting(2e-7, "variance of rate z", unit="(rad/s)^2", lo=0.0, hi=1e6)
+    gyro_x_covar: float = setting(
+        2.5e-5, "variance of the angular rate about x", unit="(rad/s)^2", lo=0.0, hi=1e6
+    )
+    gyro_y_covar: float = setting(
+        2.5e-5, "variance of the angular rate about y", unit="(rad/s)^2", lo=0.0, hi=1e6
+    )
+    gyro_z_covar: float = setting(
+        2e-7, "variance of the angular rate about z", unit="(rad/s)^2", lo=0.0, hi=1e6
+    )
     roll_covar: float = setting(4.9e-9, "variance of roll", unit="rad^2", lo=0.0, hi=1e6)
     pitch_covar: float = setting(4.9e-9, "variance of pitch", unit="rad^2", lo=0.0, hi=1e6)
     yaw_covar: float = setting(10.0, "variance of yaw", unit="rad^2", lo=0.0, hi=1e6)
@@ -192,14 +236,14 @@ class FrameConfig:
 class TopicConfig:
     """What the topics are called and how they are sent."""
 
-    point_cloud_topic_id: str = setting("/points", "topic of the clouds", form=TOPIC)
-    imu_topic_id: str = setting("/imu/data", "topic of the IMU samples", form=TOPIC)
+    point_cloud_topic_id: str = setting("/points", "topic for point clouds", form=TOPIC)
+    imu_topic_id: str = setting("/imu/data", "topic for IMU samples", form=TOPIC)
     qos_reliability: str = setting(
         "best_effort",
-        "reliability of both topics; reliable reaches every subscriber, best_effort is upstream's",
+        "QoS reliability of both topics; every subscriber can receive reliable",
         choices=("best_effort", "reliable"),
     )
-    point_layout: str = setting("native", "fields of the clouds", choices=tuple(LAYOUTS))
+    point_layout: str = setting("native", "fields of a published point", choices=tuple(LAYOUTS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,14 +251,21 @@ class WatchdogConfig:
     """What happens when the device falls silent."""
 
     timeout_ms: int = setting(
-        35_000, "longest silence", name="watchdog_timeout_ms", unit="ms", lo=100, hi=3_600_000
+        35_000,
+        "longest silence of the device before watchdog_action",
+        name="watchdog_timeout_ms",
+        unit="ms",
+        lo=100,
+        hi=3_600_000,
     )
     action: str = setting(
-        "shutdown", "end the node, or report and wait for the device", name="watchdog_action",
+        "shutdown",
+        "on a silent device: shut the node down, or report it and wait",
+        name="watchdog_action",
         choices=("shutdown", "wait"),
-    )  # fmt: skip
+    )
     standby_on_powerup_enabled: bool = setting(
-        False, "do not watch until the device has spoken, since it starts in standby"
+        False, "start the watchdog with the first packet; for a device that powers up in standby"
     )
 
 
@@ -222,26 +273,20 @@ class WatchdogConfig:
 class FileConfig:
     """Captures of what is received and sent (pcap), to write and to read."""
 
-    record_file: str = setting(
-        "", "capture to write; where there is one of that name, a number is added"
-    )
-    replay_file: str = setting("", "capture to read instead of listening for an L2")
-    replay_rate: float = setting(
-        1.0, "speed of the replay, 0 for as fast as possible", lo=0.0, hi=1000.0
-    )
-    replay_loop: bool = setting(
-        False, "begin again at the end, every stamp later by the length of the recording"
-    )
+    record_file: str = setting("", "capture file to write; a number is added if the file exists")
+    replay_file: str = setting("", "capture file to replay instead of listening to an L2")
+    replay_rate: float = setting(1.0, "replay speed; 0 is as fast as possible", lo=0.0, hi=1000.0)
+    replay_loop: bool = setting(False, "start over at the end, with stamps that continue")
     replay_clock: bool = setting(
-        True, "publish the recording's time on /clock while replaying, for use_sim_time"
+        True, "publish the recorded time on /clock during a replay, for use_sim_time"
     )
 
     def __post_init__(self) -> None:
         """Check that nothing is recorded that is a recording already."""
         if self.record_file and self.replay_file:
             raise SettingError(
-                f"parameter 'record_file': {self.record_file!r} cannot be written while "
-                "replay_file is read; give one of them"
+                f"parameter 'record_file': {self.record_file!r} cannot be combined with "
+                "replay_file; set only one of them"
             )
 
 

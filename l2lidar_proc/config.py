@@ -36,30 +36,47 @@ class MotionConfig:
     """What is known about the sensor's motion and how far it is trusted."""
 
     imu_xyz: tuple[float, ...] = setting(
-        (-0.007698, -0.014655, 0.00667), "place of the IMU in the cloud frame", unit="m"
+        (-0.007698, -0.014655, 0.00667), "position of the IMU in the cloud frame", unit="m"
     )
     imu_rpy: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), "roll, pitch, yaw of the IMU in the cloud frame", unit="deg"
     )
     max_gyro_bias: float = setting(
-        0.1, "largest mean rate at rest to take for bias", unit="rad/s", lo=0.001, hi=1.0
+        0.1,
+        "largest mean angular rate at rest that is accepted as gyro bias",
+        unit="rad/s",
+        lo=0.001,
+        hi=1.0,
     )
     use_accelerometer: bool = setting(
-        True, "let the accelerometer carry the velocity through a sweep", live=True
+        True, "integrate the accelerometer to track velocity within a sweep", live=True
     )
     velocity_max_age_ms: int = setting(
-        500, "older velocities are not used", unit="ms", lo=10, hi=5000, live=True
+        500, "maximum age of a velocity that is used", unit="ms", lo=10, hi=5000, live=True
     )
     still_speed: float = setting(
-        0.05, "a velocity below this does not contradict an IMU at rest", unit="m/s", lo=0.0,
-        hi=1.0, live=True,
-    )  # fmt: skip
-    hold_ms: int = setting(
-        20, "how long the last known rate goes on where IMU samples end", unit="ms", lo=0, hi=500,
+        0.05,
+        "largest velocity that is consistent with an IMU at rest",
+        unit="m/s",
+        lo=0.0,
+        hi=1.0,
         live=True,
-    )  # fmt: skip
+    )
+    hold_ms: int = setting(
+        20,
+        "how long the last angular rate is extrapolated past the last IMU sample",
+        unit="ms",
+        lo=0,
+        hi=500,
+        live=True,
+    )
     max_gap_ms: int = setting(
-        20, "a longer stretch without IMU samples is reported", unit="ms", lo=5, hi=1000, live=True
+        20,
+        "gaps between IMU samples longer than this are reported",
+        unit="ms",
+        lo=5,
+        hi=1000,
+        live=True,
     )
 
     def __post_init__(self) -> None:
@@ -84,23 +101,33 @@ class DeskewConfig:
     """How a sweep is put together."""
 
     reference: str = setting(
-        "start", "instant whose frame the points are moved to; it becomes the stamp",
-        choices=("start", "middle", "end"), live=True,
-    )  # fmt: skip
-    keep_time: bool = setting(
-        False, "keep the times of the points, counted from the stamp; some consumers would deskew "
-        "again", live=True,
-    )  # fmt: skip
-    imu_wait_ms: int = setting(
-        50, "longest wait for IMU samples up to the end of a sweep", unit="ms", lo=0, hi=1000,
+        "start",
+        "instant the points are deskewed to; it becomes the stamp",
+        choices=("start", "middle", "end"),
         live=True,
-    )  # fmt: skip
+    )
+    keep_time: bool = setting(
+        False,
+        "keep per-point times, relative to the stamp; a consumer that finds them may "
+        "deskew the cloud a second time",
+        live=True,
+    )
+    imu_wait_ms: int = setting(
+        50,
+        "longest wait for IMU samples that cover the end of a sweep",
+        unit="ms",
+        lo=0,
+        hi=1000,
+        live=True,
+    )
     time_unit: str = setting(
-        "auto", "unit of the points' times; auto takes it from type and spread",
-        choices=("auto", "s", "ms", "us", "ns"), live=True,
-    )  # fmt: skip
+        "auto",
+        "unit of the per-point times; auto infers it from type and range",
+        choices=("auto", "s", "ms", "us", "ns"),
+        live=True,
+    )
     organised: bool = setting(
-        False, "packets x 300 slots, NaN where nothing came back, in place of a list", live=True
+        False, "organized cloud of packets x 300 slots, NaN where there is no return", live=True
     )
 
 
@@ -109,16 +136,19 @@ class FilterConfig:
     """Which points are left out. Angles and boxes are in the cloud frame."""
 
     filters_before: tuple[str, ...] = setting(
-        ("range",), "filters on the points as measured, in this order", choices=FILTERS, live=True
+        ("range",),
+        "filters applied to the measured points, in this order",
+        choices=FILTERS,
+        live=True,
     )
     filters_after: tuple[str, ...] = setting(
-        (), "filters on the deskewed points, in this order", choices=FILTERS, live=True
+        (), "filters applied to the deskewed points, in this order", choices=FILTERS, live=True
     )
     range_min: float = setting(
-        0.0, "filter range: nearest", unit="m", lo=0.0, hi=1000.0, live=True
+        0.0, "filter range: shortest range to keep", unit="m", lo=0.0, hi=1000.0, live=True
     )
     range_max: float = setting(
-        1000.0, "filter range: farthest", unit="m", lo=0.0, hi=1000.0, live=True
+        1000.0, "filter range: longest range to keep", unit="m", lo=0.0, hi=1000.0, live=True
     )
     vertical_min: float = setting(
         -90.0, "filter vertical: lowest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
@@ -127,56 +157,99 @@ class FilterConfig:
         90.0, "filter vertical: highest elevation", unit="deg", lo=-90.0, hi=90.0, live=True
     )
     azimuth_min: float = setting(
-        -180.0, "filter azimuth: where the window begins; x ahead, counter-clockwise",
-        unit="deg", lo=-360.0, hi=360.0, live=True,
-    )  # fmt: skip
-    azimuth_max: float = setting(
-        180.0, "filter azimuth: where the window ends; below the beginning it goes across 180 deg",
-        unit="deg", lo=-360.0, hi=360.0, live=True,
-    )  # fmt: skip
-    keep_boxes: tuple[float, ...] = setting(
-        (), "filter keep_boxes: x y z of one corner and of the opposite, box after box",
-        unit="m", live=True,
-    )  # fmt: skip
-    remove_boxes: tuple[float, ...] = setting(
-        (), "filter remove_boxes: likewise, such as the robot's own body", unit="m", live=True
+        -180.0,
+        "filter azimuth: start of the window, counterclockwise from +x",
+        unit="deg",
+        lo=-360.0,
+        hi=360.0,
+        live=True,
     )
-    intensity_min: float = setting(0.0, "filter intensity: least", lo=0.0, hi=65535.0, live=True)
+    azimuth_max: float = setting(
+        180.0,
+        "filter azimuth: end of the window; less than the start wraps across 180 deg",
+        unit="deg",
+        lo=-360.0,
+        hi=360.0,
+        live=True,
+    )
+    keep_boxes: tuple[float, ...] = setting(
+        (),
+        "filter keep_boxes: x y z of two opposite corners per box",
+        unit="m",
+        live=True,
+    )
+    remove_boxes: tuple[float, ...] = setting(
+        (),
+        "filter remove_boxes: x y z of two opposite corners per box, e.g. the robot's body",
+        unit="m",
+        live=True,
+    )
+    intensity_min: float = setting(
+        0.0, "filter intensity: lowest to keep", lo=0.0, hi=65535.0, live=True
+    )
     intensity_max: float = setting(
-        65535.0, "filter intensity: most", lo=0.0, hi=65535.0, live=True
+        65535.0, "filter intensity: highest to keep", lo=0.0, hi=65535.0, live=True
     )
     isolated_slots: int = setting(
-        3, "filter isolated: neighbours are at most so many slots away, in the same packet", lo=1,
-        hi=50, live=True,
-    )  # fmt: skip
+        3,
+        "filter isolated: search window for neighbors, slots of the same packet",
+        lo=1,
+        hi=50,
+        live=True,
+    )
     isolated_neighbours: int = setting(
-        1, "filter isolated: how many neighbours a point needs", lo=1, hi=20, live=True
+        1, "filter isolated: neighbors a point needs", lo=1, hi=20, live=True
     )
     isolated_distance: float = setting(
-        0.08, "filter isolated: how far a neighbour may be", unit="m", lo=0.0, hi=10.0, live=True
+        0.08,
+        "filter isolated: largest distance of a neighbor",
+        unit="m",
+        lo=0.0,
+        hi=10.0,
+        live=True,
     )
     isolated_ratio: float = setting(
-        0.05, "filter isolated: and this times the range in addition", lo=0.0, hi=1.0, live=True
+        0.05,
+        "filter isolated: fraction of the range added to that distance",
+        lo=0.0,
+        hi=1.0,
+        live=True,
     )
     isolated_intensity: float = setting(
-        65535.0, "filter isolated: brighter points stay in any case", lo=0.0, hi=65535.0, live=True
+        65535.0,
+        "filter isolated: points brighter than this are always kept",
+        lo=0.0,
+        hi=65535.0,
+        live=True,
     )
     voxel_size: float = setting(
-        0.1, "filter voxel: edge of the cubes of which one point is kept", unit="m",
-        lo=0.001, hi=100.0, live=True,
-    )  # fmt: skip
+        0.1,
+        "filter voxel: voxel size; one point per voxel is kept",
+        unit="m",
+        lo=0.001,
+        hi=100.0,
+        live=True,
+    )
     statistical_neighbours: int = setting(
-        16, "filter statistical: neighbours to average the distance to", lo=1, hi=200, live=True
+        16, "filter statistical: neighbors in the mean distance", lo=1, hi=200, live=True
     )
     statistical_ratio: float = setting(
-        2.0, "filter statistical: standard deviations above the mean to be left out", lo=0.01,
-        hi=100.0, live=True,
-    )  # fmt: skip
+        2.0,
+        "filter statistical: standard deviations above the mean that remove a point",
+        lo=0.01,
+        hi=100.0,
+        live=True,
+    )
     radius: float = setting(
-        0.3, "filter radius: where neighbours are counted", unit="m", lo=0.001, hi=100.0, live=True
+        0.3,
+        "filter radius: radius in which neighbors are counted",
+        unit="m",
+        lo=0.001,
+        hi=100.0,
+        live=True,
     )
     radius_neighbours: int = setting(
-        3, "filter radius: how many there must be", lo=1, hi=1000, live=True
+        3, "filter radius: neighbors a point needs", lo=1, hi=1000, live=True
     )
 
     def __post_init__(self) -> None:
@@ -206,32 +279,31 @@ class ProcConfig:
 class DeskewTopics:
     """Where a deskew node listens and speaks."""
 
-    cloud_topic: str = setting("/points", "clouds with one time per point", form=TOPIC)
+    cloud_topic: str = setting("/points", "input clouds with per-point times", form=TOPIC)
     imu_topic: str = setting("/imu/data", "IMU samples", form=TOPIC)
     velocity_topic: str = setting(
-        "odometry", "velocity of the sensor or of what carries it", form=TOPIC
+        "odometry", "velocity of the sensor or of its carrier", form=TOPIC
     )
     velocity_type: str = setting(
-        "odometry", "what comes on velocity_topic: nav_msgs/Odometry, geometry_msgs/TwistStamped",
+        "odometry",
+        "message type of velocity_topic: nav_msgs/Odometry or geometry_msgs/TwistStamped",
         choices=("odometry", "twist", "none"),
-    )  # fmt: skip
+    )
     output_topic: str = setting("points_deskewed", "deskewed clouds", form=TOPIC)
     qos_reliability: str = setting(
-        "reliable", "reliability of the output", choices=("best_effort", "reliable")
+        "reliable", "QoS reliability of the output", choices=("best_effort", "reliable")
     )
     point_layout: str = setting(
         AS_INPUT,
-        "fields of the output, without the time field once points are deskewed",
+        "fields of the output; the time field is dropped once points are deskewed",
         choices=(AS_INPUT, *LAYOUTS),
     )
     input_reliability: str = setting(
         "best_effort",
-        "reliability asked of clouds and IMU samples; reliable hears reliable publishers only",
+        "QoS reliability requested for clouds and IMU; reliable matches reliable publishers only",
         choices=("best_effort", "reliable"),
     )
-    use_tf: bool = setting(
-        True, "take the mounts from /tf_static where it has them; else imu_xyz and imu_rpy hold"
-    )
+    use_tf: bool = setting(True, "take mounts from /tf_static; fall back to imu_xyz and imu_rpy")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,34 +320,34 @@ class InertialConfig:
 
     gyro_noise: float = setting(
         0.1,
-        "noise of a gyro axis per sample at 250 Hz, lines included; more is taken where seen",
+        "gyro noise per axis and sample at 250 Hz; raised when the data show more",
         unit="rad/s",
         lo=1e-4,
         hi=10.0,
     )
     accel_noise: float = setting(
         0.15,
-        "noise of an accelerometer axis per sample at 250 Hz; more is taken where more is seen",
+        "accelerometer noise per axis and sample at 250 Hz; raised when the data show more",
         unit="m/s^2",
         lo=1e-3,
         hi=100.0,
     )
     gyro_bias_walk: float = setting(
-        1e-4, "how fast the gyro's bias may wander", unit="rad/s/sqrt(s)", lo=0.0, hi=1.0
+        1e-4, "random walk of the gyro bias", unit="rad/s/sqrt(s)", lo=0.0, hi=1.0
     )
     accel_bias_walk: float = setting(
-        1e-3, "how fast the accelerometer's bias may wander", unit="m/s^2/sqrt(s)", lo=0.0, hi=10.0
+        1e-3, "random walk of the accelerometer bias", unit="m/s^2/sqrt(s)", lo=0.0, hi=10.0
     )
     imu_gap_ms: float = setting(
         50.0,
-        "a longer stretch without IMU sample is bridged by steady motion",
+        "longer gaps between IMU samples are bridged by constant velocity",
         unit="ms",
         lo=5.0,
         hi=1000.0,
     )
     use_accelerometer: bool = setting(
         True,
-        "whether the accelerometer is used; off, velocity and gravity come from the clouds alone",
+        "use the accelerometer; without it velocity and gravity come from the clouds",
     )
 
 
@@ -285,23 +357,25 @@ class SurfaceConfig:
 
     surface_sizes: tuple[float, ...] = setting(
         (0.15, 0.3, 0.6, 1.5),
-        "edges of the cells of each level of the map, fine to coarse",
+        "voxel sizes of the map's levels, fine to coarse",
         unit="m",
         lo=0.05,
         hi=10.0,
     )
     surface_thickness: float = setting(
         0.03,
-        "a cell whose points scatter more than this about a plane is not used",
+        "largest scatter of a voxel's points about their plane",
         unit="m",
         lo=0.005,
         hi=0.5,
     )
-    surface_points: int = setting(8, "points that a cell needs before it is used", lo=4, hi=100)
-    surface_capacity: int = setting(400, "points after which a cell is final", lo=10, hi=100_000)
+    surface_points: int = setting(8, "points a voxel needs before it is matched", lo=4, hi=100)
+    surface_capacity: int = setting(
+        400, "points after which a voxel is no longer updated", lo=10, hi=100_000
+    )
     point_noise: float = setting(
         0.05,
-        "how far a point may be from its surface, what neighbours share included",
+        "noise of a point's distance to its plane, including error that neighbors share",
         unit="m",
         lo=0.002,
         hi=1.0,
@@ -309,20 +383,25 @@ class SurfaceConfig:
     )
     outlier_scale: float = setting(
         0.05,
-        "distance at which a point loses three quarters of its weight",
+        "distance at which the robust kernel leaves a point a quarter of its weight",
         unit="m",
         lo=0.005,
         hi=5.0,
         live=True,
     )
     source_voxel: float = setting(
-        0.2, "one point per cube of this size is aligned", unit="m", lo=0.02, hi=5.0, live=True
+        0.2,
+        "voxel size for downsampling a sweep before alignment",
+        unit="m",
+        lo=0.02,
+        hi=5.0,
+        live=True,
     )
     source_points: int = setting(
-        3000, "largest number of points to align", lo=100, hi=100_000, live=True
+        3000, "maximum number of points to align", lo=100, hi=100_000, live=True
     )
     iterations: int = setting(
-        5, "largest number of steps of the alignment", lo=1, hi=50, live=True
+        5, "maximum number of Gauss-Newton iterations", lo=1, hi=50, live=True
     )
 
     def __post_init__(self) -> None:
@@ -343,21 +422,21 @@ class KissConfig:
         0.5, "voxel size of KISS-ICP's local map", unit="m", lo=0.05, hi=10.0
     )
     kiss_max_points_per_voxel: int = setting(
-        20, "points kept in a voxel of KISS-ICP's map", lo=1, hi=1000
+        20, "points per voxel of KISS-ICP's map", lo=1, hi=1000
     )
     kiss_initial_threshold: float = setting(
-        1.0, "KISS-ICP's first guess of how wrong the prediction is", unit="m", lo=0.01, hi=20.0
+        1.0, "initial threshold of KISS-ICP", unit="m", lo=0.01, hi=20.0
     )
     kiss_min_motion: float = setting(
         0.1,
-        "deviations below this do not sharpen KISS-ICP's threshold",
+        "smallest deviation that updates KISS-ICP's threshold",
         unit="m",
         lo=0.001,
         hi=5.0,
     )
-    kiss_iterations: int = setting(100, "largest number of iterations of KISS-ICP", lo=1, hi=1000)
-    kiss_convergence: float = setting(1e-4, "step at which KISS-ICP is done", lo=1e-8, hi=0.1)
-    threads: int = setting(1, "threads of KISS-ICP; 0 = all cores", lo=0, hi=64)
+    kiss_iterations: int = setting(100, "maximum number of KISS-ICP iterations", lo=1, hi=1000)
+    kiss_convergence: float = setting(1e-4, "convergence criterion of KISS-ICP", lo=1e-8, hi=0.1)
+    threads: int = setting(1, "threads of KISS-ICP; 0 uses all cores", lo=0, hi=64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -366,7 +445,7 @@ class OdometryConfig:
 
     mode: str = setting(
         "inertial",
-        "inertial: IMU, KISS-ICP's parts and surfaces; plain: KissICP.register_frame as it is",
+        "inertial: LiDAR-inertial odometry; plain: unmodified KISS-ICP",
         choices=("inertial", "plain"),
     )
     reference: str = setting(
@@ -374,7 +453,7 @@ class OdometryConfig:
     )
     min_range: float = setting(
         0.4,
-        "nearer points are left out: the carrier's own parts",
+        "nearer points are dropped, such as the carrier's own body",
         unit="m",
         lo=0.0,
         hi=100.0,
@@ -382,13 +461,13 @@ class OdometryConfig:
     )
     max_range: float = setting(
         100.0,
-        "farther points are left out, and the map is forgotten beyond",
+        "farther points are dropped; the map is pruned beyond this range",
         unit="m",
         lo=1.0,
         hi=1000.0,
     )
     min_points: int = setting(
-        30, "a sweep with fewer points to align is not aligned but predicted", lo=10, hi=100_000
+        30, "a sweep with fewer points is predicted instead of aligned", lo=10, hi=100_000
     )
     inertial: InertialConfig = field(default_factory=InertialConfig)
     surfaces: SurfaceConfig = field(default_factory=SurfaceConfig)
@@ -408,59 +487,57 @@ class OdometryTopics:
     """Where an odometry node listens and speaks, and which frames it names."""
 
     cloud_topic: str = setting(
-        "/points", "clouds with one time per point, not deskewed", form=TOPIC
+        "/points", "input clouds with per-point times, not deskewed", form=TOPIC
     )
     imu_topic: str = setting("/imu/data", "IMU samples", form=TOPIC)
     odometry_topic: str = setting(
         "odometry", "pose and twist of base_frame, once per sweep", form=TOPIC
     )
     fast_odometry_topic: str = setting(
-        "odometry_imu", "pose and twist carried on by the IMU, see imu_rate", form=TOPIC
+        "odometry_imu", "pose and twist propagated by the IMU, see imu_rate", form=TOPIC
     )
-    path_topic: str = setting("path", "where base_frame has been", form=TOPIC)
+    path_topic: str = setting("path", "trajectory of base_frame", form=TOPIC)
     map_topic: str = setting("local_map", "local map in odom_frame", form=TOPIC)
     registered_topic: str = setting(
         "registered_points", "deskewed cloud in odom_frame", form=TOPIC
     )
     qos_reliability: str = setting(
-        "reliable", "reliability of what is published", choices=("best_effort", "reliable")
+        "reliable", "QoS reliability of the published topics", choices=("best_effort", "reliable")
     )
-    odom_frame: str = setting("odom", "frame in which poses are given", form=FRAME)
+    odom_frame: str = setting("odom", "frame of the poses", form=FRAME)
     base_frame: str = setting(
         "",
-        "frame whose pose is given, tied to the cloud frame by /tf_static; empty = cloud frame",
+        "frame whose pose is published, connected by /tf_static; empty: the cloud frame",
         form=FRAME,
     )
     publish_tf: bool = setting(True, "publish the transform between odom_frame and base_frame")
     invert_tf: bool = setting(
-        False, "make base_frame the parent of odom_frame, for a base_frame that has a parent"
+        False, "publish base_frame as the parent of odom_frame, for a base_frame that has a parent"
     )
-    use_tf: bool = setting(
-        True, "take the mounts from /tf_static where it has them; else imu_xyz holds"
-    )
+    use_tf: bool = setting(True, "take mounts from /tf_static; fall back to imu_xyz")
     imu_xyz: tuple[float, ...] = setting(
-        (-0.007698, -0.014655, 0.00667), "place of the IMU in the cloud frame", unit="m"
+        (-0.007698, -0.014655, 0.00667), "position of the IMU in the cloud frame", unit="m"
     )
     imu_wait_ms: int = setting(
-        50, "longest wait for IMU samples up to the end of a sweep", unit="ms", lo=0, hi=1000
+        50, "longest wait for IMU samples that cover the end of a sweep", unit="ms", lo=0, hi=1000
     )
     imu_rate: float = setting(
-        0.0, "rate of the odometry carried on by the IMU, 0 = none", unit="Hz", lo=0.0, hi=250.0
+        0.0, "rate of IMU-propagated odometry; 0 turns it off", unit="Hz", lo=0.0, hi=250.0
     )
     map_period_s: float = setting(
-        2.0, "time between local maps, 0 = none", unit="s", lo=0.0, hi=3600.0, live=True
+        2.0, "period of local maps; 0 turns them off", unit="s", lo=0.0, hi=3600.0, live=True
     )
     path_length: int = setting(
         2000,
-        "poses that path keeps, 5 cm or 5 degrees apart; the oldest go first",
+        "poses kept in path, 5 cm or 5 degrees apart; the oldest are dropped",
         lo=1,
         hi=100_000,
         live=True,
     )
-    map_file: str = setting("map.ply", "what ~/save_map writes; .ply or .pcd", live=True)
+    map_file: str = setting("map.ply", "file that ~/save_map writes, .ply or .pcd", live=True)
     trajectory_file: str = setting(
         "trajectory.tum",
-        "what ~/save_trajectory writes as TUM, and beside it as KITTI",
+        "file that ~/save_trajectory writes in TUM format, with KITTI beside it",
         live=True,
     )
 
