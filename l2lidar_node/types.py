@@ -94,8 +94,17 @@ class Datagram(NamedTuple):
 class Transport(Protocol):
     """Where bytes come from and go to."""
 
-    foreign: int
-    kernel_drops: int
+    @property
+    def foreign(self) -> int:
+        """Datagrams of other senders than the device, dropped."""
+
+    @property
+    def stranger(self) -> str:
+        """Address of the last other sender; empty if there was none."""
+
+    @property
+    def kernel_drops(self) -> int:
+        """What was lost because nobody took it in time."""
 
     def receive(self, timeout_s: float) -> list[Datagram]:
         """Return what has arrived, waiting at most ``timeout_s`` for the first of it."""

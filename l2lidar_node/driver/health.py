@@ -25,6 +25,8 @@ POINTS_2D_HZ: Final = 50.0
 
 _RATE_TOLERANCE: Final = 0.1
 _LOSS_ERROR: Final = 0.05
+_FLOOD_HZ: Final = 1000.0  # foreign datagrams; twice what a second L2 would send
+_MAX_DATAGRAM_HZ: Final = 5000.0  # ten times what an L2 sends
 _MIN_VALID_SHARE: Final = 0.1
 _MAX_DIRT_PERCENT: Final = 5.0
 _MAX_APD_CELSIUS: Final = 80.0
@@ -79,6 +81,7 @@ class Period:
     now: HostNs
     counters: Counters
     foreign: int
+    stranger: str
     kernel_drops: int
     clock_events: dict[ClockEventKind, int]
 
@@ -89,6 +92,7 @@ def observe(driver: Driver, transport: Transport, now: HostNs) -> Period:
         now,
         driver.counters.snapshot(),
         transport.foreign,
+        transport.stranger,
         transport.kernel_drops,
         driver.clock_status().events,
     )
@@ -99,7 +103,7 @@ def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
     seconds = max((after.now - before.now) / 1e9, 1e-6)
     checks = [
         _device(driver, before, after, seconds),
-        _link(before, after),
+        _link(driver.config.network.l2_ip, before, after, seconds),
         _clock(driver.clock_status(), driver.round_trips, before, after),
         _points(before.counters, after.counters, seconds),
     ]
@@ -125,7 +129,10 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
     }
     address = driver.config.network.l2_ip
     if state is DeviceState.WAITING:
-        return Check("device", Level.ERROR, f"nothing heard from {address} yet", values)
+        message = f"nothing heard from {address} yet"
+        if after.foreign > before.foreign and after.stranger:
+            message += f", but from {after.stranger}: if that is the L2, set l2_ip to it"
+        return Check("device", Level.ERROR, message, values)
     if state is DeviceState.STALLED:
         return Check("device", Level.ERROR, f"{address} has fallen silent", values)
     if state is DeviceState.STANDBY:
@@ -159,7 +166,7 @@ def _measured(before: Period, after: Period) -> dict[Stream, int]:
     }
 
 
-def _link(before: Period, after: Period) -> Check:
+def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
     old, new = before.counters, after.counters
     values: dict[str, str] = {}
     lost = 0
@@ -177,6 +184,8 @@ def _link(before: Period, after: Period) -> Check:
     received = sum(_measured(before, after).values())
     drops = after.kernel_drops - before.kernel_drops
     foreign = after.foreign - before.foreign
+    datagrams = (new.datagrams - old.datagrams) / seconds
+    is_forged = datagrams > _MAX_DATAGRAM_HZ
     is_grave = lost > _LOSS_ERROR * (received + lost)
     troubles = [
         text
@@ -184,7 +193,12 @@ def _link(before: Period, after: Period) -> Check:
             (lost, f"{lost} packets lost" + (f" in {received + lost}" if is_grave else "")),
             (damaged, f"{damaged} damaged or impossible packets"),
             (drops, f"{drops} datagrams dropped by the kernel; raise receive_buffer_bytes"),
-            (foreign, f"{foreign} datagrams of other senders refused"),
+            (foreign, _of_strangers(foreign, seconds, after.stranger)),
+            (
+                is_forged,
+                f"{datagrams:.0f} datagrams/s claim to come from {address}: an L2 sends "
+                "470, so somebody else uses its address",
+            ),
         )
         if number > 0
     ]
@@ -192,6 +206,15 @@ def _link(before: Period, after: Period) -> Check:
         level = Level.ERROR if is_grave else Level.WARN
         return Check("link", level, "; ".join(troubles), values)
     return Check("link", Level.OK, "no loss", values)
+
+
+def _of_strangers(count: int, seconds: float, stranger: str) -> str:
+    text = f"{count} datagrams of other senders refused"
+    if stranger:
+        text += f", the last seen from {stranger}"
+    if count / seconds > _FLOOD_HZ:
+        text += "; it is a flood: shut it out with a firewall"
+    return text
 
 
 def _clock(

@@ -227,6 +227,13 @@ RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this b
 
 _FEW: Final = 8  # packets that may be late in a row
 
+# Bounds on how many packets can be missing between two: no stream is faster than 250 Hz, no clock
+# ratio is above 3, and a network holds packets back for a second before it delivers them at once.
+_MAX_RATE_HZ: Final = 300.0
+_MAX_RATIO: Final = 3.0
+_MAX_DELAY_NS: Final = 1_000_000_000
+_SLACK: Final = 16  # packets, for small steps of the device's clock
+
 
 class Timed(NamedTuple):
     """A packet with its arrival."""
@@ -246,6 +253,7 @@ class _Lane:
     order: SequenceOrder[Timed]
     newest: PointPacket | ImuPacket | None = None
     arrival: int = 0  # [ns] of the packet that came last
+    released: Timed | None = None  # what came out last; None: the newest one
     fallen: int = 0  # packets in a row whose stamps fell
 
 
@@ -284,6 +292,7 @@ class ReorderBuffer:
             return False
         lane.newest = packet
         lane.arrival = arrival
+        lane.released = None
         lane.fallen = 0
         return True
 
@@ -316,23 +325,26 @@ class ReorderBuffer:
     def restart(self, stream: Stream) -> Released:
         """Return what waits; the next packet of the stream is in order, whatever its number."""
         lane = self._lanes[stream]
-        lane.newest = None
+        released = _bounded(lane, lane.order.restart())
+        lane.newest = lane.released = None
         lane.fallen = 0
-        return lane.order.restart()
+        return released
 
     def push(self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs) -> Released:
         """Return what a packet releases."""
         lane = self._lanes[stream]
         order, newest, pause = lane.order, lane.newest, arrival - lane.arrival
+        if lane.released is None and newest is not None:
+            lane.released = Timed(newest, HostNs(lane.arrival))
         lane.arrival = arrival
         if newest is None or lane.fallen == 0:
             lane.newest = packet
         timed = Timed(packet, arrival)
         if newest is None:
-            return order.restart() + order.push(packet.seq, timed)
+            return _bounded(lane, order.restart() + order.push(packet.seq, timed))
         if pause > SILENCE_NS:
-            return order.resume(packet.seq, timed)
-        return order.push(packet.seq, timed)
+            return _bounded(lane, order.resume(packet.seq, timed))
+        return _bounded(lane, order.push(packet.seq, timed))
 
     def is_flowing(self, until: HostNs) -> bool:
         """Tell whether points came a moment ago and nothing waits: so nothing can be overdue."""
@@ -351,7 +363,7 @@ class ReorderBuffer:
         released: Released = []
         for lane in self._lanes.values():
             while _overdue(lane.order, until):
-                released += lane.order.give_up()
+                released += _bounded(lane, lane.order.give_up())
         return released
 
     def pause_ns(self, until: HostNs) -> int:
@@ -360,12 +372,38 @@ class ReorderBuffer:
 
     def flush(self) -> Released:
         """Return everything that waits."""
-        return [item for lane in self._lanes.values() for item in lane.order.flush()]
+        lanes = self._lanes.values()
+        return [item for lane in lanes for item in _bounded(lane, lane.order.flush())]
 
     def forget(self) -> None:
         """Take the next packet of each stream for the first one."""
         for lane in self._lanes.values():
-            lane.newest = None
+            lane.newest = lane.released = None
+
+
+def _bounded(lane: _Lane, released: Released) -> Released:
+    """Take back from the lost what cannot have been sent in the time between two packets.
+
+    A number that is far off, from whatever cause, says nothing of packets.
+    """
+    bounded: Released = []
+    for missing, timed in released:
+        before, lane.released = lane.released, timed
+        most = missing if before is None else min(missing, _most_between(before, timed))
+        lane.order.counts.lost -= missing - most
+        bounded.append((most, timed))
+    return bounded
+
+
+def _most_between(before: Timed, after: Timed) -> int:
+    """Return how many packets of a stream there can be between two."""
+    if after.arrival < before.arrival:
+        return _SLACK
+    elapsed = after.arrival - before.arrival + _MAX_DELAY_NS
+    measured = after.packet.stamp - before.packet.stamp
+    if measured >= 0:  # else the device's clock was set back
+        elapsed = min(elapsed, round(measured * _MAX_RATIO))
+    return int(elapsed * 1e-9 * _MAX_RATE_HZ) + _SLACK
 
 
 def _overdue(order: SequenceOrder[Timed], until: HostNs) -> bool:

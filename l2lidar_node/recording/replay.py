@@ -97,6 +97,7 @@ class NoTransport:
     """Stands for the transport that a recording has not."""
 
     foreign = 0
+    stranger = ""
     kernel_drops = 0
 
     def receive(self, timeout_s: float) -> list[Datagram]:

@@ -39,6 +39,8 @@ class SerialTransport:
     ----------
     foreign : int
         Always 0: there is nobody else on a serial line.
+    stranger : str
+        Always empty.
     kernel_drops : int
         Reads that were thrown away because nobody took them for too long.
     send_errors : int
@@ -54,6 +56,7 @@ class SerialTransport:
 
     def __init__(self, path: str) -> None:
         self.foreign = 0
+        self.stranger = ""
         self.kernel_drops = 0
         self.send_errors = 0
         self.interruptions = 0

@@ -1,8 +1,10 @@
-"""The socket: datagrams of one sender with the kernel's arrival times, and frames to it."""
+"""UDP socket: datagrams of one sender with the kernel's arrival times, and frames to it."""
 
 from __future__ import annotations
 
+import ctypes
 import errno
+import ipaddress
 import socket
 import struct
 import time
@@ -12,15 +14,33 @@ from l2lidar_node.config import NetworkConfig
 from l2lidar_node.types import Datagram, HostNs
 
 # Not in Python's socket module; from Linux's asm-generic/socket.h.
+_SO_ATTACH_FILTER: Final = 26
+_SO_DETACH_FILTER: Final = 27
 _SO_TIMESTAMPNS: Final = 35
-_SO_RXQ_OVFL: Final = 40
+_SO_MEMINFO: Final = 55
 _TIMESPEC = struct.Struct("@ll")
 _TIMEVAL = struct.Struct("@ll")
-_COUNTER = struct.Struct("@I")
-_ANCILLARY_SIZE: Final = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_COUNTER.size)
+_MEMINFO = struct.Struct("@9I")  # the last is what was dropped, see linux/sock_diag.h
+_ANCILLARY_SIZE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 _MAX_DATAGRAM: Final = 65_536
 _FRESH_NS: Final = 300_000
 _BATCH: Final = 256  # datagrams read before the caller gets a turn
+
+FLOOD_HZ: Final = 1000
+"""Foreign datagrams a second from which on the kernel refuses them.
+
+An L2 sends 470 a second, so one whose address is not ``l2_ip`` is still counted one by one.
+"""
+_FLOOD_NS: Final = 1_000_000_000
+
+# Classic BPF (linux/filter.h): code, jump if true, jump if false, operand.
+_BPF_INSTRUCTION = struct.Struct("@HBBI")
+_BPF_PROGRAM = struct.Struct("@HP")
+_BPF_LOAD: Final = 0x20  # LD | W | ABS
+_BPF_EQUAL: Final = 0x15  # JMP | JEQ | K
+_BPF_RETURN: Final = 0x06  # RET | K
+_IP_SOURCE: Final = 0xFFF0_0000 + 12  # SKF_NET_OFF, then the source address of an IPv4 header
+_WHOLE: Final = 0xFFFF_FFFF
 
 
 class TransportError(OSError):
@@ -30,16 +50,18 @@ class TransportError(OSError):
 class UdpTransport:
     """A UDP socket that hears one device.
 
+    The source address counts, not the port: that of a unit may differ from ``l2_port``. Datagrams
+    of other senders are read and counted. While there are more than :data:`FLOOD_HZ` of them the
+    kernel refuses them with a packet filter, before they take room in the receive buffer.
+
     Parameters
     ----------
     config : NetworkConfig
 
     Attributes
     ----------
-    foreign : int
-        Datagrams of other senders, dropped.
-    kernel_drops : int
-        Datagrams the kernel dropped because the receive buffer was full.
+    stranger : str
+        Address of the last other sender that was read; empty before the first.
     send_errors : int
         Frames that could not be sent, for example while a cable is out.
 
@@ -50,15 +72,19 @@ class UdpTransport:
     """
 
     def __init__(self, config: NetworkConfig) -> None:
-        self.foreign = 0
-        self.kernel_drops = 0
+        self.stranger = ""
         self.send_errors = 0
+        self._foreign = 0
+        self._kernel_drops = 0
+        self._dropped = 0  # as the kernel counts: for want of room, and by the filter
+        self._filters = False
+        self._window_since = 0  # [ns] strangers are counted over a second
+        self._window_foreign = 0  # what there were when it began
         self._device = config.l2_ip
         self._peer = (config.l2_ip, config.l2_port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, config.receive_buffer_bytes)
-        for option in (_SO_TIMESTAMPNS, _SO_RXQ_OVFL):
-            self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
             self._socket.bind((config.host_ip, config.host_port))
         except OSError as error:
@@ -70,6 +96,21 @@ class UdpTransport:
     def port(self) -> int:
         """The port that is listened on."""
         return int(self._socket.getsockname()[1])
+
+    @property
+    def foreign(self) -> int:
+        """Datagrams of other senders, dropped."""
+        self._count_drops()
+        return self._foreign
+
+    @property
+    def kernel_drops(self) -> int:
+        """Datagrams the kernel dropped because the receive buffer was full.
+
+        While it refuses strangers its counter does not tell the two apart: all are foreign then.
+        """
+        self._count_drops()
+        return self._kernel_drops
 
     @property
     def receive_buffer_bytes(self) -> int:
@@ -99,10 +140,12 @@ class UdpTransport:
             if sender[0] == self._device:
                 batch.append(Datagram(data, arrival))
             else:
-                self.foreign += 1
+                self._refuse(sender[0])
             if not flags and 0 <= time.time_ns() - arrival < _FRESH_NS:
                 break
             flags = socket.MSG_DONTWAIT
+        if self._filters:
+            self._watch_flood()
         return batch
 
     def send(self, frame: bytes) -> None:
@@ -124,14 +167,67 @@ class UdpTransport:
         self._timeout_s = timeout_s
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> HostNs:
-        arrival = 0
         for _, kind, value in ancillary:
             if kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack(value)
-                arrival = seconds * 1_000_000_000 + nanoseconds
-            elif kind == _SO_RXQ_OVFL:
-                self.kernel_drops = _COUNTER.unpack(value)[0]
-        return HostNs(arrival or time.time_ns())
+                return HostNs(seconds * 1_000_000_000 + nanoseconds)
+        return HostNs(time.time_ns())
+
+    def _refuse(self, sender: str) -> None:
+        """Count a datagram of another sender; have the kernel refuse them where there are many."""
+        self.stranger = sender
+        self._foreign += 1
+        now = time.monotonic_ns()
+        if now - self._window_since > _FLOOD_NS:
+            self._window_since, self._window_foreign = now, self._foreign
+        if not self._filters and self._foreign - self._window_foreign >= FLOOD_HZ:
+            self._count_drops()
+            self._filters = _attach_filter(self._socket, self._device)
+            self._window_since, self._window_foreign = now, self._foreign
+
+    def _watch_flood(self) -> None:
+        """Read strangers again when they have become few."""
+        now = time.monotonic_ns()
+        if now - self._window_since < _FLOOD_NS:
+            return
+        if self.foreign - self._window_foreign < FLOOD_HZ // 2:
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+            self._filters = False
+        self._window_since, self._window_foreign = now, self._foreign
+
+    def _count_drops(self) -> None:
+        try:
+            info = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+            dropped = _MEMINFO.unpack(info)[-1]
+        except (OSError, struct.error):  # closed, or a kernel that does not tell
+            return
+        more = (dropped - self._dropped) % (1 << 32)
+        self._dropped = dropped
+        if self._filters:
+            self._foreign += more
+        else:
+            self._kernel_drops += more
+
+
+def _attach_filter(link: socket.socket, address: str) -> bool:
+    """Have the kernel refuse all senders but one; return whether it does."""
+    program = b"".join(
+        _BPF_INSTRUCTION.pack(*instruction)
+        for instruction in (
+            (_BPF_LOAD, 0, 0, _IP_SOURCE),
+            (_BPF_EQUAL, 0, 1, int(ipaddress.IPv4Address(address))),
+            (_BPF_RETURN, 0, 0, _WHOLE),
+            (_BPF_RETURN, 0, 0, 0),
+        )
+    )
+    memory = ctypes.create_string_buffer(program)
+    count = len(program) // _BPF_INSTRUCTION.size
+    try:
+        value = _BPF_PROGRAM.pack(count, ctypes.addressof(memory))
+        link.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, value)
+    except OSError:
+        return False
+    return True
 
 
 def _bind_advice(config: NetworkConfig, error: OSError) -> str:

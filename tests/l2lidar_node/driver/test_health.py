@@ -18,6 +18,7 @@ class Link:
     """The counts of a transport."""
 
     foreign = 0
+    stranger = ""
     kernel_drops = 0
 
 
@@ -169,6 +170,35 @@ def test_damage_drops_and_foreigners_are_named():
     assert check.values["damaged: crc"] == check.values["rejected: 102.point_num"] == "1"
     watched.begin()
     assert watched.verdict("link") == (Level.OK, "no loss")
+
+
+def test_a_flood_is_named_with_its_sender_and_what_to_do():
+    watched = streaming(1.0)
+    watched.link.foreign, watched.link.stranger = 50_000, "10.0.0.7"
+    level, message = watched.verdict("link")
+    assert level is Level.WARN
+    assert message == (
+        "50000 datagrams of other senders refused, the last seen from 10.0.0.7; it is a flood: "
+        "shut it out with a firewall"
+    )
+
+
+def test_a_device_at_another_address_is_named():
+    watched = Watched()
+    watched.run.now += 1_000_000_000
+    watched.link.foreign, watched.link.stranger = 470, "192.168.1.63"
+    level, message = watched.verdict("device")
+    assert level is Level.ERROR
+    assert message.endswith("but from 192.168.1.63: if that is the L2, set l2_ip to it")
+
+
+def test_a_flood_under_the_devices_own_address_is_named():
+    watched = streaming(1.0)
+    for _ in range(20_000):
+        watched.run.driver.receive(b"", HostNs(watched.run.now))
+    level, message = watched.verdict("link")
+    assert level is Level.WARN
+    assert "claim to come from 192.168.1.62: an L2 sends 470" in message
 
 
 def test_a_clock_that_is_not_locked():

@@ -208,6 +208,23 @@ def test_after_a_silence_numbers_go_on_where_they_are():
     assert arriving.counts.late == arriving.counts.duplicates == 0
 
 
+@pytest.mark.parametrize("far", [200, 900, 1030, 100_000, 2_000_000, 4_000_000_000])
+def test_a_far_number_adds_no_more_to_the_lost_than_time_allows(far):
+    """One valid packet in a stream of which nothing is lost."""
+    arriving = Arriving()
+    out = arriving.run(*range(500))
+    stray = arriving.packet(500)._replace(seq=far)
+    out += arriving.take(stray)
+    for number in range(500, 2000):
+        released = arriving.reorder_buffer.settle(HostNs(arriving.now))
+        out += [timed.packet.seq for _, timed in released]
+        out += arriving.run(number)
+    assert sorted(n for n in out if n != far) == sorted(
+        n % 1025 for n in range(2000) if n % 1025 != far
+    )
+    assert arriving.counts.lost <= 100
+
+
 def test_what_is_forgotten_is_not_missed():
     arriving = Arriving()
     arriving.run(*range(100))

@@ -62,6 +62,7 @@ class VirtualHost:
     """Transport and clock of a session with a virtual L2."""
 
     foreign = 0
+    stranger = ""
     kernel_drops = 0
 
     def __init__(

@@ -29,6 +29,7 @@ class Link:
     """The counts of a transport."""
 
     foreign = kernel_drops = 0
+    stranger = ""
 
 
 def twisted(payload: bytes, layout: np.dtype, rng: random.Random) -> bytes:

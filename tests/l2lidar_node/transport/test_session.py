@@ -252,6 +252,7 @@ class Scripted:
     """A transport that hands out what it was given, then nothing."""
 
     foreign = kernel_drops = 0
+    stranger = ""
 
     def __init__(self, *batches: list[Datagram]):
         self.batches = list(batches)
