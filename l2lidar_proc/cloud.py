@@ -99,7 +99,7 @@ def _relative_ns(times: NDArray[Any], stamp: HostNs, unit: str) -> NDArray[np.in
         raise CloudError(f"all {len(times)} times are equal")
     factor = _UNITS[_unit(times.dtype, spread) if unit == "auto" else unit]
     if float(np.abs([float(first), float(last)]).max()) * factor > 9e18:
-        raise CloudError(f"times up to {float(last):g} are no instants")
+        raise CloudError(f"times up to {float(last):g} are not valid times")
     if times.dtype.kind == "f":
         instants = np.round(times.astype(np.float64) * factor).astype(np.int64)
     else:
@@ -109,11 +109,9 @@ def _relative_ns(times: NDArray[Any], stamp: HostNs, unit: str) -> NDArray[np.in
     # half-width numbers cannot hold an instant, only what counts from the stamp
     absolute = times.dtype.itemsize == 8 and abs(int(ends[0]) - stamp) <= _NEAR_NS
     if from_stamp and absolute:
-        raise CloudError(
-            "the times may be absolute or count from the stamp, which is near 0 itself"
-        )
+        raise CloudError("the stamp is near 0, so the times may be absolute or relative to it")
     if not from_stamp and not absolute:
-        raise CloudError("the times are neither near the stamp nor do they count from it")
+        raise CloudError("the times are neither absolute nor relative to the stamp")
     return instants - stamp if absolute else instants
 
 
@@ -126,7 +124,7 @@ def _unit(layout: np.dtype[Any], spread: float) -> str:
     if 1e6 <= spread <= 1e9:
         return "ns"
     raise CloudError(
-        f"times of type {layout} that span {spread:g} have no plain unit; set it with time_unit"
+        f"times of type {layout} that span {spread:g} have no obvious unit; set time_unit"
     )
 
 

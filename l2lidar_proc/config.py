@@ -84,7 +84,9 @@ class MotionConfig:
         for name in ("imu_xyz", "imu_rpy"):
             value = getattr(self, name)
             if len(value) != 3:
-                raise SettingError(f"parameter '{name}': {value!r} has not three numbers")
+                raise SettingError(
+                    f"parameter '{name}': {value!r} is not valid; expected three numbers"
+                )
 
     @property
     def T_cloud_imu(self) -> F64:
@@ -409,7 +411,7 @@ class SurfaceConfig:
         sizes = self.surface_sizes
         if not sizes or any(fine >= coarse for fine, coarse in pairwise(sizes)):
             raise SettingError(
-                f"parameter 'surface_sizes': {list(sizes)} cannot be it, expected at least one "
+                f"parameter 'surface_sizes': {list(sizes)} is not valid; expected at least one "
                 "edge, each larger than the one before"
             )
 
@@ -544,10 +546,12 @@ class OdometryTopics:
     def __post_init__(self) -> None:
         """Check what a single setting cannot."""
         if len(self.imu_xyz) != 3:
-            raise SettingError(f"parameter 'imu_xyz': {self.imu_xyz!r} has not three numbers")
+            raise SettingError(
+                f"parameter 'imu_xyz': {self.imu_xyz!r} is not valid; expected three numbers"
+            )
         if self.odom_frame in ("", self.base_frame):
             raise SettingError(
-                f"parameter 'odom_frame': {self.odom_frame!r} cannot be it, expected a frame name "
+                f"parameter 'odom_frame': {self.odom_frame!r} is not valid; expected a frame name "
                 "other than base_frame's"
             )
         if not self.map_file.endswith((".ply", ".pcd")):

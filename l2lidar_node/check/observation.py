@@ -407,6 +407,6 @@ def _choose(kinds: Mapping[str, str], kind: str, asked: str, option: str) -> str
         raise SourceError(f"there is no topic '{asked}'; topics of type {kind} are: {there}")
     if len(found) > 1:
         raise SourceError(
-            f"several topics are of type {kind}; say which by {option}: " + ", ".join(found)
+            f"several topics are of type {kind}; select one with {option}: " + ", ".join(found)
         )
     return found[0] if found else ""

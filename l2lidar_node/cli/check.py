@@ -184,7 +184,7 @@ def _observe(
         what = f"{source} is no file; topics" if source else "topics"
         raise SourceError(f"{what} need a sourced ROS 2 ({error})") from None
     if source and asked.cloud:
-        raise SourceError(f"topic '{source}' and --cloud {asked.cloud} say two things")
+        raise SourceError(f"topic '{source}' and --cloud {asked.cloud} contradict each other")
     seconds = _LISTEN_S if seconds is None else seconds
     with Console(stderr=True).status(f"listening for {seconds:g} s"):
         return topic_source.observe(Topics(source or asked.cloud, asked.imu), needs_imu, seconds)

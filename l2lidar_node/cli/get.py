@@ -94,7 +94,7 @@ def addresses_in_use(network: NetworkConfig) -> dict[str, str | int]:
 
 def _hear(network: NetworkConfig) -> None:
     if network.serial_port:
-        raise DeviceError("over a serial line there are no addresses to be seen")
+        raise DeviceError("a serial line carries no network addresses; connect by UDP")
     with Device(network) as device:
         if device.wait_for(lambda driver: driver.counters.datagrams > 0, _LISTEN_S) is None:
             raise DeviceError(f"nothing heard from the L2; {device.advice()}")

@@ -92,7 +92,7 @@ def _record_capture(
             file.unlink()
         elif isinstance(error, CommandError):
             left = file.rename(free_name(file.with_name(f"{file.stem}.unfinished{file.suffix}")))
-            raise CommandError(f"{error}; what came until then is in {left}") from None
+            raise CommandError(f"{error}; the data received until then is in {left}") from None
         raise
     say(f"{file}: {_size(recorder)}")
 

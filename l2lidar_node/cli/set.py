@@ -110,7 +110,7 @@ def parameters(
             device.send(commands.set_parameters(after))
             found = device.read_parameters().payload
         if found != after:
-            raise DeviceError("acknowledged, but it does not send back what was stored")
+            raise DeviceError("acknowledged, but the device reports other values than were sent")
     say("stored and read back")
 
 
@@ -152,7 +152,9 @@ def network_(
     is_hidden = blind or bool(network.serial_port)
     if is_hidden and None in given.values():
         missing = [f"--{name.replace('_', '-')}" for name in given if given[name] is None]
-        raise UsageError(f"what is in use cannot be seen: give {', '.join(missing)} as well")
+        raise UsageError(
+            f"the device does not report its addresses: give {', '.join(missing)} too"
+        )
     before = {} if is_hidden else addresses_in_use(network)
     after = before | {name: value for name, value in given.items() if value is not None}
     after["gateway"] = gateway or str(after["lidar_ip"]).rpartition(".")[0] + ".1"
@@ -233,7 +235,7 @@ def _check_subnet(values: dict[str, str | int]) -> None:
         raise ValueError(f"{error}, expected IPv4 addresses and a mask") from None
     for name, address in ends.items():
         if address.is_multicast or address.is_unspecified:
-            raise ValueError(f"{name}: {address} is no address of a machine")
+            raise ValueError(f"{name}: {address} is not a host address")
         if address not in subnet:
             raise ValueError(f"{name}: {address} is not in the unit's subnet {subnet}")
         if address in (subnet.network_address, subnet.broadcast_address):
@@ -251,4 +253,4 @@ def _mac_bytes(text: str) -> bytes:
         return bytes.fromhex("".join(parts))
     except ValueError:
         expected = "expected one such as 4c:32:01:00:00:63"
-        raise ValueError(f"'{text}' is no hardware address, {expected}") from None
+        raise ValueError(f"'{text}' is not a MAC address; {expected}") from None

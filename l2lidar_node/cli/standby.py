@@ -57,7 +57,7 @@ def stop(network: NetworkConfig) -> None:
         try:
             device.command(lambda driver, now: driver.stop_rotation(now)[0])
             if device.is_measuring(_SILENT_S) and device.is_measuring(_SILENT_S):
-                raise DeviceError("acknowledged, but it goes on measuring")
+                raise DeviceError("the device acknowledged the command but keeps measuring")
         except KeyboardInterrupt:
             if was_running:
                 _restore(device, to_running=True)
@@ -97,7 +97,7 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
             return _count(driver) > points and has_begun_anew
 
         if device.wait_for(is_back, wait) is None:
-            raise DeviceError(f"no sign of a restart within {wait:g} s")
+            raise DeviceError(f"the device did not restart within {wait:g} s")
         say("it has restarted, points are back")
 
 

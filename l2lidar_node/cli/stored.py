@@ -103,7 +103,7 @@ def with_parameters(payload: bytes, changes: list[str]) -> bytes:
         except ValueError:
             number = math.nan
         if not abs(number) <= float(np.finfo(np.float32).max):
-            raise ValueError(f"{name}: '{value}' is no finite number")
+            raise ValueError(f"{name}: '{value}' is not a finite number")
         *groups, field = name.split(".")
         part: Any = block
         for group in groups:

@@ -104,7 +104,7 @@ def sync_check(
     else:
         _show(result)
     if not status.locked:
-        raise DeviceError("the arrivals are too irregular, or the clock is: no line fits them")
+        raise DeviceError("no line fits the arrivals: network or device clock are too irregular")
 
 
 def _is_measuring(driver: Driver) -> bool:

@@ -62,7 +62,7 @@ def dtype_of(fields: Iterable[Field], point_step: int, is_bigendian: bool) -> np
         if item.offset + int(code[1]) * count > point_step:
             raise ValueError(f"field '{item.name}': does not fit point_step {point_step}")
         if not item.name or item.name in names:
-            raise ValueError(f"field '{item.name}': {'stands twice' if item.name else 'no name'}")
+            raise ValueError(f"field '{item.name}': {'occurs twice' if item.name else 'no name'}")
         names.append(item.name)
         formats.append(f"{order}{code}" if count == 1 else (f"{order}{code}", (count,)))
         offsets.append(item.offset)

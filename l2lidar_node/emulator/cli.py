@@ -347,7 +347,7 @@ def _pace(text: str) -> float:
         speed = math.nan
     if not 0.01 <= speed <= 1000.0:
         raise typer.BadParameter(
-            f"{text!r} is no speed, expected 0.01 to 1000, or max", param_hint="'--speed'"
+            f"{text!r} is not a speed; expected 0.01 to 1000, or max", param_hint="'--speed'"
         )
     return speed
 

@@ -119,7 +119,7 @@ class RayCastWorker:
                     self._futures[key] = self._pool.submit(_measure, *key)
             return self._futures.pop(wanted[0]).result()
         except BrokenProcessPool:
-            raise RayCastError("the measuring process has come to an end") from None
+            raise RayCastError("the ray-cast process ended") from None
 
 
 class WorkerScanner:

@@ -114,7 +114,7 @@ class PacketReader:
         except _CutOffError:
             self.is_cut_off = True
             return
-        raise CaptureError("this is no capture file (neither pcap nor pcapng)")
+        raise CaptureError("not a capture file (neither pcap nor pcapng)")
 
     def _pcap(self, order: str, magic: bytes) -> Iterator[RawPacket]:
         unit = 1 if struct.unpack(f"{order}I", magic)[0] == _NANO else 1000

@@ -230,7 +230,7 @@ def _chosen(
     devices = sorted({source.ip for source, _ in talks})
     if l2_ip not in devices and len(devices) > 1:
         raise CaptureError(
-            f"packets of several L2s in it, {', '.join(devices)}: say which one (l2_ip)"
+            f"packets of several L2s in it, {', '.join(devices)}: select one with l2_ip"
         )
     wanted = l2_ip if l2_ip in devices else devices[0]
     return max((talk for talk in talks if talk[0].ip == wanted), key=lambda talk: talks[talk])

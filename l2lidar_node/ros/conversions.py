@@ -172,7 +172,7 @@ def _split(data: bytes, mark: bytes) -> tuple[bytes, bytes]:
     """Return what stands before and after a mark that occurs once."""
     before, found, after = data.partition(mark)
     if not found or mark in after:
-        raise ValueError("the serialised message does not look as expected")
+        raise ValueError("the serialized message has an unexpected layout")
     return before, after
 
 

@@ -234,7 +234,7 @@ def _bind_advice(config: NetworkConfig, error: OSError) -> str:
     address = f"{config.host_ip}:{config.host_port}"
     if error.errno == errno.EADDRNOTAVAIL:
         return (
-            f"cannot listen on {address}: host_ip '{config.host_ip}' is no address of this "
+            f"cannot listen on {address}: host_ip '{config.host_ip}' is not an address of this "
             "machine; give a network interface this address, or set host_ip to one it has "
             "(0.0.0.0 for all)"
         )

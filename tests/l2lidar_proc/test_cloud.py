@@ -103,13 +103,13 @@ def test_a_given_unit_decides():
 @pytest.mark.parametrize(
     ("points", "reason"),
     [
-        (cloud("time", "<f4", [0, 100]), "no plain unit"),
-        (cloud("t", "<u4", [0, 230_000]), "no plain unit"),
+        (cloud("time", "<f4", [0, 100]), "no obvious unit"),
+        (cloud("t", "<u4", [0, 230_000]), "no obvious unit"),
         (cloud("time", "<f4", [0.1, 0.1, 0.1]), "equal"),
         (cloud("time", "<f4", [0.1]), "equal"),
         (cloud("timestamp", "<f8", [1e9, 1e9 + 0.1]), "neither"),
         (cloud("time", "<f4", [50.0, 50.1]), "neither"),
-        (cloud("timestamp", "<u8", [2**63 + 10, 2**63 + 10**8]), "no instants"),
+        (cloud("timestamp", "<u8", [2**63 + 10, 2**63 + 10**8]), "not valid times"),
         (cloud("stamp", "<f4", [0, 0.1]), "no time field"),
         (cloud("time", "<f4", [np.nan]), "finite"),
         (cloud("time", "<f4", []), "finite"),

@@ -63,7 +63,7 @@ class Flash:
                 ipaddress.IPv4Address(value)
             except ValueError:
                 raise SettingError(
-                    f"parameter '{name}': {value!r} is no IPv4 address, "
+                    f"parameter '{name}': {value!r} is not an IPv4 address; "
                     "expected one such as 192.168.1.62"
                 ) from None
         gateway = addresses.lidar_ip.rsplit(".", 1)[0] + ".1"
@@ -136,7 +136,7 @@ def mac_bytes(text: str) -> bytes:
         raw = b""
     if len(raw) != 6:
         raise SettingError(
-            f"parameter 'mac': {text!r} is no hardware address, "
+            f"parameter 'mac': {text!r} is not a MAC address; "
             "expected one such as 4c:32:01:00:00:62"
         )
     return raw

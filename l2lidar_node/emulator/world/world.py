@@ -57,7 +57,7 @@ class World:
         length = np.linalg.norm(normals, axis=1)
         solid = length > 1e-12
         if not solid.any():
-            raise ValueError("triangles: there is none with an area")
+            raise ValueError("triangles: all have zero area")
         self.triangles = triangles[solid]
         self.reflectivity = np.broadcast_to(np.asarray(reflectivity, np.float32), len(triangles))[
             solid
@@ -165,7 +165,7 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | f
     import open3d as o3d
 
     if not path.is_file():
-        raise ValueError(f"{path}: {'is no file' if path.exists() else 'there is no such file'}")
+        raise ValueError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
             mesh = o3d.io.read_triangle_mesh(path)
@@ -177,7 +177,7 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | f
             f"{path}: holds no triangles (not a mesh open3d can read, or only points)"
         )
     if indices.min() < 0 or indices.max() >= len(vertices):
-        raise ValueError(f"{path}: a face names a vertex that is not there")
+        raise ValueError(f"{path}: a face refers to a missing vertex")
     colours = np.asarray(mesh.vertex_colors)
     if len(colours) != len(vertices):
         return vertices[indices], DEFAULT_REFLECTIVITY

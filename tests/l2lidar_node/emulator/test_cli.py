@@ -161,7 +161,7 @@ def test_a_killed_measuring_process_is_one_message(host):
     os.kill(measuring(process), signal.SIGKILL)
     _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1
-    assert err == "l2lidar_emulator: the measuring process has come to an end\n"
+    assert err == "l2lidar_emulator: the ray-cast process ended\n"
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_a_port_in_use_and_a_foreign_address_are_explained() -> None:
     foreign = _run(*assigned({**LOOPBACK, "host_ip": "203.0.113.9"}))
     assert foreign.returncode == 1
     assert "203.0.113.9" in foreign.stderr
-    assert "no address of this machine" in foreign.stderr
+    assert "not an address of this machine" in foreign.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -203,7 +203,7 @@ def test_a_port_in_use(device):
 def test_an_address_of_another_machine(device):
     error = refusal(device, host_ip="192.0.2.1")
     assert error.errno == errno.EADDRNOTAVAIL
-    assert "host_ip '192.0.2.1' is no address of this machine" in str(error)
+    assert "host_ip '192.0.2.1' is not an address of this machine" in str(error)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may listen on any port")
