@@ -30,7 +30,13 @@ PULSE_M: Final = (
     0.4  # depth steps below this blend, larger ones give the nearer surface or the farther
 )
 
-_SLOT_DRAWS = 5
+_SLOT_DRAWS = 6
+
+# rain and dust: a beam that meets a particle comes back from it as from a dark surface, and only
+# from nearby (Goodin et al. 2019, "Predicting the influence of rain on lidar": most false returns
+# come from the first ten metres)
+_PARTICLE_REFLECTIVITY: Final = 0.3
+_PARTICLE_FARTHEST_M: Final = 12.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +50,13 @@ class RangeNoise:
         4.0, "full width of the beam; 0 = no mixed pixels at edges", unit="mrad", lo=0.0, hi=50.0
     )
     head_wobble: float = setting(1.0, "factor on the measured wobble of the head", lo=0.0, hi=20.0)
+    particles: float = setting(
+        0.0,
+        "drops or grains of dust that a beam meets per metre; heavy rain 0.02, dense dust 0.2",
+        unit="1/m",
+        lo=0.0,
+        hi=10.0,
+    )
 
     @classmethod
     def clean(cls) -> RangeNoise:
@@ -56,6 +69,22 @@ class RangeNoise:
 def noise_sigma(distance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the standard deviation [m] of a range [m], as measured on a real unit."""
     return np.sqrt(NOISE_NEAR_M**2 + (NOISE_FAR * distance**1.25) ** 2)
+
+
+def particle_distances(
+    uniform: NDArray[np.float32] | NDArray[np.float64], particles: float
+) -> NDArray[np.float64]:
+    """Return how far beams go until they meet a particle [m], inf beyond the 12 m that matter.
+
+    Parameters
+    ----------
+    uniform : ndarray, any shape
+        Random numbers, 0 to 1.
+    particles : float
+        Particles that a beam meets per metre, on average.
+    """
+    free = -np.log1p(-np.asarray(uniform, np.float64)) / particles
+    return np.where(free < _PARTICLE_FARTHEST_M, free, np.inf)
 
 
 def fill(
@@ -82,16 +111,20 @@ def fill(
     """
     count, slots = rays.shape
     draws = _Draws(seed, first, count, slots)
-    hits = world.cast(rays["origin"].reshape(-1, 3), rays["direction"].reshape(-1, 3)).reshape(
-        count, slots
-    )
+    flat = rays.reshape(-1)
+    hits = world.cast(flat["origin"], flat["direction"], flat["time"]).reshape(count, slots)
     rays["distance"] = hits["distance"]
     seen = hits["distance"].copy()
     if noise.divergence_mrad > 0:
         _mix(seen, rays, world, noise.divergence_mrad * 1e-3, draws)
+    strength = hits["reflectivity"] * hits["incidence"]
+    if noise.particles > 0:
+        grain = particle_distances(draws.uniform[5], noise.particles)
+        strength = np.where(grain < seen, _PARTICLE_REFLECTIVITY, strength)
+        seen = np.minimum(seen, grain)
     back = np.isfinite(seen)
     distance = np.where(back, seen, 1.0)
-    signal = hits["reflectivity"] * hits["incidence"] / np.maximum(distance, 0.1) ** 2
+    signal = strength / np.maximum(distance, 0.1) ** 2
     if noise.weak_signal:
         back &= signal > WEAKEST_SIGNAL * np.exp(0.3 * draws.normal[1])
     if noise.dropout > 0:
@@ -106,9 +139,7 @@ def fill(
     raw = np.where(back, raw, 0).astype(np.uint16)
     packets["ranges"] = raw
     rays["measured"] = np.where(raw > 0, scale * (raw + bias), 0.0)
-    bright = (
-        210.0 * np.sqrt(hits["reflectivity"] * hits["incidence"]) / (1.0 + (distance / 25.0) ** 2)
-    )
+    bright = 210.0 * np.sqrt(strength) / (1.0 + (distance / 25.0) ** 2)
     bright = np.clip(np.rint(bright * (1.0 + 0.04 * draws.normal[1])), 1, 255)
     packets["intensities"] = np.where(raw > 0, bright, 0)
 
@@ -138,7 +169,8 @@ def _mix(
     angle = (2.0 * np.pi * draws.uniform[1])[..., None]
     other = direction + radius * (np.cos(angle) * side + np.sin(angle) * up)
     other /= np.sqrt(1.0 + radius**2)
-    beside = world.distances(rays["origin"].reshape(-1, 3), other.reshape(-1, 3))
+    flat = rays.reshape(-1)
+    beside = world.distances(flat["origin"], other.reshape(-1, 3), flat["time"])
     beside = beside.reshape(seen.shape).astype(np.float64)
     share = draws.uniform[2] * 0.5  # of the beam that meets the other surface
     with np.errstate(invalid="ignore"):  # inf - inf: nothing is there

@@ -14,6 +14,7 @@ from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.unit import returns
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.units import UNITS, Unit
+from l2lidar_node.emulator.unit.view import View
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.protocol import wire
 
@@ -180,6 +181,8 @@ class Scanner:
         ``RangeNoise.clean()`` leaves the raw count's step (0.978 mm, so at most 0.489 mm of error)
         alone.
     seed : int
+    view : View, optional
+        What the carrier leaves of the view; slots that look elsewhere return nothing.
     """
 
     def __init__(
@@ -189,12 +192,14 @@ class Scanner:
         unit: Unit = UNITS["a"],
         noise: RangeNoise | None = None,
         seed: int = 0,
+        view: View | None = None,
     ) -> None:
         self.world = world
         self.motion = motion
         self.unit = unit
         self.noise = RangeNoise() if noise is None else noise
         self.seed = seed
+        self.view = View() if view is None else view
 
     @property
     def period_s(self) -> float:
@@ -270,6 +275,11 @@ class Scanner:
         flat["origin"] = position + np.einsum("nij,nj->ni", turn, origin.reshape(-1, 3))
         flat["direction"] = np.einsum("nij,nj->ni", turn, direction.reshape(-1, 3))
         returns.fill(packets, rays, self.world, self.noise, self.seed, first)
+        if not self.view.whole:
+            hidden = ~self.view.sees(direction)
+            for name in ("ranges", "intensities"):
+                packets[name][hidden] = 0
+            rays["measured"][hidden] = 0.0
         return Scan(first, packets, times, rays)
 
 

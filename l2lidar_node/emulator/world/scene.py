@@ -6,7 +6,7 @@ Every function returns an array of shape (T, 3, 3): T triangles, three corners e
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,6 +127,10 @@ class Scene:
         Height of the ground z(x, y) [m] along the way; takes and gives arrays.
     headroom : float
         Free height above the ground along the way [m].
+    tour : ndarray, shape (M, 3)
+        Stops of a way on the ground [m] that goes through doors and up stairs; may be empty.
+    glass, mirrors : ndarray, shape (T, 3, 3)
+        Triangles of panes and of mirrors; may be empty.
     """
 
     triangles: NDArray[np.float64]
@@ -135,6 +139,9 @@ class Scene:
     spot: Point
     ground: Ground
     headroom: float
+    tour: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    glass: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    mirrors: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
 
 @dataclass(frozen=True, slots=True)

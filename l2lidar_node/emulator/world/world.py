@@ -8,8 +8,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-HIT: Final = np.dtype([("distance", "<f8"), ("incidence", "<f8"), ("reflectivity", "<f4")])
-"""What one ray met: distance [m], inf = nothing; cosine of incidence; reflectivity 0..1."""
+HIT: Final = np.dtype(
+    [("distance", "<f8"), ("incidence", "<f8"), ("reflectivity", "<f4"), ("normal", "<f8", (3,))]
+)
+"""What one ray met: distance [m], inf = nothing; cosine of incidence; reflectivity 0..1; normal of
+the surface, on either side of it."""
 
 DEFAULT_REFLECTIVITY: Final = 0.5
 
@@ -89,7 +92,10 @@ class World:
             raise ValueError(f"{path}: {error}") from None
 
     def cast(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+        self,
+        origins: NDArray[np.float64],
+        directions: NDArray[np.float64],
+        times: NDArray[np.float64] | None = None,
     ) -> NDArray[np.void]:
         """Return what rays meet first.
 
@@ -100,6 +106,8 @@ class World:
         ----------
         origins, directions : ndarray, shape (N, 3)
             World frame; directions are unit vectors.
+        times : ndarray, shape (N,), optional
+            Instant of each ray [s]; nothing moves here, see :class:`moving.MovingWorld`.
 
         Returns
         -------
@@ -120,10 +128,14 @@ class World:
         hits["distance"][met[sound]] = exact[sound]
         hits["incidence"][met] = np.abs(towards)
         hits["reflectivity"][met] = self.reflectivity[triangles]
+        hits["normal"][met] = normal
         return hits
 
     def distances(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+        self,
+        origins: NDArray[np.float64],
+        directions: NDArray[np.float64],
+        times: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float32]:
         """Return only how far rays go, in float32 (some 1e-6 m), shape (N,); see :meth:`cast`."""
         return self._trace(origins, directions)[1]
