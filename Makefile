@@ -5,7 +5,7 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-BENCHES := $(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py))
+BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-noble check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
@@ -45,7 +45,7 @@ format: setup ## put every Python file into the project's format
 	$(RUN) -m ruff format .
 
 $(BENCHES:%=bench-%): bench-%: setup
-	$(RUN) -m benchmarks.bench_$* $(BENCH_ARGS)
+	$(RUN) -m benchmarks.bench_$(subst -,_,$*) $(BENCH_ARGS)
 
 faults: setup ## every fault the virtual L2 can make, and what the driver says to it
 	$(RUN) -m benchmarks.faults $(BENCH_ARGS)

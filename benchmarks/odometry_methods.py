@@ -134,13 +134,28 @@ def _limit() -> None:
 
 
 def _referee(name: str, run: Run, cut: str) -> Found | None:
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "recording.npz"
+        odometry_runs.write(run, cut, source)
+        return run_referee(name, source)
+
+
+def run_referee(name: str, source: Path) -> Found | None:
+    """Return what a referee finds in a file of sweeps, None where it gives up.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`REFEREES`.
+    source : Path
+        See :mod:`benchmarks.odometry_referee`.
+    """
     python = referee_python()
     if python is None:
         return None
     script = Path(__file__).with_name("odometry_referee.py")
     with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "recording.npz", Path(folder) / "found.npz"
-        odometry_runs.write(run, cut, source)
+        target = Path(folder) / "found.npz"
         for skipped in range(_TRIES):
             done = subprocess.run(
                 [str(python), str(script), name, str(source), str(target), str(skipped)],

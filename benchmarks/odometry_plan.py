@@ -114,9 +114,17 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """The rows found so far, one a line; several processes may append."""
+    """The rows found so far, one a line; several processes may append.
+
+    Attributes
+    ----------
+    path : Path
+    key : tuple of str
+        What tells one run from another.
+    """
 
     path: Path = Path("out") / "bench" / "odometry.jsonl"
+    key: tuple[str, ...] = KEY
 
     def clear(self) -> None:
         """Forget all rows."""
@@ -128,17 +136,16 @@ class Rows:
         with self.path.open("a", encoding="utf-8") as file:
             # the line before may have been cut off
             file.write("\n" + json.dumps(row, default=float) + "\n")
-        words = " ".join(str(row[name]) for name in ("scene", "motion", "seed"))
+        words = ", ".join(str(row[name]) for name in self.key)
         print(
-            f"{words}, {row['sweeps']}, {row['method']}: {1e3 * row['ate_m']:.1f} mm,"
-            f" {row['real_time_factor']:.1f} x real time",
+            f"{words}: {1e3 * row['ate_m']:.1f} mm, {row['real_time_factor']:.1f} x real time",
             file=sys.stderr,
             flush=True,
         )
 
     def read(self) -> list[Row]:
         """Return the rows, the last of each run; a line that was cut off does not count."""
-        return list({tuple(row[name] for name in KEY): row for row in self._rows()}.values())
+        return list({tuple(row[name] for name in self.key): row for row in self._rows()}.values())
 
     def _rows(self) -> Iterator[Row]:
         if not self.path.exists():

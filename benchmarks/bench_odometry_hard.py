@@ -1,0 +1,289 @@
+"""Judges odometries where they fail: narrow views, bare corridors, crowds; the hard benchmark.
+
+``make bench-odometry-hard``. Every run has a scene, a way, a sensor and faults of its own, drawn
+from a seed (:mod:`benchmarks.hard_scenarios`). Without options it is the short version: one run
+of 30 s of each of 16 families; ``--full`` is the campaign of 200 runs of a minute. Recordings stay
+in ``out/recordings`` (1 MB per second), so a change of the estimator is judged again without
+casting a ray; ``--fresh`` makes them anew. Every row is kept in ``out/bench/odometry_hard.jsonl``
+as soon as it is there: ``--resume`` goes on where a campaign was cut.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks import hard_pages
+from benchmarks import odometry_methods as methods
+from benchmarks.hard_recordings import Recording, recording
+from benchmarks.hard_scenarios import FAMILIES, SHORT, scenario
+from benchmarks.hard_scores import Track, score
+from benchmarks.odometry_plan import Rows
+from benchmarks.results import FOLDER, Target, at_least, at_most, keep
+from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.plain import PlainOdometry
+
+OURS: Final = methods.OURS
+REFEREES: Final = ("rko_lio", "genz_lio", "ct_icp")
+KEY: Final = ("family", "seed", "seconds", "method")
+FULL_RUNS: Final = 200
+CONSISTENT: Final = (0.85, 0.99)  # share of poses within their 95 % bound
+ATE_BOUNDS: Final = {"room, imperfect": 0.005, "hall, imperfect": 0.025, "wood, imperfect": 0.015}
+HALL_SPEED: Final = 8.0
+
+Row = dict[str, Any]
+Run = tuple[str, int]
+"""Family and seed."""
+
+
+def planned(families: tuple[str, ...], runs: int, first_seed: int = 0) -> list[Run]:
+    """Return the runs of a campaign: every family once, then every family again, and so on."""
+    return [(families[k % len(families)], first_seed + k // len(families)) for k in range(runs)]
+
+
+def track_of(method: str, given: Recording) -> Track | None:
+    """Return what a method makes of a recording, None where it gives up."""
+    if method in REFEREES:
+        found = methods.run_referee(method, given.path)
+        return None if found is None else Track(found.stamps, found.poses, found.seconds)
+    if method == methods.PLAIN:
+        return _plain(given)
+    return _ours(given)
+
+
+def _ours(given: Recording) -> Track:
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    estimates = []
+    first = 0
+    begin = time.process_time()
+    for sweep in given.sweeps():
+        last = int(np.searchsorted(given.imu["stamp"], sweep.end)) + 1
+        odometry.imu(given.imu[first:last])
+        first = last
+        estimates += odometry.register(sweep)
+    seconds = time.process_time() - begin
+    return Track(
+        np.array([item.stamp for item in estimates], dtype=np.int64),
+        np.array([item.T_odom_lidar for item in estimates]).reshape(-1, 4, 4),
+        seconds,
+        np.array([item.covariance for item in estimates]),
+        np.array([item.velocity for item in estimates]),
+        np.array([item.twist_covariance[:3, :3] for item in estimates]),
+        [tuple(status.name for status in item.status) for item in estimates],
+    )
+
+
+def _plain(given: Recording) -> Track:
+    odometry = PlainOdometry(OdometryConfig(mode="plain"))
+    begin = time.process_time()
+    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    seconds = time.process_time() - begin
+    return Track(
+        np.array([item.stamp for item in estimates], dtype=np.int64),
+        np.array([item.T_odom_lidar for item in estimates]).reshape(-1, 4, 4),
+        seconds,
+    )
+
+
+def measure(run: Run, seconds: float, method: str, *, fresh: bool = False) -> Row:
+    """Return the row of one method on one run."""
+    family, seed = run
+    given = recording(scenario(family, seed, seconds), fresh=fresh)
+    try:
+        track = track_of(method, given)
+        figures = score(given, track)
+        if track is not None and method == OURS:
+            _keep_series(run, seconds, track)
+    except Exception:  # counts as lost, and must not end the campaign
+        traceback.print_exc()
+        figures = score(given, None)
+    return {"family": family, "seed": seed, "seconds": seconds, "method": method, **figures}
+
+
+def _keep_series(run: Run, seconds: float, track: Track) -> None:
+    """Keep what ours said of every pose, for a look at how a run failed."""
+    folder = FOLDER / "odometry_hard"
+    folder.mkdir(parents=True, exist_ok=True)
+    name = "".join(c if c.isalnum() else "_" for c in run[0])
+    assert track.covariances is not None
+    assert track.velocities is not None
+    assert track.velocity_covariances is not None
+    np.savez(
+        folder / f"{name}-{run[1]}-{seconds:g}s.npz",
+        stamps=track.stamps,
+        poses=track.poses,
+        covariances=track.covariances,
+        velocities=track.velocities,
+        velocity_covariances=track.velocity_covariances,
+        status=np.array([" ".join(names) for names in track.status]),
+    )
+
+
+def targets(rows: list[Row]) -> Iterator[Target]:
+    """Yield the targets that these rows can tell about."""
+    ours = [row for row in rows if row["method"] == OURS]
+    count = len(ours)
+    for name, key in (
+        ("end more than 1 % of the way (at least 0.3 m) off", "failed"),
+        ("were LOST", "lost"),
+        ("were wrong by more than 3 sigma (at least 0.1 m) without a status", "silent"),
+    ):
+        yield at_most(f"runs of {count} that {name}", float(sum(bool(r[key]) for r in ours)), 0.0)
+    families = list(dict.fromkeys(row["family"] for row in ours))
+    for key, what in (("nees_pose", "pose"), ("nees_velocity", "velocity")):
+        shares = [_mean(ours, family, key) for family in families]
+        outside = [share for share in shares if not CONSISTENT[0] <= share <= CONSISTENT[1]]
+        name = f"scenes of {len(families)} whose NEES of the {what} is in bounds outside 85-99 %"
+        yield at_most(name, float(len(outside)), 0.0)
+    for family, bound in ATE_BOUNDS.items():
+        ates = [row["ate_m"] for row in ours if row["family"] == family]
+        if ates:
+            yield at_most(f"median ATE, {family}, m", float(np.median(ates)), bound)
+    speeds = [row["real_time_factor"] for row in ours if row["family"].startswith("hall")]
+    if speeds:
+        name = "real-time factor in the large hall, median"
+        yield at_least(name, float(np.median(speeds)), HALL_SPEED)
+    for method in dict.fromkeys(row["method"] for row in rows if row["method"] != OURS):
+        better = [name for name in families if not _ours_is_better(rows, name, method)]
+        yield at_most(f"scenes where {method} is as good or better", float(len(better)), 0.0)
+        failed = [row for row in rows if row["method"] == method and row["failed"]]
+        yield at_least(f"runs that fail {method}", float(len(failed)), 1.0)
+
+
+def _mean(rows: list[Row], family: str, key: str) -> float:
+    return float(np.mean([row[key] for row in rows if row["family"] == family]))
+
+
+def _ours_is_better(rows: list[Row], family: str, method: str) -> bool:
+    """Return whether our median ATE over the runs that both did is the smaller one."""
+    theirs = {
+        row["seed"]: row["ate_m"]
+        for row in rows
+        if row["family"] == family and row["method"] == method
+    }
+    mine = [
+        row["ate_m"]
+        for row in rows
+        if row["family"] == family and row["method"] == OURS and row["seed"] in theirs
+    ]
+    return not theirs or float(np.median(mine)) < float(np.median([*theirs.values()]))
+
+
+def show(rows: list[Row], reached: list[Target]) -> None:
+    """Print every row and every target."""
+    for row in sorted(rows, key=lambda row: (row["method"], row["family"], row["seed"])):
+        print(
+            f"{row['method']:8} {row['family']:34} {row['seed']:2d}"
+            f"  way {row['way_m']:5.1f} m  ATE {1e3 * row['ate_m']:7.0f} mm"
+            f"  end {row['end_m']:7.3f} m ({100 * row['end_share']:5.2f} %)"
+            f"  {'FAILED' if row['failed'] else 'ok    '}  x{row['real_time_factor']:4.1f}"
+            + (
+                f"  lost {row['lost']} silent {row['silent']:3d} sigmas {row['sigmas']:6.1f}"
+                f"  NEES {100 * row['nees_pose']:3.0f} / {100 * row['nees_velocity']:3.0f} %"
+                f"  {row['status']}"
+                if row["method"] == OURS
+                else ""
+            )
+        )
+    for target in reached:
+        mark = "met    " if target.met else "NOT MET"
+        print(f"{mark} {target.name}: {target.value:.4g} (bound {target.bound:.4g})")
+
+
+def _work(given: tuple[Run, tuple[str, ...], float, bool, Rows, float]) -> int:
+    """Judge the methods on one run, in a process of its own; return how many were left out."""
+    run, wanted, seconds, fresh, kept, until = given
+    for number, method in enumerate(wanted):
+        if time.monotonic() > until:
+            return len(wanted) - number
+        kept.append(measure(run, seconds, method, fresh=fresh and number == 0))
+    return 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from a command line; return 0 when all targets are met."""
+    parser = argparse.ArgumentParser(prog="bench_odometry_hard", description=__doc__)
+    parser.add_argument("--full", action="store_true", help="200 runs of 60 s of all families")
+    parser.add_argument("--runs", type=int, help="how many runs, over the families in turn")
+    parser.add_argument("--seconds", type=float, help="length of a run")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--families", nargs="+", help="those whose names contain one of these")
+    parser.add_argument("--methods", nargs="+", default=(OURS, methods.PLAIN, *REFEREES))
+    parser.add_argument(
+        "--referee-runs", type=int, default=50, help="how many runs the others get as well"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no run after that")
+    parser.add_argument("--resume", action="store_true", help="keep the rows that there are")
+    parser.add_argument("--fresh", action="store_true", help="make the recordings anew")
+    parser.add_argument("--install-referees", action="store_true")
+    parser.add_argument("--page", action="store_true", help="write docs/results/odometry_hard.md")
+    given = parser.parse_args(arguments)
+    if given.install_referees:
+        methods.install_referees()
+    families = tuple(FAMILIES if given.full else SHORT)
+    if given.families:
+        families = tuple(name for name in FAMILIES if any(part in name for part in given.families))
+        if not families:
+            parser.error(f"--families: none of {', '.join(FAMILIES)}")
+    seconds = given.seconds or (60.0 if given.full else 30.0)
+    runs = planned(
+        families, given.runs or (FULL_RUNS if given.full else len(families)), given.first_seed
+    )
+    kept = Rows(Path(FOLDER) / "odometry_hard.jsonl", KEY)
+    if not given.resume:
+        kept.clear()
+    done = {tuple(row[name] for name in KEY) for row in kept.read()}
+    there = [
+        name
+        for name in given.methods
+        if name not in REFEREES or methods.referee_python() is not None
+    ]
+    until = time.monotonic() + 60.0 * given.minutes
+    orders = []
+    for ours in (True, False):  # ours first: whenever it is cut, what is there can be used
+        for number, run in enumerate(runs):
+            wanted = tuple(
+                name
+                for name in there
+                if (name == OURS) == ours
+                and (ours or number < given.referee_runs)
+                and (*run, seconds, name) not in done
+            )
+            if wanted:
+                orders.append((run, wanted, seconds, given.fresh and ours, kept, until))
+    if given.jobs > 1:
+        with multiprocessing.get_context("fork").Pool(given.jobs, maxtasksperchild=4) as pool:
+            left = sum(pool.imap(_work, orders))
+    else:
+        left = sum(map(_work, orders))
+    asked = set(runs)
+    rows = [
+        row
+        for row in kept.read()
+        if (row["family"], row["seed"]) in asked
+        and row["seconds"] == seconds
+        and row["method"] in given.methods
+    ]
+    if left:
+        print(f"{left} runs were left out, for want of time", file=sys.stderr)
+    reached = list(targets(rows))
+    show(rows, reached)
+    path = keep("odometry_hard", rows, reached)
+    print(f"written to {path}")
+    if given.page:
+        hard_pages.write(rows, reached)
+    return 0 if all(target.met for target in reached) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,179 @@
+"""The judge of the hard runs: judged itself, by errors that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks import bench_odometry_hard, hard_pages, hard_recordings
+from benchmarks.hard_recordings import EPOCH, Recording, recording
+from benchmarks.hard_scenarios import FAMILIES, SCENES, SHORT, prepare, scenario
+from benchmarks.hard_scores import Track, errors, score, sequence
+from l2lidar_node.emulator.motion import tours, trajectories
+from l2lidar_node.emulator.motion.motion import MOUNTS
+from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node.emulator.unit import view
+from l2lidar_node.emulator.unit.other_sensors import SENSORS
+
+pytest.importorskip("open3d")
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("recordings")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hard_recordings, "FOLDER", folder)
+        return recording(scenario("corridor, 120 degrees, imperfect", 1, 4.0))
+
+
+def true_track(given: Recording, count: int = 0) -> Track:
+    """Return the truth as a track in a frame of its own, with the covariance of 1 cm, 10 mrad."""
+    middles = given.spans.mean(axis=1).astype(np.int64)
+    if count:
+        middles = np.linspace(middles[0], middles[-1], count).astype(np.int64)
+    truth = given.truth_at(middles)
+    poses = np.tile(np.eye(4), (len(truth), 1, 1))
+    poses[:, :3, :3] = rotation_matrices(truth["quaternion_wxyz"])
+    poses[:, :3, 3] = truth["position"]
+    elsewhere = np.eye(4)
+    elsewhere[:3, :3] = Rotation.from_euler("xyz", [0.1, -0.2, 2.0]).as_matrix()
+    elsewhere[:3, 3] = (5.0, -3.0, 1.0)
+    velocity = np.einsum("nji,nj->ni", poses[:, :3, :3], truth["velocity"])
+    return Track(
+        middles,
+        elsewhere @ poses,
+        1.0,
+        np.tile(np.diag([1e-4] * 6), (len(truth), 1, 1)),
+        velocity,
+        np.tile(np.diag([1e-4] * 3), (len(truth), 1, 1)),
+        [()] * len(truth),
+    )
+
+
+def test_recordings_are_kept_and_hold_what_the_scenario_says(given: Recording) -> None:
+    assert given.path.exists()
+    assert 3.5 < given.seconds < 4.1
+    azimuth = np.abs(np.arctan2(given.points["y"], given.points["x"]))
+    far = np.hypot(given.points["x"], given.points["y"]) > 1.0  # near the axis lines bend
+    assert np.percentile(azimuth[far], 95) < np.deg2rad(90.0)
+    ages = np.diff(given.imu["stamp"])
+    assert (ages > 0).all()
+    for sweep in given.sweeps():
+        assert sweep.points["time"][0] == 0.0
+        assert (np.diff(sweep.points["time"]) >= 0.0).all()
+        assert sweep.start + sweep.points["time"][-1] * 1e9 <= sweep.end + 1e6
+
+
+def test_the_truth_between_its_samples_is_that_of_the_motion(given: Recording) -> None:
+    motion = prepare(scenario("corridor, 120 degrees, imperfect", 1, 4.0)).motion
+    t = np.linspace(0.1, 3.9, 333)
+    found = given.truth_at(EPOCH + np.round(t * 1e9).astype(np.int64))
+    moving = motion.kinematics(t)
+    np.testing.assert_allclose(found["position"], moving.position, atol=1e-5)
+    np.testing.assert_allclose(found["velocity"], moving.velocity, atol=1e-3)
+    np.testing.assert_allclose(
+        np.abs(np.einsum("ni,ni->n", found["quaternion_wxyz"], moving.quaternion_wxyz)),
+        1.0,
+        atol=1e-8,
+    )
+
+
+def test_the_truth_scores_without_error(given: Recording) -> None:
+    row = score(given, true_track(given))
+    assert row["ate_m"] < 1e-5
+    assert row["end_m"] < 1e-5
+    assert not row["failed"]
+    assert (row["silent"], row["lost"]) == (0, 0)
+    assert (row["nees_pose"], row["nees_velocity"]) == (1.0, 1.0)
+
+
+def test_errors_drawn_from_the_covariance_are_consistent(given: Recording) -> None:
+    track = true_track(given, 4000)
+    rng = np.random.default_rng(3)
+    noise = rng.normal(0.0, 0.01, (4000, 6))
+    noise[0] = 0.0  # the frame is tied to the first pose
+    poses = track.poses.copy()
+    poses[:, :3, 3] += noise[:, :3]
+    poses[:, :3, :3] = Rotation.from_rotvec(noise[:, 3:]).as_matrix() @ poses[:, :3, :3]
+    assert track.velocities is not None
+    velocities = track.velocities + rng.normal(0.0, 0.01, (4000, 3))
+    noisy = replace(track, poses=poses, velocities=velocities)
+    found = errors(given, noisy)
+    np.testing.assert_allclose(found.position, noise[:, :3], atol=2e-5)
+    np.testing.assert_allclose(found.turn, noise[:, 3:], atol=2e-5)
+    row = score(given, noisy)
+    assert abs(row["nees_pose"] - 0.95) < 0.015
+    assert abs(row["nees_velocity"] - 0.95) < 0.015
+    assert row["silent"] == 0
+    sure = replace(noisy, covariances=1e-2 * np.asarray(track.covariances))
+    assert score(given, sure)["nees_pose"] < 0.01
+
+
+def test_a_drift_is_silent_unless_a_status_says_so(given: Recording) -> None:
+    track = true_track(given)
+    poses = track.poses.copy()
+    poses[:, 0, 3] += np.linspace(0.0, 0.5, len(poses))
+    drifting = replace(track, poses=poses)
+    row = score(given, drifting)
+    assert row["failed"]
+    assert row["end_m"] == pytest.approx(0.5, abs=1e-5)
+    assert row["silent"] == int((np.linspace(0.0, 0.5, len(poses)) > 0.1).sum())
+    warned = replace(drifting, status=[("DEGENERATE",)] * len(poses))
+    assert score(given, warned)["silent"] == 0
+
+
+def test_too_few_poses_count_as_a_failure(given: Recording) -> None:
+    track = true_track(given)
+    row = score(given, replace(track, stamps=track.stamps[:5], poses=track.poses[:5]))
+    assert row["failed"]
+    assert row["ate_m"] == np.inf
+    assert score(given, None)["failed"]
+
+
+def test_a_sequence_is_short_to_read() -> None:
+    assert sequence([(), (), ("LOST", "IMU_GAP"), ()]) == "ok x2, IMU_GAP LOST x1, ok x1"
+    long = [(("ok",) if k % 2 else ()) for k in range(60)]
+    assert "more" in sequence(long)
+    assert len(sequence(long)) < 200
+
+
+def test_every_scenario_can_be_prepared_and_a_campaign_visits_all() -> None:
+    runs = bench_odometry_hard.planned(tuple(FAMILIES), 200)
+    assert len(set(runs)) == 200
+    assert {family for family, _ in runs} == set(FAMILIES)
+    assert set(SHORT) <= set(FAMILIES)
+    for family, given in FAMILIES.items():
+        assert given.scene in SCENES
+        assert given.motion in (*tours.STYLES, *trajectories.MOTIONS), family
+        assert given.sensor in ("l2", *SENSORS)
+        assert given.carrier in ("", *view.CARRIERS)
+        assert given.mount in MOUNTS
+    for family in ("crowd in a hall", "lift in an atrium", "yard on a quadruped", "covered, room"):
+        setting = prepare(scenario(family, 1, 10.0))
+        assert np.isfinite(setting.motion.poses(np.linspace(0.0, 10.0, 50))[0]).all()
+
+
+def test_the_page_tells_of_every_scene_and_failure(
+    given: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hard_pages, "PAGE", tmp_path / "results" / "page.md")
+    track = true_track(given)
+    poses = track.poses.copy()
+    poses[:, 0, 3] += np.linspace(0.0, 0.9, len(poses))
+    base = {"seed": 0, "seconds": 4.0}
+    rows = [
+        {"family": "calm", "method": "ours", **base, **score(given, track)},
+        {"family": "hard", "method": "ours", **base, **score(given, replace(track, poses=poses))},
+        {"family": "hard", "method": "rko_lio", **base, **score(given, None)},
+    ]
+    reached = list(bench_odometry_hard.targets(rows))
+    assert not all(target.met for target in reached)
+    text = hard_pages.write(rows, reached).read_text()
+    assert "| calm |" in text
+    assert "| hard, 0 |" in text
+    assert "gave up, 1 of 1" in text
+    assert "**not met**" in text
