@@ -118,8 +118,8 @@ class SweepConfig:
     )
     cut: str = setting(
         "packets",
-        "what ends a cloud: a number of packets, a full or half turn of the head, or a duration; "
-        "2D packets carry no head angle and are cut by duration",
+        "what ends a cloud: a number of packets, a full or half turn of the head (fragments are "
+        "left out), or a duration; 2D packets carry no head angle and are cut by duration",
         name="sweep_cut",
         choices=("packets", "turn", "half_turn", "duration"),
         live=True,

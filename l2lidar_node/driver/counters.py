@@ -34,6 +34,8 @@ class Counters:
         Packets of the dimension (2D or 3D) that was not asked for.
     sweeps, empty_sweeps, samples : int
         What was made; an empty sweep has no valid point and is not published.
+    fragments, fragment_packets : int
+        Parts of a turn or half turn that were not made into a sweep, and their packets.
     points : int
         Points in all sweeps.
     slots : int
@@ -55,6 +57,8 @@ class Counters:
     ignored_points: int = 0
     sweeps: int = 0
     empty_sweeps: int = 0
+    fragments: int = 0
+    fragment_packets: int = 0
     samples: int = 0
     points: int = 0
     slots: int = 0

@@ -296,10 +296,16 @@ class Driver:
         events: list[Event] = []
         for sweep in self._assembler.push(packet, start, missing):
             events += self._finished(sweep)
+        self._count_fragments()
         return events
+
+    def _count_fragments(self) -> None:
+        self.counters.fragments = self._assembler.fragments
+        self.counters.fragment_packets = self._assembler.fragment_packets
 
     def _finished(self, sweep: Sweep | None) -> list[Event]:
         if sweep is None:
+            self._count_fragments()  # of a turn that a stop or a gap cut short
             return []
         self.counters.sweeps += 1
         self.counters.unlevelled = self._assembler.unlevelled

@@ -262,6 +262,8 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
         "points [1/s]": f"{(new.points - old.points) / seconds:.0f}",
         "valid share [%]": f"{100 * share:.1f}",
         "empty sweeps": str(new.empty_sweeps),
+        "fragments of turns left out": str(new.fragments),
+        "packets in fragments": str(new.fragment_packets),
         "points without orientation": str(new.unlevelled),
     }
     if new.unlevelled > old.unlevelled:

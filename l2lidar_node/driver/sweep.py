@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -30,6 +31,14 @@ class _Placed(NamedTuple):
     start: HostNs  # not before the end of the packet before
 
 
+class _Cut(Enum):
+    """Whether a sweep ends before a packet, and why."""
+
+    NONE = "none"
+    BOUNDARY = "boundary"  # of the kind that was asked for
+    BREAK = "break"  # a gap, a step of the clock, another kind of packet
+
+
 class SweepAssembler:
     """Collects packets with host stamps and makes a sweep of them when it is complete.
 
@@ -45,10 +54,16 @@ class SweepAssembler:
     ----------
     unlevelled : int
         Points left out because their packet could not be levelled.
+    fragments, fragment_packets : int
+        Parts of a turn or half turn that were left out, and their packets: the first one after a
+        start, a gap or a change of the cut, and the last one before a stop or a gap.
     """
 
     def __init__(self, config: SweepConfig, level: Level | None = None) -> None:
         self.unlevelled = 0
+        self.fragments = 0
+        self.fragment_packets = 0
+        self._begins_at_boundary = False
         self._config = config
         self._level = level
         self._packets: list[_Placed] = []
@@ -60,6 +75,8 @@ class SweepAssembler:
 
     def configure(self, config: SweepConfig, level: Level | None) -> None:
         """Use other settings from the next packet on."""
+        if config.cut != self._config.cut:
+            self._begins_at_boundary = False
         self._config = config
         self._level = level
 
@@ -81,35 +98,50 @@ class SweepAssembler:
         """
         sweeps: list[Sweep] = []
         placed = start
-        if self._packets and self._starts_anew(packet, start):
-            sweeps.append(self._finish())
+        cut = self._cut_before(packet, start) if self._packets else _Cut.BREAK
+        if self._packets and cut is not _Cut.NONE:
+            sweeps += self._finish(cut)
         elif self._packets:
             # A correction of the clock, or stamps of arrival in a burst, must not let a packet
             # begin before the previous one ended.
             last = self._packets[-1]
             placed = HostNs(max(start, last.start + last.packet.duration_ns))
             self._missing += missing
+        if cut is not _Cut.NONE:
+            self._begins_at_boundary = cut is _Cut.BOUNDARY
         self._packets.append(_Placed(packet, start, placed))
         if self._is_full():
-            sweeps.append(self._finish())
+            sweeps += self._finish(_Cut.BREAK)
         return sweeps
 
     def flush(self) -> Sweep | None:
-        """Return what has been collected so far as a sweep; None if that is nothing."""
-        return self._finish() if self._packets else None
+        """Return what has been collected so far as a sweep.
 
-    def _starts_anew(self, packet: PointPacket, start: HostNs) -> bool:
+        None if that is nothing, or part of a turn or half turn.
+        """
+        if not self._packets:
+            return None
+        return next(iter(self._finish(_Cut.BREAK)), None)
+
+    def _cuts_by_angle(self, packet: PointPacket) -> bool:
+        """Whether the head's angle ends sweeps; 2D packets have none."""
+        is_3d = packet.packet_type == wire.PacketType.POINTS_3D
+        return is_3d and self._config.cut in ("turn", "half_turn")
+
+    def _cut_before(self, packet: PointPacket, start: HostNs) -> _Cut:
         first, last = self._packets[0], self._packets[-1]
         if packet.packet_type != last.packet.packet_type:
-            return True
+            return _Cut.BREAK
         if start - last.given > MAX_GAP_NS or start < last.given:
-            return True
+            return _Cut.BREAK
         if self._config.cut == "packets":
-            return False
-        if self._config.cut == "duration" or packet.packet_type == wire.PacketType.POINTS_2D:
-            return start - first.given >= self._config.duration_ms * 1_000_000
-        period = 2 * math.pi if self._config.cut == "turn" else math.pi
-        return _passes(last.packet.head_angle, packet.head_angle, period)
+            return _Cut.NONE
+        if self._cuts_by_angle(packet):
+            period = 2 * math.pi if self._config.cut == "turn" else math.pi
+            is_over = _passes(last.packet.head_angle, packet.head_angle, period)
+        else:
+            is_over = start - first.given >= self._config.duration_ms * 1_000_000
+        return _Cut.BOUNDARY if is_over else _Cut.NONE
 
     def _is_full(self) -> bool:
         count = len(self._packets)
@@ -117,9 +149,18 @@ class SweepAssembler:
             return count >= max(self._config.packets, 1)
         return count >= MAX_PACKETS
 
-    def _finish(self) -> Sweep:
+    def _finish(self, end: _Cut) -> list[Sweep]:
+        """Return what has been collected as one sweep; nothing where it is part of a turn.
+
+        LIO-SAM takes its first cloud for a key frame and crashes on one that is too small.
+        """
         packets, self._packets = self._packets, []
         missing, self._missing = self._missing, 0
+        is_whole = self._begins_at_boundary and end is _Cut.BOUNDARY
+        if self._cuts_by_angle(packets[0].packet) and not is_whole:
+            self.fragments += 1
+            self.fragment_packets += len(packets)
+            return []
         starts = [placed.start for placed in packets]
         epoch = starts[0]
         config = self._config
@@ -135,13 +176,14 @@ class SweepAssembler:
         self.unlevelled += batch.left_out
         batch.points.flags.writeable = False
         last = packets[-1]
-        return Sweep(
+        sweep = Sweep(
             start=HostNs(epoch + round(batch.first_s * NS)),
             end=HostNs(last.start + last.packet.duration_ns),
             points=batch.points,
             packets=len(packets),
             missing=missing,
         )
+        return [sweep]
 
 
 def _passes(before: float, after: float, period: float) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -98,7 +99,8 @@ def test_warnings_fail_only_if_they_are_to(check, tmp_path):
 def test_only_so_many_seconds_are_read(check, bag):
     code, said, _ = check(bag, "--for", "lio_sam", "--seconds", "1.1", "--json")
     assert code == 0
-    assert "4 of 4 clouds" in said
+    (clouds,) = re.findall(r"samples cover \d+ of (\d+) clouds", said)
+    assert 3 <= int(clouds) <= 5  # of 4.4 a second
 
 
 @pytest.mark.parametrize(
