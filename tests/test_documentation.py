@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -59,18 +60,18 @@ def commands() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("page", "command"), commands())
-def test_a_command_is_run_or_excused(page, command):
+def test_a_command_is_run_or_excused(page: Any, command: Any) -> None:
     known = [*RUN_BY, *NOT_RUN]
     assert any(re.fullmatch(pattern, command) for pattern in known), f"{page}: {command}"
 
 
 @pytest.mark.parametrize("where", [text for text in RUN_BY.values() if text.startswith("tests/")])
-def test_the_tests_named_exist(where):
+def test_the_tests_named_exist(where: Any) -> None:
     assert (ROOT / where).exists()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page):
+def test_links_lead_somewhere(page: Any) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
         if "://" not in target:
             assert (page.parent / target).exists(), target

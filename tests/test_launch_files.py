@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -70,41 +71,41 @@ except ModuleNotFoundError:
 needs_launch = pytest.mark.skipif(not HAS_LAUNCH, reason="needs launch and launch_ros of a ROS 2")
 
 
-def name_of(path):
+def name_of(path: Any) -> Any:
     return path.name.removesuffix(".launch.py")
 
 
-def strings(path):
+def strings(path: Any) -> Any:
     tree = ast.parse(path.read_text())
     return [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)
             and isinstance(node.value, str)]  # fmt: skip
 
 
-def executables():
+def executables() -> Any:
     return set(re.findall(r'"(\w+) = l2lidar_\w+\.[\w.]+:\w+"', (ROOT / "setup.py").read_text()))
 
 
-def consumer_driver(name):
+def consumer_driver(name: Any) -> Any:
     return parameters_for(CONSUMERS / name / "driver.yaml", "l2lidar_node", "/l2lidar_node")
 
 
-def test_launch_files_are_those_known():
+def test_launch_files_are_those_known() -> None:
     assert {name_of(path) for path in LAUNCH_FILES} == set(ARGUMENTS)
 
 
 @pytest.mark.parametrize("path", [*LAUNCH_FILES, HELPERS], ids=name_of)
-def test_file_compiles(path):
+def test_file_compiles(path: Any) -> None:
     compile(path.read_text(), path.name, "exec")
 
 
 @pytest.mark.parametrize("path", LAUNCH_FILES, ids=name_of)
-def test_every_shared_file_named_exists(path):
+def test_every_shared_file_named_exists(path: Any) -> None:
     for text in strings(path):
         if re.fullmatch(r"[\w.]+\.(launch\.py|rviz|urdf|yaml|xml)", text):
             assert list(ROOT.glob(f"launch/{text}")) or list(ROOT.glob(f"[cru]*/**/{text}")), text
 
 
-def test_every_executable_started_is_installed():
+def test_every_executable_started_is_installed() -> None:
     started = {
         text for path in LAUNCH_FILES for text in strings(path) if text in OURS
     }  # l2lidar_node is the package as well
@@ -112,7 +113,7 @@ def test_every_executable_started_is_installed():
     assert started <= executables()
 
 
-def test_driver_arguments_are_parameters_of_the_driver():
+def test_driver_arguments_are_parameters_of_the_driver() -> None:
     known = {item.name for item in settings_of(DriverConfig)}
     (tree,) = (ast.parse(path.read_text()) for path in LAUNCH_FILES if name_of(path) == "l2lidar")
     passed = {
@@ -127,7 +128,7 @@ def test_driver_arguments_are_parameters_of_the_driver():
 
 
 @pytest.mark.parametrize("path", XML_FILES, ids=lambda path: path.name)
-def test_xml_names_what_exists(path):
+def test_xml_names_what_exists(path: Any) -> None:
     launch = ElementTree.parse(path).getroot()
     assert launch.tag == "launch"
     declared = {argument.get("name") for argument in launch.iter("arg")}
@@ -142,7 +143,7 @@ def test_xml_names_what_exists(path):
         assert remapped == {topic: topic[1:] for topic in topics.DRIVER_TOPICS}
 
 
-def test_example_of_several_sensors_is_what_drivers_take():
+def test_example_of_several_sensors_is_what_drivers_take() -> None:
     path = ROOT / "config" / "multi.yaml"
     sensors = [name for name in parameters_by_node(path) if name.endswith("/l2lidar_node")]
     assert sensors == ["/front/l2lidar_node", "/rear/l2lidar_node"]
@@ -154,7 +155,7 @@ def test_example_of_several_sensors_is_what_drivers_take():
 @pytest.mark.parametrize(
     "name", sorted(path.name for path in CONSUMERS.iterdir() if path.is_dir())
 )
-def test_consumer_has_what_the_driver_takes_and_a_configuration(name):
+def test_consumer_has_what_the_driver_takes_and_a_configuration(name: Any) -> None:
     config = build(DriverConfig, consumer_driver(name))
     assert config.imu.enable_publishing
     assert not config.imu.adjust, "a consumer that deskews wants the sensor's own frame"
@@ -170,7 +171,7 @@ def test_consumer_has_what_the_driver_takes_and_a_configuration(name):
             yaml.safe_load(text)
 
 
-def test_consumers_named_are_those_configured():
+def test_consumers_named_are_those_configured() -> None:
     (named,) = (
         ast.literal_eval(node.value)
         for node in ast.parse((ROOT / "launch" / "lio_input.launch.py").read_text()).body
@@ -179,16 +180,16 @@ def test_consumers_named_are_those_configured():
     assert set(named) == {path.name for path in CONSUMERS.iterdir() if path.is_dir()}
 
 
-def test_reliable_imu_subscribers_get_a_reliable_publisher():
+def test_reliable_imu_subscribers_get_a_reliable_publisher() -> None:
     for name in ("fast_lio", "point_lio"):
         assert consumer_driver(name)["qos_reliability"] == "reliable"
 
 
-def test_extrinsic_has_each_projects_own_sign():
+def test_extrinsic_has_each_projects_own_sign() -> None:
     imu_in_lidar = [-0.007698, -0.014655, 0.00667]
     lidar_in_imu = [-value for value in imu_in_lidar]
 
-    def value(path, name):
+    def value(path: Any, name: Any) -> Any:
         return parameters_for(CONSUMERS / path, "any", "/any")[name]
 
     assert value("lio_sam/params.yaml", "extrinsicTrans") == imu_in_lidar
@@ -199,7 +200,7 @@ def test_extrinsic_has_each_projects_own_sign():
     assert sensors["T_lidar_imu"] == [*imu_in_lidar, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_rings_of_the_consumers_are_those_of_the_driver():
+def test_rings_of_the_consumers_are_those_of_the_driver() -> None:
     lio_sam = parameters_for(CONSUMERS / "lio_sam/params.yaml", "any", "/any")
     assert lio_sam["N_SCAN"] == RINGS
     for name in ("fast_lio", "point_lio"):  # which have memory for 128
@@ -210,7 +211,7 @@ def test_rings_of_the_consumers_are_those_of_the_driver():
 class Started:
     """A node as a launch file would start it."""
 
-    def __init__(self, action, context):
+    def __init__(self, action: Any, context: Any) -> None:
         from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
         self.action = action
@@ -228,7 +229,7 @@ class Started:
         ]
 
     @property
-    def parameters(self):
+    def parameters(self) -> Any:
         """What the node takes from its files, as ROS reads them."""
         values = {}
         for path in self.files:
@@ -239,7 +240,7 @@ class Started:
 class Launched:
     """A launch file with its actions made, but nothing started."""
 
-    def __init__(self, path, given):
+    def __init__(self, path: Any, given: Any) -> None:
         from launch import LaunchContext, LaunchDescription
         from launch.actions import IncludeLaunchDescription
         from launch.launch_description_sources import AnyLaunchDescriptionSource
@@ -254,7 +255,7 @@ class Launched:
         self.declared = {item.name: item for item in description.get_launch_arguments()}
         self._walk(IncludeLaunchDescription(source, launch_arguments=given.items()))
 
-    def _walk(self, entity):
+    def _walk(self, entity: Any) -> None:
         from launch.actions import ExecuteProcess, LogInfo
         from launch_ros.actions import Node
 
@@ -273,17 +274,17 @@ class Launched:
             for below in entity.visit(self.context) or ():
                 self._walk(below)
 
-    def node(self, executable):
+    def node(self, executable: Any) -> Any:
         (found,) = (item for item in self.nodes if item.executable == executable)
         return found
 
     @property
-    def executables(self):
+    def executables(self) -> Any:
         return [item.executable for item in self.nodes]
 
 
 @pytest.fixture
-def launched(tmp_path, monkeypatch):
+def launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Read a launch file in a prefix that has this package and those that it starts."""
     index = tmp_path / "prefix" / "share" / "ament_index" / "resource_index" / "packages"
     index.mkdir(parents=True)
@@ -298,7 +299,7 @@ def launched(tmp_path, monkeypatch):
     known = os.environ.get("AMENT_PREFIX_PATH", "")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'prefix'}:{known}")
 
-    def run(name, **given):
+    def run(name: Any, **given: Any) -> Any:
         path = ROOT / "launch" / (name if "." in name else f"{name}.launch.py")
         return Launched(path, {**NEEDED.get(name, {}), **given})
 
@@ -307,7 +308,7 @@ def launched(tmp_path, monkeypatch):
 
 @needs_launch
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_arguments_are_described_and_have_a_default(launched, name):
+def test_arguments_are_described_and_have_a_default(launched: Any, name: Any) -> None:
     declared = launched(name).declared
     assert set(declared) == ARGUMENTS[name]
     for argument in declared.values():
@@ -318,13 +319,13 @@ def test_arguments_are_described_and_have_a_default(launched, name):
 
 @needs_launch
 @pytest.mark.parametrize("name", STARTS)
-def test_starts_what_it_says(launched, name):
+def test_starts_what_it_says(launched: Any, name: Any) -> None:
     assert launched(name).executables == STARTS[name]
 
 
 @needs_launch
 @pytest.mark.parametrize("name", [name for name in STARTS if "l2lidar_node" in STARTS[name]])
-def test_driver_gets_parameters_it_takes(launched, name):
+def test_driver_gets_parameters_it_takes(launched: Any, name: Any) -> None:
     for node in launched(name).nodes:
         if node.executable == "l2lidar_node":
             build(DriverConfig, node.parameters)
@@ -334,7 +335,7 @@ def test_driver_gets_parameters_it_takes(launched, name):
 @pytest.mark.parametrize(
     "name", [name for name in STARTS if "emulator" in DRIVER & ARGUMENTS[name]]
 )
-def test_emulator_is_on_loopback_and_ready_at_once(launched, name):
+def test_emulator_is_on_loopback_and_ready_at_once(launched: Any, name: Any) -> None:
     if name == "multi":
         return
     made = launched(name, emulator="true", l2_ip="10.0.0.1", host_port="7001")
@@ -349,14 +350,18 @@ def test_emulator_is_on_loopback_and_ready_at_once(launched, name):
 
 
 @needs_launch
-def test_emulator_options_are_split_as_a_shell_does_and_spin_up_is_announced(launched):
+def test_emulator_options_are_split_as_a_shell_does_and_spin_up_is_announced(
+    launched: Any,
+) -> None:
     made = launched("l2lidar", emulator="true", emulator_options="--world 'my world.ply'")
     assert made.processes[0][-2:] == ["--world", "my world.ply"]
     assert "points come after 25 s" in made.said[0]
 
 
 @needs_launch
-def test_arguments_go_over_the_parameter_file_and_what_is_empty_does_not(launched, tmp_path):
+def test_arguments_go_over_the_parameter_file_and_what_is_empty_does_not(
+    launched: Any, tmp_path: Path
+) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("/l2lidar_node: {ros__parameters: {l2_ip: 10.1.1.1, host_ip: 10.1.1.2}}")
     made = launched("l2_top_mount_example", params_file=str(file), l2_ip="10.42.0.62")
@@ -377,7 +382,9 @@ def test_arguments_go_over_the_parameter_file_and_what_is_empty_does_not(launche
 
 
 @needs_launch
-def test_files_keyed_by_full_name_work_in_a_pushed_namespace(launched, tmp_path):
+def test_files_keyed_by_full_name_work_in_a_pushed_namespace(
+    launched: Any, tmp_path: Path
+) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("/robot/front/l2lidar_node: {ros__parameters: {l2_ip: 10.1.1.1}}")
     outer = tmp_path / "robot.launch.py"
@@ -397,7 +404,7 @@ def test_files_keyed_by_full_name_work_in_a_pushed_namespace(launched, tmp_path)
 
 
 @needs_launch
-def test_missing_files_and_wrong_words_are_refused(launched):
+def test_missing_files_and_wrong_words_are_refused(launched: Any) -> None:
     with pytest.raises(FileNotFoundError, match=r"params_file:=absent\.yaml: there is no such"):
         launched("l2lidar", params_file="absent.yaml")
     with pytest.raises(FileNotFoundError, match="override_params_file:=absent"):
@@ -415,14 +422,14 @@ def test_missing_files_and_wrong_words_are_refused(launched):
 
 
 @needs_launch
-def test_a_required_node_that_fails_ends_the_launch():
+def test_a_required_node_that_fails_ends_the_launch() -> None:
     from launch import LaunchContext
     from launch.actions import Shutdown
     from launch.events.process import ProcessExited
 
     from l2lidar_node.ros.launching import required
 
-    def ended(code, *settings):
+    def ended(code: Any, *settings: Any) -> Any:
         event = ProcessExited(
             action=None, name="deskew_node-2", cmd=[], cwd=None, env=None, pid=1, returncode=code
         )
@@ -438,7 +445,7 @@ def test_a_required_node_that_fails_ends_the_launch():
 
 
 @needs_launch
-def test_two_sensors_share_no_name(launched):
+def test_two_sensors_share_no_name(launched: Any) -> None:
     for namespace in ("front", "rear/deep"):
         made = launched("l2lidar", namespace=namespace, l2_name=f"{namespace[:4]}_l2")
         node = made.node("l2lidar_node")
@@ -448,7 +455,7 @@ def test_two_sensors_share_no_name(launched):
 
 
 @needs_launch
-def test_one_file_starts_several_sensors(launched):
+def test_one_file_starts_several_sensors(launched: Any) -> None:
     made = launched("multi")
     assert [node.name for node in made.nodes] == ["/front/l2lidar_node", "/rear/l2lidar_node"]
     configs = [build(DriverConfig, node.parameters) for node in made.nodes]
@@ -473,7 +480,7 @@ def test_one_file_starts_several_sensors(launched):
 
 
 @needs_launch
-def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched):
+def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched: Any) -> None:
     values = launched("deskew_odometry").node("l2lidar_node").parameters
     assert values["imu_adjust"] is False
     assert values["enable_IMU_publishing"] is True
@@ -487,7 +494,7 @@ def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched):
 
 @needs_launch
 @pytest.mark.parametrize("name", [name for name in STARTS if "rviz2" in STARTS[name]][1:])
-def test_rviz_gets_points_that_tf_can_turn(launched, name):
+def test_rviz_gets_points_that_tf_can_turn(launched: Any, name: Any) -> None:
     """TF applies the mount; points that are level already would be turned twice."""
     assert launched(name).node("l2lidar_node").parameters["imu_adjust"] is False
     assert launched(name, imu_adjust="true").node("l2lidar_node").parameters["imu_adjust"] is True
@@ -497,13 +504,13 @@ def test_rviz_gets_points_that_tf_can_turn(launched, name):
 @pytest.mark.parametrize(
     "consumer", sorted(path.name for path in CONSUMERS.iterdir() if path.is_dir())
 )
-def test_consumer_goes_over_the_parameter_file(launched, consumer):
+def test_consumer_goes_over_the_parameter_file(launched: Any, consumer: Any) -> None:
     values = launched("lio_input", consumer=consumer).node("l2lidar_node").parameters
     assert consumer_driver(consumer).items() <= values.items()
 
 
 @needs_launch
-def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched):
+def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched: Any) -> None:
     made = launched("replay", rate="2", rviz="true")
     values = made.node("l2lidar_node").parameters
     assert (values["replay_file"], values["replay_rate"]) == (NEEDED["replay"]["file"], 2.0)
@@ -521,10 +528,10 @@ def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched):
 
 
 @needs_launch
-def test_only_a_driver_of_a_real_sensor_is_started_again(launched):
+def test_only_a_driver_of_a_real_sensor_is_started_again(launched: Any) -> None:
     from launch.utilities.type_utils import perform_typed_substitution
 
-    def respawns(name, **given):
+    def respawns(name: Any, **given: Any) -> Any:
         made = launched(name, **given)
         node = made.node("l2lidar_node").action
         return perform_typed_substitution(made.context, node._ExecuteLocal__respawn, bool)
@@ -536,7 +543,9 @@ def test_only_a_driver_of_a_real_sensor_is_started_again(launched):
 
 @needs_launch
 @pytest.mark.parametrize("name", [name for name in STARTS if "rviz" in ARGUMENTS[name]])
-def test_rviz_only_where_asked_for_and_before_what_would_be_left_behind(launched, name):
+def test_rviz_only_where_asked_for_and_before_what_would_be_left_behind(
+    launched: Any, name: Any
+) -> None:
     assert "rviz2" not in launched(name, rviz="false").executables
     made = launched(name, rviz="true", namespace="front")
     node = made.node("rviz2")
@@ -551,14 +560,14 @@ def test_rviz_only_where_asked_for_and_before_what_would_be_left_behind(launched
 
 
 @needs_launch
-def test_rviz_follows_the_name_of_the_sensor(launched):
+def test_rviz_follows_the_name_of_the_sensor(launched: Any) -> None:
     words = launched("l2lidar_with_rviz", l2_name="rear").node("rviz2").words
     assert words[2:4] == ["-f", "rear_link"]
     assert "-f" not in launched("l2lidar_with_rviz").node("rviz2").words
 
 
 @needs_launch
-def test_xml_starts_the_driver_with_the_same_parameters(launched):
+def test_xml_starts_the_driver_with_the_same_parameters(launched: Any) -> None:
     node = launched("l2lidar.launch.xml", namespace="front").node("l2lidar_node")
     other = launched("l2lidar", namespace="front").node("l2lidar_node")
     assert (node.name, node.parameters) == (other.name, other.parameters)
@@ -575,7 +584,9 @@ def test_xml_starts_the_driver_with_the_same_parameters(launched):
     ],
     ids=["refused parameter", "emulator fails", "interrupted"],
 )
-def test_launch_ends_with_its_parts_and_leaves_none_behind(tmp_path, words, code, text):
+def test_launch_ends_with_its_parts_and_leaves_none_behind(
+    tmp_path: Path, words: Any, code: int, text: str
+) -> None:
     """Run the real thing: what fails ends the launch with an exit code, and nothing lives on."""
     script = (
         "import sys\n"
@@ -608,7 +619,7 @@ def test_launch_ends_with_its_parts_and_leaves_none_behind(tmp_path, words, code
     assert not still, said
 
 
-def _session_of(leader):
+def _session_of(leader: Any) -> Any:
     """Return the processes of a session that still run, after at most ten seconds."""
     deadline = time.monotonic() + 10.0
     while True:
@@ -622,7 +633,7 @@ def _session_of(leader):
         time.sleep(0.1)
 
 
-def _session(path):
+def _session(path: Any) -> Any:
     try:
         state, _, _, session = path.read_text().rpartition(")")[2].split()[:4]
     except OSError:

@@ -2,8 +2,9 @@
 
 import math
 import struct
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
@@ -55,12 +56,12 @@ KINDS = {
 }
 
 
-def load(name):
+def load(name: Any) -> Any:
     return yaml.safe_load((LAYOUTS / name).read_text())
 
 
-def displays(name):
-    def walk(found):
+def displays(name: Any) -> Any:
+    def walk(found: Any) -> Iterator[Any]:
         for display in found:
             yield display
             yield from walk(display.get("Displays", []))
@@ -68,11 +69,11 @@ def displays(name):
     return list(walk(load(name)["Visualization Manager"]["Displays"]))
 
 
-def topic_of(display):
+def topic_of(display: Any) -> Any:
     return display.get("Topic") or display.get("Description Topic")
 
 
-def test_topics_and_frame_are_those_of_the_companions():
+def test_topics_and_frame_are_those_of_the_companions() -> None:
     deskew, odometry = DeskewTopics(), OdometryTopics()
     assert (deskew.cloud_topic, deskew.imu_topic) == topics.DRIVER_TOPICS
     assert (odometry.cloud_topic, odometry.imu_topic) == topics.DRIVER_TOPICS
@@ -85,18 +86,18 @@ def test_topics_and_frame_are_those_of_the_companions():
     assert odometry.odom_frame == FIXED_FRAMES["slam.rviz"]
 
 
-def test_layouts_are_those_known():
+def test_layouts_are_those_known() -> None:
     assert {path.name for path in LAYOUTS.iterdir()} == set(FIXED_FRAMES)
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_fixed_frame_is_one_that_is_published(name):
+def test_fixed_frame_is_one_that_is_published(name: Any) -> None:
     options = load(name)["Visualization Manager"]["Global Options"]
     assert options["Fixed Frame"] == FIXED_FRAMES[name]
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_classes_exist(name):
+def test_classes_exist(name: Any) -> None:
     layout = load(name)
     manager = layout["Visualization Manager"]
     assert {display["Class"] for display in displays(name)} <= DISPLAYS
@@ -107,7 +108,7 @@ def test_classes_exist(name):
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_displays_are_told_apart_and_on_or_off_in_both_places(name):
+def test_displays_are_told_apart_and_on_or_off_in_both_places(name: Any) -> None:
     names = [display["Name"] for display in displays(name)]
     assert len(set(names)) == len(names)
     for display in displays(name):
@@ -117,7 +118,7 @@ def test_displays_are_told_apart_and_on_or_off_in_both_places(name):
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_topics_are_those_of_the_nodes(name):
+def test_topics_are_those_of_the_nodes(name: Any) -> None:
     named = [display for display in displays(name) if topic_of(display)]
     assert named
     for display in named:
@@ -127,7 +128,7 @@ def test_topics_are_those_of_the_nodes(name):
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_qos_reaches_every_publisher(name):
+def test_qos_reaches_every_publisher(name: Any) -> None:
     for display in displays(name):
         topic = topic_of(display)
         if not topic:
@@ -145,7 +146,7 @@ def test_qos_reaches_every_publisher(name):
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_clouds_are_coloured_by_what_they_carry(name):
+def test_clouds_are_coloured_by_what_they_carry(name: Any) -> None:
     clouds = [display for display in displays(name) if display["Class"].endswith("PointCloud2")]
     assert clouds
     for cloud in clouds:
@@ -158,14 +159,14 @@ def test_clouds_are_coloured_by_what_they_carry(name):
             assert cloud["Min Intensity"] < cloud["Max Intensity"]
 
 
-def test_sensor_alone_is_coloured_by_range_or_time():
+def test_sensor_alone_is_coloured_by_range_or_time() -> None:
     clouds = {d["Channel Name"]: d for d in displays("rvizl2lidar.rviz") if "Channel Name" in d}
     assert clouds["range"]["Enabled"]
     assert (clouds["range"]["Min Intensity"], clouds["range"]["Max Intensity"]) == (0, 5)
     assert not clouds["time"]["Enabled"]
 
 
-def test_slam_shows_raw_beside_deskewed_and_where_the_sensor_went():
+def test_slam_shows_raw_beside_deskewed_and_where_the_sensor_went() -> None:
     shown = {
         topic_of(display)["Value"]
         for display in displays("slam.rviz")
@@ -203,7 +204,7 @@ class Docks:
 
     SIDES = ("left", "right", "top", "bottom")
 
-    def __init__(self, state):
+    def __init__(self, state: Any) -> None:
         self._bytes, self._at = bytes.fromhex(state), 0
         assert self._take(">iiB") == (0xFF, 0, 0xFD)
         self.docks, self.areas = {}, {}
@@ -224,19 +225,19 @@ class Docks:
         assert (marker, lines, position, count) == (0xFC, 1, 2, 1)  # one line of bars, above
         self.tool_bar = self._text()
 
-    def _take(self, form):
+    def _take(self, form: Any) -> Any:
         found = struct.unpack_from(form, self._bytes, self._at)
         self._at += struct.calcsize(form)
         return found
 
-    def _text(self):
+    def _text(self) -> Any:
         (length,) = self._take(">i")
         self._at += length
         return self._bytes[self._at - length : self._at].decode("utf-16-be")
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_window_opens_with_the_3d_view_at_most_of_its_width(name):
+def test_window_opens_with_the_3d_view_at_most_of_its_width(name: Any) -> None:
     layout = load(name)
     geometry = layout["Window Geometry"]
     saved = Docks(geometry["QMainWindow State"])
@@ -259,7 +260,7 @@ def test_window_opens_with_the_3d_view_at_most_of_its_width(name):
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_qt_restores_the_window(name):
+def test_qt_restores_the_window(name: Any) -> None:
     pytest.importorskip("PySide6.QtWidgets", reason="needs Qt (pip install PySide6-Essentials)")
     from PySide6 import QtCore, QtWidgets
 
@@ -289,7 +290,7 @@ def test_qt_restores_the_window(name):
 
 
 @pytest.mark.parametrize("name", FIXED_FRAMES)
-def test_names_of_frames_can_be_read(name):
+def test_names_of_frames_can_be_read(name: Any) -> None:
     (tf,) = (display for display in displays(name) if display["Class"].endswith("/TF"))
     view = load(name)["Visualization Manager"]["Views"]["Current"]
     # RViz's camera opens 45 degrees; a name is 0.1 m high at a marker scale of 1.

@@ -2,6 +2,7 @@
 
 import runpy
 from pathlib import Path
+from typing import Any
 from xml.dom.minidom import Document
 from xml.etree import ElementTree
 
@@ -25,7 +26,7 @@ POSES = {
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
 
 
-def triangles(path):
+def triangles(path: Any) -> Any:
     content = path.read_bytes()
     (count,) = np.frombuffer(content, "<u4", 1, 80)
     records = np.frombuffer(content, STL_TRIANGLE, offset=84)
@@ -33,7 +34,7 @@ def triangles(path):
     return records
 
 
-def joints(robot):
+def joints(robot: Any) -> Any:
     """Return child -> parent of every joint; each link has at most one parent."""
     parents = {}
     for joint in robot.iter("joint"):
@@ -43,7 +44,7 @@ def joints(robot):
     return parents
 
 
-def roots(parents):
+def roots(parents: Any) -> Any:
     """Return the frames without a parent; follows every frame up, so a cycle fails."""
     for frame in parents:
         seen = {frame}
@@ -53,14 +54,14 @@ def roots(parents):
     return set(parents.values()) - set(parents)
 
 
-def test_mesh_is_what_its_script_makes(tmp_path):
+def test_mesh_is_what_its_script_makes(tmp_path: Path) -> None:
     script = runpy.run_path(str(ROOT / "scripts" / "make_mesh.py"))
     for name in ("first.stl", "second.stl"):
         script["main"]([str(tmp_path / name)])
         assert (tmp_path / name).read_bytes() == MESH.read_bytes()
 
 
-def test_mesh_is_closed_and_faces_outwards():
+def test_mesh_is_closed_and_faces_outwards() -> None:
     corners = triangles(MESH)["corners"].astype(float)
     edges = {}
     for triangle in corners:
@@ -74,7 +75,7 @@ def test_mesh_is_closed_and_faces_outwards():
     assert 0.5 < volume / (0.075 * 0.075 * 0.065) < 0.9
 
 
-def test_mesh_has_the_published_outline():
+def test_mesh_has_the_published_outline() -> None:
     assert MESH.stat().st_size < 300_000
     corners = triangles(MESH)["corners"].reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -92,7 +93,7 @@ def test_mesh_has_the_published_outline():
         np.testing.assert_allclose(middle, expected, atol=1e-4)
 
 
-def test_examples_differ_in_one_origin_only():
+def test_examples_differ_in_one_origin_only() -> None:
     origins, rest = {}, {}
     for name, path in EXAMPLES.items():
         robot = ElementTree.parse(path).getroot()
@@ -107,7 +108,7 @@ def test_examples_differ_in_one_origin_only():
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_example_and_driver_make_one_tree(name):
+def test_example_and_driver_make_one_tree(name: Any) -> None:
     robot = ElementTree.parse(EXAMPLES[name]).getroot()
     parents = joints(robot)
     links = {link.get("name") for link in robot.iter("link")}
@@ -119,7 +120,7 @@ def test_example_and_driver_make_one_tree(name):
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_example_loads_and_puts_the_sensor_on_the_cube(name):
+def test_example_loads_and_puts_the_sensor_on_the_cube(name: Any) -> None:
     yourdfpy = pytest.importorskip("yourdfpy")
     robot = yourdfpy.URDF.load(
         str(EXAMPLES[name]),
@@ -140,7 +141,7 @@ def test_example_loads_and_puts_the_sensor_on_the_cube(name):
     assert "l2_lidar.stl" in robot.scene.geometry
 
 
-def expand(tmp_path, call) -> ElementTree.Element:
+def expand(tmp_path: Path, call: Any) -> ElementTree.Element:
     """Return a robot that calls the macro, as plain URDF."""
     xacro = pytest.importorskip("xacro")
     path = tmp_path / "robot.urdf.xacro"
@@ -153,7 +154,7 @@ def expand(tmp_path, call) -> ElementTree.Element:
     return ElementTree.fromstring(document.toxml())
 
 
-def test_macro_makes_the_drivers_default_frame(tmp_path):
+def test_macro_makes_the_drivers_default_frame(tmp_path: Path) -> None:
     robot = expand(
         tmp_path, '<xacro:l2lidar parent="mast"><origin xyz="1 2 3" rpy="0 0 0"/></xacro:l2lidar>'
     )
@@ -164,7 +165,7 @@ def test_macro_makes_the_drivers_default_frame(tmp_path):
     assert float(robot.find(".//mass").get("value")) == pytest.approx(0.23)
 
 
-def test_macro_can_make_the_imu_frame_and_several_sensors(tmp_path):
+def test_macro_can_make_the_imu_frame_and_several_sensors(tmp_path: Path) -> None:
     robot = expand(
         tmp_path,
         "".join(

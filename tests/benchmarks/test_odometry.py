@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +29,7 @@ PLAN = Plan(
 )
 
 
-def row(method=OURS, ate=0.001, **changes):
+def row(method: Any = OURS, ate: float = 0.001, **changes: Any) -> Any:
     found = {
         "scene": "room",
         "motion": "walk",
@@ -43,7 +45,7 @@ def row(method=OURS, ate=0.001, **changes):
     return {**found, **changes}
 
 
-def planned(plan, done=()):
+def planned(plan: Any, done: Any = ()) -> Any:
     return [
         (task.seed, task.scene, cut, name)
         for task in plan.tasks(done)
@@ -51,7 +53,7 @@ def planned(plan, done=()):
     ]
 
 
-def test_everything_that_is_wanted_is_planned_once():
+def test_everything_that_is_wanted_is_planned_once() -> None:
     found = planned(PLAN)
     assert len(found) == len(set(found))
     # two local methods and three seeds; two quick referees and two seeds; the slow ones get full
@@ -62,7 +64,7 @@ def test_everything_that_is_wanted_is_planned_once():
     assert slow == found[-len(slow) :]
 
 
-def test_only_what_is_missing_is_planned_again():
+def test_only_what_is_missing_is_planned_again() -> None:
     done = [row(), row("ct_icp"), row(scene="yard", seconds=10.0)]
     gone = set(planned(PLAN)) - set(planned(PLAN, done))
     assert gone == {(0, "room", "turn", OURS), (0, "room", "turn", "ct_icp")}
@@ -71,7 +73,7 @@ def test_only_what_is_missing_is_planned_again():
     assert not PLAN.has(row("ct_icp", seed=1, sweeps="half turn"))
 
 
-def test_rows_outlive_a_run_that_is_cut(tmp_path):
+def test_rows_outlive_a_run_that_is_cut(tmp_path: Path) -> None:
     rows = Rows(tmp_path / "bench" / "rows.jsonl")
     assert rows.read() == []
     some = [row(), row("ct_icp", math.inf)]
@@ -86,7 +88,7 @@ def test_rows_outlive_a_run_that_is_cut(tmp_path):
     assert rows.read() == []
 
 
-def test_a_row_after_one_that_was_cut_off_counts(tmp_path):
+def test_a_row_after_one_that_was_cut_off_counts(tmp_path: Path) -> None:
     rows = Rows(tmp_path / "rows.jsonl")
     rows.path.write_text('{"scene": "ro')
     rows.append(row())
@@ -94,11 +96,11 @@ def test_a_row_after_one_that_was_cut_off_counts(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def run():
+def run() -> Any:
     return odometry_runs.record("room", "walk", 0, 6.0)
 
 
-def test_a_score_is_the_distance_from_the_truth_after_an_alignment(run):
+def test_a_score_is_the_distance_from_the_truth_after_an_alignment(run: Any) -> None:
     stamps = odometry_runs.EPOCH + (np.arange(0.5, 6.0, 0.1) * 1e9).astype(np.int64)
     positions, quaternions = odometry_runs.truth(run, stamps)
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
@@ -115,10 +117,12 @@ def test_a_score_is_the_distance_from_the_truth_after_an_alignment(run):
 
 
 @pytest.mark.parametrize("answer", ["nothing", "too few", "an exception"])
-def test_a_method_that_fails_is_lost(run, monkeypatch, answer):
+def test_a_method_that_fails_is_lost(
+    run: Any, monkeypatch: pytest.MonkeyPatch, answer: str
+) -> None:
     stamps = odometry_runs.EPOCH + np.arange(10) * 100_000_000
 
-    def method(*_):
+    def method(*_: Any) -> Any:
         if answer == "an exception":
             raise ValueError(answer)
         if answer == "nothing":
@@ -131,7 +135,7 @@ def test_a_method_that_fails_is_lost(run, monkeypatch, answer):
     assert found["real_time_factor"] == 0.0
 
 
-def test_targets_compare_the_same_runs_only():
+def test_targets_compare_the_same_runs_only() -> None:
     rows = [
         row(ate=0.001),
         row(ate=0.04, scene="corridor", sweeps="half turn"),
@@ -150,7 +154,7 @@ def test_targets_compare_the_same_runs_only():
     assert not any("genz_lio" in name or "rko_lio" in name for name in found)
 
 
-def test_a_lost_run_fails_its_targets():
+def test_a_lost_run_fails_its_targets() -> None:
     found = {
         item.name: item for item in bench_odometry.targets([row(), row(ate=math.inf, seed=1)])
     }
@@ -158,7 +162,9 @@ def test_a_lost_run_fails_its_targets():
     assert not found["largest ATE of any run, m"].met
 
 
-def test_the_page_tells_of_runs_that_are_lost_and_of_targets_not_met(tmp_path, monkeypatch):
+def test_the_page_tells_of_runs_that_are_lost_and_of_targets_not_met(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page, plot = tmp_path / "odometry.md", tmp_path / "odometry.png"
     page.write_text(f"before\n{odometry_pages.BEGIN}\nold\n{odometry_pages.END}\nafter\n")
     monkeypatch.setattr(odometry_pages, "PAGE", page)
@@ -174,7 +180,7 @@ def test_the_page_tells_of_runs_that_are_lost_and_of_targets_not_met(tmp_path, m
     assert 2_000 < plot.stat().st_size < 150_000
 
 
-def test_lio_sam_gets_the_rings_of_the_velodyne_layout(run):
+def test_lio_sam_gets_the_rings_of_the_velodyne_layout(run: Any) -> None:
     sweep = next(odometry_runs.sweeps(run, "turn"))
     points = np.stack([sweep.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
     fake = SimpleNamespace(
@@ -190,7 +196,7 @@ def test_lio_sam_gets_the_rings_of_the_velodyne_layout(run):
     assert [point.t for point in made] == np.round(times * 1e9).astype(int).tolist()
 
 
-def test_the_referees_read_what_was_written(run, tmp_path):
+def test_the_referees_read_what_was_written(run: Any, tmp_path: Path) -> None:
     odometry_runs.write(run, "half turn", tmp_path / "run.npz")
     recording = odometry_referee.Recording(str(tmp_path / "run.npz"))
     some = list(odometry_runs.sweeps(run, "half turn"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,7 +81,7 @@ def test_hostile_input_is_survived(name: str) -> None:
 
 
 @pytest.mark.parametrize("case", [fault_world.stranger, fault_world.closed, fault_world.disk])
-def test_the_world_outside(case) -> None:
+def test_the_world_outside(case: Any) -> None:
     finding = fault_world.run(case)
     assert finding.good, finding
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from l2lidar_node.config import DriverConfig, FrameConfig, NetworkConfig, SweepConfig
@@ -49,23 +51,23 @@ SETTINGS = {item.name: item for item in settings_of(DriverConfig)}
 
 
 @pytest.mark.parametrize("name", UPSTREAM)
-def test_a_setting_of_upstream(name):
+def test_a_setting_of_upstream(name: Any) -> None:
     item = SETTINGS[name]
     assert (item.type, item.default, item.live) == UPSTREAM[name]
 
 
-def test_upstreams_whole_file_is_taken():
+def test_upstreams_whole_file_is_taken() -> None:
     values = {name: default for name, (_, default, _) in UPSTREAM.items()}
     assert build(DriverConfig, values) == DriverConfig()
 
 
 @pytest.mark.parametrize("name", sorted(set(SETTINGS) - set(UPSTREAM)))
-def test_a_setting_of_ours_is_in_snake_case(name):
+def test_a_setting_of_ours_is_in_snake_case(name: Any) -> None:
     assert name == name.lower()
     assert name.isidentifier()
 
 
-def test_names_are_unique_and_described():
+def test_names_are_unique_and_described() -> None:
     items = list(settings_of(DriverConfig))
     assert len(items) == len(SETTINGS)
     for item in items:
@@ -73,7 +75,7 @@ def test_names_are_unique_and_described():
         assert item.type is bool or item.type is str or item.range_text, item.name
 
 
-def test_every_default_is_in_its_range():
+def test_every_default_is_in_its_range() -> None:
     for item in SETTINGS.values():
         assert item.check(item.default) == item.default
 
@@ -88,7 +90,7 @@ def test_every_default_is_in_its_range():
         ("host_port", 1, 65535),
     ],
 )
-def test_ranges_are_upstreams_and_inclusive(name, lo, hi):
+def test_ranges_are_upstreams_and_inclusive(name: str, lo: float, hi: float) -> None:
     for value in (lo, hi):
         assert values_of(build(DriverConfig, {name: value}))[name] == value
     for value in (lo - 0.001 if isinstance(lo, float) else lo - 1, hi + 1):
@@ -127,13 +129,13 @@ def test_ranges_are_upstreams_and_inclusive(name, lo, hi):
         ("watchdog_action", "restart", "is not known, expected one of 'shutdown', 'wait'"),
     ],
 )  # fmt: skip
-def test_a_bad_value_is_refused(name, value, expectation):
+def test_a_bad_value_is_refused(name: str, value: Any, expectation: str) -> None:
     with pytest.raises(SettingError, match=f"^parameter '{name}': .*{expectation}"):
         build(DriverConfig, {name: value})
 
 
 @pytest.mark.parametrize(("num", "denom"), [(2, 1), (1998, 1000), (1, 1), (1, 2), (3, 1)])
-def test_first_guesses_of_the_clock_ratio(num, denom):
+def test_first_guesses_of_the_clock_ratio(num: int, denom: int) -> None:
     config = build(DriverConfig, {"timeScaleNum": num, "timeScaleDenom": denom})
     assert (config.clock.time_scale_num, config.clock.time_scale_denom) == (num, denom)
 
@@ -148,12 +150,12 @@ def test_first_guesses_of_the_clock_ratio(num, denom):
         ("watchdog_timeout", "watchdog_timeout_ms"),
     ],
 )
-def test_a_typing_error_gets_a_suggestion(wrong, right):
+def test_a_typing_error_gets_a_suggestion(wrong: str, right: str) -> None:
     with pytest.raises(SettingError, match=f"'{wrong}' is not known; did you mean '{right}'?"):
         build(DriverConfig, {wrong: 1})
 
 
-def test_several_live_changes_are_made_together_or_not_at_all():
+def test_several_live_changes_are_made_together_or_not_at_all() -> None:
     config = DriverConfig()
     changed = change(config, {"aggregateNframes": 10, "calRangeBias": -525.5, "imu_adjust": False})
     assert changed.sweep.packets == 10
@@ -177,12 +179,14 @@ def test_several_live_changes_are_made_together_or_not_at_all():
         ("l2lidar", "link_link_x", "link_link_x", "link_link_x_imu"),
     ],
 )  # fmt: skip
-def test_frame_names_follow_upstreams_table(l2_name, cloud_frame, cloud, imu):
+def test_frame_names_follow_upstreams_table(
+    l2_name: str, cloud_frame: str, cloud: str, imu: str
+) -> None:
     frames = FrameConfig(l2_name=l2_name, cloud_frame=cloud_frame)
     assert (frames.cloud, frames.imu) == (cloud, imu)
 
 
-def test_groups_check_themselves_however_they_are_made():
+def test_groups_check_themselves_however_they_are_made() -> None:
     with pytest.raises(SettingError, match="'host_ip'"):
         NetworkConfig(host_ip="somewhere")
     with pytest.raises(SettingError, match="'range_min'"):

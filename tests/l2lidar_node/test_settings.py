@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -45,11 +46,11 @@ class Group:
 NAMES = ["rate_hz", "mode", "low", "high", "isOn", "name", "frames", "weights"]
 
 
-def test_settings_come_in_order_of_declaration_nested_ones_in_place():
+def test_settings_come_in_order_of_declaration_nested_ones_in_place() -> None:
     assert [item.name for item in settings_of(Group)] == NAMES
 
 
-def test_a_setting_carries_what_was_declared():
+def test_a_setting_carries_what_was_declared() -> None:
     rate, *_, is_on, _, frames, weights = settings_of(Group)
     assert (rate.name, rate.field, rate.type, rate.default) == ("rate_hz", "rate_hz", float, 10.0)
     assert (rate.lo, rate.hi, rate.unit, rate.live, rate.item) == (0.5, 100.0, "Hz", True, None)
@@ -59,7 +60,7 @@ def test_a_setting_carries_what_was_declared():
     assert (weights.type, weights.item) == (tuple, float)
 
 
-def test_range_texts():
+def test_range_texts() -> None:
     texts = {item.name: item.range_text for item in settings_of(Group)}
     assert texts["mode"] == "'fast', 'slow'"
     assert texts["low"] == "0 to unbounded"
@@ -67,11 +68,11 @@ def test_range_texts():
     assert texts["name"] == ""
 
 
-def test_defaults():
+def test_defaults() -> None:
     assert build(Group, {}) == Group()
 
 
-def test_values_of_both_levels():
+def test_values_of_both_levels() -> None:
     group = build(Group, {"rate_hz": 2, "isOn": False, "frames": ["x"], "weights": [1, 2.0]})
     assert group.inner.rate_hz == 2.0
     assert isinstance(group.inner.rate_hz, float)
@@ -106,7 +107,9 @@ def test_values_of_both_levels():
         ("weights", [math.nan], "nan is not a finite number"),
     ],
 )
-def test_a_wrong_value_is_refused_with_name_value_and_expectation(name, value, message):
+def test_a_wrong_value_is_refused_with_name_value_and_expectation(
+    name: str, value: Any, message: str
+) -> None:
     with pytest.raises(SettingError) as caught:
         build(Group, {name: value})
     assert str(caught.value).startswith(f"parameter '{name}': ")
@@ -114,7 +117,7 @@ def test_a_wrong_value_is_refused_with_name_value_and_expectation(name, value, m
 
 
 @pytest.mark.parametrize("value", [0.5, 100, 100.0])
-def test_bounds_are_inclusive(value):
+def test_bounds_are_inclusive(value: float) -> None:
     assert build(Group, {"rate_hz": value}).inner.rate_hz == value
 
 
@@ -127,43 +130,43 @@ def test_bounds_are_inclusive(value):
         ("zzz", "parameter 'zzz' is not known"),
     ],
 )
-def test_a_typing_error_gets_a_suggestion(name, message):
+def test_a_typing_error_gets_a_suggestion(name: str, message: str) -> None:
     with pytest.raises(SettingError) as caught:
         build(Group, {name: 1})
     assert str(caught.value) == message
 
 
-def test_a_setting_error_is_a_value_error():
+def test_a_setting_error_is_a_value_error() -> None:
     assert issubclass(SettingError, ValueError)
 
 
-def test_a_change_keeps_the_rest_and_leaves_the_old_one_alone():
+def test_a_change_keeps_the_rest_and_leaves_the_old_one_alone() -> None:
     before = build(Group, {"rate_hz": 2.0, "name": "n"})
     after = change(before, {"isOn": False, "low": 3})
     assert (after.inner.rate_hz, after.name, after.is_on, after.inner.low) == (2.0, "n", False, 3)
     assert before == build(Group, {"rate_hz": 2.0, "name": "n"})
 
 
-def test_a_change_is_made_whole_or_not_at_all():
+def test_a_change_is_made_whole_or_not_at_all() -> None:
     before = Group()
     with pytest.raises(SettingError, match=r"'mode'"):
         change(before, {"rate_hz": 20.0, "mode": "nonsense", "name": "x"})
     assert before == Group()
 
 
-def test_a_change_of_two_settings_that_only_fit_together():
+def test_a_change_of_two_settings_that_only_fit_together() -> None:
     assert change(Group(), {"low": 7, "high": 9}).inner.low == 7
     with pytest.raises(SettingError, match=r"parameter 'low': 7 is above high \(5\)"):
         change(Group(), {"low": 7})
 
 
-def test_values_can_be_built_from_again():
+def test_values_can_be_built_from_again() -> None:
     group = build(Group, {"rate_hz": 3.5, "frames": ["q"], "isOn": False})
     assert list(values_of(group)) == NAMES
     assert build(Group, values_of(group)) == group
 
 
-def test_a_group_cannot_be_written():
+def test_a_group_cannot_be_written() -> None:
     group = Group()
     with pytest.raises(dataclasses.FrozenInstanceError):
         group.name = "x"  # type: ignore[misc]  # that is the point
@@ -171,7 +174,7 @@ def test_a_group_cannot_be_written():
         object.__setattr__(group, "naem", "x")
 
 
-def test_the_table():
+def test_the_table() -> None:
     lines = markdown_table(Group).splitlines()
     assert lines[0] == "| Parameter | Type | Default | Range | Live | Description |"
     assert len(lines) == 2 + len(NAMES)
@@ -195,7 +198,7 @@ JUNK = st.one_of(
 
 
 @given(st.sampled_from(NAMES), JUNK)
-def test_any_value_is_taken_in_its_type_or_refused_by_name(name, value):
+def test_any_value_is_taken_in_its_type_or_refused_by_name(name: Any, value: Any) -> None:
     message = ""
     try:
         group = build(Group, {name: value})

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ Said = tuple[int, str, str]
 
 
 @pytest.fixture
-def check(monkeypatch, capsys):
+def check(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
     """Return exit code, output and errors of the command."""
 
     def run(*arguments: object) -> Said:
@@ -34,7 +35,7 @@ def check(monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def bag(tmp_path_factory) -> Path:
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return good("lio_sam").write(tmp_path_factory.mktemp("bags") / "good")
 
 
@@ -45,7 +46,7 @@ def small() -> Recording:
     return made
 
 
-def test_a_good_recording_is_ready(check, bag):
+def test_a_good_recording_is_ready(check: Any, bag: Path) -> None:
     code, said, _ = check(bag, "--for", "lio_sam", "--strict")
     lines = said.splitlines()
     assert code == 0
@@ -54,7 +55,7 @@ def test_a_good_recording_is_ready(check, bag):
     assert lines[-1].startswith("ready for LIO-SAM: no errors, no warnings")
 
 
-def test_a_finding_is_one_line_with_what_to_do(check, bag):
+def test_a_finding_is_one_line_with_what_to_do(check: Any, bag: Path) -> None:
     code, said, _ = check(bag, "--for", "fast_lio")
     (line,) = [line for line in said.splitlines() if line.startswith("ERROR")]
     assert code == 1
@@ -62,7 +63,7 @@ def test_a_finding_is_one_line_with_what_to_do(check, bag):
     assert said.splitlines()[-1].startswith("not ready for FAST-LIO2: 1 error,")
 
 
-def test_json_says_the_same(check, bag):
+def test_json_says_the_same(check: Any, bag: Path) -> None:
     code, said, _ = check(bag, "--for", "fast_lio", "--json")
     data = json.loads(said)
     assert code == 1
@@ -73,7 +74,9 @@ def test_json_says_the_same(check, bag):
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
-def test_both_storages_and_the_bare_file_are_read(check, storage, tmp_path):
+def test_both_storages_and_the_bare_file_are_read(
+    check: Any, storage: Any, tmp_path: Path
+) -> None:
     folder = good("kiss_icp").write(tmp_path / "bag", storage)
     assert check(folder, "--for", "kiss_icp", "--strict")[0] == 0
     if storage is StoragePlugin.MCAP:
@@ -82,11 +85,11 @@ def test_both_storages_and_the_bare_file_are_read(check, storage, tmp_path):
 
 
 @pytest.mark.parametrize("consumer", CONSUMERS)
-def test_every_consumer_is_known(check, consumer, tmp_path):
+def test_every_consumer_is_known(check: Any, consumer: Any, tmp_path: Path) -> None:
     assert check(small().write(tmp_path / "bag"), "--for", consumer)[0] in (0, 1)
 
 
-def test_warnings_fail_only_if_they_are_to(check, tmp_path):
+def test_warnings_fail_only_if_they_are_to(check: Any, tmp_path: Path) -> None:
     made = copied(good("lio_sam"))
     made.transforms = []
     path = made.write(tmp_path / "bag")
@@ -96,7 +99,7 @@ def test_warnings_fail_only_if_they_are_to(check, tmp_path):
     assert check(path, "--for", "lio_sam", "--strict")[0] == 1
 
 
-def test_only_so_many_seconds_are_read(check, bag):
+def test_only_so_many_seconds_are_read(check: Any, bag: Path) -> None:
     code, said, _ = check(bag, "--for", "lio_sam", "--seconds", "1.1", "--json")
     assert code == 0
     (clouds,) = re.findall(r"samples cover \d+ of (\d+) clouds", said)
@@ -111,13 +114,13 @@ def test_only_so_many_seconds_are_read(check, bag):
         (("--imu", "/points"), "is of type sensor_msgs/msg/PointCloud2"),
     ],
 )
-def test_a_wrong_topic_is_a_usage_error(check, bag, arguments, said):
+def test_a_wrong_topic_is_a_usage_error(check: Any, bag: Path, arguments: Any, said: str) -> None:
     code, _, error = check(bag, "--for", "lio_sam", *arguments)
     assert code == 2
     assert said in error
 
 
-def test_a_recording_without_clouds_says_what_it_has(check, tmp_path):
+def test_a_recording_without_clouds_says_what_it_has(check: Any, tmp_path: Path) -> None:
     made = small()
     made.clouds, made.cloud_arrivals = [], []
     made.cloud_arrivals = [0]
@@ -126,7 +129,7 @@ def test_a_recording_without_clouds_says_what_it_has(check, tmp_path):
     assert "/imu/data" in error
 
 
-def test_an_unknown_consumer_is_a_usage_error(check, bag):
+def test_an_unknown_consumer_is_a_usage_error(check: Any, bag: Path) -> None:
     code, _, error = check(bag, "--for", "loam")
     assert code == 2
     assert "lio_sam" in error
@@ -183,7 +186,9 @@ def _bad_database(folder: Path) -> Path:
     [_no_file, _empty_folder, _empty_file, _other_file, _bad_metadata, _other_metadata, _no_data,
      _bad_database],
 )  # fmt: skip
-def test_what_is_no_recording_is_a_usage_error_with_one_line(check, make, tmp_path):
+def test_what_is_no_recording_is_a_usage_error_with_one_line(
+    check: Any, make: Any, tmp_path: Path
+) -> None:
     path = make(tmp_path)
     code, said, error = check(path, "--for", "lio_sam")
     assert (code, said) == (2, "")
@@ -193,7 +198,9 @@ def test_what_is_no_recording_is_a_usage_error_with_one_line(check, make, tmp_pa
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.999])
-def test_a_recording_that_was_cut_off_is_refused_or_judged(check, share, tmp_path):
+def test_a_recording_that_was_cut_off_is_refused_or_judged(
+    check: Any, share: float, tmp_path: Path
+) -> None:
     (file,) = small().write(tmp_path / "bag").glob("*.mcap")
     data = file.read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -202,7 +209,9 @@ def test_a_recording_that_was_cut_off_is_refused_or_judged(check, share, tmp_pat
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_recording_with_wrong_bytes_is_refused_or_judged(check, seed, tmp_path):
+def test_a_recording_with_wrong_bytes_is_refused_or_judged(
+    check: Any, seed: Any, tmp_path: Path
+) -> None:
     draw = np.random.default_rng(seed)
     (file,) = small().write(tmp_path / "bag").glob("*.mcap")
     data = np.frombuffer(file.read_bytes(), np.uint8).copy()
@@ -213,7 +222,9 @@ def test_a_recording_with_wrong_bytes_is_refused_or_judged(check, seed, tmp_path
 
 
 @pytest.mark.parametrize("source", [("/points",), ()])
-def test_without_ros_a_topic_is_a_usage_error(check, monkeypatch, source):
+def test_without_ros_a_topic_is_a_usage_error(
+    check: Any, monkeypatch: pytest.MonkeyPatch, source: Any
+) -> None:
     monkeypatch.setitem(sys.modules, "l2lidar_node.ros.topic_source", None)
     monkeypatch.delattr("l2lidar_node.ros.topic_source", raising=False)
     code, _, error = check(*source, "--for", "lio_sam")
@@ -221,7 +232,7 @@ def test_without_ros_a_topic_is_a_usage_error(check, monkeypatch, source):
     assert "need a sourced ROS 2" in error
 
 
-def test_several_topics_have_to_be_told_apart():
+def test_several_topics_have_to_be_told_apart() -> None:
     kinds = {"/points": CLOUD, "/points_deskewed": CLOUD, "/imu/data": IMU, "/camera/imu": IMU}
     with pytest.raises(SourceError, match="--cloud: /points, /points_deskewed"):
         choose(kinds, Topics(), needs_imu=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -49,7 +51,9 @@ def observed(code: str, *values: float, name: str = "t") -> Observation:
         (TimeUnit.RKO, "f8", (1_700_000_000.0, 1_700_000_000.25), -0.25, 0.25),
     ],
 )
-def test_values_become_seconds_after_the_stamp(unit, code, values, first, spread):
+def test_values_become_seconds_after_the_stamp(
+    unit: Any, code: str, values: Any, first: float, spread: float
+) -> None:
     found = read(unit, code, *values)
     assert found.refused == 0
     assert found.first[0] == pytest.approx(first, abs=1e-6)
@@ -57,17 +61,17 @@ def test_values_become_seconds_after_the_stamp(unit, code, values, first, spread
 
 
 @pytest.mark.parametrize("first", [0.0011, 0.1, 3.0])
-def test_rko_lio_refuses_a_first_time_from_1_ms_on(first):
+def test_rko_lio_refuses_a_first_time_from_1_ms_on(first: float) -> None:
     assert read(TimeUnit.RKO, "f4", first, first + 0.2).refused == 1
     assert read(TimeUnit.RKO, "f4", 0.0009, 0.2).refused == 0
 
 
-def test_glim_takes_a_second_or_more_for_absolute():
+def test_glim_takes_a_second_or_more_for_absolute() -> None:
     assert read(TimeUnit.GLIM, "f4", 0.0, 0.999).least[0] == 0.0
     assert read(TimeUnit.GLIM, "f4", 0.0, 1.001).least[0] < -1e9
 
 
-def test_kiss_icp_takes_any_unit_and_origin():
+def test_kiss_icp_takes_any_unit_and_origin() -> None:
     for values in ((5.0, 5.25), (0, 250_000_000)):
         found = read(TimeUnit.SPREAD, "f8", *values)
         assert (found.first[0], found.spread[0]) == pytest.approx((0.0, 0.25))
@@ -82,13 +86,13 @@ def test_kiss_icp_takes_any_unit_and_origin():
         ("rtabmap", "stamps", "f4", ""),
     ],
 )
-def test_the_input_that_fits_best_is_taken(consumer, name, code, when):
+def test_the_input_that_fits_best_is_taken(consumer: str, name: str, code: str, when: str) -> None:
     form = observed(code, 0.0, name=name).clouds[0].format
     way = reading(form, CONSUMERS[consumer])
     assert (way.input.when, way.time.name, way.code) == (when, name, code)
 
 
-def test_an_ouster_cloud_is_judged_as_such():
+def test_an_ouster_cloud_is_judged_as_such() -> None:
     made = recordings.copied(recordings.good("lio_sam"))
     layout = LAYOUTS["ouster_legacy"]
     made.clouds = [
@@ -100,7 +104,7 @@ def test_an_ouster_cloud_is_judged_as_such():
     assert any("sensor: ouster" in item.text for item in findings)
 
 
-def test_a_cell_keeps_one_point():
+def test_a_cell_keeps_one_point() -> None:
     """Four points in two rings: two share ring and column, one is half a degree beside."""
     angle = np.radians([10.0, 10.01, 10.5, 10.0])
     ring = np.array([3, 3, 3, 4])

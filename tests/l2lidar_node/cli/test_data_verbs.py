@@ -12,6 +12,7 @@ import threading
 import time
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import dpkt
 import numpy as np
@@ -86,7 +87,7 @@ def live(
     ],
     ids=str,
 )
-def test_a_recorded_run_replays_bit_for_bit(unit: Unit, tmp_path: Path, settings) -> None:
+def test_a_recorded_run_replays_bit_for_bit(unit: Unit, tmp_path: Path, settings: Any) -> None:
     config, found = live(unit, tmp_path / "run.pcap", 4, **settings)
     with (tmp_path / "run.pcap").open("rb") as stream:
         replayed = list(events(Recording(stream), config))
@@ -136,7 +137,7 @@ class Sniffer:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may capture packets")
 @pytest.mark.parametrize("settings", [{"sweep_cut": "turn"}, {"imu_adjust": False}], ids=str)
-def test_a_tcpdump_of_a_run_replays(make_unit, tmp_path: Path, settings) -> None:
+def test_a_tcpdump_of_a_run_replays(make_unit: Any, tmp_path: Path, settings: Any) -> None:
     unit = make_unit(int(WorkMode.WAIT_FOR_START))  # nothing is sent before all listen
     sniffer = Sniffer(tmp_path / "tcpdump.pcap", unit.host_port)
     config, found = live(unit, tmp_path / "own.pcap", 4, **settings)
@@ -332,7 +333,9 @@ def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"), [(b"no capture at all", "no capture file"), (b"", "no capture file")]
 )
-def test_what_is_no_capture_is_refused(run: Run, tmp_path: Path, content: bytes, words) -> None:
+def test_what_is_no_capture_is_refused(
+    run: Run, tmp_path: Path, content: bytes, words: str
+) -> None:
     path = tmp_path / "a.pcap"
     path.write_bytes(content)
     for verb in (["replay", str(path)], ["convert", str(path), str(tmp_path / "bag")]):
@@ -397,7 +400,7 @@ def replayed(run: Run, path: Path, *options: str) -> tuple[list[bytes], str]:
     return listener.stop(), outcome.out
 
 
-def test_replay_sends_what_was_received(run: Run, capture) -> None:
+def test_replay_sends_what_was_received(run: Run, capture: tuple[Path, list[Received]]) -> None:
     path, entries = capture
     begun = time.monotonic()
     data, said = replayed(run, path, "--rate", "2")
@@ -407,7 +410,7 @@ def test_replay_sends_what_was_received(run: Run, capture) -> None:
     assert f"{len(entries)} datagrams sent" in said
 
 
-def test_replay_seeks_and_stops(run: Run, capture) -> None:
+def test_replay_seeks_and_stops(run: Run, capture: tuple[Path, list[Received]]) -> None:
     path, entries = capture
     seconds = np.array([entry.time - entries[0].time for entry in entries]) / 1e9
     # Between two of its packets: a pause of this machine may be anywhere.
@@ -419,7 +422,9 @@ def test_replay_seeks_and_stops(run: Run, capture) -> None:
     assert data == [entry.data for entry, is_in in zip(entries, within, strict=True) if is_in]
 
 
-def test_replay_from_beyond_the_end_says_so(run: Run, capture) -> None:
+def test_replay_from_beyond_the_end_says_so(
+    run: Run, capture: tuple[Path, list[Received]]
+) -> None:
     path, _ = capture
     outcome = run("replay", str(path), "--start", "1000", "--to", f"127.0.0.1:{free_port()}")
     assert outcome.code == 1
@@ -437,7 +442,7 @@ def started(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def wait_until(condition, process: subprocess.Popen[str]) -> None:
+def wait_until(condition: Any, process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + LIMIT_S
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -470,7 +475,7 @@ def test_a_killed_recording_is_there_but_for_its_end(unit: Unit, tmp_path: Path)
         assert sum(isinstance(entry, Received) for entry in recording) > 300
 
 
-def test_ctrl_c_ends_a_loop(run: Run, capture) -> None:
+def test_ctrl_c_ends_a_loop(run: Run, capture: tuple[Path, list[Received]]) -> None:
     path, entries = capture
     listener = Listener()
     process = started(
@@ -496,7 +501,9 @@ def repeated(entries: list[Received], path: Path, times: int, first: int | None 
                 writer.received(entry.data, HostNs(entry.time + shift + lap * length))
 
 
-def test_an_interrupted_convert_leaves_nothing(capture, tmp_path: Path) -> None:
+def test_an_interrupted_convert_leaves_nothing(
+    capture: tuple[Path, list[Received]], tmp_path: Path
+) -> None:
     path = tmp_path / "long.pcap"
     repeated(capture[1], path, 100)
     process = started("convert", str(path), str(tmp_path / "run.mcap"))
@@ -508,7 +515,9 @@ def test_an_interrupted_convert_leaves_nothing(capture, tmp_path: Path) -> None:
     assert sorted(item.name for item in tmp_path.iterdir()) == ["long.pcap", "run.pcap"]
 
 
-def test_times_that_no_stamp_can_hold_are_explained(run: Run, capture, tmp_path: Path) -> None:
+def test_times_that_no_stamp_can_hold_are_explained(
+    run: Run, capture: tuple[Path, list[Received]], tmp_path: Path
+) -> None:
     path = tmp_path / "late.pcap"
     repeated(capture[1], path, 1, first=2**31 * 10**9 - 500_000_000)
     outcome = run("convert", str(path), str(tmp_path / "late.mcap"))

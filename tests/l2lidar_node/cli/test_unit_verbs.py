@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,7 +54,7 @@ def test_info_tells_what_the_unit_is(run: Run, unit: Unit) -> None:
     assert about["health"]["device"]["state"] == "streaming"
 
 
-def test_info_of_a_unit_in_standby_says_what_is_not_known(run: Run, make_unit) -> None:
+def test_info_of_a_unit_in_standby_says_what_is_not_known(run: Run, make_unit: Any) -> None:
     unit = make_unit(mode=int(WorkMode.WAIT_FOR_START))
     outcome = run("info", *unit.options)
     assert outcome.code == 0
@@ -150,14 +151,14 @@ def test_monitor_prints_a_judgement_a_second(run: Run, unit: Unit) -> None:
     assert "streaming" in run("monitor", *unit.options, "--duration", "1").out
 
 
-def test_monitor_ends_with_1_on_an_error(run: Run, make_unit) -> None:
+def test_monitor_ends_with_1_on_an_error(run: Run, make_unit: Any) -> None:
     unit = make_unit(faults=FaultConfig(loss=0.3))
     outcome = run("monitor", *unit.options, "--duration", "2", "--json")
     assert outcome.code == 1
     assert json.loads(outcome.out.splitlines()[-1])["link"]["level"] == "ERROR"
 
 
-def test_discover_finds_who_sends_and_who_answers(run: Run, make_unit) -> None:
+def test_discover_finds_who_sends_and_who_answers(run: Run, make_unit: Any) -> None:
     sending = make_unit()
     arguments = ["--host-port", str(sending.host_port), "--l2-port", str(sending.lidar_port)]
     outcome = run("discover", *arguments, "--probe", "127.0.0.1", "--timeout", "1.2", "--json")
@@ -191,7 +192,7 @@ def test_stop_and_start_do_what_they_say(run: Run, unit: Unit) -> None:
     assert "running already" in run("start", *unit.options).out
 
 
-def test_start_waits_in_vain_for_a_unit_that_does_not_wake(run: Run, make_unit) -> None:
+def test_start_waits_in_vain_for_a_unit_that_does_not_wake(run: Run, make_unit: Any) -> None:
     unit = make_unit(mode=int(WorkMode.WAIT_FOR_START), wakes=False)
     outcome = run("start", *unit.options, "--wait", "0.5")
     assert outcome.code == 1
@@ -200,13 +201,13 @@ def test_start_waits_in_vain_for_a_unit_that_does_not_wake(run: Run, make_unit) 
 
 @pytest.mark.parametrize(("verb", "runs"), [("start", False), ("stop", True)])
 def test_interrupted_it_leaves_the_unit_as_it_was(
-    run: Run, make_unit, monkeypatch: pytest.MonkeyPatch, verb: str, runs: bool
+    run: Run, make_unit: Any, monkeypatch: pytest.MonkeyPatch, verb: str, runs: bool
 ) -> None:
     unit = make_unit(mode=0 if runs else int(WorkMode.WAIT_FOR_START))
     command = Device.command
     sent = []
 
-    def interrupted(self, start):
+    def interrupted(self, start: Any) -> Any:
         answer = command(self, start)
         sent.append(answer.command)
         if len(sent) == 1:
@@ -229,7 +230,7 @@ def test_reset_reboots_the_unit(run: Run, unit: Unit) -> None:
     assert run("reset", *unit.options).out == "reset sent\n"
 
 
-def test_a_reset_that_does_not_arrive_is_noticed(run: Run, make_unit) -> None:
+def test_a_reset_that_does_not_arrive_is_noticed(run: Run, make_unit: Any) -> None:
     unit = make_unit(faults=FaultConfig(command_loss=1.0))
     outcome = run("reset", *unit.options, "--wait", "1")
     assert outcome.code == 1
@@ -289,7 +290,7 @@ def test_work_mode_is_shown_asked_for_stored_and_read_back(run: Run, unit: Unit)
     assert unit.flash.work_mode == 6
 
 
-def test_a_change_may_begin_with_a_minus(run: Run, make_unit) -> None:
+def test_a_change_may_begin_with_a_minus(run: Run, make_unit: Any) -> None:
     unit = make_unit(mode=int(WorkMode.IMU_OFF))
     outcome = run("set", "work-mode", "-imu_off", *unit.options, "--yes")
     assert outcome.code == 0, outcome.err
@@ -324,7 +325,7 @@ def test_an_interrupted_change_is_undone(
     read = Device.read_parameters
     calls = []
 
-    def interrupted(self):
+    def interrupted(self) -> Any:
         calls.append(unit.flash)
         if len(calls) == 2:
             raise KeyboardInterrupt
@@ -411,7 +412,7 @@ def test_wrong_networks_are_refused(run: Run, unit: Unit, change: list[str], wor
     assert unit.flash == before
 
 
-def test_a_unit_that_sends_elsewhere_can_be_told_to_come_back(run: Run, make_unit) -> None:
+def test_a_unit_that_sends_elsewhere_can_be_told_to_come_back(run: Run, make_unit: Any) -> None:
     unit = make_unit()
     elsewhere = ["--l2-ip", "127.0.0.1", "--l2-port", str(unit.lidar_port)]
     elsewhere += ["--host-port", str(free_port())]
@@ -432,7 +433,7 @@ def test_a_unit_that_sends_elsewhere_can_be_told_to_come_back(run: Run, make_uni
     assert unit.flash.network.user_port == 7001
 
 
-def test_ctrl_c_while_it_waits_for_points_puts_the_unit_back(make_unit) -> None:
+def test_ctrl_c_while_it_waits_for_points_puts_the_unit_back(make_unit: Any) -> None:
     unit = make_unit(
         int(WorkMode.WAIT_FOR_START), boot_scale=1.0, link_s=0.0, wake_imu_s=0.0,
         wake_points_s=120.0,
@@ -481,14 +482,14 @@ def test_the_mac_of_the_loopback_interface_is_not_known(run: Run, unit: Unit) ->
     assert json.loads(run("get", "mac", *unit.options, "--json").out) == {"mac": None}
 
 
-def test_a_unit_that_does_not_acknowledge_is_exit_code_1(run: Run, make_unit) -> None:
+def test_a_unit_that_does_not_acknowledge_is_exit_code_1(run: Run, make_unit: Any) -> None:
     unit = make_unit(faults=FaultConfig(command_loss=1.0))
     outcome = run("set", "work-mode", "4", *unit.options, "--yes")
     assert outcome.code == 1
     assert unit.flash.work_mode == 0
 
 
-def test_sync_check_measures_a_unit_without_imu(run: Run, make_unit) -> None:
+def test_sync_check_measures_a_unit_without_imu(run: Run, make_unit: Any) -> None:
     unit = make_unit(mode=int(WorkMode.IMU_OFF))
     outcome = run("sync-check", *unit.options, "--duration", "2", "--json")
     assert outcome.code == 0, outcome.err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ START = HostNs(1_700_000_000_123_456_789)
 
 
 @pytest.fixture
-def points():
+def points() -> Any:
     payload = build.points_3d(intensities=np.arange(300) % 256)
     return Projector(PacketType.POINTS_3D).points([payload], np.zeros(1)).points
 
@@ -43,19 +45,19 @@ PUBLISHED = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_offsets_and_types_are_the_published_ones(name):
+def test_offsets_and_types_are_the_published_ones(name: Any) -> None:
     layout = LAYOUTS[name].dtype
     fields = (layout.fields or {}).items()
     words = [f"{field}{offset}{kind.str}" for field, (kind, offset) in fields]
     assert (layout.itemsize, " ".join(words)) == PUBLISHED[name]
 
 
-def test_native_is_the_point_itself(points):
+def test_native_is_the_point_itself(points: Any) -> None:
     assert LAYOUTS["native"].convert(points, START) is points
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_positions_and_intensities_are_kept(name, points):
+def test_positions_and_intensities_are_kept(name: Any, points: Any) -> None:
     converted = LAYOUTS[name].convert(points, START)
     assert converted.dtype == LAYOUTS[name].dtype
     for field in ("x", "y", "z", "intensity"):
@@ -63,7 +65,7 @@ def test_positions_and_intensities_are_kept(name, points):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_times_are_in_the_consumers_unit(name, points):
+def test_times_are_in_the_consumers_unit(name: Any, points: Any) -> None:
     layout = LAYOUTS[name]
     converted = layout.convert(points, START)
     seconds = points["time"].astype(np.float64)
@@ -79,7 +81,7 @@ def test_times_are_in_the_consumers_unit(name, points):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_without_time_only_the_time_is_missing(name, points):
+def test_without_time_only_the_time_is_missing(name: Any, points: Any) -> None:
     layout = LAYOUTS[name]
     bare = layout.without_time()
     assert bare.time_field == ""
@@ -90,14 +92,14 @@ def test_without_time_only_the_time_is_missing(name, points):
         np.testing.assert_array_equal(part[field], whole[field])
 
 
-def test_ranges_are_in_the_consumers_unit(points):
+def test_ranges_are_in_the_consumers_unit(points: Any) -> None:
     millimetres = LAYOUTS["ouster_legacy"].convert(points, START)["range"]
     np.testing.assert_allclose(millimetres / 1e3, points["range"], atol=5.1e-4)
     metres = LAYOUTS["autoware"].convert(points, START)["distance"]
     np.testing.assert_array_equal(metres, points["range"])
 
 
-def test_angles_of_autoware_lead_back_to_the_point(points):
+def test_angles_of_autoware_lead_back_to_the_point(points: Any) -> None:
     converted = LAYOUTS["autoware"].convert(points, START)
     distance = np.linalg.norm([points["x"], points["y"], points["z"]], axis=0)
     level = distance * np.cos(converted["elevation"])
@@ -106,19 +108,19 @@ def test_angles_of_autoware_lead_back_to_the_point(points):
 
 
 @pytest.mark.parametrize("name", ["velodyne", "unitree", "hesai", "native_ring", "ouster_legacy"])
-def test_the_ring_is_that_of_the_point(name, points):
+def test_the_ring_is_that_of_the_point(name: str, points: Any) -> None:
     converted = LAYOUTS[name].convert(points, START)
     np.testing.assert_array_equal(converted["ring"], rings(points))
     assert converted["ring"].max() < RINGS
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_layout_converts_no_points(name):
+def test_a_layout_converts_no_points(name: Any) -> None:
     converted = LAYOUTS[name].convert(np.empty(0, POINT), START)
     assert converted.shape == (0,)
 
 
-def test_lio_sam_keeps_nearly_all_points():
+def test_lio_sam_keeps_nearly_all_points() -> None:
     """Its projection keeps the first point of each cell of ring and azimuth column."""
     packets = 50
     payloads = [
@@ -137,7 +139,7 @@ def test_lio_sam_keeps_nearly_all_points():
     assert len(cells) > 0.95 * len(points)
 
 
-def test_points_of_other_drivers_get_what_they_lack(points):
+def test_points_of_other_drivers_get_what_they_lack(points: Any) -> None:
     bare = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f4")])
     for name in bare.dtype.names:
         bare[name] = points[name]

@@ -6,6 +6,7 @@ Explain it in the commit that writes the digests anew (``python -m tests.support
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,21 +16,21 @@ from tests.support import build
 
 
 @pytest.mark.parametrize("name", build.DIGESTED)
-def test_sweeps_have_not_changed(name):
+def test_sweeps_have_not_changed(name: Any) -> None:
     recorded = json.loads((build.DIGESTS / f"{name}.digest.json").read_text(encoding="utf-8"))
     changed = build.differences(recorded, build.digests(name))
     # Where only bits have changed no length did by 10 um and no time by 10 ns.
     assert changed == []
 
 
-def test_every_digest_is_checked():
+def test_every_digest_is_checked() -> None:
     assert {path.name for path in build.DIGESTS.iterdir()} == {
         f"{name}.digest.json" for name in build.DIGESTED
     }
 
 
 @pytest.mark.parametrize("name", ["x", "y", "z", "intensity", "range", "time"])
-def test_a_change_of_one_bit_is_seen_and_named_by_its_field(name):
+def test_a_change_of_one_bit_is_seen_and_named_by_its_field(name: str) -> None:
     whole = build.sweeps(build.capture(0.5))
     before = [build.digest(sweep.points) for sweep in whole]
     points = whole[1].points.copy()
@@ -49,7 +50,7 @@ def test_a_change_of_one_bit_is_seen_and_named_by_its_field(name):
         ("time_increment", 8, {"time"}),
     ],
 )
-def test_a_change_of_one_bit_of_a_packet_is_seen_and_named(at, bit, fields):
+def test_a_change_of_one_bit_of_a_packet_is_seen_and_named(at: str, bit: int, fields: Any) -> None:
     datagrams = list(build.capture(0.5))
     before = [build.digest(sweep.points) for sweep in build.sweeps(datagrams)]
     number = next(i for i, item in enumerate(datagrams) if len(item.data) > 1000)
@@ -64,7 +65,7 @@ def test_a_change_of_one_bit_of_a_packet_is_seen_and_named(at, bit, fields):
     assert named == fields
 
 
-def test_a_rounded_digest_does_not_depend_on_the_last_bits():
+def test_a_rounded_digest_does_not_depend_on_the_last_bits() -> None:
     points = build.sweeps(build.capture(0.2))[0].points.copy()
     before = build.digest(points)
     points["x"] = np.round(points["x"], 5) + 1e-6
@@ -74,7 +75,7 @@ def test_a_rounded_digest_does_not_depend_on_the_last_bits():
     assert before["y"] == middle["y"]
 
 
-def test_a_sweep_more_or_less_is_seen():
+def test_a_sweep_more_or_less_is_seen() -> None:
     whole = build.digests("unit_a_by_packets")
     assert build.differences(whole, whole[:-1]) == [
         f"{len(whole)} sweeps are {len(whole) - 1} now"

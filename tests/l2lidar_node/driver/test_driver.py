@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ TICK_NS = 10_000_000
 class Run:
     """A driver that hears datagrams and is ticked every 10 ms, as a session does it."""
 
-    def __init__(self, **values):
+    def __init__(self, **values: Any) -> None:
         self.driver = Driver(configure(DriverConfig, PLAIN | values))
         self.events: list[Event] = []
         self.sent: list[bytes] = []
@@ -73,7 +74,7 @@ def datagrams() -> list[Datagram]:
 
 
 @pytest.fixture(scope="module")
-def played(datagrams) -> Run:
+def played(datagrams: list[Datagram]) -> Run:
     return Run().play(datagrams)
 
 
@@ -89,7 +90,9 @@ def _same(one: Event, other: Event) -> bool:
     return facts[0] == facts[1]
 
 
-def test_sweeps_and_samples_come_once_the_clock_is_locked(played, datagrams):
+def test_sweeps_and_samples_come_once_the_clock_is_locked(
+    played: Run, datagrams: list[Datagram]
+) -> None:
     counters = played.driver.counters
     unlocked = counters.unlocked
     assert 0 < unlocked[Stream.IMU] < 250
@@ -105,7 +108,7 @@ def test_sweeps_and_samples_come_once_the_clock_is_locked(played, datagrams):
     assert [event.kind.name for event in played.of(ClockEvent)] == ["LOCKED"]
 
 
-def test_stamps_are_true_but_for_the_constant_latency(played):
+def test_stamps_are_true_but_for_the_constant_latency(played: Run) -> None:
     """The unit's clock runs at half speed; arrivals are 0.2 ms late, which nothing can tell."""
     first = played.driver.counters.unlocked[Stream.POINTS]
     for number, sweep in enumerate(played.of(Sweep)):
@@ -117,11 +120,11 @@ def test_stamps_are_true_but_for_the_constant_latency(played):
         assert abs(sample.stamp - 200_000 - true) < 20_000
 
 
-def test_a_replay_gives_the_same(played, datagrams):
+def test_a_replay_gives_the_same(played: Run, datagrams: list[Datagram]) -> None:
     assert same(played.events, Run().play(datagrams).events)
 
 
-def test_a_sample_carries_what_was_sent():
+def test_a_sample_carries_what_was_sent() -> None:
     fields = {
         "quaternion_wxyz": np.array([0.5, 0.5, -0.5, 0.5]) * 0.9983,
         "rate": (0.25, -0.5, 1.0),
@@ -136,7 +139,9 @@ def test_a_sample_carries_what_was_sent():
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 9])
-def test_how_packets_are_cut_into_datagrams_does_not_matter(played, datagrams, pieces):
+def test_how_packets_are_cut_into_datagrams_does_not_matter(
+    played: Run, datagrams: list[Datagram], pieces: int
+) -> None:
     """Each piece comes when its packet came, the last one completes it."""
     cut = []
     for arrival, data in datagrams:
@@ -145,7 +150,7 @@ def test_how_packets_are_cut_into_datagrams_does_not_matter(played, datagrams, p
     assert same(played.events, Run().play(cut).events)
 
 
-def test_coalesced_packets_give_the_same_points(played, datagrams):
+def test_coalesced_packets_give_the_same_points(played: Run, datagrams: list[Datagram]) -> None:
     pairs = zip(datagrams[::2], datagrams[1::2], strict=False)
     joined = [Datagram(second.arrival_ns, first.data + second.data) for first, second in pairs]
     run = Run().play(joined)
@@ -155,7 +160,7 @@ def test_coalesced_packets_give_the_same_points(played, datagrams):
     assert build.digest(run.of(Sweep)[0].points)["points"] > 10_000
 
 
-def test_late_packets_are_put_into_their_place(played, datagrams):
+def test_late_packets_are_put_into_their_place(played: Run, datagrams: list[Datagram]) -> None:
     late = list(datagrams)
     for at in range(400, 800, 50):
         item = late.pop(at)
@@ -170,7 +175,7 @@ def test_late_packets_are_put_into_their_place(played, datagrams):
             np.testing.assert_array_equal(one.points[name], other.points[name])
 
 
-def test_lost_packets_are_counted_by_stream_and_sweep(datagrams):
+def test_lost_packets_are_counted_by_stream_and_sweep(datagrams: list[Datagram]) -> None:
     points = [item for item in datagrams if len(item.data) == 1044]
     gone = set(points[200:203]) | {points[300]}
     gone |= {item for item in datagrams[700:720] if len(item.data) == 80}
@@ -181,7 +186,7 @@ def test_lost_packets_are_counted_by_stream_and_sweep(datagrams):
     assert sum(sweep.missing for sweep in run.of(Sweep)) == 4
 
 
-def test_doubled_packets_are_used_once(played, datagrams):
+def test_doubled_packets_are_used_once(played: Run, datagrams: list[Datagram]) -> None:
     run = Run().play(item for item in datagrams for _ in range(2))
     assert same(played.of(Sweep), run.of(Sweep))
     counts = run.driver.counters.sequence
@@ -189,7 +194,7 @@ def test_doubled_packets_are_used_once(played, datagrams):
     assert counts[Stream.IMU].duplicates == 500
 
 
-def test_damage_is_counted_and_costs_the_packet_it_hit(datagrams):
+def test_damage_is_counted_and_costs_the_packet_it_hit(datagrams: list[Datagram]) -> None:
     damaged = list(datagrams)
     for at in (500, 600):
         arrival, data = damaged[at]
@@ -201,7 +206,7 @@ def test_damage_is_counted_and_costs_the_packet_it_hit(datagrams):
     assert sum(count.lost for count in counters.sequence.values()) == 2
 
 
-def test_impossible_contents_are_counted_by_reason():
+def test_impossible_contents_are_counted_by_reason() -> None:
     run = Run()
     run.hear(PacketType.POINTS_3D, build.points_3d(count=301))
     run.hear(PacketType.IMU, build.imu(quaternion_wxyz=(0, 0, 0, 0)))
@@ -211,7 +216,7 @@ def test_impossible_contents_are_counted_by_reason():
     }  # fmt: skip
 
 
-def test_unknown_types_are_counted_as_one():
+def test_unknown_types_are_counted_as_one() -> None:
     run = Run()
     for packet_type in (42, 4242, 0xFFFF_FFFF):
         assert run.hear(packet_type, b"whatever") == []
@@ -219,7 +224,7 @@ def test_unknown_types_are_counted_as_one():
 
 
 @pytest.mark.parametrize("frame3d", [True, False])
-def test_packets_of_the_other_dimension_are_left_out_but_heard(frame3d):
+def test_packets_of_the_other_dimension_are_left_out_but_heard(frame3d: bool) -> None:
     run = Run(frame3d=frame3d, publish_unlocked=True, aggregateNframes=1)
     run.hear(PacketType.POINTS_3D, build.points_3d())
     run.hear(PacketType.POINTS_2D, build.points_2d())
@@ -228,13 +233,13 @@ def test_packets_of_the_other_dimension_are_left_out_but_heard(frame3d):
     assert run.state is DeviceState.STREAMING
 
 
-def test_an_empty_sweep_is_counted_and_not_published():
+def test_an_empty_sweep_is_counted_and_not_published() -> None:
     run = Run(publish_unlocked=True, aggregateNframes=1)
     assert run.hear(PacketType.POINTS_3D, build.points_3d(ranges=0)) == []
     assert run.driver.counters.empty_sweeps == run.driver.counters.sweeps == 1
 
 
-def test_gravity_alignment_turns_the_cloud(played, datagrams):
+def test_gravity_alignment_turns_the_cloud(played: Run, datagrams: list[Datagram]) -> None:
     tilt = Rotation.from_euler("ZYX", [30, 20, -10], degrees=True)
     x, y, z, w = tilt.as_quat()
     tilted = build.capture(2.0, imu_fields={"quaternion_wxyz": np.array([w, x, y, z]) * 0.9983})
@@ -247,7 +252,9 @@ def test_gravity_alignment_turns_the_cloud(played, datagrams):
     assert run.driver.counters.unlevelled == 0
 
 
-def test_gravity_alignment_without_imu_publishes_nothing_and_says_so(datagrams):
+def test_gravity_alignment_without_imu_publishes_nothing_and_says_so(
+    datagrams: list[Datagram],
+) -> None:
     run = Run(imu_adjust=True).play(item for item in datagrams if len(item.data) == 1044)
     assert run.of(Sweep) == []
     counters = run.driver.counters
@@ -255,7 +262,7 @@ def test_gravity_alignment_without_imu_publishes_nothing_and_says_so(datagrams):
     assert counters.unlevelled > 10_000 * counters.sweeps
 
 
-def test_live_settings(datagrams):
+def test_live_settings(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams[:600])
     live = {"aggregateNframes": 10, "EnableCalRangeOVR": True, "calRangeScale": 0.002}
     run.driver.configure(configure(DriverConfig, PLAIN | live))
@@ -271,7 +278,7 @@ def test_live_settings(datagrams):
 # Time that passes without packets
 
 
-def test_a_stalled_stream_hands_out_what_there_is(datagrams):
+def test_a_stalled_stream_hands_out_what_there_is(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams)
     complete = len(run.of(Sweep))
     run.wait(0.1)
@@ -283,7 +290,7 @@ def test_a_stalled_stream_hands_out_what_there_is(datagrams):
     assert len(run.of(Sweep)) == complete + 1
 
 
-def test_flush_hands_out_everything(datagrams):
+def test_flush_hands_out_everything(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams)
     (sweep,) = (event for event in run.driver.flush() if isinstance(event, Sweep))
     used = sum(item.packets for item in run.of(Sweep)) + sweep.packets
@@ -291,7 +298,7 @@ def test_flush_hands_out_everything(datagrams):
     assert run.driver.flush() == []
 
 
-def test_a_packet_waits_for_a_lost_one_so_long_and_no_longer():
+def test_a_packet_waits_for_a_lost_one_so_long_and_no_longer() -> None:
     run = Run(publish_unlocked=True, reorder_window=200)
     run.hear(PacketType.IMU, build.imu(0, 1_000_000))
     run.now += TICK_NS
@@ -303,7 +310,7 @@ def test_a_packet_waits_for_a_lost_one_so_long_and_no_longer():
     assert len(run.of(ImuSample)) == 2
 
 
-def test_waiting_is_limited_while_the_stream_goes_on():
+def test_waiting_is_limited_while_the_stream_goes_on() -> None:
     run = Run(publish_unlocked=True, reorder_window=200)
     run.hear(PacketType.IMU, build.imu(0, 0))
     for seq in range(2, 30):
@@ -314,7 +321,9 @@ def test_waiting_is_limited_while_the_stream_goes_on():
     assert run.driver.counters.sequence[Stream.IMU].lost == 1
 
 
-def test_silence_is_reported_once_and_again_after_the_device_spoke(datagrams):
+def test_silence_is_reported_once_and_again_after_the_device_spoke(
+    datagrams: list[Datagram],
+) -> None:
     run = Run(watchdog_timeout_ms=1000).play(datagrams[:300])
     run.wait(5.0)
     (silence,) = run.of(Silence)
@@ -325,7 +334,7 @@ def test_silence_is_reported_once_and_again_after_the_device_spoke(datagrams):
     assert len(run.of(Silence)) == 2
 
 
-def test_states_from_power_on():
+def test_states_from_power_on() -> None:
     run = Run(publish_unlocked=True)
     assert run.state is DeviceState.WAITING
     run.hear(PacketType.IMU, build.imu(0))
@@ -347,7 +356,7 @@ def shifted(datagrams: list[Datagram], seconds: float) -> list[Datagram]:
     return [Datagram(item.arrival_ns + round(seconds * 1e9), item.data) for item in datagrams]
 
 
-def test_a_device_that_restarts_goes_on_without_loss(datagrams):
+def test_a_device_that_restarts_goes_on_without_loss(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams)
     run.hear(PacketType.VERSION, build.version())
     before = len(run.of(ImuSample))
@@ -363,7 +372,7 @@ def test_a_device_that_restarts_goes_on_without_loss(datagrams):
 
 
 @pytest.mark.parametrize("outage_s", [1.5, 4.0, 4.5, 9.0])
-def test_after_an_outage_no_packet_is_taken_for_late(outage_s):
+def test_after_an_outage_no_packet_is_taken_for_late(outage_s: float) -> None:
     """4 and 4.5 s are nearly a turn of the numbers: 1024 IMU or 970 point packets."""
     whole = build.capture(4.0 + outage_s)
     begin, end = (build.EPOCH_NS + round(s * 1e9) for s in (2.0, 2.0 + outage_s))
@@ -378,7 +387,7 @@ def test_after_an_outage_no_packet_is_taken_for_late(outage_s):
     assert all(one.stamp < other.stamp for one, other in pairwise(run.of(ImuSample)))
 
 
-def test_standby_is_no_loss(datagrams):
+def test_standby_is_no_loss(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams)
     run.driver.stop_rotation(HostNs(run.now))
     run.wait(20)
@@ -398,7 +407,7 @@ def ack(run: Run, command: commands.Command, status: int = AckStatus.OK) -> list
     return run.hear(PacketType.ACK, build.ack(command.packet_type, number, value, status))
 
 
-def test_start_is_sent_once_and_answered():
+def test_start_is_sent_once_and_answered() -> None:
     run = Run()
     ticket = run.driver.start_rotation(HostNs(run.now))
     assert run.outbox() == [commands.start().encode()]
@@ -408,14 +417,14 @@ def test_start_is_sent_once_and_answered():
     assert run.driver.counters.stray_acks == 0
 
 
-def test_a_refusal_is_answered_with_its_reason():
+def test_a_refusal_is_answered_with_its_reason() -> None:
     run = Run()
     run.driver.start_rotation(HostNs(run.now))
     (answer,) = ack(run, commands.start(), AckStatus.NOT_READY)
     assert (answer.ok, answer.text) == (False, "start rotation: refused: not ready")
 
 
-def test_without_an_ack_it_is_repeated_and_said_so():
+def test_without_an_ack_it_is_repeated_and_said_so() -> None:
     run = Run()
     ticket = run.driver.start_rotation(HostNs(run.now))
     run.wait(TRIES * REPEAT_NS / 1e9 + 0.1)
@@ -425,7 +434,7 @@ def test_without_an_ack_it_is_repeated_and_said_so():
     assert answer.text == "start rotation: the device did not acknowledge it"
 
 
-def test_stop_hands_out_what_there_is_and_pauses_the_watchdog(datagrams):
+def test_stop_hands_out_what_there_is_and_pauses_the_watchdog(datagrams: list[Datagram]) -> None:
     run = Run(watchdog_timeout_ms=1000).play(datagrams)
     ticket, events = run.driver.stop_rotation(HostNs(run.now))
     (sweep,) = events
@@ -437,7 +446,7 @@ def test_stop_hands_out_what_there_is_and_pauses_the_watchdog(datagrams):
     assert run.of(Silence) == []
 
 
-def test_a_stop_is_not_undone_by_repeats_of_an_earlier_start():
+def test_a_stop_is_not_undone_by_repeats_of_an_earlier_start() -> None:
     run = Run()
     run.driver.start_rotation(HostNs(run.now))
     run.wait(0.1)
@@ -448,7 +457,7 @@ def test_a_stop_is_not_undone_by_repeats_of_an_earlier_start():
     assert commands.start().encode() not in run.sent
 
 
-def test_reset_is_not_answered_and_hands_out_what_there_is(datagrams):
+def test_reset_is_not_answered_and_hands_out_what_there_is(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams)
     run.hear(PacketType.PARAMETERS, build.parameters())
     (sweep,) = run.driver.reset_device(HostNs(run.now))
@@ -460,13 +469,13 @@ def test_reset_is_not_answered_and_hands_out_what_there_is(datagrams):
     assert run.of(Answer) == []
 
 
-def test_an_ack_of_nothing_is_counted():
+def test_an_ack_of_nothing_is_counted() -> None:
     run = Run()
     assert run.hear(PacketType.ACK, build.ack(106)) == []
     assert run.driver.counters.stray_acks == 1
 
 
-def test_version_and_parameters_are_asked_for_until_they_come():
+def test_version_and_parameters_are_asked_for_until_they_come() -> None:
     run = Run().wait(3.5)
     version, parameters = (
         command.encode() for command in (commands.request_version(), commands.request_parameters())
@@ -487,12 +496,12 @@ def test_version_and_parameters_are_asked_for_until_they_come():
     assert run.sent == []
 
 
-def test_nothing_but_questions_is_sent_without_being_asked(played):
+def test_nothing_but_questions_is_sent_without_being_asked(played: Run) -> None:
     kinds = {wire.HEADER.unpack_from(frame)[1] for frame in played.sent}
     assert kinds == {PacketType.COMMAND}
 
 
-def test_the_devices_clock_is_set_once_if_wanted():
+def test_the_devices_clock_is_set_once_if_wanted() -> None:
     run = Run(enable_l2_host_sync=True).wait(0.5)
     syncs = [frame for frame in run.sent if wire.HEADER.unpack_from(frame)[1] == 106]
     assert len(syncs) == 1
@@ -500,7 +509,7 @@ def test_the_devices_clock_is_set_once_if_wanted():
     assert syncs == [commands.sync_time(HostNs(first_tick)).encode()]
 
 
-def test_the_round_trip_is_measured_if_wanted():
+def test_the_round_trip_is_measured_if_wanted() -> None:
     run = Run(enable_latency_measure=True).wait(1.0)
     requests = [commands.latency(101).encode(), commands.latency(102).encode()]
     assert [frame for frame in run.sent if frame in requests] == requests[:1]
@@ -518,7 +527,7 @@ def test_the_round_trip_is_measured_if_wanted():
     assert run.of(Answer) == []
 
 
-def test_counters_can_be_kept():
+def test_counters_can_be_kept() -> None:
     run = Run()
     run.hear(42, b"x")
     kept = run.driver.counters.snapshot()
@@ -531,12 +540,12 @@ def test_counters_can_be_kept():
     assert dataclasses.asdict(kept) == dataclasses.asdict(kept.snapshot())
 
 
-def test_standby_on_power_up_is_not_watched():
+def test_standby_on_power_up_is_not_watched() -> None:
     run = Run(watchdog_timeout_ms=1000, standby_on_powerup_enabled=True).wait(5)
     assert run.of(Silence) == []
 
 
-def test_user_command_numbers_are_not_confused_between_families():
+def test_user_command_numbers_are_not_confused_between_families() -> None:
     """2000/3 asks for parameters, 100/3 for the version; only the first is pending here."""
     run = Run()
     run.driver.send(commands.request_parameters(), HostNs(run.now))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -47,7 +48,7 @@ CASES = DAMAGE | CONTENT | HARMLESS | TRAFFIC | EVERYTHING
 class Outcome:
     """What a driver made of a faulty device, and what it could have made of it."""
 
-    def __init__(self, faults: dict[str, object], mode: WorkMode, seconds: float = 3.0):
+    def __init__(self, faults: dict[str, object], mode: WorkMode, seconds: float = 3.0) -> None:
         unit = DeviceConfig(
             power=rig.READY,
             identity=IdentityConfig(work_mode=int(mode)),
@@ -105,12 +106,14 @@ def outcomes() -> dict[tuple[str, int], Outcome]:
 
 
 @pytest.fixture(params=MODES, ids=["3d", "2d"])
-def mode(request) -> WorkMode:
+def mode(request: pytest.FixtureRequest) -> WorkMode:
     return request.param
 
 
 @pytest.fixture
-def outcome(request, outcomes, mode) -> Outcome:
+def outcome(
+    request: pytest.FixtureRequest, outcomes: dict[tuple[str, int], Outcome], mode: WorkMode
+) -> Outcome:
     key = (request.param, int(mode))
     if key not in outcomes:
         outcomes[key] = Outcome(CASES[request.param], mode)
@@ -118,7 +121,7 @@ def outcome(request, outcomes, mode) -> Outcome:
 
 
 @pytest.mark.parametrize("outcome", CASES, indirect=True)
-def test_every_packet_that_arrived_whole_is_decoded(outcome):
+def test_every_packet_that_arrived_whole_is_decoded(outcome: Any) -> None:
     booked = Counter({k: n for k, n in rig.booked(outcome.device).items() if is_measurement(k)})
     assert booked - outcome.decoded == Counter()
     assert booked.total() > 400
@@ -126,7 +129,9 @@ def test_every_packet_that_arrived_whole_is_decoded(outcome):
 
 @pytest.mark.parametrize("outcome", CASES, indirect=True)
 @pytest.mark.parametrize("stream", Stream)
-def test_every_packet_that_was_decoded_is_used_once_and_in_order(outcome, stream):
+def test_every_packet_that_was_decoded_is_used_once_and_in_order(
+    outcome: Any, stream: Any
+) -> None:
     counts = outcome.driver.counters.sequence[stream]
     assert outcome.used(stream) + counts.late == outcome.distinct(stream)
     assert counts.restarts == 0
@@ -138,7 +143,7 @@ def test_every_packet_that_was_decoded_is_used_once_and_in_order(outcome, stream
 
 @pytest.mark.parametrize("outcome", CASES, indirect=True)
 @pytest.mark.parametrize("stream", Stream)
-def test_the_loss_counted_is_the_loss(outcome, stream):
+def test_the_loss_counted_is_the_loss(outcome: Any, stream: Any) -> None:
     types = (104,) if stream is Stream.IMU else (102, 103)
     numbers = [
         (int(row["stamp_ns"]), int(row["seq"]))
@@ -152,12 +157,12 @@ def test_the_loss_counted_is_the_loss(outcome, stream):
 
 
 @pytest.mark.parametrize("outcome", [*HARMLESS, *CONTENT], indirect=True)
-def test_nothing_is_called_damaged_that_is_not(outcome):
+def test_nothing_is_called_damaged_that_is_not(outcome: Any) -> None:
     assert outcome.driver.counters.faults.total() == 0
 
 
 @pytest.mark.parametrize("outcome", DAMAGE, indirect=True)
-def test_damage_is_counted(outcome):
+def test_damage_is_counted(outcome: Any) -> None:
     counters = outcome.driver.counters
     assert counters.faults.total() > 20
     assert counters.rejected.total() == 0
@@ -168,13 +173,13 @@ def test_damage_is_counted(outcome):
     [("nan", "not_finite"), ("hostile_count", "point_num")],
     indirect=["outcome"],
 )
-def test_impossible_content_is_counted_by_reason(outcome, reason):
+def test_impossible_content_is_counted_by_reason(outcome: str, reason: str) -> None:
     rejected = outcome.driver.counters.rejected
     assert rejected.total() > 5
     assert {name.split(".")[1] for name in rejected} == {reason}
 
 
-def test_a_reboot_loses_no_packet(mode):
+def test_a_reboot_loses_no_packet(mode: WorkMode) -> None:
     outcome = Outcome({"reboot_at": [1.9]}, mode)
     for stream in Stream:
         counts = outcome.driver.counters.sequence[stream]
@@ -185,7 +190,7 @@ def test_a_reboot_loses_no_packet(mode):
     assert "REBOOT" in [event.kind.name for event in outcome.of(ClockEvent)]
 
 
-def test_a_pulled_cable_costs_what_was_sent_meanwhile():
+def test_a_pulled_cable_costs_what_was_sent_meanwhile() -> None:
     outcome = Outcome({"silence_at": [1.5], "silence_s": 4.2}, WorkMode(0), seconds=8.0)
     for stream in Stream:
         assert outcome.used(stream) == outcome.distinct(stream)
@@ -195,7 +200,7 @@ def test_a_pulled_cable_costs_what_was_sent_meanwhile():
 
 
 @pytest.mark.parametrize("fault", [{"clock_step_at": [1.5]}, {"foreign_sync_at": [1.5]}])
-def test_steps_of_the_devices_clock_lose_nothing(fault, mode):
+def test_steps_of_the_devices_clock_lose_nothing(fault: Any, mode: WorkMode) -> None:
     outcome = Outcome(fault, mode)
     for stream in Stream:
         counts = outcome.driver.counters.sequence[stream]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,20 +19,20 @@ WIDE = RangeLimits(-1e9, 1e9)
 
 
 def project(
-    payloads,
-    limits=WIDE,
-    override=None,
-    kind=PacketType.POINTS_3D,
-    start_s=None,
-    projector=None,
-    rotations=None,
+    payloads: Any,
+    limits: Any = WIDE,
+    override: Any = None,
+    kind: Any = PacketType.POINTS_3D,
+    start_s: Any = None,
+    projector: Any = None,
+    rotations: Any = None,
 ) -> PointBatch:
     if start_s is None:
         start_s = np.arange(len(payloads)) * 0.005
     return (projector or Projector(kind)).points(payloads, start_s, limits, override, rotations)
 
 
-def xyz(points):
+def xyz(points: Any) -> Any:
     return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float64)
 
 
@@ -81,7 +82,7 @@ def float32_3d(payload: bytes) -> np.ndarray:
     return np.array(found, np.float64)
 
 
-def random_packet(rng, far_m: float = 30.0, **fields) -> bytes:
+def random_packet(rng: Any, far_m: float = 30.0, **fields: Any) -> bytes:
     """Return a packet of a made-up unit; ranges up to ``far_m``, some without return."""
     calibration = {
         "a_axis_dist": 0.0445,
@@ -108,7 +109,7 @@ def random_packet(rng, far_m: float = 30.0, **fields) -> bytes:
     return build.points_3d(**(given | fields))
 
 
-def compare(payloads, tolerance=1e-6, **arguments):
+def compare(payloads: Any, tolerance: float = 1e-6, **arguments: Any) -> Any:
     batch = project(payloads, **arguments)
     expected = np.concatenate([scalar_3d(payload) for payload in payloads])
     assert len(batch.points) == len(expected)
@@ -120,12 +121,12 @@ def compare(payloads, tolerance=1e-6, **arguments):
     return batch
 
 
-def test_against_the_scalar_model_up_to_30_m():
+def test_against_the_scalar_model_up_to_30_m() -> None:
     rng = np.random.default_rng(1)
     compare([random_packet(rng) for _ in range(40)])
 
 
-def test_one_calibration_for_all_packets():
+def test_one_calibration_for_all_packets() -> None:
     """The common case: one run, one table, small differences of the step."""
     rng = np.random.default_rng(2)
     payloads = [random_packet(rng, calibration=build.UNIT_A) for _ in range(40)]
@@ -133,27 +134,27 @@ def test_one_calibration_for_all_packets():
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.01, 0.05, 0.08, 0.2, 3.0])
-def test_however_much_the_step_varies(spread):
+def test_however_much_the_step_varies(spread: float) -> None:
     rng = np.random.default_rng(3)
     steps = build.STEP_RAD * (1 + rng.uniform(-spread, spread, 30))
     payloads = [random_packet(rng, calibration=build.UNIT_B, step=step) for step in steps]
     compare(payloads)
 
 
-def test_one_packet_with_another_step_among_many():
+def test_one_packet_with_another_step_among_many() -> None:
     rng = np.random.default_rng(4)
     payloads = [random_packet(rng, calibration=build.UNIT_A, step=2e-4) for _ in range(30)]
     payloads[7] = random_packet(rng, calibration=build.UNIT_A, step=-0.02)
     compare(payloads)
 
 
-def test_calibrations_that_change_within_a_batch():
+def test_calibrations_that_change_within_a_batch() -> None:
     rng = np.random.default_rng(5)
     units = [build.UNIT_A, build.UNIT_A, build.UNIT_B, build.UNIT_A, build.PLAIN, build.UNIT_B]
     compare([random_packet(rng, calibration=unit) for unit in units])
 
 
-def test_more_packets_than_are_projected_at_once():
+def test_more_packets_than_are_projected_at_once() -> None:
     rng = np.random.default_rng(11)
     payloads = [random_packet(rng, calibration=build.UNIT_A) for _ in range(150)]
     starts = 1.0 + np.arange(150) * 0.005
@@ -167,7 +168,7 @@ def test_more_packets_than_are_projected_at_once():
     assert within.max() < 300 * build.SLOT_NS * 1e-9
 
 
-def test_every_packet_is_turned_by_its_rotation():
+def test_every_packet_is_turned_by_its_rotation() -> None:
     """As exactly as it is placed without: there is one rounding to float32, at the end."""
     rng = np.random.default_rng(12)
     steps = [build.STEP_RAD, build.STEP_RAD * 1.2, -0.02] * 10
@@ -182,7 +183,7 @@ def test_every_packet_is_turned_by_its_rotation():
 
 
 @pytest.mark.parametrize("kind", [PacketType.POINTS_3D, PacketType.POINTS_2D])
-def test_packets_whose_rotation_is_not_known_are_left_out(kind):
+def test_packets_whose_rotation_is_not_known_are_left_out(kind: Any) -> None:
     maker = build.points_3d if kind == PacketType.POINTS_3D else build.points_2d
     payloads = [maker(ranges=2000), maker(ranges=2500), maker(ranges=3000, count=100)]
     level, unknown = np.eye(3), np.full((3, 3), np.nan)
@@ -193,7 +194,7 @@ def test_packets_whose_rotation_is_not_known_are_left_out(kind):
     assert batch.counts.tolist() == [expected.counts[0], 0, 100]
 
 
-def test_limits_and_angles_that_change_within_a_batch():
+def test_limits_and_angles_that_change_within_a_batch() -> None:
     rng = np.random.default_rng(6)
     common = {"calibration": build.UNIT_A}
     payloads = [
@@ -207,7 +208,7 @@ def test_limits_and_angles_that_change_within_a_batch():
 
 
 @pytest.mark.parametrize(("farthest_angle", "bound"), [(4.0, 3.5e-4), (2 * math.pi, 8e-4)])
-def test_against_the_vendors_float32_at_5_m(farthest_angle, bound):
+def test_against_the_vendors_float32_at_5_m(farthest_angle: Any, bound: float) -> None:
     """Its rounding grows with the head's angle, bias included: it doubles at 4 and 8 rad."""
     rng = np.random.default_rng(7)
     payloads = [
@@ -220,7 +221,7 @@ def test_against_the_vendors_float32_at_5_m(farthest_angle, bound):
     assert error.max() > 1e-6  # the client's rounding is there: it was not compared with itself
 
 
-def test_a_point_by_hand():
+def test_a_point_by_hand() -> None:
     """A slot straight up, with nothing but the offsets: 3 m + a above, b ahead of the axis."""
     unit = build.PLAIN | {"a_axis_dist": 0.04, "b_axis_dist": 0.01}
     payload = build.points_3d(
@@ -233,7 +234,7 @@ def test_a_point_by_hand():
     assert point["time"] == 0
 
 
-def test_the_first_slot_looks_to_the_left_of_the_heads_angle():
+def test_the_first_slot_looks_to_the_left_of_the_heads_angle() -> None:
     """At the horizon (alpha 0) the beam lies along +90 degrees of theta; at alpha pi along -90."""
     payload = build.points_3d(
         ranges=2000, calibration=build.PLAIN, theta=0.5, step=0.0, angle_increment=math.pi / 299
@@ -244,7 +245,7 @@ def test_the_first_slot_looks_to_the_left_of_the_heads_angle():
         assert (point["x"], point["y"], point["z"]) == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_wide_field_of_view_reaches_below_the_horizon():
+def test_the_wide_field_of_view_reaches_below_the_horizon() -> None:
     payload = build.points_3d(
         ranges=2000, calibration=build.PLAIN, angle_min=-0.105, angle_increment=0.01117
     )
@@ -252,7 +253,7 @@ def test_the_wide_field_of_view_reaches_below_the_horizon():
     compare([payload])
 
 
-def test_2d_packets_lie_in_one_plane():
+def test_2d_packets_lie_in_one_plane() -> None:
     rng = np.random.default_rng(8)
     ranges = rng.integers(0, 30_000, 1800)
     payload = build.points_2d(ranges=ranges, intensities=np.arange(1800) % 256)
@@ -270,27 +271,27 @@ def test_2d_packets_lie_in_one_plane():
 
 
 @pytest.mark.parametrize("count", [0, 1, 150, 299])
-def test_slots_beyond_the_count_are_left_out(count):
+def test_slots_beyond_the_count_are_left_out(count: int) -> None:
     full, short = build.points_3d(), build.points_3d(count=count)
     batch = project([full, short, full])
     assert batch.counts.tolist() == [300, count, 300]
     assert len(batch.points) == 600 + count
 
 
-def test_slots_without_return_are_left_out_even_if_the_bias_makes_them_positive():
+def test_slots_without_return_are_left_out_even_if_the_bias_makes_them_positive() -> None:
     unit = build.PLAIN | {"range_bias": 100.0}
     payload = build.points_3d(ranges=[0, 1, *[0] * 298], calibration=unit, range_min=0.0)
     (point,) = project([payload]).points
     assert point["range"] == pytest.approx(0.101)
 
 
-def limited(raw: int, scale: float = 0.001, limits: RangeLimits = WIDE, **fields) -> bool:
+def limited(raw: int, scale: float = 0.001, limits: RangeLimits = WIDE, **fields: Any) -> bool:
     unit = build.PLAIN | {"range_scale": scale}
     payload = build.points_3d(ranges=[raw, *[0] * 299], calibration=unit, **fields)
     return len(project([payload], limits).points) == 1
 
 
-def test_limits_of_the_packet_are_inclusive():
+def test_limits_of_the_packet_are_inclusive() -> None:
     quarter = 1 / 1024  # exact in float32, so that the limit can be met exactly
     assert limited(1024, quarter, range_min=1.0)
     assert not limited(1023, quarter, range_min=1.0)
@@ -298,7 +299,7 @@ def test_limits_of_the_packet_are_inclusive():
     assert not limited(2049, quarter, range_max=2.0)
 
 
-def test_limits_of_the_user_are_inclusive():
+def test_limits_of_the_user_are_inclusive() -> None:
     quarter = 1 / 1024
     assert limited(1024, quarter, RangeLimits(1.0, 2.0))
     assert limited(2048, quarter, RangeLimits(1.0, 2.0))
@@ -306,20 +307,20 @@ def test_limits_of_the_user_are_inclusive():
     assert not limited(2049, quarter, RangeLimits(1.0, 2.0))
 
 
-def test_rounding_of_the_scale_counts_as_in_the_vendors_client():
+def test_rounding_of_the_scale_counts_as_in_the_vendors_client() -> None:
     """0.001 is a little more in float32, so 50000 counts are beyond 50 m."""
     assert not limited(50_000, range_max=50.0)
     assert limited(49_999, range_max=50.0)
 
 
-def test_negative_ranges_are_left_out_by_default():
+def test_negative_ranges_are_left_out_by_default() -> None:
     payload = build.points_3d(ranges=[100, 365, 366, 3000, *[0] * 296], range_min=-1.0)
     points = Projector(PacketType.POINTS_3D).points([payload], np.zeros(1)).points
     assert (points["range"] >= 0).all()
     assert len(points) == 2
 
 
-def test_the_override_replaces_scale_and_bias():
+def test_the_override_replaces_scale_and_bias() -> None:
     payloads = [build.points_3d(ranges=2000), build.points_3d(calibration=build.UNIT_B)]
     batch = project(payloads, override=RangeCalibration(0.002, -500.0))
     assert batch.points["range"][0] == np.float32(3.0)
@@ -329,7 +330,7 @@ def test_the_override_replaces_scale_and_bias():
     np.testing.assert_allclose(xyz(batch.points[:300]), xyz(same.points), atol=1e-6)
 
 
-def test_times_are_relative_to_the_first_kept_point():
+def test_times_are_relative_to_the_first_kept_point() -> None:
     ranges = [0] * 3 + [3000] * 297
     payloads = [build.points_3d(ranges=ranges), build.points_3d(), build.points_3d(count=10)]
     batch = project(payloads, start_s=np.array([0.0, 0.005, 0.013]))
@@ -343,7 +344,7 @@ def test_times_are_relative_to_the_first_kept_point():
     assert (np.diff(batch.points["time"]) > 0).all()
 
 
-def test_a_batch_without_points():
+def test_a_batch_without_points() -> None:
     batch = project([build.points_3d(ranges=0), build.points_3d(count=0)])
     assert len(batch.points) == 0
     assert batch.points.dtype == POINT
@@ -351,7 +352,7 @@ def test_a_batch_without_points():
     assert batch.counts.tolist() == [0, 0]
 
 
-def test_results_do_not_depend_on_what_was_computed_before():
+def test_results_do_not_depend_on_what_was_computed_before() -> None:
     rng = np.random.default_rng(9)
     batches = [[random_packet(rng) for _ in range(n)] for n in (40, 3, 38, 1, 60, 38)]
     projector = Projector(PacketType.POINTS_3D)
@@ -363,7 +364,7 @@ def test_results_do_not_depend_on_what_was_computed_before():
     assert not np.array_equal(kept[2], kept[5])
 
 
-def test_results_do_not_depend_on_the_batch_but_by_rounding():
+def test_results_do_not_depend_on_the_batch_but_by_rounding() -> None:
     rng = np.random.default_rng(10)
     payloads = [random_packet(rng, calibration=build.UNIT_A) for _ in range(20)]
     together = xyz(project(payloads).points)
@@ -371,7 +372,7 @@ def test_results_do_not_depend_on_the_batch_but_by_rounding():
     np.testing.assert_allclose(together, alone, atol=5e-6)
 
 
-def test_impossible_values_make_no_warning_and_no_infinity():
+def test_impossible_values_make_no_warning_and_no_infinity() -> None:
     payload = build.points_3d(
         ranges=65535, calibration=build.UNIT_A | {"range_scale": 1e6, "a_axis_dist": -1e6},
         range_max=1e6, theta=1e6, step=1e6, angle_increment=1e6,

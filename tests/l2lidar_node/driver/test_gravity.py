@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -11,7 +13,7 @@ from l2lidar_node.types import HostNs, ImuSample
 UP = (0.0, 0.0, GRAVITY)
 
 
-def sample(acceleration=UP, rotation: Rotation | None = None) -> ImuSample:
+def sample(acceleration: Any = UP, rotation: Rotation | None = None) -> ImuSample:
     x, y, z, w = (rotation or Rotation.identity()).as_quat()
     return ImuSample(HostNs(0), (w, x, y, z), (0.0, 0.0, 0.0), tuple(acceleration))
 
@@ -23,12 +25,12 @@ def report(*samples: ImuSample) -> GravityReport | None:
     return monitor.take()
 
 
-def test_nothing_to_report():
+def test_nothing_to_report() -> None:
     assert report() is None
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (30, 20, -40), (0, -90, 0), (10, 0, 180)])
-def test_a_tilted_sensor_at_rest_agrees_with_gravity(angles):
+def test_a_tilted_sensor_at_rest_agrees_with_gravity(angles: Any) -> None:
     """Specific force points up in the world, so in the sensor it is up turned back."""
     rotation = Rotation.from_euler("ZYX", angles, degrees=True)
     found = report(sample(rotation.inv().apply(UP), rotation))
@@ -38,13 +40,13 @@ def test_a_tilted_sensor_at_rest_agrees_with_gravity(angles):
 
 
 @pytest.mark.parametrize("degrees", [5, 90, 180])
-def test_an_orientation_that_is_off(degrees):
+def test_an_orientation_that_is_off(degrees: int) -> None:
     found = report(sample(UP, Rotation.from_euler("x", degrees, degrees=True)))
     assert found is not None
     assert found.tilt_deg == pytest.approx(degrees)
 
 
-def test_vibration_is_averaged_and_a_period_begins_anew():
+def test_vibration_is_averaged_and_a_period_begins_anew() -> None:
     monitor = GravityMonitor()
     for sign in (1, -1) * 50:
         monitor.add(sample((3.0 * sign, -2.0 * sign, GRAVITY + sign)))
@@ -59,7 +61,7 @@ def test_vibration_is_averaged_and_a_period_begins_anew():
     assert (found.samples, found.norm) == (1, 18.0)
 
 
-def test_free_fall_has_no_direction():
+def test_free_fall_has_no_direction() -> None:
     found = report(sample((0.0, 0.0, 0.0)))
     assert found is not None
     assert found.norm == 0

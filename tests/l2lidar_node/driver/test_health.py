@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ class Link:
 class Watched:
     """A run whose health is judged over what happens after the first second."""
 
-    def __init__(self, **values):
+    def __init__(self, **values: Any) -> None:
         self.run = Run(**values)
         self.link = Link()
         self.before = self.period()
@@ -46,7 +47,7 @@ class Watched:
         return check.level, check.message
 
 
-def streaming(seconds: float = 3.0, keep=lambda item: True, **values) -> Watched:
+def streaming(seconds: float = 3.0, keep: Any = lambda item: True, **values: Any) -> Watched:
     """Return a run judged over all but its first second."""
     watched = Watched(**values)
     datagrams = [item for item in build.capture(seconds) if keep(item)]
@@ -66,7 +67,7 @@ def healthy() -> Watched:
     return streaming()
 
 
-def test_a_healthy_device_is_all_right(healthy):
+def test_a_healthy_device_is_all_right(healthy: Watched) -> None:
     checks = healthy.checks()
     assert set(checks) >= {"device", "link", "clock", "points", "hardware"}
     assert {check.level for check in checks.values()} == {Level.OK}
@@ -81,7 +82,7 @@ def test_a_healthy_device_is_all_right(healthy):
     assert checks["hardware"].values["APD temperature [degC]"] == "43.7"
 
 
-def test_a_device_that_is_not_there():
+def test_a_device_that_is_not_there() -> None:
     watched = Watched(l2_ip="192.168.1.99")
     watched.run.wait(1)
     assert watched.verdict("device") == (Level.ERROR, "nothing heard from 192.168.1.99 yet")
@@ -89,7 +90,7 @@ def test_a_device_that_is_not_there():
     assert set(watched.checks()) == {"device", "link", "clock", "points"}
 
 
-def test_spin_up_says_how_long():
+def test_spin_up_says_how_long() -> None:
     watched = Watched()
     watched.run.play(item for item in build.capture(1.0) if is_imu(item))
     level, message = watched.verdict("device")
@@ -97,25 +98,25 @@ def test_spin_up_says_how_long():
     assert message == "spinning up, points in about 20 s"
 
 
-def test_a_device_that_fell_silent():
+def test_a_device_that_fell_silent() -> None:
     watched = streaming(1.5)
     watched.run.wait(2)
     assert watched.verdict("device") == (Level.ERROR, "192.168.1.62 has fallen silent")
 
 
-def test_standby_is_as_asked():
+def test_standby_is_as_asked() -> None:
     watched = streaming(1.5)
     watched.run.driver.stop_rotation(HostNs(watched.run.now))
     watched.run.wait(2)
     assert watched.verdict("device") == (Level.OK, "in standby as asked")
 
 
-def test_points_without_imu():
+def test_points_without_imu() -> None:
     watched = streaming(keep=lambda item: not is_imu(item))
     assert watched.verdict("device") == (Level.WARN, "streaming points but no IMU")
 
 
-def test_a_slow_device():
+def test_a_slow_device() -> None:
     watched = streaming(keep=lambda item: is_imu(item) or item.arrival_ns // build.PERIOD_NS % 4)
     assert watched.verdict("device") == (Level.WARN, "streaming below its nominal rate")
 
@@ -123,7 +124,7 @@ def test_a_slow_device():
 @pytest.mark.parametrize(
     ("frame3d", "measured", "asked"), [(True, "2D", "3D"), (False, "3D", "2D")]
 )
-def test_the_other_dimension_than_asked_for(frame3d, measured, asked):
+def test_the_other_dimension_than_asked_for(frame3d: bool, measured: str, asked: str) -> None:
     watched = Watched(frame3d=frame3d)
     for number in range(50):
         watched.run.now += 20_000_000
@@ -135,7 +136,7 @@ def test_the_other_dimension_than_asked_for(frame3d, measured, asked):
     assert watched.verdict("device") == (Level.ERROR, message)
 
 
-def test_a_little_loss_is_a_warning_and_much_is_an_error():
+def test_a_little_loss_is_a_warning_and_much_is_an_error() -> None:
     little = streaming(keep=lambda item: item.arrival_ns // 1_000 % 97)
     level, message = little.verdict("link")
     assert level is Level.WARN
@@ -146,7 +147,7 @@ def test_a_little_loss_is_a_warning_and_much_is_an_error():
     assert "packets lost in" in message
 
 
-def test_much_loss_names_its_cause_where_it_is_known():
+def test_much_loss_names_its_cause_where_it_is_known() -> None:
     watched = streaming(keep=lambda item: item.arrival_ns // 1_000 % 7)
     watched.link.kernel_drops = 9
     level, message = watched.verdict("link")
@@ -155,7 +156,7 @@ def test_much_loss_names_its_cause_where_it_is_known():
     assert "9 datagrams dropped by the kernel" in message
 
 
-def test_damage_drops_and_foreigners_are_named():
+def test_damage_drops_and_foreigners_are_named() -> None:
     watched = streaming(1.5)
     watched.run.hear(PacketType.POINTS_3D, build.points_3d(count=999))
     bad = build.frame(PacketType.ACK, build.ack(1))
@@ -172,7 +173,7 @@ def test_damage_drops_and_foreigners_are_named():
     assert watched.verdict("link") == (Level.OK, "no loss")
 
 
-def test_a_flood_is_named_with_its_sender_and_what_to_do():
+def test_a_flood_is_named_with_its_sender_and_what_to_do() -> None:
     watched = streaming(1.0)
     watched.link.foreign, watched.link.stranger = 50_000, "10.0.0.7"
     level, message = watched.verdict("link")
@@ -183,7 +184,7 @@ def test_a_flood_is_named_with_its_sender_and_what_to_do():
     )
 
 
-def test_a_device_at_another_address_is_named():
+def test_a_device_at_another_address_is_named() -> None:
     watched = Watched()
     watched.run.now += 1_000_000_000
     watched.link.foreign, watched.link.stranger = 470, "192.168.1.63"
@@ -192,7 +193,7 @@ def test_a_device_at_another_address_is_named():
     assert message.endswith("but from 192.168.1.63: if that is the L2, set l2_ip to it")
 
 
-def test_a_flood_under_the_devices_own_address_is_named():
+def test_a_flood_under_the_devices_own_address_is_named() -> None:
     watched = streaming(1.0)
     for _ in range(20_000):
         watched.run.driver.receive(b"", HostNs(watched.run.now))
@@ -201,13 +202,13 @@ def test_a_flood_under_the_devices_own_address_is_named():
     assert "claim to come from 192.168.1.62: an L2 sends 470" in message
 
 
-def test_a_clock_that_is_not_locked():
+def test_a_clock_that_is_not_locked() -> None:
     watched = Watched()
     watched.run.play(build.capture(0.2))
     assert watched.verdict("clock") == (Level.WARN, "not locked yet")
 
 
-def test_a_covered_sensor():
+def test_a_covered_sensor() -> None:
     watched = Watched(publish_unlocked=True, aggregateNframes=1)
     watched.run.hear(PacketType.POINTS_3D, build.points_3d(ranges=[0] * 280 + [3000] * 20))
     level, message = watched.verdict("points")
@@ -215,7 +216,7 @@ def test_a_covered_sensor():
     assert message == "hardly any returns: is the sensor covered?"
 
 
-def test_gravity_alignment_without_imu():
+def test_gravity_alignment_without_imu() -> None:
     watched = streaming(keep=lambda item: not is_imu(item), imu_adjust=True)
     assert watched.verdict("points") == (
         Level.WARN, "imu_adjust drops points for want of IMU data",
@@ -232,7 +233,7 @@ def test_gravity_alignment_without_imu():
         ("apd_voltage", math.nan, "it reports values that are no numbers"),
     ],
 )
-def test_unhealthy_hardware(name, value, message):
+def test_unhealthy_hardware(name: str, value: Any, message: str) -> None:
     watched = Watched(publish_unlocked=True)
     payload = build.points_3d(state=build.STATE | {name: value})
     watched.run.hear(PacketType.POINTS_3D, payload)
@@ -248,7 +249,7 @@ def test_unhealthy_hardware(name, value, message):
         ((5.0, 0.0, 8.43), Level.WARN, "the orientation is 31 degrees off gravity"),
     ],
 )
-def test_the_imu_against_gravity(acceleration, level, message):
+def test_the_imu_against_gravity(acceleration: Any, level: Any, message: str) -> None:
     watched = Watched(publish_unlocked=True)
     watched.run.hear(PacketType.IMU, build.imu(acceleration=acceleration))
     found, text = watched.verdict("imu")
@@ -256,6 +257,6 @@ def test_the_imu_against_gravity(acceleration, level, message):
     assert text.startswith(message)
 
 
-def test_levels_are_those_of_the_ros_message():
+def test_levels_are_those_of_the_ros_message() -> None:
     assert [int(level) for level in Level] == [0, 1, 2, 3]
     assert np.array([level.name for level in Level]).tolist() == ["OK", "WARN", "ERROR", "STALE"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
@@ -35,7 +36,7 @@ def judged(begin: float = 2.5, end: float = 3.5, **run: object) -> dict[str, Che
     return {check.name: check for check in found}
 
 
-def test_without_a_fault_everything_is_ok():
+def test_without_a_fault_everything_is_ok() -> None:
     checks = judged()
     assert {name: check.level for name, check in checks.items()} == dict.fromkeys(
         ("device", "link", "clock", "points", "hardware", "imu"), OK
@@ -59,38 +60,38 @@ def test_without_a_fault_everything_is_ok():
     ],
     ids=str,
 )
-def test_a_fault_is_named(faults, name, level, message):
+def test_a_fault_is_named(faults: Any, name: str, level: Any, message: str) -> None:
     check = judged(end=4.5, faults=faults)[name]
     assert check.level is level
     assert re.search(message, check.message)
 
 
-def test_packets_that_stay_late_are_told():
+def test_packets_that_stay_late_are_told() -> None:
     check = judged(6.0, 7.0, late=[(4.0, 9.0, 1.5)])["clock"]
     assert check.level is WARN
     assert check.message == "locked; packets come 1.5 s late, stamps allow for it"
     assert judged(6.0, 7.0, late=[(4.0, 4.5, 0.2)])["clock"].message == "locked"
 
 
-def test_spinning_up_counts_down():
+def test_spinning_up_counts_down() -> None:
     checks = judged(9.0, 10.0, power=PowerConfig())
     assert checks["device"].level is WARN
     assert checks["device"].message == "spinning up, points in about 15 s"
     assert checks["clock"].level is OK
 
 
-def test_a_clock_that_has_not_locked_yet():
+def test_a_clock_that_has_not_locked_yet() -> None:
     faults = {"jitter": "heavy", "jitter_ms": 50.0}
     assert judged(0.1, 0.3, faults=faults)["clock"].level is WARN
 
 
-def test_a_unit_told_to_stop_is_as_asked():
+def test_a_unit_told_to_stop_is_as_asked() -> None:
     calls = [(1.0, lambda driver, now: driver.stop_rotation(now))]
     check = judged(calls=calls)["device"]
     assert (check.level, check.message) == (OK, "in standby as asked")
 
 
-def test_a_covered_sensor():
+def test_a_covered_sensor() -> None:
     assert judged(empty=True)["points"].level is WARN
 
 
@@ -102,12 +103,12 @@ def test_a_covered_sensor():
         (WorkMode.WAIT_FOR_START, ERROR, "nothing heard"),
     ],
 )
-def test_work_modes_that_do_not_fit(mode, level, message):
+def test_work_modes_that_do_not_fit(mode: Any, level: Any, message: str) -> None:
     check = judged(mode=mode)["device"]
     assert check.level is level
     assert message in check.message
 
 
-def test_gravity_alignment_without_imu():
+def test_gravity_alignment_without_imu() -> None:
     checks = judged(mode=WorkMode.IMU_OFF, settings={"imu_adjust": True})
     assert checks["points"].level is WARN

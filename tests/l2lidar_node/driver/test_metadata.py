@@ -12,7 +12,7 @@ from tests.l2lidar_node.driver.test_driver import Run
 from tests.support import build
 
 
-def test_a_device_that_said_nothing_yet():
+def test_a_device_that_said_nothing_yet() -> None:
     facts = metadata(Run().driver)
     assert (facts.firmware, facts.name, facts.work_mode, facts.work_mode_names) == (
         "",
@@ -28,7 +28,7 @@ def test_a_device_that_said_nothing_yet():
 
 
 @pytest.mark.parametrize("frame3d", [True, False])
-def test_a_device_that_said_everything(frame3d):
+def test_a_device_that_said_everything(frame3d: bool) -> None:
     run = Run(frame3d=frame3d, publish_unlocked=True, cloud_frame="front_link")
     mode = WorkMode.WIDE_FOV | (WorkMode(0) if frame3d else WorkMode.MODE_2D)
     run.hear(PacketType.VERSION, build.version())
@@ -53,7 +53,7 @@ def test_a_device_that_said_everything(frame3d):
     assert facts.imu_frame == "front_imu"
 
 
-def test_unknown_bits_of_the_work_mode_have_no_name():
+def test_unknown_bits_of_the_work_mode_have_no_name() -> None:
     run = Run()
     run.hear(PacketType.PARAMETERS, build.parameters(work_mode=0x100 | 8))
     assert metadata(run.driver).work_mode == 0x108

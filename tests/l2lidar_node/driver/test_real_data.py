@@ -5,6 +5,8 @@ The recordings are not part of the project: where they are absent the tests are 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -18,11 +20,11 @@ pytestmark = pytest.mark.skipif(not build.REAL_L2.is_dir(), reason=f"no data in 
 
 
 @pytest.fixture(scope="module", params=[1, 2])
-def capture(request) -> build.RealCapture:
+def capture(request: pytest.FixtureRequest) -> build.RealCapture:
     return build.real_capture(request.param)
 
 
-def xyz(points) -> np.ndarray:
+def xyz(points: Any) -> np.ndarray:
     return np.stack([points[name] for name in "xyz"], axis=1)
 
 
@@ -34,19 +36,19 @@ def check(found: np.ndarray, recorded: np.ndarray) -> None:
     assert error.max() < 2.5e-3
 
 
-def test_points_come_back_where_they_were_recorded(capture):
+def test_points_come_back_where_they_were_recorded(capture: build.RealCapture) -> None:
     found = build.sweeps(capture.datagrams())
     kept = np.isfinite(capture.points[..., 0])
     check(np.concatenate([xyz(sweep.points) for sweep in found]), capture.points[kept])
 
 
-def test_sweeps_by_turn_follow_the_real_heads_wobble(capture):
+def test_sweeps_by_turn_follow_the_real_heads_wobble(capture: build.RealCapture) -> None:
     found = build.sweeps(capture.datagrams(), {"sweep_cut": "turn"})
     assert {sweep.packets for sweep in found[1:-1]} <= {48, 49, 50, 51}
     assert all((np.diff(sweep.points["time"]) > 0).all() for sweep in found)
 
 
-def test_points_come_out_of_the_driver(capture):
+def test_points_come_out_of_the_driver(capture: build.RealCapture) -> None:
     values = {"enable_l2_host_sync": False, "imu_adjust": False, "publish_unlocked": True}
     driver = Driver(configure(DriverConfig, values))
     events = []
@@ -60,6 +62,6 @@ def test_points_come_out_of_the_driver(capture):
     check(np.concatenate([xyz(sweep.points) for sweep in found]), capture.points[kept])
 
 
-def test_the_first_packets_can_be_had_alone():
+def test_the_first_packets_can_be_had_alone() -> None:
     few = build.real_capture(1, packets=50)
     assert len(few.payloads) == len(few.points) == 50

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,7 +24,7 @@ IMU = Stream.IMU
 class Arriving:
     """An intake that IMU packets arrive at, 4 ms apart, the device's clock running with them."""
 
-    def __init__(self, uptime_s: float = 10.0):
+    def __init__(self, uptime_s: float = 10.0) -> None:
         self.reorder_buffer = ReorderBuffer(8)
         self.clock_ns = round(uptime_s * S)  # what the device's clock shows for number 0
         self.now = build.EPOCH_NS
@@ -50,7 +52,7 @@ class Arriving:
         return [seq for number in numbers for seq in self.take(self.packet(number))]
 
     @property
-    def counts(self):
+    def counts(self) -> Any:
         return self.reorder_buffer.counts[IMU]
 
 
@@ -60,7 +62,7 @@ def points(seq: int) -> PointPacket:
     return packet
 
 
-def test_packets_keep_their_own_arrival():
+def test_packets_keep_their_own_arrival() -> None:
     arriving = Arriving()
     arriving.run(0)
     waited = arriving.now + PERIOD
@@ -70,7 +72,7 @@ def test_packets_keep_their_own_arrival():
     assert [timed.arrival for _, timed in released] == [waited + PERIOD, waited]
 
 
-def test_streams_do_not_disturb_each_other():
+def test_streams_do_not_disturb_each_other() -> None:
     arriving = Arriving()
     assert arriving.run(7) == [7]
     other = points(500)
@@ -79,7 +81,7 @@ def test_streams_do_not_disturb_each_other():
     assert arriving.run(8) == [8]
 
 
-def test_what_waits_is_overdue_after_so_long():
+def test_what_waits_is_overdue_after_so_long() -> None:
     arriving = Arriving()
     arriving.run(0, 2, 4)
     first, second = (HostNs(arriving.now - PERIOD + REORDER_NS + after) for after in (0, PERIOD))
@@ -93,7 +95,7 @@ def test_what_waits_is_overdue_after_so_long():
     assert not arriving.reorder_buffer.is_overdue(HostNs(second + S))
 
 
-def test_a_pause_is_one_of_the_points():
+def test_a_pause_is_one_of_the_points() -> None:
     arriving = Arriving()
     arriving.run(0)
     assert arriving.reorder_buffer.pause_ns(HostNs(arriving.now + 5)) == 0
@@ -102,7 +104,7 @@ def test_a_pause_is_one_of_the_points():
     assert arriving.reorder_buffer.pause_ns(HostNs(arriving.now + 5)) == 3 + PERIOD
 
 
-def test_nothing_can_be_overdue_while_it_flows():
+def test_nothing_can_be_overdue_while_it_flows() -> None:
     arriving = Arriving()
     reorder_buffer = arriving.reorder_buffer
     assert not reorder_buffer.is_flowing(HostNs(arriving.now))
@@ -126,7 +128,7 @@ def test_nothing_can_be_overdue_while_it_flows():
         max_size=60,
     )
 )
-def test_the_short_way_is_the_long_way(steps):
+def test_the_short_way_is_the_long_way(steps: Any) -> None:
     """What follows the packet before it is handled as if it had gone through everything."""
     short, long = Arriving(), Arriving()
     seq, stamp = 1000, 10 * S
@@ -141,7 +143,7 @@ def test_the_short_way_is_the_long_way(steps):
 
 
 @pytest.mark.parametrize("last", [5, 500, 1024])
-def test_a_reboot_is_told_by_falling_stamps(last):
+def test_a_reboot_is_told_by_falling_stamps(last: int) -> None:
     arriving = Arriving(uptime_s=100.0)
     arriving.run(*range(last + 1))
     arriving.clock_ns = 4 * S
@@ -151,7 +153,7 @@ def test_a_reboot_is_told_by_falling_stamps(last):
     assert arriving.counts.lost == 0
 
 
-def test_a_reboot_is_told_though_the_clock_was_set_soon_after_it():
+def test_a_reboot_is_told_though_the_clock_was_set_soon_after_it() -> None:
     """The other stream may have shown the reboot already, and the host has set the clock."""
     arriving = Arriving(uptime_s=100.0)
     arriving.run(*range(60))
@@ -160,14 +162,14 @@ def test_a_reboot_is_told_though_the_clock_was_set_soon_after_it():
     assert arriving.restarts == 1
 
 
-def test_a_reboot_costs_nothing_unless_its_numbers_look_late():
+def test_a_reboot_costs_nothing_unless_its_numbers_look_late() -> None:
     arriving = Arriving(uptime_s=100.0)
     arriving.run(*range(500))
     arriving.clock_ns = 4 * S
     assert arriving.run(0, 1, 2) == [0, 1, 2]
 
 
-def test_a_reboot_after_a_pause_costs_nothing_though_its_numbers_look_late():
+def test_a_reboot_after_a_pause_costs_nothing_though_its_numbers_look_late() -> None:
     arriving = Arriving(uptime_s=100.0)
     arriving.run(*range(43))
     arriving.clock_ns = 4 * S
@@ -177,7 +179,7 @@ def test_a_reboot_after_a_pause_costs_nothing_though_its_numbers_look_late():
 
 
 @pytest.mark.parametrize("late", [[9], [8, 9], [9, 8], [5, 6, 7, 8, 9]])
-def test_late_packets_from_before_a_sync_are_no_reboot(late):
+def test_late_packets_from_before_a_sync_are_no_reboot(late: Any) -> None:
     """The device's clock is set forward by decades; some packets from before are still to come."""
     arriving = Arriving(uptime_s=10.0)
     out = arriving.run(*(n for n in range(10) if n not in late))
@@ -190,7 +192,7 @@ def test_late_packets_from_before_a_sync_are_no_reboot(late):
     assert arriving.restarts == arriving.counts.lost == 0
 
 
-def test_a_clock_set_back_in_mid_stream_loses_nothing():
+def test_a_clock_set_back_in_mid_stream_loses_nothing() -> None:
     arriving = Arriving(uptime_s=100.0)
     out = arriving.run(*range(10))
     arriving.clock_ns = 50 * S
@@ -199,7 +201,7 @@ def test_a_clock_set_back_in_mid_stream_loses_nothing():
     assert arriving.counts.lost == 0
 
 
-def test_after_a_silence_numbers_go_on_where_they_are():
+def test_after_a_silence_numbers_go_on_where_they_are() -> None:
     arriving = Arriving()
     arriving.run(*range(100))
     arriving.now += 4 * S
@@ -209,7 +211,7 @@ def test_after_a_silence_numbers_go_on_where_they_are():
 
 
 @pytest.mark.parametrize("far", [200, 900, 1030, 100_000, 2_000_000, 4_000_000_000])
-def test_a_far_number_adds_no_more_to_the_lost_than_time_allows(far):
+def test_a_far_number_adds_no_more_to_the_lost_than_time_allows(far: int) -> None:
     """One valid packet in a stream of which nothing is lost."""
     arriving = Arriving()
     out = arriving.run(*range(500))
@@ -225,7 +227,7 @@ def test_a_far_number_adds_no_more_to_the_lost_than_time_allows(far):
     assert arriving.counts.lost <= 100
 
 
-def test_what_is_forgotten_is_not_missed():
+def test_what_is_forgotten_is_not_missed() -> None:
     arriving = Arriving()
     arriving.run(*range(100))
     arriving.reorder_buffer.forget()
@@ -233,7 +235,7 @@ def test_what_is_forgotten_is_not_missed():
     assert arriving.counts.lost == 0
 
 
-def test_flush_releases_what_waits():
+def test_flush_releases_what_waits() -> None:
     arriving = Arriving()
     arriving.run(0, 2, 5)
     assert [timed.packet.seq for _, timed in arriving.reorder_buffer.flush()] == [2, 5]

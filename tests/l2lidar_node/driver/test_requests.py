@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from l2lidar_node.driver.device import MAX_PENDING, REPEAT_NS, TRIES, CommandClient
@@ -24,7 +26,7 @@ def echo(command: Command, status: int = AckStatus.OK) -> Ack:
     return Ack(command.packet_type, number, value, status)
 
 
-def test_an_ack_answers_with_the_ticket_and_the_round_trip():
+def test_an_ack_answers_with_the_ticket_and_the_round_trip() -> None:
     requests = CommandClient()
     ticket = requests.add(commands.start(), NOW)
     answer = requests.answer(echo(commands.start()), after(700_000))
@@ -43,7 +45,7 @@ def test_an_ack_answers_with_the_ticket_and_the_round_trip():
         (77, "start rotation: refused: unknown status 77"),
     ],
 )
-def test_a_refusal_says_why(status, text):
+def test_a_refusal_says_why(status: Any, text: str) -> None:
     requests = CommandClient()
     requests.add(commands.start(), NOW)
     answer = requests.answer(echo(commands.start(), status), after(1))
@@ -52,14 +54,14 @@ def test_a_refusal_says_why(status, text):
     assert answer.text == text
 
 
-def test_an_ack_of_something_else_answers_nothing():
+def test_an_ack_of_something_else_answers_nothing() -> None:
     requests = CommandClient()
     requests.add(commands.start(), NOW)
     assert requests.answer(Ack(wire.PacketType.TIME_SYNC, 0, 0, 1), NOW) is None
     assert requests.expire(NOW) == ([], [])
 
 
-def test_an_unanswered_command_is_repeated_and_then_given_up():
+def test_an_unanswered_command_is_repeated_and_then_given_up() -> None:
     requests = CommandClient()
     ticket = requests.add(commands.start(), NOW)
     assert requests.expire(after(REPEAT_NS - 1)) == ([], [])
@@ -73,7 +75,7 @@ def test_an_unanswered_command_is_repeated_and_then_given_up():
     assert requests.expire(after(99 * REPEAT_NS)) == ([], [])
 
 
-def test_the_round_trip_counts_from_the_last_repeat():
+def test_the_round_trip_counts_from_the_last_repeat() -> None:
     requests = CommandClient()
     requests.add(commands.start(), NOW)
     requests.expire(after(REPEAT_NS))
@@ -82,7 +84,7 @@ def test_the_round_trip_counts_from_the_last_repeat():
     assert answer.round_trip_ns == 5
 
 
-def test_a_later_command_of_the_kind_stops_the_repeats_of_the_earlier_one():
+def test_a_later_command_of_the_kind_stops_the_repeats_of_the_earlier_one() -> None:
     """Otherwise a start that nobody acknowledged would undo the stop that followed."""
     requests = CommandClient()
     first = requests.add(commands.start(), NOW)
@@ -95,7 +97,7 @@ def test_a_later_command_of_the_kind_stops_the_repeats_of_the_earlier_one():
     assert answer.ticket == second
 
 
-def test_an_exact_echo_is_preferred_to_the_oldest():
+def test_an_exact_echo_is_preferred_to_the_oldest() -> None:
     requests = CommandClient()
     first = requests.add(commands.start(), NOW)
     second = requests.add(commands.standby(), NOW)
@@ -107,7 +109,7 @@ def test_an_exact_echo_is_preferred_to_the_oldest():
     assert tickets == [second, first]
 
 
-def test_an_echo_with_a_wrong_value_answers_the_oldest():
+def test_an_echo_with_a_wrong_value_answers_the_oldest() -> None:
     requests = CommandClient()
     first = requests.add(commands.start(), NOW)
     requests.add(commands.standby(), NOW)
@@ -116,7 +118,7 @@ def test_an_echo_with_a_wrong_value_answers_the_oldest():
     assert answer.ticket == first
 
 
-def test_a_single_try_is_not_repeated():
+def test_a_single_try_is_not_repeated() -> None:
     requests = CommandClient()
     requests.add(commands.latency(101), NOW, tries=1)
     repeats, (answer,) = requests.expire(after(REPEAT_NS))
@@ -124,14 +126,14 @@ def test_a_single_try_is_not_repeated():
     assert not answer.ok
 
 
-def test_a_host_clock_set_back_does_not_freeze_a_command():
+def test_a_host_clock_set_back_does_not_freeze_a_command() -> None:
     requests = CommandClient()
     requests.add(commands.start(), NOW)
     assert requests.expire(after(-3_600_000_000_000)) == ([commands.start()], [])
 
 
 @pytest.mark.parametrize("count", [1, 31, 40, 60, 63, 64])
-def test_so_many_may_wait_at_once(count):
+def test_so_many_may_wait_at_once(count: int) -> None:
     requests = CommandClient()
     tickets = [requests.add(commands.latency(number), NOW) for number in range(count)]
     for number, ticket in enumerate(tickets):
@@ -140,7 +142,7 @@ def test_so_many_may_wait_at_once(count):
         assert answer.ticket == ticket
 
 
-def test_too_many_are_given_up_oldest_first_and_said_so():
+def test_too_many_are_given_up_oldest_first_and_said_so() -> None:
     requests = CommandClient()
     tickets = [requests.add(commands.latency(n), NOW) for n in range(MAX_PENDING + 3)]
     repeats, answers = requests.expire(after(1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,7 +13,7 @@ from l2lidar_node.driver.reorder import SequenceCounts, SequenceOrder
 WINDOW = 8
 
 
-def run(numbers, modulus=1025, window=WINDOW, first=0):
+def run(numbers: Any, modulus: int = 1025, window: Any = WINDOW, first: int = 0) -> Any:
     """Push numbers that never wrap; return what came out of it and the order.
 
     Each comes out as (missing before it, number).
@@ -29,7 +31,7 @@ def counted(**counts: int) -> SequenceCounts:
 
 
 @pytest.mark.parametrize("start", [0, 1, 500, 1020, 1024])
-def test_in_order_over_the_wrap_everything_comes_at_once(start):
+def test_in_order_over_the_wrap_everything_comes_at_once(start: int) -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in range(start, start + 3000):
         assert order.push(number % 1025, number) == [(0, number)]
@@ -37,7 +39,7 @@ def test_in_order_over_the_wrap_everything_comes_at_once(start):
 
 
 @pytest.mark.parametrize("at", [5, 1020, 1024, 1025])
-def test_a_lost_one_is_given_up_when_the_window_is_full(at):
+def test_a_lost_one_is_given_up_when_the_window_is_full(at: int) -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in range(at):
         order.push(number % 1025, number)
@@ -48,44 +50,44 @@ def test_a_lost_one_is_given_up_when_the_window_is_full(at):
     assert order.counts == counted(lost=1)
 
 
-def test_a_swap_is_put_right():
+def test_a_swap_is_put_right() -> None:
     released, order = run([0, 2, 1, 3])
     assert released == [(0, 0), (0, 1), (0, 2), (0, 3)]
     assert order.counts == counted(reordered=1)
 
 
-def test_every_one_that_comes_after_a_later_one_is_reordered():
+def test_every_one_that_comes_after_a_later_one_is_reordered() -> None:
     released, order = run([0, 4, 3, 2, 1, 5])
     assert [number for _, number in released] == [0, 1, 2, 3, 4, 5]
     assert order.counts == counted(reordered=3)
 
 
-def test_duplicates_come_once():
+def test_duplicates_come_once() -> None:
     released, order = run([0, 0, 1, 3, 3, 2, 2, 1])
     assert [number for _, number in released] == [0, 1, 2, 3]
     assert order.counts == counted(duplicates=4, reordered=1)
 
 
-def test_a_late_one_is_dropped_and_counted_as_late_instead_of_lost():
+def test_a_late_one_is_dropped_and_counted_as_late_instead_of_lost() -> None:
     released, order = run([0, *range(2, 20), 1, 1])
     assert [number for _, number in released] == [0, *range(2, 20)]
     assert order.counts == counted(late=1, duplicates=1)
 
 
-def test_late_ones_of_several_gaps_are_told_from_duplicates():
+def test_late_ones_of_several_gaps_are_told_from_duplicates() -> None:
     numbers = [n for n in range(60) if n not in (5, 20, 35)]
     _, order = run([*numbers, 5, 20, 35, 20])
     assert order.counts == counted(late=3, duplicates=1)
 
 
-def test_a_number_given_up_a_turn_ago_is_not_late_for_this_turn():
+def test_a_number_given_up_a_turn_ago_is_not_late_for_this_turn() -> None:
     numbers = [n for n in range(1025 + 20) if n != 5]
     released, order = run([*numbers, 1025 + 5])
     assert [number for _, number in released] == numbers
     assert order.counts == counted(lost=1, duplicates=1)
 
 
-def test_window_zero_waits_for_nothing():
+def test_window_zero_waits_for_nothing() -> None:
     order: SequenceOrder[int] = SequenceOrder(0)
     assert order.push(0, 0) == [(0, 0)]
     assert order.push(3, 3) == [(2, 3)]
@@ -93,7 +95,7 @@ def test_window_zero_waits_for_nothing():
     assert order.counts == counted(lost=1, late=1)
 
 
-def test_flush_releases_in_order_and_counts_gaps():
+def test_flush_releases_in_order_and_counts_gaps() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in (0, 5, 2):
         order.push(number, number)
@@ -103,7 +105,7 @@ def test_flush_releases_in_order_and_counts_gaps():
     assert order.counts.lost == 3
 
 
-def test_give_up_releases_up_to_the_next_gap():
+def test_give_up_releases_up_to_the_next_gap() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in (0, 5, 2, 3):
         order.push(number, number)
@@ -112,7 +114,7 @@ def test_give_up_releases_up_to_the_next_gap():
     assert order.give_up() == []
 
 
-def test_restart_takes_the_next_number_as_the_first():
+def test_restart_takes_the_next_number_as_the_first() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in (500, 502):
         order.push(number, number)
@@ -122,14 +124,14 @@ def test_restart_takes_the_next_number_as_the_first():
     assert order.counts == counted(lost=1, restarts=1)
 
 
-def test_restart_of_one_that_never_ran_is_none():
+def test_restart_of_one_that_never_ran_is_none() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     assert order.restart() == []
     assert order.counts == counted()
 
 
 @pytest.mark.parametrize("outage", [1, 500, 960, 1000, 1024])
-def test_after_a_silence_nothing_is_taken_for_late(outage):
+def test_after_a_silence_nothing_is_taken_for_late(outage: int) -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in range(100):
         order.push(number, number)
@@ -140,7 +142,7 @@ def test_after_a_silence_nothing_is_taken_for_late(outage):
     assert order.counts == counted(lost=outage)
 
 
-def test_what_comes_after_the_one_that_ended_a_silence_is_late_and_not_twice():
+def test_what_comes_after_the_one_that_ended_a_silence_is_late_and_not_twice() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     order.push(0, 0)
     assert order.resume(10, 10) == [(9, 10)]
@@ -148,20 +150,20 @@ def test_what_comes_after_the_one_that_ended_a_silence_is_late_and_not_twice():
     assert order.counts == counted(lost=8, late=1)
 
 
-def test_a_silence_releases_what_waits_first():
+def test_a_silence_releases_what_waits_first() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in (0, 2):
         order.push(number, number)
     assert order.resume(10, 10) == [(1, 2), (7, 10)]
 
 
-def test_the_first_packet_may_be_a_resumption():
+def test_the_first_packet_may_be_a_resumption() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     assert order.resume(700, 700) == [(0, 700)]
 
 
 @pytest.mark.parametrize("modulus", [256, 1000, 1024, 1025, 1026, 2048])
-def test_another_modulus_is_learned_within_three_turns(modulus):
+def test_another_modulus_is_learned_within_three_turns(modulus: int) -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     for number in range(3 * modulus):
         order.push(number % modulus, number)
@@ -174,7 +176,7 @@ def test_another_modulus_is_learned_within_three_turns(modulus):
 
 
 @pytest.mark.parametrize(("modulus", "window"), [(100, WINDOW), (1025, 256)])
-def test_a_large_window_leaves_room_ahead(modulus, window):
+def test_a_large_window_leaves_room_ahead(modulus: int, window: Any) -> None:
     order: SequenceOrder[int] = SequenceOrder(window)
     for number in range(3 * modulus):
         order.push(number % modulus, number)
@@ -186,7 +188,7 @@ def test_a_large_window_leaves_room_ahead(modulus, window):
 
 
 @pytest.mark.parametrize("modulus", [65536, 2**32])
-def test_the_wrap_of_a_large_modulus_costs_nothing(modulus):
+def test_the_wrap_of_a_large_modulus_costs_nothing(modulus: Any) -> None:
     numbers = range(modulus - 300, modulus + 300)
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     released = [pair for number in numbers for pair in order.push(number % modulus, number)]
@@ -194,13 +196,13 @@ def test_the_wrap_of_a_large_modulus_costs_nothing(modulus):
     assert order.counts == counted()
 
 
-def test_a_larger_modulus_costs_nothing():
+def test_a_larger_modulus_costs_nothing() -> None:
     released, order = run(range(5000), modulus=2048)
     assert released == [(0, number) for number in range(5000)]
     assert order.counts == counted()
 
 
-def test_a_loss_at_a_wrap_that_is_not_known_yet():
+def test_a_loss_at_a_wrap_that_is_not_known_yet() -> None:
     numbers = [n for n in range(6000) if n not in (2047, 2048, 4095)]
     released, order = run(numbers, modulus=2048)
     assert [number for _, number in released] == numbers
@@ -208,7 +210,7 @@ def test_a_loss_at_a_wrap_that_is_not_known_yet():
     assert order.counts.lost <= 3
 
 
-def test_a_wild_number_does_not_stop_the_stream():
+def test_a_wild_number_does_not_stop_the_stream() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     released = [pair for n in range(50) for pair in order.push(n, n)]
     released += order.push(4_000_000_000, -1)
@@ -219,7 +221,7 @@ def test_a_wild_number_does_not_stop_the_stream():
 
 
 @st.composite
-def disturbed(draw, largest_gap: int = 60):
+def disturbed(draw: Any, largest_gap: int = 60) -> Any:
     """Draw the numbers of a stream that lost, doubled and displaced some, and where it began."""
     count = draw(st.integers(1, 250))
     first = draw(st.integers(0, 1500))
@@ -234,7 +236,7 @@ def disturbed(draw, largest_gap: int = 60):
 
 
 @given(disturbed(), st.sampled_from([1025, 2000]))
-def test_order_is_restored_and_nothing_comes_twice(stream, modulus):
+def test_order_is_restored_and_nothing_comes_twice(stream: Any, modulus: Any) -> None:
     first, numbers = stream
     released, order = run(numbers, modulus, first=first)
     out = [number for _, number in released]
@@ -245,7 +247,7 @@ def test_order_is_restored_and_nothing_comes_twice(stream, modulus):
 
 
 @given(disturbed())
-def test_what_was_within_the_window_is_not_lost_and_counts_add_up(stream):
+def test_what_was_within_the_window_is_not_lost_and_counts_add_up(stream: Any) -> None:
     first, numbers = stream
     if first == 0 and numbers:
         first = numbers[0]  # what comes before the first packet was never missed
@@ -261,7 +263,7 @@ def test_what_was_within_the_window_is_not_lost_and_counts_add_up(stream):
 
 
 @given(st.lists(st.integers(0, 2**32 - 1)), st.integers(0, 20))
-def test_any_numbers_are_taken(numbers, window):
+def test_any_numbers_are_taken(numbers: Any, window: Any) -> None:
     order: SequenceOrder[int] = SequenceOrder(window)
     released = []
     for index, number in enumerate(numbers):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ PERIOD = build.PERIOD_NS
 TURN = 2 * math.pi
 
 
-def packet(kind: int = wire.PacketType.POINTS_3D, **fields) -> PointPacket:
+def packet(kind: int = wire.PacketType.POINTS_3D, **fields: Any) -> PointPacket:
     maker = build.points_3d if kind == wire.PacketType.POINTS_3D else build.points_2d
     decoded = decode(Frame(kind, maker(**fields)))
     assert isinstance(decoded, PointPacket)
@@ -36,7 +37,7 @@ DURATION = PLAIN.duration_ns
 class Stream:
     """Pushes packets at their pace and collects the sweeps."""
 
-    def __init__(self, **config):
+    def __init__(self, **config: Any) -> None:
         self.assembler = SweepAssembler(SweepConfig(**config))
         self.sweeps: list[Sweep] = []
         self.now = START
@@ -56,7 +57,7 @@ class Stream:
 
 
 @pytest.mark.parametrize("count", [1, 2, 38, 100])
-def test_a_number_of_packets(count):
+def test_a_number_of_packets(count: int) -> None:
     stream = Stream(packets=count)
     completed = [stream.push() for _ in range(3 * count)]
     assert completed == ([0] * (count - 1) + [1]) * 3
@@ -67,12 +68,12 @@ def test_a_number_of_packets(count):
     ]
 
 
-def test_zero_packets_means_every_packet():
+def test_zero_packets_means_every_packet() -> None:
     stream = Stream(packets=0)
     assert [stream.push() for _ in range(5)] == [1] * 5
 
 
-def test_the_largest_number_of_packets():
+def test_the_largest_number_of_packets() -> None:
     stream = Stream(packets=4000)
     small = packet(count=1)
     assert [stream.push(small) for _ in range(4000)] == [0] * 3999 + [1]
@@ -82,7 +83,7 @@ def test_the_largest_number_of_packets():
 @pytest.mark.parametrize("per_turn", [38.9, 49.53])
 @pytest.mark.parametrize("wobble", [0.0, math.radians(0.2)])
 @pytest.mark.parametrize("begin", [0.0, 1.0, 3.2, 6.2])
-def test_a_turn_of_the_head(per_turn, wobble, begin):
+def test_a_turn_of_the_head(per_turn: float, wobble: Any, begin: float) -> None:
     stream = Stream(cut="turn")
     stream.turn(round(10.5 * per_turn), per_turn, begin, wobble)
     counts = [sweep.packets for sweep in stream.sweeps]
@@ -92,7 +93,7 @@ def test_a_turn_of_the_head(per_turn, wobble, begin):
 
 @pytest.mark.parametrize("per_turn", [38.9, 49.53])
 @pytest.mark.parametrize("begin", [0.0, 1.0, 3.2, 6.2])
-def test_half_a_turn_of_the_head(per_turn, begin):
+def test_half_a_turn_of_the_head(per_turn: float, begin: float) -> None:
     stream = Stream(cut="half_turn")
     stream.turn(round(10.5 * per_turn), per_turn, begin, math.radians(0.2))
     counts = [sweep.packets for sweep in stream.sweeps]
@@ -100,7 +101,7 @@ def test_half_a_turn_of_the_head(per_turn, begin):
     assert set(counts) <= {math.floor(per_turn / 2), math.ceil(per_turn / 2)}
 
 
-def test_sweeps_of_a_turn_begin_within_a_packet_of_the_same_angle():
+def test_sweeps_of_a_turn_begin_within_a_packet_of_the_same_angle() -> None:
     stream = Stream(cut="turn")
     for number in range(300):
         stream.push(packet(theta=TURN * number / 49.53 % TURN))
@@ -112,7 +113,9 @@ def test_sweeps_of_a_turn_begin_within_a_packet_of_the_same_angle():
 @pytest.mark.parametrize("cut", ["turn", "half_turn"])
 @pytest.mark.parametrize("begin", np.linspace(0, TURN, 23))
 @pytest.mark.parametrize("lost", [10, 20, 28, 35, 40])
-def test_a_turn_is_neither_missed_nor_invented_when_packets_are_lost(cut, begin, lost):
+def test_a_turn_is_neither_missed_nor_invented_when_packets_are_lost(
+    cut: str, begin: Any, lost: int
+) -> None:
     """40 packets are 293 degrees; 42 would be longer than the longest gap."""
     stream = Stream(cut=cut)
     stream.push(PLAIN._replace(head_angle=begin % TURN), gap_ns=(lost + 1) * PERIOD)
@@ -125,14 +128,14 @@ def test_a_turn_is_neither_missed_nor_invented_when_packets_are_lost(cut, begin,
 
 
 @pytest.mark.parametrize("cut", ["turn", "half_turn"])
-def test_a_head_that_stands_still_makes_no_turns(cut):
+def test_a_head_that_stands_still_makes_no_turns(cut: str) -> None:
     stream = Stream(cut=cut)
     for number in range(500):
         stream.push(PLAIN._replace(head_angle=1.0 + 0.001 * (-1) ** number))
     assert stream.sweeps == []
 
 
-def test_a_turn_that_ends_exactly_at_zero():
+def test_a_turn_that_ends_exactly_at_zero() -> None:
     stream = Stream(cut="turn")
     for number in range(200):
         stream.push(PLAIN._replace(head_angle=TURN * (number % 50) / 50))
@@ -140,7 +143,7 @@ def test_a_turn_that_ends_exactly_at_zero():
 
 
 @pytest.mark.parametrize("duration_ms", [5, 100, 230])
-def test_a_duration(duration_ms):
+def test_a_duration(duration_ms: int) -> None:
     stream = Stream(cut="duration", duration_ms=duration_ms)
     for _ in range(400):
         stream.push()
@@ -149,7 +152,7 @@ def test_a_duration(duration_ms):
 
 
 @pytest.mark.parametrize("cut", ["turn", "half_turn"])
-def test_2d_packets_know_no_angle_and_are_cut_by_duration(cut):
+def test_2d_packets_know_no_angle_and_are_cut_by_duration(cut: str) -> None:
     stream = Stream(cut=cut, duration_ms=100)
     flat = packet(wire.PacketType.POINTS_2D)
     for _ in range(21):
@@ -157,7 +160,7 @@ def test_2d_packets_know_no_angle_and_are_cut_by_duration(cut):
     assert [sweep.packets for sweep in stream.sweeps] == [5] * 4
 
 
-def test_a_head_that_reports_no_angle_cannot_grow_a_sweep_for_ever():
+def test_a_head_that_reports_no_angle_cannot_grow_a_sweep_for_ever() -> None:
     stream = Stream(cut="turn")
     small = packet(count=1)
     for _ in range(MAX_PACKETS + 5):
@@ -168,7 +171,9 @@ def test_a_head_that_reports_no_angle_cannot_grow_a_sweep_for_ever():
 
 @pytest.mark.parametrize("cut", ["turn", "half_turn"])
 @pytest.mark.parametrize("begin", [0.0, 0.05, 1.0, 3.0, 6.2])
-def test_every_turn_is_whole_however_the_stream_begins_pauses_and_ends(cut, begin):
+def test_every_turn_is_whole_however_the_stream_begins_pauses_and_ends(
+    cut: str, begin: float
+) -> None:
     """LIO-SAM crashed on a first cloud of 1,158 points of 14,500."""
     stream = Stream(cut=cut)
     stream.turn(120, 49.53, begin)
@@ -186,7 +191,7 @@ def test_every_turn_is_whole_however_the_stream_begins_pauses_and_ends(cut, begi
     assert stream.assembler.fragments == 4  # before and after each stretch
 
 
-def test_a_half_turn_is_not_taken_for_a_turn_when_the_cut_changes():
+def test_a_half_turn_is_not_taken_for_a_turn_when_the_cut_changes() -> None:
     stream = Stream(cut="half_turn")
     stream.turn(80, 49.53, 0.3)  # ends 14 packets before the third half turn does
     assert len(stream.sweeps) == 2
@@ -198,7 +203,7 @@ def test_a_half_turn_is_not_taken_for_a_turn_when_the_cut_changes():
 
 
 @pytest.mark.parametrize("cut", ["packets", "duration"])
-def test_a_stall_ends_the_sweep(cut):
+def test_a_stall_ends_the_sweep(cut: str) -> None:
     stream = Stream(cut=cut, duration_ms=20_000)
     stream.push()
     stream.push(gap_ns=MAX_GAP_NS + 1)
@@ -207,14 +212,14 @@ def test_a_stall_ends_the_sweep(cut):
     assert stream.sweeps[0].end == START + PERIOD + DURATION
 
 
-def test_a_clock_that_steps_back_ends_the_sweep():
+def test_a_clock_that_steps_back_ends_the_sweep() -> None:
     stream = Stream()
     stream.push(gap_ns=-1_000_000)
     assert stream.push() == 1
     assert stream.assembler.flush().start == START - 1_000_000
 
 
-def test_another_type_ends_the_sweep():
+def test_another_type_ends_the_sweep() -> None:
     stream = Stream()
     stream.push()
     assert stream.push(packet(wire.PacketType.POINTS_2D)) == 1
@@ -222,14 +227,14 @@ def test_another_type_ends_the_sweep():
     assert len(stream.assembler.flush().points) == 1800
 
 
-def test_two_sweeps_at_once():
+def test_two_sweeps_at_once() -> None:
     stream = Stream(packets=2)
     stream.push()
     stream.assembler.configure(SweepConfig(packets=1), None)
     assert stream.push(packet(wire.PacketType.POINTS_2D)) == 2
 
 
-def test_flush_returns_what_there_is_once():
+def test_flush_returns_what_there_is_once() -> None:
     stream = Stream()
     assert stream.assembler.flush() is None
     stream.push()
@@ -239,7 +244,7 @@ def test_flush_returns_what_there_is_once():
     assert stream.assembler.flush() is None
 
 
-def test_settings_changed_in_mid_sweep_take_effect_with_the_next_packet():
+def test_settings_changed_in_mid_sweep_take_effect_with_the_next_packet() -> None:
     stream = Stream(packets=38)
     for _ in range(20):
         stream.push()
@@ -253,7 +258,7 @@ def test_settings_changed_in_mid_sweep_take_effect_with_the_next_packet():
     assert stream.sweeps[1].packets == 10
 
 
-def test_the_override_uses_the_users_scale_and_bias():
+def test_the_override_uses_the_users_scale_and_bias() -> None:
     config = {"override_range_calibration": True, "range_scale": 0.001, "range_bias": -500.0}
     stream = Stream(packets=1, **config)
     stream.push()
@@ -262,7 +267,7 @@ def test_the_override_uses_the_users_scale_and_bias():
     assert stream.assembler._config.range_bias == -500.0
 
 
-def test_the_users_range_limits():
+def test_the_users_range_limits() -> None:
     ranges = np.where(np.arange(300) % 2, 3000, 6000)
     for lo, hi, expected in ((0.0, 4.0, 150), (4.0, 100.0, 150), (0.0, 100.0, 300)):
         stream = Stream(packets=1, range_min=lo, range_max=hi)
@@ -270,7 +275,7 @@ def test_the_users_range_limits():
         assert len(stream.sweeps[0].points) == expected
 
 
-def test_the_start_is_the_first_kept_point():
+def test_the_start_is_the_first_kept_point() -> None:
     stream = Stream(packets=2)
     stream.push(packet(ranges=0))
     stream.push(packet(ranges=[0] * 7 + [3000] * 293))
@@ -282,7 +287,7 @@ def test_the_start_is_the_first_kept_point():
     assert sweep.packets == 2
 
 
-def test_times_ascend_and_end_with_the_sweep():
+def test_times_ascend_and_end_with_the_sweep() -> None:
     stream = Stream(packets=50)
     for number in range(50):
         stream.push(gap_ns=PERIOD + (number % 7) * 1000)
@@ -292,7 +297,7 @@ def test_times_ascend_and_end_with_the_sweep():
     assert times[-1] * 1e9 == pytest.approx(sweep.end - sweep.start, abs=20)
 
 
-def test_a_packet_that_seems_to_begin_before_the_last_one_ended_is_put_behind_it():
+def test_a_packet_that_seems_to_begin_before_the_last_one_ended_is_put_behind_it() -> None:
     stream = Stream(packets=3)
     stream.push(gap_ns=DURATION // 2)
     stream.push(gap_ns=PERIOD)
@@ -302,7 +307,7 @@ def test_a_packet_that_seems_to_begin_before_the_last_one_ended_is_put_behind_it
     assert times[300] == pytest.approx(DURATION / 1e9)
 
 
-def test_a_burst_of_arrivals_is_one_sweep():
+def test_a_burst_of_arrivals_is_one_sweep() -> None:
     """With stamps of arrival a backlog comes microseconds apart; that is no clock step."""
     stream = Stream(packets=38)
     for _ in range(38):
@@ -313,14 +318,14 @@ def test_a_burst_of_arrivals_is_one_sweep():
     assert sweep.end == START + 38 * DURATION
 
 
-def test_missing_packets_are_counted_within_the_sweep():
+def test_missing_packets_are_counted_within_the_sweep() -> None:
     stream = Stream(packets=4)
     for missing in (9, 0, 2, 1, 5, 0, 0, 3):
         stream.push(missing=missing)
     assert [sweep.missing for sweep in stream.sweeps] == [3, 3]
 
 
-def test_points_cannot_be_written_and_are_not_used_again():
+def test_points_cannot_be_written_and_are_not_used_again() -> None:
     stream = Stream(packets=2)
     for _ in range(4):
         stream.push()
@@ -333,7 +338,7 @@ def test_points_cannot_be_written_and_are_not_used_again():
     np.testing.assert_array_equal(first.points["x"], second.points["x"])
 
 
-def test_a_sweep_without_points_is_a_sweep():
+def test_a_sweep_without_points_is_a_sweep() -> None:
     stream = Stream(packets=2)
     stream.push(packet(ranges=0))
     stream.push(packet(ranges=0))
@@ -343,7 +348,7 @@ def test_a_sweep_without_points_is_a_sweep():
     assert sweep.start == START
 
 
-def test_gravity_alignment_sees_every_packets_start_and_turns_its_points():
+def test_gravity_alignment_sees_every_packets_start_and_turns_its_points() -> None:
     seen: list[list[int]] = []
 
     def level(starts: list[HostNs]) -> np.ndarray:
@@ -375,7 +380,9 @@ def test_gravity_alignment_sees_every_packets_start_and_turns_its_points():
         max_size=25,
     ),
 )
-def test_whatever_comes_no_packet_is_lost_or_doubled_and_times_ascend(cut, steps):
+def test_whatever_comes_no_packet_is_lost_or_doubled_and_times_ascend(
+    cut: Any, steps: Any
+) -> None:
     stream = Stream(cut=cut, packets=7)
     for gap, angle, count, is_3d in steps:
         kind = wire.PacketType.POINTS_3D if is_3d else wire.PacketType.POINTS_2D

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from l2lidar_node.config import WatchdogConfig
@@ -27,7 +29,7 @@ def at(seconds: float) -> HostNs:
 class Watched:
     """A watchdog that is asked ten times a second, as a node does."""
 
-    def __init__(self, **config):
+    def __init__(self, **config: Any) -> None:
         self.watchdog = Watchdog(WatchdogConfig(**config))
         self.now = START
         self.expiries: list[float] = []
@@ -49,7 +51,7 @@ class Watched:
 IMU, POINTS = Stream.IMU, Stream.POINTS
 
 
-def test_from_power_on_to_streaming():
+def test_from_power_on_to_streaming() -> None:
     watched = Watched()
     assert watched.state is DeviceState.WAITING
     watched.run(4)
@@ -61,14 +63,14 @@ def test_from_power_on_to_streaming():
     assert watched.expiries == []
 
 
-def test_points_alone_are_streaming():
+def test_points_alone_are_streaming() -> None:
     watched = Watched()
     watched.run(0.1, POINTS)
     assert watched.state is DeviceState.STREAMING
 
 
 @pytest.mark.parametrize("streams", [(), (IMU,)])
-def test_points_that_stop_are_a_stall(streams):
+def test_points_that_stop_are_a_stall(streams: Any) -> None:
     watched = Watched()
     watched.run(5, IMU, POINTS)
     watched.run(SILENCE_NS / S, *streams)
@@ -77,14 +79,14 @@ def test_points_that_stop_are_a_stall(streams):
     assert watched.state is DeviceState.STALLED
 
 
-def test_spin_up_that_breaks_off_is_a_stall():
+def test_spin_up_that_breaks_off_is_a_stall() -> None:
     watched = Watched()
     watched.run(5, IMU)
     watched.run(1.2)
     assert watched.state is DeviceState.STALLED
 
 
-def test_a_silence_expires_once():
+def test_a_silence_expires_once() -> None:
     watched = Watched(timeout_ms=5000)
     watched.run(3, IMU, POINTS)
     watched.run(20)
@@ -94,7 +96,7 @@ def test_a_silence_expires_once():
     assert len(watched.expiries) == 2
 
 
-def test_a_device_that_never_speaks_expires():
+def test_a_device_that_never_speaks_expires() -> None:
     watched = Watched(timeout_ms=35_000)
     watched.run(40)
     assert watched.expiries == [pytest.approx(35.2, abs=0.11)]
@@ -102,13 +104,13 @@ def test_a_device_that_never_speaks_expires():
 
 
 @pytest.mark.parametrize("stream", [IMU, POINTS])
-def test_either_stream_keeps_it_alive(stream):
+def test_either_stream_keeps_it_alive(stream: Any) -> None:
     watched = Watched(timeout_ms=1000)
     watched.run(5, stream)
     assert watched.expiries == []
 
 
-def test_standby_pauses_it_and_start_gives_the_whole_time_again():
+def test_standby_pauses_it_and_start_gives_the_whole_time_again() -> None:
     watched = Watched(timeout_ms=5000)
     watched.run(3, IMU, POINTS)
     watched.watchdog.stopped(HostNs(watched.now))
@@ -125,7 +127,7 @@ def test_standby_pauses_it_and_start_gives_the_whole_time_again():
     assert len(watched.expiries) == 1
 
 
-def test_a_device_that_does_not_stop_is_watched_again():
+def test_a_device_that_does_not_stop_is_watched_again() -> None:
     watched = Watched(timeout_ms=3000)
     watched.run(3, IMU, POINTS)
     watched.watchdog.stopped(HostNs(watched.now))
@@ -136,7 +138,7 @@ def test_a_device_that_does_not_stop_is_watched_again():
     assert len(watched.expiries) == 1
 
 
-def test_waking_from_standby_spins_up_again():
+def test_waking_from_standby_spins_up_again() -> None:
     watched = Watched()
     watched.run(3, IMU, POINTS)
     watched.watchdog.stopped(HostNs(watched.now))
@@ -149,7 +151,7 @@ def test_waking_from_standby_spins_up_again():
     assert watched.state is DeviceState.STREAMING
 
 
-def test_a_start_in_standby_is_not_watched_until_the_device_speaks():
+def test_a_start_in_standby_is_not_watched_until_the_device_speaks() -> None:
     watched = Watched(timeout_ms=2000, standby_on_powerup_enabled=True)
     watched.run(100)
     assert watched.expiries == []
@@ -158,7 +160,7 @@ def test_a_start_in_standby_is_not_watched_until_the_device_speaks():
     assert len(watched.expiries) == 1
 
 
-def test_spin_up_time():
+def test_spin_up_time() -> None:
     watchdog = Watchdog(WatchdogConfig())
     assert watchdog.spin_up_left_s(at(0)) == SPIN_UP_NS / S
     for tenth in range(100):
@@ -167,7 +169,7 @@ def test_spin_up_time():
     assert watchdog.spin_up_left_s(at(30)) == 0
 
 
-def test_an_imu_that_paused_begins_to_spin_up_anew():
+def test_an_imu_that_paused_begins_to_spin_up_anew() -> None:
     watchdog = Watchdog(WatchdogConfig())
     watchdog.heard(IMU, at(0))
     watchdog.heard(IMU, at(10))
@@ -176,7 +178,7 @@ def test_an_imu_that_paused_begins_to_spin_up_anew():
 
 @pytest.mark.parametrize("hours", [24 * 365, 1, -1])
 @pytest.mark.parametrize("heard_first", [True, False])
-def test_a_host_clock_that_is_set_is_no_silence(hours, heard_first):
+def test_a_host_clock_that_is_set_is_no_silence(hours: Any, heard_first: bool) -> None:
     watched = Watched(timeout_ms=6000)
     watched.run(3, IMU, POINTS)
     watched.now += hours * 3600 * S
@@ -189,7 +191,7 @@ def test_a_host_clock_that_is_set_is_no_silence(hours, heard_first):
     assert len(watched.expiries) == 1
 
 
-def test_a_step_as_long_as_a_busy_host_may_sleep_is_a_silence():
+def test_a_step_as_long_as_a_busy_host_may_sleep_is_a_silence() -> None:
     watchdog = Watchdog(WatchdogConfig(timeout_ms=4000))
     watchdog.heard(IMU, at(0))
     assert not watchdog.expired(at(0))

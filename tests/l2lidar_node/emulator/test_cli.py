@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def ask(host: socket.socket, lidar: tuple[str, int], data: bytes) -> int:
     raise AssertionError("no acknowledgement")
 
 
-def test_a_bounded_run_says_what_it_is_and_what_it_did(host):
+def test_a_bounded_run_says_what_it_is_and_what_it_did(host: socket.socket) -> None:
     code, out, err = run(
         *QUICK, "--host-port", port_of(host), "--duration", "4", "--speed", "20", "--loss", "0.1",
         "--clock-ratio", "2",
@@ -114,7 +115,7 @@ def test_a_bounded_run_says_what_it_is_and_what_it_did(host):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("world", ["pattern", pytest.param("box", marks=needs_rays)])
-def test_it_ends_cleanly_when_told_to(host, number, world):
+def test_it_ends_cleanly_when_told_to(host: socket.socket, number: Any, world: str) -> None:
     process = started(*QUICK, "--world", world, "--host-port", port_of(host))
     times = ask(host, lidar_of(process), command(2000, 6, 1))
     os.killpg(process.pid, number)  # as a terminal or a supervisor does
@@ -125,7 +126,7 @@ def test_it_ends_cleanly_when_told_to(host, number, world):
     assert 1 <= int(heard[1]) <= times
 
 
-def measuring(process):
+def measuring(process: Any) -> Any:
     """Return the number of the measuring process, once there is one."""
     while True:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
@@ -137,7 +138,9 @@ def measuring(process):
 
 @needs_rays
 @pytest.mark.parametrize("is_ready", [False, True])
-def test_it_does_not_wait_for_a_measuring_process_that_is_held_up(host, is_ready):
+def test_it_does_not_wait_for_a_measuring_process_that_is_held_up(
+    host: socket.socket, is_ready: bool
+) -> None:
     options = ["--world", "box", "--boot-scale", "10", "--lidar-port", "0"]
     for _ in range(10):
         process = started(*options, "--host-port", port_of(host))
@@ -153,7 +156,7 @@ def test_it_does_not_wait_for_a_measuring_process_that_is_held_up(host, is_ready
 
 
 @needs_rays
-def test_a_killed_measuring_process_is_one_message(host):
+def test_a_killed_measuring_process_is_one_message(host: socket.socket) -> None:
     process = started(
         "--world", "box", "--ready", "--lidar-port", "0", "--host-port", port_of(host)
     )
@@ -194,7 +197,9 @@ def test_a_killed_measuring_process_is_one_message(host):
         (["--worlds", "room"], ["--worlds"]),
     ],
 )
-def test_a_wrong_option_is_named_with_what_would_be_right(options, words, monkeypatch, capfd):
+def test_a_wrong_option_is_named_with_what_would_be_right(
+    options: Any, words: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(sys, "argv", ["l2lidar_emulator", "--lidar-port", "0", *options])
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -212,7 +217,7 @@ def test_a_wrong_option_is_named_with_what_would_be_right(options, words, monkey
 
 
 @pytest.mark.skipif(find_spec("open3d") is not None, reason="needs a machine without open3d")
-def test_a_world_without_what_casts_rays_is_one_message():
+def test_a_world_without_what_casts_rays_is_one_message() -> None:
     code, _, err = run("--lidar-port", "0")
     assert code == 1
     assert err.splitlines() == [
@@ -220,7 +225,7 @@ def test_a_world_without_what_casts_rays_is_one_message():
     ]
 
 
-def test_a_port_in_use_is_one_message(host):
+def test_a_port_in_use_is_one_message(host: socket.socket) -> None:
     code, out, err = run("--world", "pattern", "--lidar-port", port_of(host))
     assert (code, out) == (1, "")
     assert err.splitlines() == [
@@ -228,7 +233,7 @@ def test_a_port_in_use_is_one_message(host):
     ]
 
 
-def test_a_folder_that_cannot_be_written_is_one_message(tmp_path):
+def test_a_folder_that_cannot_be_written_is_one_message(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     code, out, err = run(*QUICK, "--duration", "9", "--truth", str(tmp_path / "file" / "truth"))
     assert (code, out) == (1, "")  # before it runs: afterwards the truth would be lost
@@ -236,7 +241,7 @@ def test_a_folder_that_cannot_be_written_is_one_message(tmp_path):
     assert "truth: Not a directory" in err
 
 
-def test_help_shows_every_setting_once():
+def test_help_shows_every_setting_once() -> None:
     code, out, _ = run("--help")
     assert code == 0
     text = out.split()
@@ -248,7 +253,7 @@ def test_help_shows_every_setting_once():
         assert f"─ {heading} ─" in out
 
 
-def test_what_the_unit_stores_outlives_it(host, tmp_path):
+def test_what_the_unit_stores_outlives_it(host: socket.socket, tmp_path: Path) -> None:
     file = tmp_path / "flash.json"
     process = started(*QUICK, "--host-port", port_of(host), "--flash", str(file))
     ask(host, lidar_of(process), command(2002, int(WorkMode.IMU_OFF)))
@@ -261,7 +266,7 @@ def test_what_the_unit_stores_outlives_it(host, tmp_path):
     assert "IMU," not in out.splitlines()[2]
 
 
-def test_a_pseudo_terminal_is_named_and_carries_packets():
+def test_a_pseudo_terminal_is_named_and_carries_packets() -> None:
     process = started("--world", "none", "--ready", "--serial", "pty")
     assert process.stdout is not None
     process.stdout.readline()
@@ -281,7 +286,7 @@ def test_a_pseudo_terminal_is_named_and_carries_packets():
 
 
 @needs_rays
-def test_the_truth_of_a_run(host, tmp_path):
+def test_the_truth_of_a_run(host: socket.socket, tmp_path: Path) -> None:
     """What arrives at the socket, the packet log, the trajectory and the exact points agree."""
     folder = tmp_path / "truth"
     process = started(
@@ -342,7 +347,7 @@ def test_the_truth_of_a_run(host, tmp_path):
     assert poses.dtype == tum.POSE
 
 
-def test_asking_for_points_that_were_never_measured_says_so(tmp_path):
+def test_asking_for_points_that_were_never_measured_says_so(tmp_path: Path) -> None:
     code, _, err = run(*QUICK, "--duration", "0.2", "--truth", str(tmp_path))
     assert code == 0, err
     with pytest.raises(KeyError, match="no points of packet 3"):

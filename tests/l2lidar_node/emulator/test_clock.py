@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from tests.l2lidar_node.emulator.rig import MS, READY, Bench, S, command, identi
 
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 1.95, 1.99866, 2.0, 3.0])
-def test_the_clock_is_exact_for_a_month(ratio):
+def test_the_clock_is_exact_for_a_month(ratio: float) -> None:
     origin = 1_800_000_000 * S
     clock = UnitClock(CrystalConfig(clock_ratio=ratio), origin)
     elapsed = np.array([0, 1, 999_999_999, S, 3600 * S, 86_400 * S, 30 * 86_400 * S])
@@ -26,13 +27,13 @@ def test_the_clock_is_exact_for_a_month(ratio):
     assert clock.at(origin + 999_999_999) == math.floor(999_999_999 / Fraction(ratio))
 
 
-def test_ratio_one_without_drift_counts_true_nanoseconds():
+def test_ratio_one_without_drift_counts_true_nanoseconds() -> None:
     clock = UnitClock(CrystalConfig(clock_ratio=1.0), 5)
     instants = np.array([5, 6, 12_345_678_901_234], dtype=np.int64)
     assert clock.stamps(instants).tolist() == [0, 1, 12_345_678_901_229]
 
 
-def test_drift_is_the_integral_of_the_rate():
+def test_drift_is_the_integral_of_the_rate() -> None:
     config = CrystalConfig(
         clock_ratio=2.0, clock_drift_ppm_per_h=7200.0, clock_wave_ppm=50.0, clock_wave_s=100.0
     )
@@ -51,7 +52,9 @@ def test_drift_is_the_integral_of_the_rate():
     st.floats(0.0, 1000.0),
     st.lists(st.integers(0, 10**13), min_size=2, max_size=50),
 )
-def test_it_never_runs_backwards_by_itself(ratio, drift, wave, instants):
+def test_it_never_runs_backwards_by_itself(
+    ratio: Any, drift: Any, wave: Any, instants: Any
+) -> None:
     clock = UnitClock(
         CrystalConfig(clock_ratio=ratio, clock_drift_ppm_per_h=drift, clock_wave_ppm=wave), 0
     )
@@ -59,7 +62,7 @@ def test_it_never_runs_backwards_by_itself(ratio, drift, wave, instants):
     assert (np.diff(stamps) >= 0).all()
 
 
-def test_setting_the_clock_leaves_earlier_instants_alone():
+def test_setting_the_clock_leaves_earlier_instants_alone() -> None:
     clock = UnitClock(CrystalConfig(clock_ratio=2.0), 0)
     clock.set(10 * S, 1000 * S)
     clock.set(11 * S, 2000 * S)
@@ -69,7 +72,7 @@ def test_setting_the_clock_leaves_earlier_instants_alone():
     ]  # fmt: skip
 
 
-def test_old_epochs_are_forgotten_and_recent_ones_kept():
+def test_old_epochs_are_forgotten_and_recent_ones_kept() -> None:
     clock = UnitClock(CrystalConfig(clock_ratio=2.0), 0)
     for k in range(10_000):
         clock.set(k * 50 * MS, k * 1000 * S)
@@ -78,7 +81,7 @@ def test_old_epochs_are_forgotten_and_recent_ones_kept():
     assert clock.at(last - 25 * MS) == 9_998 * 1000 * S + 12_500_000
 
 
-def test_stamps_on_the_wire_are_the_clock_at_the_true_instant():
+def test_stamps_on_the_wire_are_the_clock_at_the_true_instant() -> None:
     bench = Bench(
         DeviceConfig(
             power=READY,
@@ -97,7 +100,7 @@ def test_stamps_on_the_wire_are_the_clock_at_the_true_instant():
     }
 
 
-def test_points_and_imu_share_the_clock():
+def test_points_and_imu_share_the_clock() -> None:
     bench = Bench()
     bench.run(30.0)
     packets = bench.device.packet_log.packets
@@ -108,7 +111,7 @@ def test_points_and_imu_share_the_clock():
     assert slopes == pytest.approx([1 / 1.99866] * 2, rel=1e-9)
 
 
-def test_a_sync_takes_effect_when_it_arrives_and_not_on_what_is_measured_already():
+def test_a_sync_takes_effect_when_it_arrives_and_not_on_what_is_measured_already() -> None:
     bench = Bench()
     bench.run(9.998)
     value = 1_800_000_000 * S + 999_999_999
@@ -125,7 +128,7 @@ def test_a_sync_takes_effect_when_it_arrives_and_not_on_what_is_measured_already
     assert np.abs(after["stamp_ns"] - expected).max() <= 1
 
 
-def test_repeated_syncs_step_by_half_of_what_passed_between():
+def test_repeated_syncs_step_by_half_of_what_passed_between() -> None:
     bench = Bench(power_on_ns=1_800_000_000 * S)
     for _ in range(40):
         bench.run(0.05)
@@ -138,7 +141,7 @@ def test_repeated_syncs_step_by_half_of_what_passed_between():
     assert behind.max() == pytest.approx(50 * MS * (1 - 1 / 1.99866), abs=2.1 * MS)
 
 
-def test_the_clock_restarts_at_0_at_every_boot_and_drift_goes_on():
+def test_the_clock_restarts_at_0_at_every_boot_and_drift_goes_on() -> None:
     faults = FaultConfig(reboot_at=(10.0, 20.0))
     crystal = CrystalConfig(clock_ratio=1.0, clock_drift_ppm_per_h=36_000.0)
     bench = Bench(DeviceConfig(power=PowerConfig(boot_scale=0.0), faults=faults, crystal=crystal))
@@ -153,7 +156,7 @@ def test_the_clock_restarts_at_0_at_every_boot_and_drift_goes_on():
         assert rows["stamp_ns"] == pytest.approx((t + ppm_s * 1e-6) * S, abs=2)
 
 
-def test_clock_step_and_foreign_sync():
+def test_clock_step_and_foreign_sync() -> None:
     faults = FaultConfig(
         clock_step_at=(2.0,), clock_step_ms=-50.0, foreign_sync_at=(4.0,), foreign_sync_error_s=5.0
     )

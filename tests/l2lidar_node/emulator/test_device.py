@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ def stored(mode: WorkMode) -> Flash:
         ),
     ],
 )
-def test_every_command_gets_its_answer(sent, answers):
+def test_every_command_gets_its_answer(sent: Any, answers: Any) -> None:
     bench = Bench()
     bench.run(1.0)
     got = bench.ask(sent)
@@ -96,7 +97,7 @@ def test_every_command_gets_its_answer(sent, answers):
     assert acks(got) == [ack for _, ack in answers if ack is not None]
 
 
-def test_the_answer_leaves_after_the_reply_delay():
+def test_the_answer_leaves_after_the_reply_delay() -> None:
     bench = Bench(delays=DelayConfig(reply_delay_us=300.0))
     bench.run(1.0)
     bench.device.command(client("latency 101"), bench.now)
@@ -104,7 +105,7 @@ def test_the_answer_leaves_after_the_reply_delay():
     assert answer == [S + 300_000]
 
 
-def test_version_says_who_the_unit_is():
+def test_version_says_who_the_unit_is() -> None:
     bench = Bench()
     bench.run(1.0)
     payload = bench.ask(client("version"))[0].payload
@@ -113,7 +114,7 @@ def test_version_says_who_the_unit_is():
     assert payload[32:40].rstrip(b"\0") == b"250715"
 
 
-def test_version_is_ignored_then_refused_then_answered_also_in_standby():
+def test_version_is_ignored_then_refused_then_answered_also_in_standby() -> None:
     bench = Bench(DeviceConfig())
     answers = {}
     for at in (1.0, 3.0, 10.0, 26.0):
@@ -127,7 +128,7 @@ def test_version_is_ignored_then_refused_then_answered_also_in_standby():
     assert [frame.packet_type for frame in bench.ask(client("version"))] == [105, 101]
 
 
-def test_other_commands_are_heard_as_soon_as_the_link_is_up():
+def test_other_commands_are_heard_as_soon_as_the_link_is_up() -> None:
     bench = Bench(DeviceConfig())
     bench.run(1.9)
     assert bench.ask(client("latency 101")) == []
@@ -135,7 +136,7 @@ def test_other_commands_are_heard_as_soon_as_the_link_is_up():
     assert acks(bench.ask(client("latency 101"))) == [(2000, 6, 101, OK)]
 
 
-def test_parameters_state_work_mode_limits_and_calibration():
+def test_parameters_state_work_mode_limits_and_calibration() -> None:
     bench = Bench(flash=stored(WorkMode.WAIT_FOR_START))
     bench.ask(command(2002, 0x15))
     payload = bench.ask(client("parameters"))[0].payload
@@ -147,7 +148,7 @@ def test_parameters_state_work_mode_limits_and_calibration():
     assert len(payload) == 172
 
 
-def test_parameters_can_be_replaced_and_reset():
+def test_parameters_can_be_replaced_and_reset() -> None:
     bench = Bench()
     bench.run(1.0)
     factory = bench.ask(client("parameters"))[0].payload
@@ -158,7 +159,7 @@ def test_parameters_can_be_replaced_and_reset():
     assert bench.ask(client("parameters"))[0].payload == factory
 
 
-def test_power_on_timeline():
+def test_power_on_timeline() -> None:
     bench = Bench(DeviceConfig(), power_on_ns=7 * S)
     bench.run(30.0)
     packets = bench.device.packet_log.packets
@@ -168,7 +169,7 @@ def test_power_on_timeline():
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.1])
-def test_the_timeline_can_be_compressed(scale):
+def test_the_timeline_can_be_compressed(scale: float) -> None:
     bench = Bench(DeviceConfig(power=PowerConfig(boot_scale=scale)))
     bench.run(3.0)
     packets = bench.device.packet_log.packets
@@ -176,7 +177,7 @@ def test_the_timeline_can_be_compressed(scale):
     assert 0 <= packets["start_ns"][packets["type"] == 102][0] - 25 * scale * S < 4_639_000
 
 
-def test_rates_and_sequence_numbers():
+def test_rates_and_sequence_numbers() -> None:
     bench = Bench()
     count = bench.count(60.0)
     assert count[104] == 60 * 250
@@ -186,7 +187,7 @@ def test_rates_and_sequence_numbers():
         assert (seq == np.arange(len(seq)) % 1025).all()
 
 
-def test_a_points_packet_is_stamped_at_its_first_slot_and_leaves_after_its_last():
+def test_a_points_packet_is_stamped_at_its_first_slot_and_leaves_after_its_last() -> None:
     bench = Bench(delays=DelayConfig(points_delay_us=200.0, imu_delay_us=100.0))
     times = {identity(read(data)[0]): time for time, data in bench.run(1.0)}
     packets = bench.device.packet_log.packets
@@ -200,7 +201,7 @@ def test_a_points_packet_is_stamped_at_its_first_slot_and_leaves_after_its_last(
     assert late[packets["type"] == 102] == pytest.approx(sweep + 200_000, abs=2)
 
 
-def test_the_measurement_is_the_scanners_and_the_frame_is_right():
+def test_the_measurement_is_the_scanners_and_the_frame_is_right() -> None:
     bench = Bench()
     frames = [read(data)[0] for _, data in bench.run(0.5)]
     expected, _ = PatternScanner().packets(0, 50)
@@ -213,7 +214,7 @@ def test_the_measurement_is_the_scanners_and_the_frame_is_right():
     assert struct.unpack_from("<I", imu, 4) == (56,)
 
 
-def test_standby_stops_both_streams_and_start_brings_the_imu_back_first():
+def test_standby_stops_both_streams_and_start_brings_the_imu_back_first() -> None:
     bench = Bench(DeviceConfig(power=PowerConfig(imu_s=0.0, points_s=0.0, link_s=0.0)))
     bench.run(1.0)
     bench.ask(command(100, 2, 1))
@@ -232,7 +233,7 @@ def test_standby_stops_both_streams_and_start_brings_the_imu_back_first():
     )
 
 
-def test_start_while_running_changes_nothing():
+def test_start_while_running_changes_nothing() -> None:
     bench, other = Bench(), Bench()
     for item in (bench, other):
         item.run(1.0)
@@ -241,7 +242,7 @@ def test_start_while_running_changes_nothing():
     assert answered == other.run(3.0)
 
 
-def test_some_units_do_not_wake():
+def test_some_units_do_not_wake() -> None:
     bench = Bench(power=PowerConfig(boot_scale=0.0, wakes=False))
     bench.run(0.1)
     bench.ask(command(100, 2, 1))
@@ -251,7 +252,7 @@ def test_some_units_do_not_wake():
     assert bench.count(1.0)[104] == 250
 
 
-def test_reset_is_a_reboot():
+def test_reset_is_a_reboot() -> None:
     bench = Bench(DeviceConfig(power=PowerConfig(boot_scale=0.1)))
     bench.run(10.0)
     assert bench.ask(client("reset")) == []
@@ -269,7 +270,7 @@ def test_reset_is_a_reboot():
     assert 0 <= new[new["type"] == 102]["start_ns"][0] - (began + 2.5 * S) < 4_639_000
 
 
-def test_what_follows_a_reset_in_the_same_datagram_is_forgotten():
+def test_what_follows_a_reset_in_the_same_datagram_is_forgotten() -> None:
     bench = Bench()
     bench.run(1.0)
     assert bench.ask(client("reset") + command(100, 2, 1)) == []
@@ -277,7 +278,7 @@ def test_what_follows_a_reset_in_the_same_datagram_is_forgotten():
     assert bench.count(1.0)[104] == 250, "it did not go to standby"
 
 
-def test_network_settings_come_into_force_after_a_reset():
+def test_network_settings_come_into_force_after_a_reset() -> None:
     bench = Bench()
     before = bench.device.network
     wanted = before._replace(lidar_ip="127.0.0.9", user_ip="127.0.0.8", user_port=7000)
@@ -291,7 +292,7 @@ def test_network_settings_come_into_force_after_a_reset():
     assert bench.device.network == before
 
 
-def test_network_bytes_are_in_dotted_order():
+def test_network_bytes_are_in_dotted_order() -> None:
     bench = Bench()
     payload = bytes([192, 168, 1, 62, 192, 168, 1, 2, 192, 168, 1, 1, 255, 255, 255, 0])
     bench.ask(wire.encode_frame(108, payload + struct.pack("<HH", 6101, 6201)))
@@ -300,13 +301,13 @@ def test_network_bytes_are_in_dotted_order():
     )  # fmt: skip
 
 
-def test_the_hardware_address_is_stored():
+def test_the_hardware_address_is_stored() -> None:
     bench = Bench()
     bench.ask(wire.encode_frame(109, bytes.fromhex("0200000000070000")))
     assert bench.device.flash.mac == "02:00:00:00:00:07"
 
 
-def test_imu_off_and_wide_view_act_at_once():
+def test_imu_off_and_wide_view_act_at_once() -> None:
     bench = Bench()
     bench.run(1.0)
     bench.ask(command(2002, int(WorkMode.IMU_OFF | WorkMode.WIDE_FOV)))
@@ -319,7 +320,7 @@ def test_imu_off_and_wide_view_act_at_once():
     assert bench.count(1.0)[104] in (249, 250)
 
 
-def test_2d_mode_acts_after_a_restart_and_comes_in_four_datagrams():
+def test_2d_mode_acts_after_a_restart_and_comes_in_four_datagrams() -> None:
     bench = Bench()
     bench.ask(command(2002, int(WorkMode.MODE_2D)))
     assert bench.count(1.0)[103] == 0
@@ -336,7 +337,7 @@ def test_2d_mode_acts_after_a_restart_and_comes_in_four_datagrams():
     assert row["point_num"][0] == 1800
 
 
-def test_the_serial_bit_loses_ethernet_at_the_next_boot():
+def test_the_serial_bit_loses_ethernet_at_the_next_boot() -> None:
     bench = Bench()
     bench.ask(command(2002, int(WorkMode.SERIAL)))
     assert bench.count(0.1)[104] == 25
@@ -346,13 +347,13 @@ def test_the_serial_bit_loses_ethernet_at_the_next_boot():
     assert bench.device.next_ns is None
 
 
-def test_a_unit_on_its_serial_port_answers_there():
+def test_a_unit_on_its_serial_port_answers_there() -> None:
     bench = Bench(flash=stored(WorkMode.SERIAL), link=Link.SERIAL)
     assert bench.count(1.0)[104] == 250
     assert acks(bench.ask(client("latency 101"))) == [(2000, 6, 101, OK)]
 
 
-def test_wait_for_start_waits():
+def test_wait_for_start_waits() -> None:
     bench = Bench(flash=stored(WorkMode.WAIT_FOR_START))
     assert bench.count(5.0) == {}
     assert acks(bench.ask(client("version"))) == [(2000, 4, 0, NOT_READY)]
@@ -361,7 +362,7 @@ def test_wait_for_start_waits():
     assert [frame.packet_type for frame in bench.ask(client("version"))] == [105, 101]
 
 
-def test_the_vendors_client_gets_what_it_waits_for():
+def test_the_vendors_client_gets_what_it_waits_for() -> None:
     bench = Bench(DeviceConfig(power=PowerConfig(boot_scale=0.05)))
     bench.run(1.5)
     for name in ("start", "mode 0", "reset"):
@@ -376,7 +377,7 @@ def test_the_vendors_client_gets_what_it_waits_for():
 
 
 @pytest.mark.parametrize("cut", [1, 4, 11, 12, 31])
-def test_commands_may_be_split_and_follow_garbage(cut):
+def test_commands_may_be_split_and_follow_garbage(cut: int) -> None:
     bench = Bench()
     bench.run(1.0)
     stream = b"\x55\x55\xaa" + client("latency 101")
@@ -385,20 +386,20 @@ def test_commands_may_be_split_and_follow_garbage(cut):
 
 
 @pytest.mark.parametrize("prefix", [wire.MAGIC, client("start")[:8] + b"\x20\0\0\0\0\0"])
-def test_a_command_may_begin_within_what_looked_like_one(prefix):
+def test_a_command_may_begin_within_what_looked_like_one(prefix: Any) -> None:
     bench = Bench()
     bench.run(1.0)
     assert acks(bench.ask(prefix + client("latency 101") + bytes(20)))[-1] == (2000, 6, 101, OK)
 
 
-def test_half_a_command_costs_itself_alone():
+def test_half_a_command_costs_itself_alone() -> None:
     bench = Bench()
     bench.run(1.0)
     assert bench.ask(client("start")[:20]) == []
     assert acks(bench.ask(client("latency 101")))[-1] == (2000, 6, 101, OK)
 
 
-def test_it_does_not_matter_how_often_one_looks():
+def test_it_does_not_matter_how_often_one_looks() -> None:
     whole, fine = Bench(), Bench()
     whole.run(2.0)
     whole.ask(client("latency 101"))
@@ -413,7 +414,7 @@ def test_it_does_not_matter_how_often_one_looks():
     assert (fine.device.packet_log.packets == whole.device.packet_log.packets).all()
 
 
-def test_next_is_when_the_next_datagram_leaves():
+def test_next_is_when_the_next_datagram_leaves() -> None:
     bench = Bench()
     for _ in range(100):
         due = bench.device.next_ns
@@ -424,7 +425,7 @@ def test_next_is_when_the_next_datagram_leaves():
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.binary(max_size=300), max_size=10))
-def test_garbage_never_hurts(pieces):
+def test_garbage_never_hurts(pieces: Any) -> None:
     inbox = Inbox()
     for piece in pieces:
         list(inbox.feed(piece))
@@ -434,7 +435,7 @@ def test_garbage_never_hurts(pieces):
     assert found[-1].payload == struct.pack("<2I", 6, 101)
 
 
-def test_flash_survives_as_text():
+def test_flash_survives_as_text() -> None:
     bench = Bench()
     bench.ask(command(2002, 5))
     bench.ask(wire.encode_frame(109, bytes.fromhex("0200000000070000")))
@@ -442,7 +443,7 @@ def test_flash_survives_as_text():
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"network": {}}', '{"network": 3}', "null"])
-def test_broken_flash_is_refused(text):
+def test_broken_flash_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="stored settings"):
         Flash.from_json(text)
 
@@ -456,6 +457,6 @@ def test_broken_flash_is_refused(text):
         ({"identity": IdentityConfig(mac="1234")}, "mac"),
     ],
 )
-def test_wrong_settings_are_named(groups, name):
+def test_wrong_settings_are_named(groups: Any, name: str) -> None:
     with pytest.raises(SettingError, match=f"parameter '{name}'"):
         VirtualL2(DeviceConfig(power=READY, **groups), PatternScanner(), StillInertial())

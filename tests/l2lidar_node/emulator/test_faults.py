@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def struck(bench: Bench, fault: Fault) -> np.ndarray:
     return packets[(packets["faults"] & int(fault)) != 0]
 
 
-def test_without_faults_every_packet_is_its_own_datagram_in_time():
+def test_without_faults_every_packet_is_its_own_datagram_in_time() -> None:
     bench = bench_with()
     datagrams = bench.run(5.0)
     packets = bench.device.packet_log.packets
@@ -68,14 +69,14 @@ def test_without_faults_every_packet_is_its_own_datagram_in_time():
     assert bench.device.packet_log.events == ()
 
 
-def test_a_rate_of_zero_is_byte_identical_to_no_fault():
+def test_a_rate_of_zero_is_byte_identical_to_no_fault() -> None:
     plain, zero = bench_with(), bench_with(**dict.fromkeys(RANDOM, 0.0), jitter_ms=7.0)
     assert plain.run(3.0) == zero.run(3.0)
 
 
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("mode", [PLAIN, WorkMode.MODE_2D])
-def test_the_packet_log_knows_what_a_good_reader_gets(name, mode):
+def test_the_packet_log_knows_what_a_good_reader_gets(name: Any, mode: Any) -> None:
     bench = bench_with(mode=mode, **EVERY[name])
     datagrams = bench.run(6.0)
     assert identities(datagrams) == booked(bench.device)
@@ -105,7 +106,9 @@ def test_the_packet_log_knows_what_a_good_reader_gets(name, mode):
     st.sampled_from([PLAIN, WorkMode.MODE_2D]),
     st.integers(0, 1000),
 )
-def test_the_packet_log_is_right_for_any_mixture(rates, timed, mode, seed):
+def test_the_packet_log_is_right_for_any_mixture(
+    rates: Any, timed: Any, mode: Any, seed: Any
+) -> None:
     bench = bench_with(seed, mode, **rates, **timed, burst_every_s=0.1)
     bench.run(0.4)
     bench.ask(command(100, 4, 9))
@@ -120,7 +123,7 @@ def test_the_packet_log_is_right_for_any_mixture(rates, timed, mode, seed):
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_the_same_seed_does_the_same(name):
+def test_the_same_seed_does_the_same(name: Any) -> None:
     first, second = bench_with(5, **EVERY[name]), bench_with(5, **EVERY[name])
     whole = first.run(3.0)
     parts = [item for _ in range(300) for item in second.run(0.01)]
@@ -131,12 +134,12 @@ def test_the_same_seed_does_the_same(name):
 
 
 @pytest.mark.parametrize("name", RANDOM)
-def test_another_seed_does_something_else(name):
+def test_another_seed_does_something_else(name: Any) -> None:
     first, second = bench_with(5, **EVERY[name]), bench_with(6, **EVERY[name])
     assert first.run(3.0) != second.run(3.0)
 
 
-def test_one_fault_strikes_alike_with_and_without_another():
+def test_one_fault_strikes_alike_with_and_without_another() -> None:
     alone, both = bench_with(loss=0.05), bench_with(loss=0.05, duplicate=0.5)
     alone.run(5.0)
     both.run(5.0)
@@ -144,7 +147,7 @@ def test_one_fault_strikes_alike_with_and_without_another():
 
 
 @pytest.mark.parametrize("name", RANDOM)
-def test_the_rate_is_met(name):
+def test_the_rate_is_met(name: Any) -> None:
     bench = bench_with(**{name: 0.1})
     bench.run(20.0)
     count = bench.device.packet_log.counts[Fault[name.upper()]]
@@ -153,7 +156,7 @@ def test_the_rate_is_met(name):
     assert 0.08 < count / of < 0.12
 
 
-def test_random_faults_keep_to_their_window():
+def test_random_faults_keep_to_their_window() -> None:
     bench = bench_with(loss=0.5, nan=0.5, reorder=0.5, fault_from_s=1.0, fault_until_s=2.0)
     bench.run(3.0)
     times = np.array([event.time_ns for event in bench.device.packet_log.events]) / S
@@ -162,7 +165,7 @@ def test_random_faults_keep_to_their_window():
     assert times.max() < 2.0
 
 
-def test_bad_crc_flips_one_bit_of_the_payload():
+def test_bad_crc_flips_one_bit_of_the_payload() -> None:
     plain, bad = bench_with().run(2.0), bench_with(bad_crc=0.2).run(2.0)
     flipped = 0
     for (_, a), (_, b) in zip(plain, bad, strict=True):
@@ -175,14 +178,14 @@ def test_bad_crc_flips_one_bit_of_the_payload():
     assert flipped > 50
 
 
-def test_truncation_keeps_a_beginning():
+def test_truncation_keeps_a_beginning() -> None:
     plain, cut = bench_with().run(2.0), bench_with(truncate=0.2).run(2.0)
     shorter = [(a, b) for (_, a), (_, b) in zip(plain, cut, strict=True) if a != b]
     assert len(shorter) > 50
     assert all(a.startswith(b) and 0 < len(b) <= len(a) - 12 for a, b in shorter)
 
 
-def test_hostile_sizes_are_the_famous_ones():
+def test_hostile_sizes_are_the_famous_ones() -> None:
     sizes = {
         int.from_bytes(data[8:12], "little") for _, data in bench_with(hostile_size=0.3).run(3.0)
     }
@@ -191,7 +194,7 @@ def test_hostile_sizes_are_the_famous_ones():
 
 
 @pytest.mark.parametrize(("mode", "room"), [(PLAIN, 300), (WorkMode.MODE_2D, 1800)])
-def test_hostile_counts_have_a_right_crc(mode, room):
+def test_hostile_counts_have_a_right_crc(mode: Any, room: int) -> None:
     bench = bench_with(mode=mode, hostile_count=0.5)
     frames = read(b"".join(data for _, data in bench.run(3.0)))
     points = [frame for frame in frames if frame.packet_type in (102, 103)]
@@ -200,7 +203,7 @@ def test_hostile_counts_have_a_right_crc(mode, room):
     assert counts == {room, room + 1, 0xFFFFFFFF}
 
 
-def test_nan_has_a_right_crc_and_reaches_every_vital_float():
+def test_nan_has_a_right_crc_and_reaches_every_vital_float() -> None:
     bench = bench_with(nan=0.9)
     frames = read(b"".join(data for _, data in bench.run(10.0)))
     assert len(frames) == len(bench.device.packet_log.packets)
@@ -221,14 +224,14 @@ def test_nan_has_a_right_crc_and_reaches_every_vital_float():
     }  # fmt: skip
 
 
-def test_garbage_comes_before_packets_and_costs_nothing():
+def test_garbage_comes_before_packets_and_costs_nothing() -> None:
     plain, dirty = bench_with().run(3.0), bench_with(garbage=0.3).run(3.0)
     good = [item for item in dirty if item in set(plain)]
     assert good == plain
     assert len(dirty) > len(plain) + 200
 
 
-def test_coalescing_fills_datagrams_up_to_the_limit():
+def test_coalescing_fills_datagrams_up_to_the_limit() -> None:
     bench = bench_with(coalesce=0.6)
     datagrams = bench.run(5.0)
     sizes = {len(data) for _, data in datagrams}
@@ -240,7 +243,7 @@ def test_coalescing_fills_datagrams_up_to_the_limit():
     assert b"".join(data for _, data in plain).startswith(joined)
 
 
-def test_nothing_waits_for_company_for_ever():
+def test_nothing_waits_for_company_for_ever() -> None:
     bench = bench_with(coalesce=1.0)
     bench.run(1.0)
     bench.ask(command(100, 2, 1))
@@ -249,20 +252,20 @@ def test_nothing_waits_for_company_for_ever():
     assert (packets["copies"] == 1).all()
 
 
-def test_splitting_loses_no_byte():
+def test_splitting_loses_no_byte() -> None:
     plain, cut = bench_with().run(3.0), bench_with(split=0.5).run(3.0)
     assert len(cut) > 1.4 * len(plain)
     assert b"".join(data for _, data in plain) == b"".join(data for _, data in cut)
 
 
-def test_duplicates_come_twice_with_nothing_between():
+def test_duplicates_come_twice_with_nothing_between() -> None:
     datagrams = bench_with(duplicate=0.5).run(3.0)
     plain = bench_with().run(3.0)
     assert list(dict.fromkeys(datagrams)) == plain
     assert 1.4 < len(datagrams) / len(plain) < 1.6
 
 
-def test_a_reordered_packet_is_late_and_the_others_are_not():
+def test_a_reordered_packet_is_late_and_the_others_are_not() -> None:
     bench = bench_with(reorder=0.05, reorder_ms=10.0)
     bench.run(10.0)
     packets = bench.device.packet_log.packets
@@ -277,7 +280,9 @@ def test_a_reordered_packet_is_late_and_the_others_are_not():
 @pytest.mark.parametrize(
     ("kind", "median", "p99"), [("uniform", 10.0, 19.8), ("heavy", 0.92, 20.0)]
 )
-def test_jitter_has_the_stated_distribution_and_keeps_the_order(kind, median, p99):
+def test_jitter_has_the_stated_distribution_and_keeps_the_order(
+    kind: str, median: float, p99: float
+) -> None:
     bench = bench_with(jitter=kind, jitter_ms=20.0)
     times = [time for time, _ in bench.run(60.0)]
     assert times == sorted(times)
@@ -293,7 +298,7 @@ def test_jitter_has_the_stated_distribution_and_keeps_the_order(kind, median, p9
     assert late.max() <= (20.0 if kind == "uniform" else 100.0)
 
 
-def test_bursts_withhold_and_let_go_at_once():
+def test_bursts_withhold_and_let_go_at_once() -> None:
     bench = bench_with(burst_ms=100.0, burst_every_s=1.0)
     bench.run(5.5)
     packets = bench.device.packet_log.packets
@@ -304,7 +309,7 @@ def test_bursts_withhold_and_let_go_at_once():
     assert 35 < np.count_nonzero(held & (packets["left_ns"] // S == 2)) < 55
 
 
-def test_silence_is_a_pulled_cable_in_both_directions():
+def test_silence_is_a_pulled_cable_in_both_directions() -> None:
     bench = bench_with(silence_at=(1.0,), silence_s=0.5)
     bench.run(1.2)
     assert bench.ask(command(100, 4, 9)) == []
@@ -319,7 +324,7 @@ def test_silence_is_a_pulled_cable_in_both_directions():
     assert bench.ask(command(100, 4, 9)) != []
 
 
-def test_a_reboot_by_itself():
+def test_a_reboot_by_itself() -> None:
     bench = bench_with(reboot_at=(1.0, 2.0))
     bench.run(3.0)
     assert bench.device.boots == 2
@@ -328,14 +333,14 @@ def test_a_reboot_by_itself():
     assert set(boots) == {0, 1, 2}
 
 
-def test_lost_commands_have_no_effect():
+def test_lost_commands_have_no_effect() -> None:
     bench = bench_with(command_loss=1.0)
     assert bench.ask(command(100, 2, 1)) == []
     assert bench.count(1.0)[104] in (249, 250)
     assert bench.device.packet_log.counts[Fault.COMMAND_LOSS] == 1
 
 
-def test_fault_events_name_the_packet():
+def test_fault_events_name_the_packet() -> None:
     bench = bench_with(loss=0.1)
     bench.run(3.0)
     packets = bench.device.packet_log.packets
@@ -347,7 +352,7 @@ def test_fault_events_name_the_packet():
     assert events == [(int(r["type"]), int(r["ordinal"]), int(r["left_ns"])) for r in gone]
 
 
-def test_a_short_memory_is_bounded_and_still_right():
+def test_a_short_memory_is_bounded_and_still_right() -> None:
     config = DeviceConfig(power=READY, faults=FaultConfig(split=0.5, reorder=0.1))
     full, small = Bench(config), Bench(config, packet_log=PacketLog(keep=100))
     for _ in range(100):
@@ -359,7 +364,7 @@ def test_a_short_memory_is_bounded_and_still_right():
     assert packet_log.counts == full.device.packet_log.counts
 
 
-def test_pieces_that_do_not_follow_each_other_make_no_packet():
+def test_pieces_that_do_not_follow_each_other_make_no_packet() -> None:
     packet_log = PacketLog()
     rows = np.zeros(2, packet_log.packets.dtype)
     assert packet_log.book(rows) == 0
@@ -372,7 +377,7 @@ def test_pieces_that_do_not_follow_each_other_make_no_packet():
 
 
 @given(st.binary(min_size=1, max_size=5000), st.lists(st.integers(1, 4999), max_size=5))
-def test_cutting_and_joining_change_nothing(data, cuts):
+def test_cutting_and_joining_change_nothing(data: Any, cuts: Any) -> None:
     whole = Datagram(5, data, (Piece(0, 0, len(data), len(data)),))
     rest, parts = whole, []
     for at in sorted(cuts):

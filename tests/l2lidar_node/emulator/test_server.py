@@ -97,7 +97,7 @@ def running(device: VirtualL2, port: Port, **options: object) -> Iterator[Server
         assert not thread.is_alive()
 
 
-def test_a_driver_on_the_same_machine_gets_everything_and_is_answered(host):
+def test_a_driver_on_the_same_machine_gets_everything_and_is_answered(host: Host) -> None:
     device = unit(config_for(host.port))
     port = UdpPort(device.network)
     with running(device, port):
@@ -115,7 +115,7 @@ def test_a_driver_on_the_same_machine_gets_everything_and_is_answered(host):
     assert device.received == {2000: 2}
 
 
-def test_the_stamps_lie_on_the_hosts_clock(host):
+def test_the_stamps_lie_on_the_hosts_clock(host: Host) -> None:
     before = time.time_ns()
     device = unit(config_for(host.port))
     with running(device, UdpPort(device.network)):
@@ -127,7 +127,7 @@ def test_the_stamps_lie_on_the_hosts_clock(host):
     assert packets["left_ns"][-1] <= after
 
 
-def test_as_fast_as_the_receiver_takes_it_nothing_is_lost(host):
+def test_as_fast_as_the_receiver_takes_it_nothing_is_lost(host: Host) -> None:
     host.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 106_496)
     device = unit(config_for(host.port))
     port = UdpPort(device.network)
@@ -143,14 +143,14 @@ def test_as_fast_as_the_receiver_takes_it_nothing_is_lost(host):
     assert device.sent[wire.PacketType.IMU] == 2000
 
 
-def test_a_stop_ends_even_a_race_that_nobody_reads(host):
+def test_a_stop_ends_even_a_race_that_nobody_reads(host: Host) -> None:
     device = unit(config_for(host.port))
     with running(device, UdpPort(device.network), speed=MAX_SPEED):
         assert port.unread("127.0.0.1", host.port) is not None
         host.read()
 
 
-def test_a_duration_is_in_the_units_time(host):
+def test_a_duration_is_in_the_units_time(host: Host) -> None:
     device = unit(config_for(host.port))
     port = UdpPort(device.network)
     server = Server(device, port, 20.0)
@@ -160,7 +160,7 @@ def test_a_duration_is_in_the_units_time(host):
     assert server.latency.count == sum(device.sent.values())
 
 
-def test_it_moves_to_a_new_address_at_the_reset(host):
+def test_it_moves_to_a_new_address_at_the_reset(host: Host) -> None:
     device = unit(config_for(host.port))
     port = UdpPort(device.network)
     stored: list[Flash] = []
@@ -179,7 +179,7 @@ def test_it_moves_to_a_new_address_at_the_reset(host):
     other.socket.close()
 
 
-def test_it_can_answer_whoever_asks(host):
+def test_it_can_answer_whoever_asks(host: Host) -> None:
     config = config_for(
         9, addresses=AddressConfig(lidar_port=0, host_port=9, reply_to_sender=True)
     )
@@ -192,7 +192,7 @@ def test_it_can_answer_whoever_asks(host):
     assert port.host == ("127.0.0.1", host.port)
 
 
-def test_nobody_listening_is_no_reason_to_fail():
+def test_nobody_listening_is_no_reason_to_fail() -> None:
     (unused,) = free_udp_ports(1)
     device = unit(config_for(unused))
     port = UdpPort(device.network)
@@ -202,7 +202,7 @@ def test_nobody_listening_is_no_reason_to_fail():
     assert port.unread("127.0.0.1", unused) is None
 
 
-def test_an_address_in_use_or_elsewhere_is_named(host):
+def test_an_address_in_use_or_elsewhere_is_named(host: Host) -> None:
     network = Flash.factory(AddressConfig(lidar_port=host.port), IdentityConfig()).network
     with pytest.raises(PortError, match=rf"127\.0\.0\.1:{host.port}: .*in use"):
         UdpPort(network)
@@ -210,7 +210,7 @@ def test_an_address_in_use_or_elsewhere_is_named(host):
         UdpPort(network._replace(lidar_ip="192.0.2.1", lidar_port=6101))
 
 
-def test_the_backlog_is_what_the_receiver_has_not_read(host):
+def test_the_backlog_is_what_the_receiver_has_not_read(host: Host) -> None:
     assert port.unread("127.0.0.1", host.port) == 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(5):
@@ -237,7 +237,7 @@ def read_serial(descriptor: int, until: bytes, at_least: int = 1) -> bytes:
     return stream
 
 
-def test_a_serial_line_carries_the_same_packets_and_commands():
+def test_a_serial_line_carries_the_same_packets_and_commands() -> None:
     device = serial_unit()
     port = SerialPort("pty")
     line = os.open(port.name.split()[1], os.O_RDWR | os.O_NOCTTY)
@@ -252,7 +252,7 @@ def test_a_serial_line_carries_the_same_packets_and_commands():
     os.close(line)
 
 
-def test_a_serial_line_sets_the_pace_of_a_race():
+def test_a_serial_line_sets_the_pace_of_a_race() -> None:
     device = serial_unit()
     port = SerialPort("pty")
     line = os.open(port.name.split()[1], os.O_RDWR | os.O_NOCTTY)
@@ -269,7 +269,7 @@ def test_a_serial_line_sets_the_pace_of_a_race():
     assert Counter(frame.packet_type for frame in read(stream)) == dict(device.sent)
 
 
-def test_a_serial_line_without_a_reader_loses_bytes_and_goes_on():
+def test_a_serial_line_without_a_reader_loses_bytes_and_goes_on() -> None:
     device = serial_unit()
     port = SerialPort("pty")
     server = Server(device, port, 50.0)
@@ -279,7 +279,7 @@ def test_a_serial_line_without_a_reader_loses_bytes_and_goes_on():
     assert device.sent[wire.PacketType.IMU] == 750
 
 
-def test_a_serial_line_that_is_cut_ends_the_run():
+def test_a_serial_line_that_is_cut_ends_the_run() -> None:
     other, line = os.openpty()
     port = SerialPort(os.ttyname(line))
     os.close(line)
@@ -290,18 +290,18 @@ def test_a_serial_line_that_is_cut_ends_the_run():
 
 
 @pytest.mark.parametrize("path", ["/nonexistent/ttyACM0", "/dev/null"])
-def test_a_serial_device_that_is_none_is_named(path):
+def test_a_serial_device_that_is_none_is_named(path: str) -> None:
     with pytest.raises(PortError, match=path):
         SerialPort(path)
 
 
-def test_faults_reach_the_socket(host):
+def test_faults_reach_the_socket(host: Host) -> None:
     device = unit(config_for(host.port, faults=FaultConfig(coalesce=1.0)))
     with running(device, UdpPort(device.network)):
         assert max(len(host.read()) for _ in range(20)) > 1
 
 
-def test_latency_is_counted_in_bounded_memory():
+def test_latency_is_counted_in_bounded_memory() -> None:
     late = Latency()
     assert late.quantile_ns(0.5) == 0
     for k in range(1000):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -137,7 +139,7 @@ def test_settings_are_checked_by_their_ranges() -> None:
         build(PhysicsConfig, {"range_noise": -1.0})
 
 
-def test_meshes_and_trajectories_come_from_files(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_meshes_and_trajectories_come_from_files(tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     mesh, trajectory = tmp_path / "wall.obj", tmp_path / "path.tum"
     mesh.write_text("v 3 -9 -9\nv 3 9 -9\nv 3 0 20\nf 1 2 3\n")
     trajectory.write_text("".join(f"{t} {0.1 * t} 0 0 0 0 0 1\n" for t in range(6)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from typing import Any
 
 import pytest
 
@@ -29,14 +30,14 @@ LISTED = [
 
 
 @pytest.mark.parametrize(("command", "packet_type", "listed"), LISTED)
-def test_bytes_are_the_listed_ones(command, packet_type, listed):
+def test_bytes_are_the_listed_ones(command: Any, packet_type: Any, listed: Any) -> None:
     body = bytes.fromhex(listed)
     size = 12 + len(body) + 8
     head = bytes.fromhex("55aa050a") + struct.pack("<II", packet_type, size)
     assert command.encode() == head + body + bytes.fromhex("00000000 0000 00ff")
 
 
-def test_time_sync():
+def test_time_sync() -> None:
     command = commands.sync_time(HostNs(1_700_000_123_456_789_012))
     payload = struct.pack("<II", 1_700_000_123, 456_789_012)
     assert command.encode()[:24] == (
@@ -47,7 +48,7 @@ def test_time_sync():
 
 
 @pytest.mark.parametrize("now", [-1, (1 << 32) * 10**9])
-def test_a_time_the_device_cannot_hold(now):
+def test_a_time_the_device_cannot_hold(now: Any) -> None:
     with pytest.raises(ValueError, match=f"^now: {now} ns"):
         commands.sync_time(HostNs(now))
 
@@ -58,7 +59,7 @@ NETWORK = {
 }  # fmt: skip
 
 
-def test_network():
+def test_network() -> None:
     command = commands.set_network(**NETWORK)
     assert command.packet_type == PacketType.NETWORK
     assert command.payload.hex(" ", 4) == "c0a8013e c0a80102 c0a80101 ffffff00 d5173918"
@@ -67,19 +68,19 @@ def test_network():
 
 @pytest.mark.parametrize("name", ["lidar_ip", "user_ip", "gateway", "subnet_mask"])
 @pytest.mark.parametrize("value", ["", "192.168.1", "192.168.1.256", "::1", "lidar", "1.2.3.4/24"])
-def test_a_bad_address_is_named(name, value):
+def test_a_bad_address_is_named(name: str, value: str) -> None:
     with pytest.raises(ValueError, match=f"^{name}: '{value}' is not an IPv4 address"):
         commands.set_network(**NETWORK | {name: value})
 
 
 @pytest.mark.parametrize("name", ["lidar_port", "user_port"])
 @pytest.mark.parametrize("value", [0, -1, 65536])
-def test_a_bad_port_is_named(name, value):
+def test_a_bad_port_is_named(name: str, value: int) -> None:
     with pytest.raises(ValueError, match=f"^{name}: {value} is out of range, expected 1 to 65535"):
         commands.set_network(**NETWORK | {name: value})
 
 
-def test_mac():
+def test_mac() -> None:
     command = commands.set_mac(bytes.fromhex("02a1b2c3d4e5"))
     assert command.packet_type == PacketType.MAC
     assert command.payload == bytes.fromhex("02a1b2c3d4e5 0000")
@@ -89,18 +90,18 @@ def test_mac():
 @pytest.mark.parametrize(
     "mac", [b"", bytes(5), bytes(7), bytes.fromhex("01a1b2c3d4e5"), b"\xff" * 6]
 )
-def test_a_bad_mac_is_named(mac):
+def test_a_bad_mac_is_named(mac: Any) -> None:
     with pytest.raises(ValueError, match=r"^mac: "):
         commands.set_mac(mac)
 
 
 @pytest.mark.parametrize("mode", [1 << 22, 0xFFFF_FFFF, -1])
-def test_a_bad_work_mode_is_named(mode):
+def test_a_bad_work_mode_is_named(mode: Any) -> None:
     with pytest.raises(ValueError, match=r"^mode: "):
         commands.set_work_mode(mode)
 
 
-def test_a_latency_number_wraps_with_its_field():
+def test_a_latency_number_wraps_with_its_field() -> None:
     assert commands.latency(1 << 32).payload == commands.latency(0).payload
 
 
@@ -108,30 +109,30 @@ def answered(command: Command, packet_type: int, number: int, value: int, status
     return command.is_answered_by(Ack(packet_type, number, value, status))
 
 
-def test_an_ack_answers_the_command_it_repeats_whatever_its_value_and_status():
+def test_an_ack_answers_the_command_it_repeats_whatever_its_value_and_status() -> None:
     assert answered(commands.start(), 100, UserCommand.STANDBY, 0)
     assert answered(commands.start(), 100, UserCommand.STANDBY, 77, status=5)
     assert not answered(commands.start(), 100, UserCommand.VERSION, 0)
     assert not answered(commands.start(), 2000, UserCommand.STANDBY, 0)
 
 
-def test_a_latency_echo_must_carry_the_number():
+def test_a_latency_echo_must_carry_the_number() -> None:
     assert answered(commands.latency(101), 2000, 6, 101)
     assert not answered(commands.latency(101), 2000, 6, 100)
 
 
-def test_an_ack_without_a_command_number_answers_by_its_type():
+def test_an_ack_without_a_command_number_answers_by_its_type() -> None:
     assert answered(commands.set_mac(bytes(6)), 109, 0, 0)
     assert answered(commands.set_work_mode(WorkMode(0)), 2002, 3, 4)
     assert not answered(commands.set_work_mode(WorkMode(0)), 107, 0, 0)
 
 
-def test_a_reset_is_never_answered():
+def test_a_reset_is_never_answered() -> None:
     assert not commands.reset().acknowledged
     assert not answered(commands.reset(), 100, UserCommand.RESET, 1)
 
 
-def test_an_exact_echo():
+def test_an_exact_echo() -> None:
     ack = Ack(100, UserCommand.STANDBY, 1, wire.AckStatus.OK)
     assert commands.standby().is_echoed_by(ack)
     assert not commands.start().is_echoed_by(ack)
@@ -149,6 +150,6 @@ def test_an_exact_echo():
         (commands.latency(1), commands.latency(2), False),
     ],
 )
-def test_what_sets_the_same_thing(one, other, expected):
+def test_what_sets_the_same_thing(one: Any, other: Any, expected: bool) -> None:
     assert one.is_same_kind(other) is expected
     assert other.is_same_kind(one) is expected

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -39,14 +40,14 @@ def header(packet_type: int, size: int) -> bytes:
     return wire.HEADER.pack(MAGIC, packet_type, size)
 
 
-def test_one_frame_to_a_datagram():
+def test_one_frame_to_a_datagram() -> None:
     framer = Framer()
     for frame in MIXED:
         assert frames(frame, framer=framer) == [frame]
         assert framer.pending == 0
 
 
-def test_byte_by_byte_nothing_comes_before_the_last_byte():
+def test_byte_by_byte_nothing_comes_before_the_last_byte() -> None:
     framer = Framer()
     for frame in MIXED:
         for at in range(len(frame) - 1):
@@ -54,7 +55,7 @@ def test_byte_by_byte_nothing_comes_before_the_last_byte():
         assert frames(frame[-1:], framer=framer) == [frame]
 
 
-def test_coalesced_frames_and_a_piece_of_the_next():
+def test_coalesced_frames_and_a_piece_of_the_next() -> None:
     framer = Framer()
     assert frames(b"".join(MIXED) + POINTS[:700], framer=framer) == MIXED
     assert framer.pending == 700
@@ -62,13 +63,13 @@ def test_coalesced_frames_and_a_piece_of_the_next():
 
 
 @given(st.lists(st.integers(0, 1472), max_size=30))
-def test_cuts_anywhere(sizes):
+def test_cuts_anywhere(sizes: Any) -> None:
     assert frames(*build.cut(b"".join(MIXED), sizes)) == MIXED
     assert errors(*build.cut(b"".join(MIXED), sizes)) == []
 
 
 @given(st.data())
-def test_one_flipped_byte_costs_at_most_the_frame_it_hit(data):
+def test_one_flipped_byte_costs_at_most_the_frame_it_hit(data: Any) -> None:
     stream = bytearray(b"".join([*MIXED, *IMU[3:40]]))
     at = data.draw(st.integers(0, sum(map(len, MIXED)) - 1))
     stream[at] ^= data.draw(st.integers(1, 255))
@@ -84,7 +85,7 @@ def test_one_flipped_byte_costs_at_most_the_frame_it_hit(data):
 
 
 @pytest.mark.parametrize("kept", [1, 3, 4, 11, 12, 13, 600, 1043])
-def test_a_truncated_frame_costs_only_itself_and_delays_nothing(kept):
+def test_a_truncated_frame_costs_only_itself_and_delays_nothing(kept: int) -> None:
     framer = Framer()
     framer.feed(POINTS[:kept])
     for frame in (IMU[0], PLANE, ACK):
@@ -92,7 +93,7 @@ def test_a_truncated_frame_costs_only_itself_and_delays_nothing(kept):
 
 
 @pytest.mark.parametrize("stub", [PLANE[:1384], PLANE[:40], POINTS[:600], IMU[9][:40]])
-def test_split_frames_behind_a_stub_come_as_soon_as_they_are_complete(stub):
+def test_split_frames_behind_a_stub_come_as_soon_as_they_are_complete(stub: Any) -> None:
     framer = Framer()
     framer.feed(stub)
     for number in range(60):
@@ -102,20 +103,20 @@ def test_split_frames_behind_a_stub_come_as_soon_as_they_are_complete(stub):
         assert framer.pending < MAX_FRAME
 
 
-def test_coalesced_frames_behind_a_stub_come_at_once():
+def test_coalesced_frames_behind_a_stub_come_at_once() -> None:
     framer = Framer()
     framer.feed(PLANE[:1384])
     assert frames(IMU[0] + IMU[1] + POINTS[:500], framer=framer) == IMU[:2]
     assert frames(POINTS[500:] + IMU[2], framer=framer) == [POINTS, IMU[2]]
 
 
-def test_a_lost_fragment_costs_one_packet():
+def test_a_lost_fragment_costs_one_packet() -> None:
     found = frames(*FRAGMENTS[:2], IMU[0], *FRAGMENTS[3:], IMU[1], *FRAGMENTS, IMU[2])
     assert found == [IMU[0], IMU[1], PLANE, IMU[2]]
 
 
 @pytest.mark.parametrize("between", [IMU[0], IMU[0] + IMU[1], POINTS])
-def test_a_datagram_between_the_fragments_of_a_packet_loses_nothing(between):
+def test_a_datagram_between_the_fragments_of_a_packet_loses_nothing(between: Any) -> None:
     for place in (1, 2, 3):
         datagrams = [*FRAGMENTS[:place], between, *FRAGMENTS[place:]]
         assert sorted(frames(*datagrams)) == sorted([*frames(between), PLANE])
@@ -123,25 +124,25 @@ def test_a_datagram_between_the_fragments_of_a_packet_loses_nothing(between):
 
 
 @pytest.mark.parametrize("head", [2, 4, 8])
-def test_a_datagram_inside_a_header_loses_nothing(head):
+def test_a_datagram_inside_a_header_loses_nothing(head: int) -> None:
     assert frames(POINTS[:head], IMU[0], POINTS[head:]) == [IMU[0], POINTS]
 
 
-def test_a_damaged_datagram_between_fragments_costs_only_itself():
+def test_a_damaged_datagram_between_fragments_costs_only_itself() -> None:
     damaged = IMU[0][:40] + b"\xee" + IMU[0][41:]
     assert frames(*FRAGMENTS[:2], damaged, *FRAGMENTS[2:]) == [PLANE]
 
 
 @pytest.mark.parametrize("packet_type", [104, 100, 107, 2001, 4242, 0, 0xFFFF_FFFF])
 @pytest.mark.parametrize("size", [0, 12, 23, 24, 10_001, 0x7FFF_FFFF, 0xFFFF_FFFF])
-def test_impossible_sizes_are_dropped_at_once(packet_type, size):
+def test_impossible_sizes_are_dropped_at_once(packet_type: int, size: int) -> None:
     bad = header(packet_type, size)
     assert frames(bad + IMU[0]) == [IMU[0]]
     assert frames(bad, IMU[0]) == [IMU[0]]
     assert errors(bad + IMU[0]) == [FrameError(Fault.SIZE, 12)]
 
 
-def test_a_known_type_must_have_its_size():
+def test_a_known_type_must_have_its_size() -> None:
     wrong = build.frame(PacketType.POINTS_3D, b"\0" * 500)
     assert frames(wrong + IMU[0]) == [IMU[0]]
     assert errors(wrong) == [FrameError(Fault.SIZE, len(wrong))]
@@ -149,12 +150,12 @@ def test_a_known_type_must_have_its_size():
 
 @pytest.mark.parametrize("size", [1, 4, 180, MAX_FRAME - wire.OVERHEAD])
 @pytest.mark.parametrize("packet_type", [2001, 4242])
-def test_unknown_types_and_parameters_may_have_any_size(packet_type, size):
+def test_unknown_types_and_parameters_may_have_any_size(packet_type: int, size: Any) -> None:
     frame = build.frame(packet_type, bytes(size))
     assert frames(frame) == [frame]
 
 
-def test_faults_are_told_apart():
+def test_faults_are_told_apart() -> None:
     crc = POINTS[:300] + b"\xee" + POINTS[301:]
     tail = POINTS[:-1] + b"\xfe"
     assert errors(b"garbage" + IMU[0]) == [FrameError(Fault.JUNK, 7)]
@@ -163,13 +164,13 @@ def test_faults_are_told_apart():
     assert errors(tail + crc + IMU[0]) == errors(tail) + errors(crc)
 
 
-def test_the_ignored_fields_of_the_tail_are_ignored():
+def test_the_ignored_fields_of_the_tail_are_ignored() -> None:
     free = POINTS[:-8] + b"\x12\x34\x56\x78\x9a\xbc" + POINTS[-2:]
     assert frames(free) == [POINTS]
 
 
 @pytest.mark.parametrize("junk", [b"\x55", b"\x55\x55", MAGIC, MAGIC[:3], MAGIC[:2] * 3])
-def test_pieces_of_a_magic_before_a_frame(junk):
+def test_pieces_of_a_magic_before_a_frame(junk: Any) -> None:
     assert frames(junk + IMU[0] + IMU[1]) == IMU[:2]
     assert frames(IMU[0] + junk, IMU[1], IMU[2]) == IMU[:3]
 
@@ -180,7 +181,7 @@ def test_pieces_of_a_magic_before_a_frame(junk):
     st.builds(header, st.sampled_from([101, 102, 103, 104, 2001, 77]), st.integers(0, 2**32 - 1)),
     st.builds(header, st.sampled_from([101, 103, 2001, 77]), st.integers(0, 6001)),
 ), max_size=40))  # fmt: skip
-def test_garbage_never_raises_never_grows_and_ends(pieces):
+def test_garbage_never_raises_never_grows_and_ends(pieces: Any) -> None:
     framer = Framer()
     for piece in pieces:
         before = framer.pending
@@ -193,7 +194,7 @@ def test_garbage_never_raises_never_grows_and_ends(pieces):
     assert IMU[5] in frames(*[b"\0" * 1000] * 6, IMU[5], framer=framer)
 
 
-def test_reset_forgets_the_incomplete_frame():
+def test_reset_forgets_the_incomplete_frame() -> None:
     framer = Framer()
     framer.feed(POINTS[:600])
     framer.reset()
@@ -225,7 +226,9 @@ def checked_bytes(monkeypatch: pytest.MonkeyPatch, pieces: list[bytes]) -> int:
     return total
 
 
-def test_the_cost_of_hostile_bytes_grows_with_their_number_only(monkeypatch):
+def test_the_cost_of_hostile_bytes_grows_with_their_number_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     per_byte = MAX_FRAME / wire.HEADER.size
     for length in (12_000, 24_000, 48_000):
         hostile = dense_magics(length)
@@ -234,7 +237,7 @@ def test_the_cost_of_hostile_bytes_grows_with_their_number_only(monkeypatch):
         assert checked_bytes(monkeypatch, pieces) <= 2 * per_byte * length
 
 
-def test_the_cost_of_a_call_behind_a_stub_is_bounded(monkeypatch):
+def test_the_cost_of_a_call_behind_a_stub_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     hostile = header(103, 5536) + dense_magics(5000)
     before = checked_bytes(monkeypatch, [hostile])
     for calls in (10, 100):
@@ -242,11 +245,13 @@ def test_the_cost_of_a_call_behind_a_stub_is_bounded(monkeypatch):
         assert cost <= calls * 8 * MAX_FRAME
 
 
-def test_looking_behind_an_incomplete_frame_is_not_repeated_for_every_magic(monkeypatch):
+def test_looking_behind_an_incomplete_frame_is_not_repeated_for_every_magic(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     looked = 0
     frame_at = framing._frame_at
 
-    def counted(*arguments):
+    def counted(*arguments: Any) -> Any:
         nonlocal looked
         looked += 1
         return frame_at(*arguments)

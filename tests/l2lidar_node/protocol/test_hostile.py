@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def check(event: object) -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("seed", range(12))
-def test_nothing_raises_warns_or_comes_out_infinite(seed):
+def test_nothing_raises_warns_or_comes_out_infinite(seed: Any) -> None:
     rng = random.Random(seed)
     values = {
         "publish_unlocked": rng.random() < 0.7,

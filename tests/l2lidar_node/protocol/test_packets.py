@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def reason(packet_type: int, payload: bytes) -> str:
     return packet.reason
 
 
-def test_a_3d_packet_from_its_bytes():
+def test_a_3d_packet_from_its_bytes() -> None:
     payload = bytearray(1020)
     struct.pack_into("<4I", payload, 0, 1023, 1020, 110, 406_000_123)
     struct.pack_into("<8f", payload, 84, 1.25, 2e-4, 0.0046, 0.05, 50.0, 0.0, 0.0105, 7.7e-6)
@@ -58,7 +59,7 @@ def test_a_3d_packet_from_its_bytes():
     assert packet.payload == payload
 
 
-def test_a_2d_packet():
+def test_a_2d_packet() -> None:
     packet = decode(Frame(103, build.points_2d(7, 12_000_000_001, time_increment=5e-6)))
     assert isinstance(packet, PointPacket)
     assert (packet.packet_type, packet.seq) == (PacketType.POINTS_2D, 7)
@@ -67,7 +68,7 @@ def test_a_2d_packet():
     assert packet.duration_ns == pytest.approx(1799 * 5_000, abs=2)
 
 
-def test_an_imu_packet_from_its_bytes():
+def test_an_imu_packet_from_its_bytes() -> None:
     payload = struct.pack(
         "<4I 4f 3f 3f", 5, 56, 3, 4, 0.9, 0.1, 0.2, 0.3, 0.5, 0.25, -0.5, 1.0, 2.0, 9.5
     )
@@ -83,7 +84,7 @@ def test_an_imu_packet_from_its_bytes():
 
 
 @pytest.mark.parametrize("norm", [0.5001, 0.9983, 1.0, 1.5])
-def test_the_quaternion_is_normalised(norm):
+def test_the_quaternion_is_normalised(norm: float) -> None:
     quaternion = np.array([0.5, -0.5, 0.5, 0.5]) * norm
     packet = decode(Frame(104, build.imu(quaternion_wxyz=quaternion)))
     assert isinstance(packet, ImuPacket)
@@ -92,48 +93,48 @@ def test_the_quaternion_is_normalised(norm):
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0.49, 0, 0, 0)])
-def test_an_imu_that_is_switched_off_is_dropped(quaternion):
+def test_an_imu_that_is_switched_off_is_dropped(quaternion: Any) -> None:
     assert reason(104, build.imu(quaternion_wxyz=quaternion)) == "quaternion_norm"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("offset", range(28, 68, 4))
-def test_an_imu_value_that_is_no_number(offset, value):
+def test_an_imu_value_that_is_no_number(offset: Any, value: Any) -> None:
     assert reason(104, patched(build.imu(), offset, "<f", value)) == "not_finite"
 
 
 @pytest.mark.parametrize("offset", [44, 48, 52, 56, 60, 64])
-def test_an_imu_value_beyond_any_sensor(offset):
+def test_an_imu_value_beyond_any_sensor(offset: int) -> None:
     assert reason(104, patched(build.imu(), offset, "<f", 1e24)) == "implausible"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("offset", range(64, 128, 4))
-def test_a_calibration_or_angle_of_3d_that_is_no_number(offset, value):
+def test_a_calibration_or_angle_of_3d_that_is_no_number(offset: Any, value: Any) -> None:
     assert reason(102, patched(build.points_3d(), offset, "<f", value)) == "not_finite"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("offset", range(64, 120, 4))
-def test_a_calibration_or_angle_of_2d_that_is_no_number(offset, value):
+def test_a_calibration_or_angle_of_2d_that_is_no_number(offset: Any, value: Any) -> None:
     assert reason(103, patched(build.points_2d(), offset, "<f", value)) == "not_finite"
 
 
 @pytest.mark.parametrize("offset", range(64, 124, 4))
 @pytest.mark.parametrize("value", [3e38, -2e6])
-def test_a_calibration_or_angle_beyond_any_unit(offset, value):
+def test_a_calibration_or_angle_beyond_any_unit(offset: Any, value: float) -> None:
     assert reason(102, patched(build.points_3d(), offset, "<f", value)) == "implausible"
 
 
 @pytest.mark.parametrize("offset", range(36, 64, 4))
-def test_health_that_is_no_number_costs_no_points(offset):
+def test_health_that_is_no_number_costs_no_points(offset: Any) -> None:
     payload = patched(build.points_3d(), offset, "<f", math.nan)
     assert isinstance(decode(Frame(102, payload)), PointPacket)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("surplus", [1, 5000, 0xFFFF_FFFF])
-def test_more_points_than_there_is_room_for(kind, surplus):
+def test_more_points_than_there_is_room_for(kind: Any, surplus: int) -> None:
     capacity = {PacketType.POINTS_3D: 300, PacketType.POINTS_2D: 1800}[kind]
     payload = MAKERS[kind](count=min(capacity + surplus, 0xFFFF_FFFF))
     assert reason(kind, payload) == "point_num"
@@ -141,7 +142,7 @@ def test_more_points_than_there_is_room_for(kind, surplus):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [0, 1, 299, 300])
-def test_fewer_points_are_fine(kind, count):
+def test_fewer_points_are_fine(kind: Any, count: int) -> None:
     packet = decode(Frame(kind, MAKERS[kind](count=count, time_increment=1e-5)))
     assert isinstance(packet, PointPacket)
     assert packet.duration_ns == pytest.approx(max(count - 1, 0) * 10_000, abs=2)
@@ -149,37 +150,37 @@ def test_fewer_points_are_fine(kind, count):
 
 @pytest.mark.parametrize("packet_type", [102, 103, 104])
 @pytest.mark.parametrize("nsec", [1_000_000_000, 0xFFFF_FFFF])
-def test_a_stamp_with_too_many_nanoseconds(packet_type, nsec):
+def test_a_stamp_with_too_many_nanoseconds(packet_type: int, nsec: int) -> None:
     maker = {102: build.points_3d, 103: build.points_2d, 104: build.imu}[packet_type]
     assert reason(packet_type, patched(maker(), 24, "<I", nsec)) == "stamp"
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("increment", [0.0, -7e-6, 1e-3, 0.5])
-def test_a_time_increment_that_cannot_be(kind, increment):
+def test_a_time_increment_that_cannot_be(kind: Any, increment: float) -> None:
     assert reason(kind, MAKERS[kind](time_increment=increment)) == "time_increment"
 
 
 @pytest.mark.parametrize("packet_type", [101, 102, 103, 104, 105])
 @pytest.mark.parametrize("change", [-1, 1, 4])
-def test_a_wrong_length(packet_type, change):
+def test_a_wrong_length(packet_type: int, change: int) -> None:
     size = wire.PAYLOADS[packet_type].itemsize
     assert reason(packet_type, bytes(size + change)) == "length"
 
 
-def test_a_version():
+def test_a_version() -> None:
     packet = decode(Frame(105, build.version()))
     assert packet == Version("2.2.1.1", "2.8.11.1", "YS-L2", "250715", "")
 
 
-def test_a_version_with_full_and_foreign_text():
+def test_a_version_with_full_and_foreign_text() -> None:
     packet = decode(Frame(105, build.version(name=b"x" * 24, date=b"\xff2507\x0099")))
     assert isinstance(packet, Version)
     assert packet.name == "x" * 24
     assert packet.date == "\N{REPLACEMENT CHARACTER}2507"
 
 
-def test_an_ack():
+def test_an_ack() -> None:
     assert decode(Frame(101, struct.pack("<4I", 2000, 6, 101, 9))) == Ack(2000, 6, 101, 9)
 
 
@@ -193,17 +194,19 @@ def test_an_ack():
         (172, 0.0625, 50.0),
     ],
 )
-def test_parameters_of_every_size_a_firmware_may_send(size, range_min, range_max):
+def test_parameters_of_every_size_a_firmware_may_send(
+    size: int, range_min: Any, range_max: Any
+) -> None:
     payload = (build.parameters(17, 0.0625, 50.0) + bytes(40))[:size]
     assert decode(Frame(2001, payload)) == Parameters(17, range_min, range_max, payload)
 
 
-def test_parameters_too_short_for_the_work_mode():
+def test_parameters_too_short_for_the_work_mode() -> None:
     assert reason(2001, bytes(15)) == "length"
 
 
 @pytest.mark.parametrize("packet_type", [100, 106, 107, 108, 109, 2000, 2002, 0, 4242])
-def test_what_only_hosts_send_is_unknown(packet_type):
+def test_what_only_hosts_send_is_unknown(packet_type: int) -> None:
     assert decode(Frame(packet_type, b"abc")) == UnknownPacket(packet_type, b"abc")
 
 
@@ -212,12 +215,14 @@ def test_what_only_hosts_send_is_unknown(packet_type):
     st.binary(max_size=300),
 )
 @example(2001, b"")
-def test_any_payload_decodes_to_something(packet_type, payload):
+def test_any_payload_decodes_to_something(packet_type: Any, payload: Any) -> None:
     decode(Frame(packet_type, payload))
 
 
 @given(st.sampled_from([102, 103, 104, 105, 101, 2001]), st.randoms(use_true_random=False))
-def test_any_payload_of_the_right_size_decodes_to_finite_values(packet_type, random):
+def test_any_payload_of_the_right_size_decodes_to_finite_values(
+    packet_type: Any, random: Any
+) -> None:
     payload = random.randbytes(wire.PAYLOADS[packet_type].itemsize)
     packet = decode(Frame(packet_type, payload))
     if isinstance(packet, PointPacket):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,12 +41,12 @@ OFFSETS_PARAMETERS = {
 }  # fmt: skip
 
 
-def test_frame_sizes_are_the_protocols():
+def test_frame_sizes_are_the_protocols() -> None:
     assert wire.FRAME_SIZES == SIZES
     assert max(SIZES.values()) <= wire.MAX_FRAME
 
 
-def test_every_packet_type_has_a_layout():
+def test_every_packet_type_has_a_layout() -> None:
     assert set(wire.PAYLOADS) == set(PacketType)
 
 
@@ -60,13 +61,13 @@ def test_every_packet_type_has_a_layout():
         (PacketType.PARAMETERS, OFFSETS_PARAMETERS),
     ],
 )
-def test_fields_stand_where_the_protocol_says(packet_type, offsets):
+def test_fields_stand_where_the_protocol_says(packet_type: Any, offsets: Any) -> None:
     fields = wire.PAYLOADS[packet_type].fields
     assert fields is not None
     assert {name: entry[1] + 12 for name, entry in fields.items()} == offsets
 
 
-def test_blocks_stand_where_the_protocol_says():
+def test_blocks_stand_where_the_protocol_says() -> None:
     state = {name: entry[1] for name, entry in (wire.INSIDE_STATE.fields or {}).items()}
     assert list(state.values()) == [0, 4, 8, 12, 16, 20, 24, 28, 32]
     assert state["com_rotation_period"] == 4
@@ -79,7 +80,7 @@ def test_blocks_stand_where_the_protocol_says():
 
 
 @pytest.mark.parametrize("packet_type", list(PacketType))
-def test_layouts_are_little_endian_and_packed(packet_type):
+def test_layouts_are_little_endian_and_packed(packet_type: Any) -> None:
     def check(layout: np.dtype) -> int:
         if layout.fields is None:
             base = layout.base
@@ -91,7 +92,7 @@ def test_layouts_are_little_endian_and_packed(packet_type):
     assert check(layout) == layout.itemsize
 
 
-def test_encode_frame_is_what_the_protocol_shows():
+def test_encode_frame_is_what_the_protocol_shows() -> None:
     payload = struct.pack("<II", 2, 0)
     assert wire.encode_frame(100, payload).hex() == (
         "55aa050a 64000000 20000000 02000000 00000000 14d80727 00000000 0000 00ff".replace(" ", "")
@@ -99,7 +100,7 @@ def test_encode_frame_is_what_the_protocol_shows():
 
 
 @pytest.mark.parametrize("size", [0, 1, 1020])
-def test_crc_covers_the_payload_only(size):
+def test_crc_covers_the_payload_only(size: int) -> None:
     payload = bytes(range(256)) * 4
     payload = payload[:size]
     frame = wire.encode_frame(4242, payload)

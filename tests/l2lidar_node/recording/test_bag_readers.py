@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def _known_at(event: Sweep | ImuSample) -> int:
 
 
 @pytest.fixture(scope="module", params=["run", "run.mcap"])
-def bag(request, tmp_path_factory):
+def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return a bag of clouds and samples: a folder, or a single file."""
     path = tmp_path_factory.mktemp("bags") / request.param
     world = recording("room", "walk")
@@ -67,7 +68,7 @@ def bag(request, tmp_path_factory):
 
 
 @pytest.mark.parametrize("chosen", [(), ("--topic", "/points")], ids=["guessed", "named"])
-def test_kiss_icp_reads_every_cloud(bag, chosen, tmp_path):
+def test_kiss_icp_reads_every_cloud(bag: Any, chosen: Any, tmp_path: Path) -> None:
     # its own reader of single files fails on every MCAP, its reader of bags takes files as well
     run("kiss_icp_pipeline", "--dataloader", "rosbag", *chosen, bag, cwd=tmp_path)
     (poses,) = tmp_path.glob("results/*-*/*_poses_tum.txt")
@@ -77,7 +78,7 @@ def test_kiss_icp_reads_every_cloud(bag, chosen, tmp_path):
     np.testing.assert_allclose(found[:, 0], starts[:SWEEPS], atol=1e-3)
 
 
-def test_kiss_icp_gets_the_points_and_their_times(bag):
+def test_kiss_icp_gets_the_points_and_their_times(bag: Any) -> None:
     from kiss_icp.datasets.rosbag import RosbagDataset
 
     clouds = RosbagDataset(bag, "/points")
@@ -89,7 +90,7 @@ def test_kiss_icp_gets_the_points_and_their_times(bag):
 
 
 @pytest.mark.parametrize("name", ["run", "run.mcap"])
-def test_evo_reads_odometry_out_of_a_bag(name, tmp_path):
+def test_evo_reads_odometry_out_of_a_bag(name: str, tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
     world = recording("room", "walk")
@@ -124,7 +125,7 @@ def test_evo_reads_odometry_out_of_a_bag(name, tmp_path):
     assert float(re.search(r"rmse\s+([\d.]+)", said)[1]) < 1e-6
 
 
-def test_evo_judges_the_trajectory_of_a_bag(bag, tmp_path):
+def test_evo_judges_the_trajectory_of_a_bag(bag: Any, tmp_path: Path) -> None:
     run("l2lidar", "odometry", bag, "out/run", cwd=tmp_path)
     world = recording("room", "walk")
     stamps = np.arange(0, 6_000_000_000, 5_000_000) + int(world.imu["stamp"][0])

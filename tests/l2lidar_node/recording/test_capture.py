@@ -1,6 +1,7 @@
 import contextlib
 import io
 import struct
+from typing import Any
 
 import dpkt
 import pytest
@@ -82,7 +83,7 @@ def read(stream: io.BytesIO) -> list[UdpDatagram]:
     return list(CaptureReader(stream))
 
 
-def test_what_is_written_is_a_capture_for_others():
+def test_what_is_written_is_a_capture_for_others() -> None:
     stream = io.BytesIO()
     writer = CaptureWriter(stream)
     writer.write(UdpDatagram(TIME, DEVICE, HOST, IMU))
@@ -102,7 +103,7 @@ def test_what_is_written_is_a_capture_for_others():
 @given(
     st.lists(st.tuples(st.integers(0, (1 << 32) * NS - 1), st.binary(max_size=2000)), max_size=9)
 )
-def test_what_is_written_comes_back(items):
+def test_what_is_written_comes_back(items: Any) -> None:
     stream = io.BytesIO()
     writer = CaptureWriter(stream)
     datagrams = [UdpDatagram(HostNs(time), DEVICE, HOST, data) for time, data in items]
@@ -112,13 +113,13 @@ def test_what_is_written_comes_back(items):
     assert read(stream) == datagrams
 
 
-def test_a_datagram_that_udp_cannot_carry_is_refused():
+def test_a_datagram_that_udp_cannot_carry_is_refused() -> None:
     with pytest.raises(ValueError, match="65508 bytes"):
         CaptureWriter(io.BytesIO()).write(UdpDatagram(TIME, DEVICE, HOST, bytes(65_508)))
 
 
 @pytest.mark.parametrize("nano", [False, True])
-def test_times_of_tcpdump_are_exact(nano):
+def test_times_of_tcpdump_are_exact(nano: bool) -> None:
     from decimal import Decimal
 
     exact = TIME if nano else TIME // 1000 * 1000
@@ -126,7 +127,7 @@ def test_times_of_tcpdump_are_exact(nano):
     assert [datagram.time for datagram in read(stream)] == [exact]
 
 
-def test_both_byte_orders_are_read():
+def test_both_byte_orders_are_read() -> None:
     packet = ethernet(udp_packet(IMU))
     head = struct.pack(">I2H4I", 0xA1B23C4D, 2, 4, 0, 0, 65535, 1)
     record = struct.pack(">4I", *divmod(TIME, NS), len(packet), len(packet))
@@ -135,7 +136,7 @@ def test_both_byte_orders_are_read():
 
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize(("resolution", "unit"), [(6, 1000), (9, 1), (3, 1_000_000)])
-def test_pcapng_is_read(order, resolution, unit):
+def test_pcapng_is_read(order: Any, resolution: int, unit: int) -> None:
     ticks = (TIME - 100 * NS) // unit
     stream = pcapng([(ticks, ethernet(udp_packet(IMU)))], order, resolution)
     reader = CaptureReader(stream)
@@ -143,7 +144,7 @@ def test_pcapng_is_read(order, resolution, unit):
     assert reader.ignored == {"without a time": 1}
 
 
-def test_pcapng_with_binary_resolution():
+def test_pcapng_with_binary_resolution() -> None:
     stream = pcapng([(5 << 20 | 1 << 19, ethernet(udp_packet(IMU)))], "<", 0x80 | 20)
     assert [item.time for item in read(stream)] == [105 * NS + NS // 2]
 
@@ -173,17 +174,17 @@ def cooked_2(kind: int) -> bytes:
         (276, cooked_2(4), True),
     ],
 )
-def test_link_layers(link, data, outgoing):
+def test_link_layers(link: int, data: Any, outgoing: Any) -> None:
     (datagram,) = read(tcpdump([(1.0, data)], link))
     assert datagram[1:] == (DEVICE, HOST, IMU, outgoing)
 
 
-def test_ethernet_padding_is_no_content():
+def test_ethernet_padding_is_no_content() -> None:
     (datagram,) = read(tcpdump([(1.0, ethernet(udp_packet(b"short")) + bytes(20))]))
     assert datagram.data == b"short"
 
 
-def test_other_traffic_is_left_out_and_counted():
+def test_other_traffic_is_left_out_and_counted() -> None:
     fragment = udp_packet(IMU)
     fragment.mf = 1
     wrong = udp_packet(IMU)
@@ -203,7 +204,7 @@ def test_other_traffic_is_left_out_and_counted():
     assert reader.ignored == {"not UDP over IPv4": 3, "fragmented": 1, "damaged": 2}
 
 
-def test_packets_cut_by_the_snap_length_are_counted():
+def test_packets_cut_by_the_snap_length_are_counted() -> None:
     packet = ethernet(udp_packet(IMU))
     stream = io.BytesIO()
     PacketWriter(stream, 1).write(TIME, packet[:60])
@@ -214,14 +215,14 @@ def test_packets_cut_by_the_snap_length_are_counted():
     assert reader.ignored == {"cut short": 1}
 
 
-def test_an_unknown_link_type_is_named():
+def test_an_unknown_link_type_is_named() -> None:
     reader = CaptureReader(tcpdump([(1.0, b"x" * 40)], 195))
     assert list(reader) == []
     assert reader.ignored == {"of link type 195": 1}
 
 
 @given(st.integers(0, 3000))
-def test_a_file_cut_anywhere_gives_the_packets_before(length):
+def test_a_file_cut_anywhere_gives_the_packets_before(length: Any) -> None:
     stream = io.BytesIO()
     writer = CaptureWriter(stream)
     for number in range(20):
@@ -239,7 +240,7 @@ def test_a_file_cut_anywhere_gives_the_packets_before(length):
 
 
 @given(st.binary(max_size=400), st.sampled_from(["<nano", ">nano", "<ng", ">ng", ""]))
-def test_garbage_never_raises_anything_else(data, start):
+def test_garbage_never_raises_anything_else(data: Any, start: Any) -> None:
     heads = {
         "<nano": struct.pack("<I2H4I", 0xA1B23C4D, 2, 4, 0, 0, 65535, 1),
         ">nano": struct.pack(">I2H4I", 0xA1B23C4D, 2, 4, 0, 0, 65535, 1),
@@ -252,7 +253,7 @@ def test_garbage_never_raises_anything_else(data, start):
 
 
 @given(st.integers(0, 600), st.integers(0, 255))
-def test_one_wrong_byte_never_raises_anything_else(at, value):
+def test_one_wrong_byte_never_raises_anything_else(at: Any, value: Any) -> None:
     data = bytearray(pcapng([(1, ethernet(udp_packet(IMU)))] * 3, "<", 9).getvalue())
     data[at % len(data)] = value
     with contextlib.suppress(CaptureError):
@@ -260,7 +261,7 @@ def test_one_wrong_byte_never_raises_anything_else(at, value):
 
 
 @given(st.sampled_from([0, 1, 101, 113, 276]), st.binary(max_size=120), st.booleans())
-def test_packets_of_garbage_are_left_out(link, data, is_ip):
+def test_packets_of_garbage_are_left_out(link: Any, data: Any, is_ip: Any) -> None:
     if is_ip:
         data = b"\x45" + data
     stream = io.BytesIO()
@@ -270,14 +271,14 @@ def test_packets_of_garbage_are_left_out(link, data, is_ip):
     assert len(list(reader)) + sum(reader.ignored.values()) == 1
 
 
-def test_a_block_or_packet_that_claims_too_much_is_damage():
+def test_a_block_or_packet_that_claims_too_much_is_damage() -> None:
     head = struct.pack("<I2H4I", 0xA1B23C4D, 2, 4, 0, 0, 65535, 1)
     for rest in (struct.pack("<4I", 1, 1, 1 << 20, 1 << 20), struct.pack("<4I", 1, 1, 1 << 31, 1)):
         with pytest.raises(CaptureError, match="damaged"):
             list(PacketReader(io.BytesIO(head + rest)))
 
 
-def test_a_recording_takes_what_its_host_and_device_said():
+def test_a_recording_takes_what_its_host_and_device_said() -> None:
     other = Endpoint("10.0.0.9", 5000)
     packets = [
         udp_packet(SYNC, HOST, DEVICE),
@@ -302,7 +303,7 @@ def test_a_recording_takes_what_its_host_and_device_said():
     assert first.command.time == first.time == TIME  # as the driver counted it
 
 
-def test_only_exact_notes_of_the_host_to_itself_count():
+def test_only_exact_notes_of_the_host_to_itself_count() -> None:
     wrong = [b"", STEPPED, STEPPED % 10**30, STEPPED % 5 + b"!", WAITED[:-1]]
     notes = [STEPPED % 0, STEPPED % -3_600_000_000_000, WAITED]
     packets = [udp_packet(data, HOST, HOST) for data in wrong + notes]
@@ -312,7 +313,7 @@ def test_only_exact_notes_of_the_host_to_itself_count():
     assert [item.by_ns for item in items[1:3]] == [0, -3_600_000_000_000]
 
 
-def test_cooked_captures_of_the_loopback_interface_show_everything_once():
+def test_cooked_captures_of_the_loopback_interface_show_everything_once() -> None:
     packets = [(1.0, cooked(4)), (1.0, cooked(0)), (2.0, cooked(4)), (2.0, cooked(0))]
     assert (
         len([item for item in Recording(tcpdump(packets, 113)) if isinstance(item, Received)]) == 2
@@ -327,18 +328,18 @@ def two_devices() -> io.BytesIO:
     return tcpdump([(1.0, bytes(packet)) for packet in packets], 101)
 
 
-def test_of_several_devices_one_must_be_named():
+def test_of_several_devices_one_must_be_named() -> None:
     with pytest.raises(CaptureError, match=r"several L2s in it, 10\.0\.0\.1, 10\.0\.0\.2"):
         Recording(two_devices(), "192.168.1.62")
     assert Recording(two_devices(), "10.0.0.2").device.ip == "10.0.0.2"
 
 
-def test_the_only_device_is_taken_whatever_its_address():
+def test_the_only_device_is_taken_whatever_its_address() -> None:
     stream = tcpdump([(1.0, bytes(udp_packet(IMU, Endpoint("10.0.0.1", 1))))], 101)
     assert Recording(stream, "192.168.1.62").device == Endpoint("10.0.0.1", 1)
 
 
-def test_a_capture_without_an_l2_says_what_is_in_it():
+def test_a_capture_without_an_l2_says_what_is_in_it() -> None:
     packets = [udp_packet(b"x" * 50, destination=Endpoint("1.2.3.4", 53))] * 3
     stream = tcpdump([(1.0, bytes(packet)) for packet in packets] + [(1.0, b"?")], 101)
     with pytest.raises(
@@ -348,7 +349,7 @@ def test_a_capture_without_an_l2_says_what_is_in_it():
 
 
 @pytest.mark.skipif(not SHARED_DATA.exists(), reason="the recordings are not here")
-def test_a_capture_of_another_sensor_is_told_from_ours():
+def test_a_capture_of_another_sensor_is_told_from_ours() -> None:
     (path,) = (SHARED_DATA / "ouster_os1").glob("*.pcap")
     with path.open("rb") as stream:
         reader = CaptureReader(stream)

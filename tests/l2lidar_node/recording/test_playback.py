@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import threading
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ LIMIT_S = 120.0  # generous: only a failure waits that long
 class Played:
     """A playback and everything it says."""
 
-    def __init__(self, stream: io.BytesIO, config, laps: int = 1, **files: object) -> None:
+    def __init__(self, stream: io.BytesIO, config: Any, laps: int = 1, **files: object) -> None:
         self.events: list[Event] = []
         self.laps: list[list[Event]] = []
         self.shifts: list[int | None] = []
@@ -43,12 +44,12 @@ class Played:
 
 
 @pytest.fixture
-def recorded():
+def recorded() -> Any:
     config, events, tap = live_run(2.5, faults={"loss": 0.01, "reorder": 0.02})
     return config, events, tap.stream
 
 
-def test_it_hands_out_what_the_live_session_did_and_ends(recorded):
+def test_it_hands_out_what_the_live_session_did_and_ends(recorded: Any) -> None:
     config, live, stream = recorded
     played = Played(stream, config)
     assert played.playback.wait(LIMIT_S)
@@ -57,7 +58,7 @@ def test_it_hands_out_what_the_live_session_did_and_ends(recorded):
     assert essence(played.laps[0]) == essence(live)
 
 
-def test_its_time_is_the_recordings(recorded):
+def test_its_time_is_the_recordings(recorded: Any) -> None:
     config, _, stream = recorded
     played = Played(stream, config)
     assert played.playback.wait(LIMIT_S)
@@ -68,7 +69,7 @@ def test_its_time_is_the_recordings(recorded):
     assert done.cancelled()
 
 
-def test_its_time_stands_where_the_recordings_goes_back(recorded):
+def test_its_time_stands_where_the_recordings_goes_back(recorded: Any) -> None:
     config, _, stream = recorded
     data = bytearray(stream.getvalue())
     at, number, last = 24, 0, 0
@@ -87,7 +88,7 @@ def test_its_time_stands_where_the_recordings_goes_back(recorded):
     assert played.times == sorted(played.times)
 
 
-def test_laps_are_alike_and_never_go_back_in_time(recorded):
+def test_laps_are_alike_and_never_go_back_in_time(recorded: Any) -> None:
     config, live, stream = recorded
     played = Played(stream, config, laps=3, replay_loop=True)
     assert played.ended.wait(LIMIT_S)
@@ -109,7 +110,7 @@ def test_laps_are_alike_and_never_go_back_in_time(recorded):
     assert played.times == sorted(played.times)
 
 
-def test_it_answers_calls_and_stops_while_it_waits(recorded):
+def test_it_answers_calls_and_stops_while_it_waits(recorded: Any) -> None:
     config, _, stream = recorded
     played = Played(stream, config, replay_rate=0.01)
     start = Recording(io.BytesIO(stream.getvalue())).start
@@ -120,7 +121,7 @@ def test_it_answers_calls_and_stops_while_it_waits(recorded):
     assert played.shifts == []
 
 
-def test_damage_ends_it_with_a_reason(recorded):
+def test_damage_ends_it_with_a_reason(recorded: Any) -> None:
     config, live, stream = recorded
     data = bytearray(stream.getvalue())
     at = 24

@@ -1,5 +1,6 @@
 import io
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -43,7 +44,7 @@ FAULTS = {
     ("settings", "faults"),
     [*((name, "rough") for name in SETTINGS), *(("periodic", name) for name in FAULTS)],
 )
-def test_replay_is_the_live_run_bit_for_bit(settings, faults):
+def test_replay_is_the_live_run_bit_for_bit(settings: Any, faults: Any) -> None:
     config, live, tap = live_run(4.0, settings=SETTINGS[settings], faults=FAULTS[faults])
     replayed = list(events(Recording(tap.stream), config))
     assert any(isinstance(event, Sweep) for event in live)
@@ -51,7 +52,7 @@ def test_replay_is_the_live_run_bit_for_bit(settings, faults):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_busy_host_makes_no_difference(seed):
+def test_a_busy_host_makes_no_difference(seed: Any) -> None:
     config, live, tap = live_run(
         6.0,
         settings=SETTINGS["periodic"],
@@ -62,7 +63,7 @@ def test_a_busy_host_makes_no_difference(seed):
     assert essence(list(events(Recording(tap.stream), config))) == essence(live)
 
 
-def test_commands_of_the_live_run_cut_the_same_sweeps():
+def test_commands_of_the_live_run_cut_the_same_sweeps() -> None:
     calls = [
         (1.2, lambda driver, now: driver.stop_rotation(now)),
         (1.9, lambda driver, now: driver.start_rotation(now)),
@@ -74,14 +75,14 @@ def test_commands_of_the_live_run_cut_the_same_sweeps():
     assert essence(list(events(Recording(tap.stream), config))) == essence(live)
 
 
-def test_giving_up_is_recorded_only_where_it_matters():
+def test_giving_up_is_recorded_only_where_it_matters() -> None:
     _, _, smooth = live_run(2.0)
     assert not [item for item in Recording(smooth.stream) if isinstance(item, Waited)]
     _, _, pulled = live_run(4.0, faults={"silence_at": (2.0,), "silence_s": 1.0})
     assert len([item for item in Recording(pulled.stream) if isinstance(item, Waited)]) == 1
 
 
-def test_other_settings_decode_the_same_recording_otherwise():
+def test_other_settings_decode_the_same_recording_otherwise() -> None:
     config, live, tap = live_run(3.0, settings={"imu_adjust": False})
     replayed = list(events(Recording(tap.stream), config))
     assert essence(replayed) == essence(live)
@@ -90,7 +91,7 @@ def test_other_settings_decode_the_same_recording_otherwise():
     assert turns[1].packets in (49, 50)
 
 
-def test_a_file_that_was_cut_off_gives_what_it_holds():
+def test_a_file_that_was_cut_off_gives_what_it_holds() -> None:
     config, live, tap = live_run(3.0)
     data = tap.stream.getvalue()
     recording = Recording(io.BytesIO(data[: len(data) * 2 // 3 + 7]))
@@ -102,7 +103,7 @@ def test_a_file_that_was_cut_off_gives_what_it_holds():
     assert part == whole[: len(part)]
 
 
-def test_shifted_events_move_in_time_and_in_nothing_else():
+def test_shifted_events_move_in_time_and_in_nothing_else() -> None:
     _, live, _ = live_run(2.0)
     later = [shifted(event, 1_000) for event in live]
     for before, after in zip(live, later, strict=True):
@@ -117,7 +118,7 @@ def test_shifted_events_move_in_time_and_in_nothing_else():
 
 
 @pytest.mark.parametrize("step", [-1.0, 0.05, 3600.0])
-def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step):
+def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step: float) -> None:
     config, live, tap = live_run(6.0, host_steps=((3.0, step),), settings={"imu_adjust": False})
 
     entries = [entry for entry in Recording(tap.stream) if isinstance(entry, Stepped)]
@@ -132,7 +133,7 @@ def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step):
 
 
 @pytest.mark.parametrize("late", [1.0, 5.0])
-def test_packets_that_stay_late_are_stamped_as_measured(late):
+def test_packets_that_stay_late_are_stamped_as_measured(late: float) -> None:
     config, live, tap = live_run(12.0, late=[(2.0, 5.0, late)], settings={"imu_adjust": False})
 
     stamps = [event.stamp for event in live if isinstance(event, ImuSample)]

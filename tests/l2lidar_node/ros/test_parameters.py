@@ -1,6 +1,9 @@
 """Settings as ROS parameters, from files as ROS reads them."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import pytest
 import rclpy
@@ -18,10 +21,10 @@ class Lists:
 
 
 @pytest.fixture
-def started(tmp_path):
+def started(tmp_path: Path) -> Iterator[Any]:
     made = []
 
-    def start(text):
+    def start(text: Any) -> Any:
         file = tmp_path / "parameters.yaml"
         file.write_text(text)
         context = rclpy.Context()
@@ -37,18 +40,18 @@ def started(tmp_path):
         rclpy.shutdown(context=context)
 
 
-def test_empty_list_in_a_file_is_an_empty_list(started):
+def test_empty_list_in_a_file_is_an_empty_list(started: Any) -> None:
     node, parameters, _ = started("lists: {ros__parameters: {names: [], sizes: []}}")
     assert parameters.value == Lists(names=(), sizes=())
     assert node.get_parameter("names").type_ != Parameter.Type.NOT_SET
 
 
-def test_list_that_is_not_named_keeps_its_default(started):
+def test_list_that_is_not_named_keeps_its_default(started: Any) -> None:
     _, parameters, _ = started("lists: {ros__parameters: {sizes: [2.0, 3.0]}}")
     assert parameters.value == Lists(sizes=(2.0, 3.0))
 
 
-def test_empty_list_can_be_filled_live(started):
+def test_empty_list_can_be_filled_live(started: Any) -> None:
     node, parameters, changes = started("lists: {ros__parameters: {names: []}}")
     (result,) = node.set_parameters([Parameter("names", value=["c"])])
     assert result.successful, result.reason

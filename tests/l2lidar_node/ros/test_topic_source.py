@@ -51,7 +51,9 @@ def errors(data: dict[str, Any]) -> set[str]:
     return {item["check"] for item in data["findings"] if item["level"] == "ERROR"}
 
 
-def test_the_publishers_parameter_and_qos_are_asked_for(results) -> None:
+def test_the_publishers_parameter_and_qos_are_asked_for(
+    results: dict[str, tuple[int, dict[str, Any]]],
+) -> None:
     code, data = results["fast_lio"]
     assert code == 1
     assert data["topics"] == {"cloud": "/points", "imu": "/imu/data"}
@@ -60,7 +62,9 @@ def test_the_publishers_parameter_and_qos_are_asked_for(results) -> None:
     assert "imu_adjust is true" in said
 
 
-def test_only_the_gravity_alignment_is_wrong_for_lio_sam(results) -> None:
+def test_only_the_gravity_alignment_is_wrong_for_lio_sam(
+    results: dict[str, tuple[int, dict[str, Any]]],
+) -> None:
     code, data = results["lio_sam"]
     assert code == 1
     assert errors(data) == {"levelled"}
@@ -69,7 +73,9 @@ def test_only_the_gravity_alignment_is_wrong_for_lio_sam(results) -> None:
     assert judged["fields"].endswith("read with sensor: velodyne")
 
 
-def test_levelled_clouds_are_right_for_nav2(results) -> None:
+def test_levelled_clouds_are_right_for_nav2(
+    results: dict[str, tuple[int, dict[str, Any]]],
+) -> None:
     code, data = results["nav2"]
     assert (code, errors(data)) == (0, set())
 

@@ -33,7 +33,7 @@ class Host:
 
 
 @pytest.fixture
-def host(monkeypatch) -> Host:
+def host(monkeypatch: pytest.MonkeyPatch) -> Host:
     made = Host()
     monkeypatch.setattr(time, "clock_gettime_ns", made.uptime)
     monkeypatch.setattr(time, "time_ns", made.shown)
@@ -41,7 +41,7 @@ def host(monkeypatch) -> Host:
 
 
 @pytest.mark.parametrize("step_s", [0.001, 0.05, 1, 3600, -0.05, -1, -3600])
-def test_a_step_is_told_once_and_to_the_microsecond(host, step_s):
+def test_a_step_is_told_once_and_to_the_microsecond(host: Host, step_s: float) -> None:
     clock = HostClock()
     host.true_ns += 10**10
     assert clock.step_ns() == 0
@@ -50,7 +50,7 @@ def test_a_step_is_told_once_and_to_the_microsecond(host, step_s):
     assert clock.step_ns() == 0
 
 
-def test_an_adjusted_rate_is_no_step(host):
+def test_an_adjusted_rate_is_no_step(host: Host) -> None:
     clock = HostClock()
     for _ in range(1000):  # an hour at 500 ppm, as if only the one clock felt it
         host.true_ns += 3_600_000_000
@@ -58,7 +58,7 @@ def test_an_adjusted_rate_is_no_step(host):
         assert clock.step_ns() == 0
 
 
-def test_a_process_that_is_held_up_while_it_looks_sees_no_step(host):
+def test_a_process_that_is_held_up_while_it_looks_sees_no_step(host: Host) -> None:
     clock = HostClock()
     host.looks = iter([100, 2_000_000_000, 100, 100, 100, 3_000_000_000, 100, 100, 100])
     assert clock.step_ns() == 0
@@ -70,7 +70,7 @@ def test_a_process_that_is_held_up_while_it_looks_sees_no_step(host):
     assert clock.step_ns() == pytest.approx(1e9, abs=1_000)
 
 
-def test_a_host_too_busy_at_first_begins_when_it_can(host):
+def test_a_host_too_busy_at_first_begins_when_it_can(host: Host) -> None:
     host.looks = iter([2_000_000_000] * 15)
     clock = HostClock()
     assert clock.step_ns() == 0
@@ -78,7 +78,7 @@ def test_a_host_too_busy_at_first_begins_when_it_can(host):
     assert clock.step_ns() == pytest.approx(-1e9, abs=1_000)
 
 
-def test_the_real_clocks_agree():
+def test_the_real_clocks_agree() -> None:
     clock = HostClock()
     before = time.time_ns()
     assert before <= clock.now() <= time.time_ns()

@@ -8,6 +8,7 @@ import threading
 import time
 import tty
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -73,7 +74,9 @@ def read(transport: SerialTransport, octets: int) -> list[Datagram]:
     return found
 
 
-def test_bytes_come_as_they_were_sent_with_the_time_of_arrival(line, transport):
+def test_bytes_come_as_they_were_sent_with_the_time_of_arrival(
+    line: Line, transport: SerialTransport
+) -> None:
     data = bytes(range(256)) * 8
     before = time.time_ns()
     os.write(line.end, data)
@@ -83,14 +86,14 @@ def test_bytes_come_as_they_were_sent_with_the_time_of_arrival(line, transport):
     assert transport.receive(0.01) == []
 
 
-def test_frames_go_out_as_they_are(line, transport):
+def test_frames_go_out_as_they_are(line: Line, transport: SerialTransport) -> None:
     frame = commands.sync_time(0x0A0D_1311_0403_7F00).encode()
     transport.send(frame)
     assert os.read(line.end, 4096) == frame
     assert transport.send_errors == 0
 
 
-def test_the_line_is_raw_at_4_mbaud_8n1(line, transport):
+def test_the_line_is_raw_at_4_mbaud_8n1(line: Line, transport: SerialTransport) -> None:
     descriptor = os.open(line.name, os.O_RDWR | os.O_NOCTTY)
     attributes = termios.tcgetattr(descriptor)
     os.close(descriptor)
@@ -102,7 +105,7 @@ def test_the_line_is_raw_at_4_mbaud_8n1(line, transport):
     assert not attributes[3] & (termios.ICANON | termios.ECHO | termios.ISIG)
 
 
-def test_nothing_is_lost_while_nobody_receives(line, transport):
+def test_nothing_is_lost_while_nobody_receives(line: Line, transport: SerialTransport) -> None:
     """Far more than the kernel keeps for a terminal."""
     block = bytes(range(250)) * 16
     for _ in range(100):
@@ -114,7 +117,7 @@ def test_nothing_is_lost_while_nobody_receives(line, transport):
     assert transport.kernel_drops == 0
 
 
-def test_closing_twice_and_while_waiting(line):
+def test_closing_twice_and_while_waiting(line: Line) -> None:
     transport = SerialTransport(line.name)
     waiting = threading.Thread(target=transport.receive, args=(0.5,))
     waiting.start()
@@ -126,7 +129,7 @@ def test_closing_twice_and_while_waiting(line):
     assert transport.send_errors == 1
 
 
-def test_a_device_that_goes_away_is_taken_up_again(tmp_path):
+def test_a_device_that_goes_away_is_taken_up_again(tmp_path: Path) -> None:
     name = tmp_path / "ttyL2"
     first, second = Line(), Line()
     name.symlink_to(first.name)
@@ -159,12 +162,12 @@ def test_a_device_that_goes_away_is_taken_up_again(tmp_path):
         ("/", "cannot open the serial device /: "),
     ],
 )
-def test_what_cannot_be_opened_is_explained(path, words):
+def test_what_cannot_be_opened_is_explained(path: str, words: str) -> None:
     with pytest.raises(TransportError, match=words):
         SerialTransport(path)
 
 
-def test_settings_choose_the_transport(line):
+def test_settings_choose_the_transport(line: Line) -> None:
     network = NetworkConfig(serial_port=line.name)
     transport = open_transport(network)
     assert isinstance(transport, SerialTransport)
@@ -179,7 +182,7 @@ def answers_to(event: Event, ticket: int) -> bool:
     return isinstance(event, Answer) and event.ticket == ticket
 
 
-def test_a_driver_works_over_a_serial_line():
+def test_a_driver_works_over_a_serial_line() -> None:
     config = DeviceConfig(power=PowerConfig(boot_scale=0.0))
     flash = Flash.factory(config.addresses, IdentityConfig(work_mode=WorkMode.SERIAL))
     device = VirtualL2(

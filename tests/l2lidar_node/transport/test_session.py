@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future
+from typing import Any
 
 import pytest
 
@@ -33,7 +34,7 @@ VALUES = {
 class Running:
     """A session and the device at the other end of its socket."""
 
-    def __init__(self, device: socket.socket, **values):
+    def __init__(self, device: socket.socket, **values: Any) -> None:
         self.device = device
         (port,) = free_udp_ports(1)
         ports = {"l2_port": device.getsockname()[1], "host_port": port}
@@ -84,14 +85,14 @@ def device() -> Iterator[socket.socket]:
 
 
 @pytest.fixture
-def running(device) -> Iterator[Running]:
+def running(device: socket.socket) -> Iterator[Running]:
     result = Running(device)
     result.session.start()
     yield result
     result.session.stop()
 
 
-def test_datagrams_become_sweeps_and_samples_and_stop_hands_out_the_rest(running):
+def test_datagrams_become_sweeps_and_samples_and_stop_hands_out_the_rest(running: Running) -> None:
     running.send(*(data for _, data in build.capture(0.5)))
     events: list[Event] = []
     while sum(isinstance(event, ImuSample) for event in events) < 125:
@@ -109,7 +110,7 @@ def test_datagrams_become_sweeps_and_samples_and_stop_hands_out_the_rest(running
     assert running.session.failure is None
 
 
-def test_a_stalled_stream_is_handed_out_without_being_asked(running):
+def test_a_stalled_stream_is_handed_out_without_being_asked(running: Running) -> None:
     running.send(*build.frames_3d(build.points_3d(seq, seq * 2_000_000) for seq in range(7)))
     packets = 0
     while packets < 7:
@@ -117,7 +118,7 @@ def test_a_stalled_stream_is_handed_out_without_being_asked(running):
     assert packets == 7
 
 
-def test_calls_run_in_the_loops_thread_and_return_or_raise(running):
+def test_calls_run_in_the_loops_thread_and_return_or_raise(running: Running) -> None:
     def who(driver: Driver, now: HostNs) -> tuple[bool, str]:
         return now > build.EPOCH_NS, threading.current_thread().name
 
@@ -131,7 +132,7 @@ def test_calls_run_in_the_loops_thread_and_return_or_raise(running):
     assert running.session.failure is None
 
 
-def test_a_call_that_nobody_wants_any_more_harms_nothing(running):
+def test_a_call_that_nobody_wants_any_more_harms_nothing(running: Running) -> None:
     reached, go_on = threading.Event(), threading.Event()
     running.session.call(lambda *_: (reached.set(), go_on.wait(PATIENCE_S)))
     assert reached.wait(PATIENCE_S)
@@ -142,7 +143,9 @@ def test_a_call_that_nobody_wants_any_more_harms_nothing(running):
     assert wanted.result(PATIENCE_S) == 2
 
 
-def test_a_command_reaches_the_device_and_its_ack_comes_back(patient, running):
+def test_a_command_reaches_the_device_and_its_ack_comes_back(
+    patient: None, running: Running
+) -> None:
     ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(
         PATIENCE_S
     )
@@ -154,7 +157,7 @@ def test_a_command_reaches_the_device_and_its_ack_comes_back(patient, running):
     assert 0 < answer.round_trip_ns < PATIENCE_S * 1e9
 
 
-def test_a_device_that_answers_nothing_is_asked_again_and_given_up(running):
+def test_a_device_that_answers_nothing_is_asked_again_and_given_up(running: Running) -> None:
     running.session.call(lambda driver, now: driver.start_rotation(now))
     for _ in range(TRIES):
         running.received(commands.start())
@@ -163,7 +166,7 @@ def test_a_device_that_answers_nothing_is_asked_again_and_given_up(running):
     assert answer.text == "start rotation: the device did not acknowledge it"
 
 
-def test_others_cannot_inject_samples_points_or_answers(patient, running):
+def test_others_cannot_inject_samples_points_or_answers(patient: None, running: Running) -> None:
     """Everything is right about their packets but where they come from."""
     ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(
         PATIENCE_S
@@ -190,27 +193,27 @@ def test_others_cannot_inject_samples_points_or_answers(patient, running):
     assert (answer.ticket, answer.ok) == (ticket, True)
 
 
-def test_silence_comes_by_itself(device):
+def test_silence_comes_by_itself(device: socket.socket) -> None:
     running = Running(device, watchdog_timeout_ms=100)
     running.session.start()
     assert running.events.get(timeout=PATIENCE_S).duration_ns > 100_000_000
     running.session.stop()
 
 
-def test_calls_after_the_end_are_cancelled(running):
+def test_calls_after_the_end_are_cancelled(running: Running) -> None:
     running.session.stop()
     with pytest.raises(CancelledError):
         running.session.call(lambda *_: 1).result(PATIENCE_S)
 
 
-def test_stopping_twice_and_without_a_start(device):
+def test_stopping_twice_and_without_a_start(device: socket.socket) -> None:
     running = Running(device)
     running.session.stop()
     assert running.is_closed()
     running.session.stop()
 
 
-def test_a_receiver_may_stop_the_session(device):
+def test_a_receiver_may_stop_the_session(device: socket.socket) -> None:
     running = Running(device)
     seen = threading.Event()
 
@@ -229,7 +232,7 @@ def test_a_receiver_may_stop_the_session(device):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_receiver_that_fails_ends_the_session_and_says_why(device):
+def test_a_receiver_that_fails_ends_the_session_and_says_why(device: socket.socket) -> None:
     running = Running(device)
 
     def fail(event: Event) -> None:
@@ -254,7 +257,7 @@ class Scripted:
     foreign = kernel_drops = 0
     stranger = ""
 
-    def __init__(self, *batches: list[Datagram]):
+    def __init__(self, *batches: list[Datagram]) -> None:
         self.batches = list(batches)
         self.sent: list[bytes] = []
         self.closed = 0
@@ -298,7 +301,7 @@ class Notes:
         self.closed += 1
 
 
-def test_a_tap_hears_everything_in_both_directions():
+def test_a_tap_hears_everything_in_both_directions() -> None:
     datagrams = [Datagram(data, HostNs(arrival)) for arrival, data in build.capture(0.2)]
     transport, notes = Scripted(datagrams[:50], datagrams[50:]), Notes()
     events: list[Event] = []

@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -30,7 +31,7 @@ def device() -> Iterator[socket.socket]:
 
 
 @contextmanager
-def opened(device: socket.socket, **config) -> Iterator[UdpTransport]:
+def opened(device: socket.socket, **config: Any) -> Iterator[UdpTransport]:
     given = {
         "l2_ip": DEVICE, "l2_port": device.getsockname()[1], "host_ip": HOST,
         "host_port": free_udp_ports(1)[0],
@@ -51,7 +52,7 @@ def receive(link: UdpTransport, count: int) -> list[Datagram]:
     return got
 
 
-def test_datagrams_come_whole_and_in_order(device):
+def test_datagrams_come_whole_and_in_order(device: socket.socket) -> None:
     sent = [b"", b"x", bytes(1472), bytes(range(256)) * 200]
     with opened(device) as link:
         for data in sent:
@@ -60,14 +61,16 @@ def test_datagrams_come_whole_and_in_order(device):
         assert link.foreign == 0
 
 
-def test_more_than_one_batch(device):  # and no more than the kernel keeps by default
+def test_more_than_one_batch(
+    device: socket.socket,
+) -> None:  # and no more than the kernel keeps by default
     with opened(device) as link:
         for number in range(400):
             device.sendto(number.to_bytes(2), (HOST, link.port))
         assert [item.data for item in receive(link, 400)] == [n.to_bytes(2) for n in range(400)]
 
 
-def test_arrivals_are_the_kernels_and_ascend(device):
+def test_arrivals_are_the_kernels_and_ascend(device: socket.socket) -> None:
     with opened(device) as link:
         before = time.time_ns()
         for _ in range(3):
@@ -80,7 +83,7 @@ def test_arrivals_are_the_kernels_and_ascend(device):
     assert arrivals[-1] <= after + 40_000_000
 
 
-def test_other_senders_are_counted_and_dropped(device):
+def test_other_senders_are_counted_and_dropped(device: socket.socket) -> None:
     with opened(device) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreigner:
         foreigner.bind((FOREIGNER, 0))
         for _ in range(3):
@@ -98,7 +101,7 @@ def flood(link: UdpTransport, foreigner: socket.socket) -> None:
         link.receive(0.001)
 
 
-def test_a_flood_of_strangers_takes_no_room_from_the_device(device):
+def test_a_flood_of_strangers_takes_no_room_from_the_device(device: socket.socket) -> None:
     """Every datagram of the device comes, and every one of the strangers is counted."""
     with opened(device) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreigner:
         foreigner.bind((FOREIGNER, 0))
@@ -115,7 +118,9 @@ def test_a_flood_of_strangers_takes_no_room_from_the_device(device):
         assert link.stranger == FOREIGNER
 
 
-def test_after_a_flood_strangers_are_read_again(device, monkeypatch):
+def test_after_a_flood_strangers_are_read_again(
+    device: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with opened(device) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreigner:
         foreigner.bind((FOREIGNER, 0))
         flood(link, foreigner)
@@ -129,26 +134,26 @@ def test_after_a_flood_strangers_are_read_again(device, monkeypatch):
         assert link.foreign == 2 * udp.FLOOD_HZ + 1
 
 
-def test_another_port_of_the_device_is_the_device(device):
+def test_another_port_of_the_device_is_the_device(device: socket.socket) -> None:
     with opened(device) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind((DEVICE, 0))
         other.sendto(b"x", (HOST, link.port))
         assert [item.data for item in receive(link, 1)] == [b"x"]
 
 
-def test_nothing_comes_in_time(device):
+def test_nothing_comes_in_time(device: socket.socket) -> None:
     with opened(device) as link:
         assert link.receive(0.01) == []
         assert link.receive(0.0) == []
 
 
-def test_a_listener_on_all_addresses(device):
+def test_a_listener_on_all_addresses(device: socket.socket) -> None:
     with opened(device, host_ip="0.0.0.0") as link:
         device.sendto(b"x", (DEVICE, link.port))
         assert [item.data for item in receive(link, 1)] == [b"x"]
 
 
-def test_drops_of_the_kernel_are_counted(device):
+def test_drops_of_the_kernel_are_counted(device: socket.socket) -> None:
     with opened(device, receive_buffer_bytes=4096) as link:
         assert 4096 <= link.receive_buffer_bytes < 100_000
         for _ in range(400):
@@ -160,7 +165,7 @@ def test_drops_of_the_kernel_are_counted(device):
         assert got + link.kernel_drops == 400
 
 
-def test_frames_go_to_the_device_from_the_port_that_receives(device):
+def test_frames_go_to_the_device_from_the_port_that_receives(device: socket.socket) -> None:
     with opened(device) as link:
         link.send(b"command")
         data, sender = device.recvfrom(100)
@@ -168,7 +173,7 @@ def test_frames_go_to_the_device_from_the_port_that_receives(device):
         assert sender == (HOST, link.port)
 
 
-def test_a_frame_that_cannot_be_sent_is_counted(device):
+def test_a_frame_that_cannot_be_sent_is_counted(device: socket.socket) -> None:
     with opened(device) as link:
         link.send(bytes(70_000))
         assert link.send_errors == 1
@@ -176,7 +181,7 @@ def test_a_frame_that_cannot_be_sent_is_counted(device):
         assert device.recvfrom(100)[0] == b"next"
 
 
-def test_a_device_that_is_not_there_stops_nothing(device):
+def test_a_device_that_is_not_there_stops_nothing(device: socket.socket) -> None:
     with opened(device, l2_port=free_udp_ports(1)[0]) as link:
         for _ in range(3):
             link.send(b"x")
@@ -185,14 +190,14 @@ def test_a_device_that_is_not_there_stops_nothing(device):
         assert [item.data for item in receive(link, 1)] == [b"back"]
 
 
-def refusal(device: socket.socket, **config) -> TransportError:
+def refusal(device: socket.socket, **config: Any) -> TransportError:
     """Return the error of listening where one cannot."""
     with pytest.raises(TransportError) as caught, opened(device, **config):
         pass
     return caught.value
 
 
-def test_a_port_in_use(device):
+def test_a_port_in_use(device: socket.socket) -> None:
     with opened(device) as first:
         error = refusal(device, host_port=first.port)
         assert error.errno == errno.EADDRINUSE
@@ -200,14 +205,14 @@ def test_a_port_in_use(device):
         assert "in use; end the other program" in str(error)
 
 
-def test_an_address_of_another_machine(device):
+def test_an_address_of_another_machine(device: socket.socket) -> None:
     error = refusal(device, host_ip="192.0.2.1")
     assert error.errno == errno.EADDRNOTAVAIL
     assert "host_ip '192.0.2.1' is not an address of this machine" in str(error)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may listen on any port")
-def test_a_privileged_port(device):
+def test_a_privileged_port(device: socket.socket) -> None:
     error = refusal(device, host_port=80)
     assert "no permission; set host_port to 1024 or above" in str(error)
 
@@ -219,13 +224,13 @@ def test_a_privileged_port(device):
         (errno.ENOBUFS, os.strerror(errno.ENOBUFS)),
     ],
 )
-def test_the_advice_for_what_a_test_cannot_provoke(number, advice):
+def test_the_advice_for_what_a_test_cannot_provoke(number: Any, advice: Any) -> None:
     error = OSError(number, os.strerror(number))
     text = udp._bind_advice(NetworkConfig(), error)
     assert text == f"cannot listen on 192.168.1.2:6201: {advice}"
 
 
-def test_closing_twice_and_listening_again(device):
+def test_closing_twice_and_listening_again(device: socket.socket) -> None:
     with opened(device) as link:
         port = link.port
         link.close()
