@@ -20,11 +20,11 @@ from benchmarks import deskew_pages, deskew_real
 from benchmarks.results import Target, at_least, at_most, publish
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
+from l2lidar_node.types import HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.config import MotionConfig, OdometryConfig, ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
-from l2lidar_proc.motion.sweep_trajectory import VELOCITY
 from l2lidar_proc.motion.tracker import MotionTracker
 from l2lidar_proc.odometry.odometry import Odometry
 from tests.support.deskew_scenarios import Recording, Scenario, TrueSweep, record, stamp
@@ -121,8 +121,8 @@ def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]
                 tracker.imu(part)
             odometry.imu(part)
         fed = until
-        for row in _true_velocities(recording, item):
-            trackers["true velocity"].velocity(row["stamp"], row["velocity"], "truth")
+        for instant, velocity in _true_velocities(recording, item):
+            trackers["true velocity"].velocity(instant, velocity, "truth")
         if item.start_s >= _SETTLED_S:
             clouds = {
                 "none": _xyz(item.sweep.points),
@@ -145,17 +145,15 @@ def _follow(odometry: Odometry, tracker: MotionTracker, item: TrueSweep) -> None
 
 
 def _ours(tracker: MotionTracker, item: TrueSweep) -> F64:
-    path, _ = tracker.path(item.sweep.start, item.sweep.end)
+    path, _ = tracker.trajectory(item.sweep.start, item.sweep.end)
     return _xyz(deskew(item.sweep.points, item.sweep.start, path, item.sweep.start))
 
 
-def _true_velocities(recording: Recording, item: TrueSweep) -> NDArray[np.void]:
-    """Return the true velocities of a sweep at 50 Hz."""
+def _true_velocities(recording: Recording, item: TrueSweep) -> list[tuple[HostNs, F64]]:
+    """Return the true velocities of a sweep at 50 Hz, with their instants."""
     times = np.arange(item.start_s, item.end_s + 0.02, 0.02)
-    found = np.zeros(len(times), dtype=VELOCITY)
-    found["stamp"] = [stamp(t) for t in times]
-    found["velocity"] = recording.motion.kinematics(times).velocity_body
-    return found
+    velocities = recording.motion.kinematics(times).velocity_body
+    return [(stamp(t), v) for t, v in zip(times.tolist(), velocities, strict=True)]
 
 
 def _per_packet(recording: Recording, item: TrueSweep) -> F64:
@@ -191,9 +189,9 @@ def cost(recording: Recording, rounds: int = 100) -> dict[str, float]:
     tracker = MotionTracker(MotionConfig())
     for first in range(0, len(recording.samples), 10):
         tracker.imu(recording.samples[first : first + 10])
-    for row in _true_velocities(recording, recording.sweeps[-3])[:6]:
-        tracker.velocity(row["stamp"], row["velocity"], "truth")
-    assert not tracker.path(item.sweep.start, item.sweep.end)[1].is_still
+    for instant, velocity in _true_velocities(recording, recording.sweeps[-3])[:6]:
+        tracker.velocity(instant, velocity, "truth")
+    assert not tracker.trajectory(item.sweep.start, item.sweep.end)[1].is_still
     delta = _pose(recording, item.start_s, item.end_s)
     xyz = _xyz(item.sweep.points)
     vector = kiss_icp_pybind._Vector3dVector(xyz)
@@ -217,7 +215,7 @@ def cost(recording: Recording, rounds: int = 100) -> dict[str, float]:
 
 
 def _timed_ours(tracker: MotionTracker, item: TrueSweep) -> None:
-    path, _ = tracker.path(item.sweep.start, item.sweep.end)
+    path, _ = tracker.trajectory(item.sweep.start, item.sweep.end)
     deskew(item.sweep.points, item.sweep.start, path, item.sweep.start)
 
 

@@ -73,7 +73,7 @@ def _ours(given: Recording) -> Track:
     seconds = time.process_time() - begin
     return Track(
         np.array([item.stamp for item in estimates], dtype=np.int64),
-        np.array([item.T_odom_lidar for item in estimates]).reshape(-1, 4, 4),
+        np.array([item.T_map_lidar for item in estimates]).reshape(-1, 4, 4),
         seconds,
         np.array([item.covariance for item in estimates]),
         np.array([item.velocity for item in estimates]),
@@ -89,7 +89,7 @@ def _plain(given: Recording) -> Track:
     seconds = time.process_time() - begin
     return Track(
         np.array([item.stamp for item in estimates], dtype=np.int64),
-        np.array([item.T_odom_lidar for item in estimates]).reshape(-1, 4, 4),
+        np.array([item.T_map_lidar for item in estimates]).reshape(-1, 4, 4),
         seconds,
     )
 

@@ -1,8 +1,8 @@
 """Deskews real scans of a fast-turning sensor that come with a deskewed reference.
 
 Three scans of the Newer College data, kept outside this repository. They carry no IMU samples, so
-the motion is fitted: the rates and velocities that our deskew is fed with are those that bring a
-few hundred points to their reference, and all points are judged.
+the motion is fitted: rates and forces of an IMU, and the first velocity, that bring a few hundred
+points to their reference; all points are judged.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from scipy.optimize import least_squares
 
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs
 from l2lidar_proc.deskew.deskew import deskew
-from l2lidar_proc.motion.sweep_trajectory import VELOCITY, integrate
-from l2lidar_proc.motion.sweep_trajectory import Path as MotionPath
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.preintegration import integrate, segment
+from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 
 F64 = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ BOUNDS_MM: Final = (31.0, 6.0, 20.0)  # what a fit with one constant rate and ve
 _START: Final = HostNs(1_600_000_000_000_000_000)
 _SPAN_S: Final = 0.1
 _RATES: Final = 6
-_VELOCITIES: Final = 3
+_FORCES: Final = 2
 
 
 def newer_college(scans: tuple[int, ...] = (0, 1, 2)) -> list[tuple[str, float, float, float]]:
@@ -60,7 +61,7 @@ def _scan(number: int) -> tuple[F64, F64, F64]:
     return turned, times[usable].astype(np.float64), expected[usable].astype(np.float64)
 
 
-def _fitted(raw: F64, times: F64, expected: F64) -> MotionPath:
+def _fitted(raw: F64, times: F64, expected: F64) -> SweepTrajectory:
     chosen = np.random.default_rng(0).choice(len(raw), 500, replace=False)
     stamps = _START + np.round(times[chosen] * 1e9).astype(np.int64)
 
@@ -71,23 +72,23 @@ def _fitted(raw: F64, times: F64, expected: F64) -> MotionPath:
         moved = raw[chosen] + w * t + np.cross(u, t) + p
         return np.asarray((moved - expected[chosen]).ravel())
 
-    unknowns = np.zeros(3 * (_RATES + _VELOCITIES))
+    unknowns = np.zeros(3 * (_RATES + _FORCES + 1))
     fit = least_squares(residuals, unknowns, loss="soft_l1", f_scale=0.02, max_nfev=40)
     return _path(fit.x)
 
 
-def _path(motion: F64) -> MotionPath:
+def _path(motion: F64) -> SweepTrajectory:
     samples = np.zeros(_RATES, dtype=IMU_SAMPLE)
-    samples["stamp"] = _START + np.linspace(0, _SPAN_S * 1e9, _RATES).astype(np.int64)
-    samples["angular_velocity"] = motion[: 3 * _RATES].reshape(-1, 3)
-    velocities = np.zeros(_VELOCITIES, dtype=VELOCITY)
-    velocities["stamp"] = _START + np.linspace(0, _SPAN_S * 1e9, _VELOCITIES).astype(np.int64)
-    velocities["velocity"] = motion[3 * _RATES :].reshape(-1, 3)
-    return integrate(
-        samples,
-        _START,
-        HostNs(_START + round(_SPAN_S * 1e9)),
-        T_cloud_imu=np.eye(4),
-        bias=np.zeros(3),
-        velocities=velocities,
+    at = np.linspace(0.0, 1.0, _RATES)
+    samples["stamp"] = _START + np.round(at * _SPAN_S * 1e9).astype(np.int64)
+    rates, forces, (velocity,) = np.split(motion.reshape(-1, 3), (_RATES, _RATES + _FORCES))
+    samples["angular_velocity"] = rates
+    samples["linear_acceleration"] = forces[0] + at[:, None] * (forces[1] - forces[0])
+    nothing = np.zeros(3)
+    state = InertialState(_START, np.eye(3), nothing, velocity, nothing, nothing, nothing)
+    end = HostNs(_START + round(_SPAN_S * 1e9))
+    imu = segment(samples, [_START, end], 10**9, nothing)
+    preintegrated = integrate(
+        imu, 0, gyro_bias=nothing, accel_bias=nothing, rest_force=state.rest_force
     )
+    return SweepTrajectory.of(preintegrated, state, nothing)

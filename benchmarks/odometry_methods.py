@@ -97,13 +97,13 @@ def _ours(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:
         last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
         odometry.imu(run.imu[first:last])
         first = last
-        out += [(item.stamp, item.T_odom_lidar) for item in odometry.register(sweep)]
+        out += [(item.stamp, item.T_map_lidar) for item in odometry.register(sweep)]
     return out
 
 
 def _plain(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:
     odometry = PlainOdometry(OdometryConfig(mode="plain"))
-    return [(item.stamp, item.T_odom_lidar) for sweep in some for item in odometry.register(sweep)]
+    return [(item.stamp, item.T_map_lidar) for sweep in some for item in odometry.register(sweep)]
 
 
 def _deskewed(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc import rotations
-from l2lidar_proc.motion.sweep_trajectory import Path
+from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 
 F32 = NDArray[np.float32]
 
 
 def deskew(
-    points: NDArray[np.void], start: HostNs, path: Path, reference: HostNs
+    points: NDArray[np.void], start: HostNs, trajectory: SweepTrajectory, reference: HostNs
 ) -> NDArray[np.void]:
     """Return the points in the cloud frame of one instant.
 
@@ -24,7 +24,7 @@ def deskew(
         and ``time`` [s] after ``start``, ascending.
     start : HostNs
         Instant that ``time`` counts from.
-    path : Path
+    trajectory : SweepTrajectory
         Covers the points and the reference; beyond its ends its end poses hold.
     reference : HostNs
         The instant to move to.
@@ -32,7 +32,7 @@ def deskew(
     Returns
     -------
     ndarray, shape (N,)
-        Same dtype and other fields; the very same array where the path does not move.
+        Same dtype and other fields; the very same array where the trajectory does not move.
 
     Notes
     -----
@@ -41,23 +41,23 @@ def deskew(
     the pose of that knot as ``p + (R - I) p + d``, which keeps small turns exact in single
     precision.
     """
-    if not len(points) or not (path.rates.any() or path.positions.any()):
+    if not len(points) or trajectory.is_still:
         return points
     moved = points.copy()
-    for name, coordinate in zip("xyz", _moved(points, start, path, reference), strict=True):
+    for name, coordinate in zip("xyz", _moved(points, start, trajectory, reference), strict=True):
         moved[name] = coordinate
     return moved
 
 
 def _moved(
-    points: NDArray[np.void], start: HostNs, path: Path, reference: HostNs
+    points: NDArray[np.void], start: HostNs, trajectory: SweepTrajectory, reference: HostNs
 ) -> tuple[F32, F32, F32]:
     """Return x, y and z at the reference, each of shape (N,)."""
     times = np.ascontiguousarray(points["time"])
-    knots = ((path.stamps - start) * 1e-9).astype(np.float32)
+    knots = ((trajectory.stamps - start) * 1e-9).astype(np.float32)
     cuts = np.searchsorted(times, knots[1:-1])
     counts = np.diff(cuts, prepend=0, append=len(times))
-    table = _table(path, knots, reference)
+    table = _table(trajectory, knots, reference)
     # one row per coefficient, one column per point: plain contiguous vectors from here on
     t0, wx, wy, wz, sx, sy, sz, vx, vy, vz, *pose = np.repeat(table, counts, axis=1)
     xx, xy, xz, yx, yy, yz, zx, zy, zz, dx, dy, dz = pose
@@ -81,22 +81,22 @@ def _moved(
     )
 
 
-def _table(path: Path, knots: F32, reference: HostNs) -> F32:
+def _table(trajectory: SweepTrajectory, knots: F32, reference: HostNs) -> F32:
     """Return the motion from each knot on, seen from the reference, shape (22, K - 1).
 
     Rows: instant [s]; rate (3) [rad/s] and its slope (3) [rad/s^2]; velocity (3) [m/s]; R - I row
     by row (9); position (3) [m].
     """
-    q_reference, p_reference = path.pose(reference)
+    q_reference, p_reference = trajectory.pose(reference)
     back = rotations.conjugate(q_reference)
-    turn = rotations.matrices(rotations.multiply(back, path.rotations_wxyz[:-1])) - np.eye(3)
-    position = rotations.rotate(back, path.positions - p_reference)
-    seconds = np.diff(path.stamps)[:, None] * 1e-9
-    slope = np.diff(path.rates, axis=0) / seconds
+    turn = rotations.matrices(rotations.multiply(back, trajectory.rotations_wxyz[:-1])) - np.eye(3)
+    position = rotations.rotate(back, trajectory.positions - p_reference)
+    seconds = np.diff(trajectory.stamps)[:, None] * 1e-9
+    slope = np.diff(trajectory.rates, axis=0) / seconds
     velocity = np.diff(position, axis=0) / seconds
     columns = (
         knots[:-1, None],
-        path.rates[:-1],
+        trajectory.rates[:-1],
         slope,
         velocity,
         turn.reshape(-1, 9),

@@ -20,7 +20,7 @@ from l2lidar_proc.deskew.filters import FilterError
 from l2lidar_proc.deskew.organise import organise
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
-from l2lidar_proc.motion.sweep_trajectory import Path
+from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, MotionTracker, Quality
 from l2lidar_proc.rotations import F64
 
@@ -130,50 +130,58 @@ class Pipeline:
         """Take a sweep that arrives at ``now`` [ns]."""
         if self._sequencer.push(sweep, now):
             self._jumped()
-            newest = self.tracker.window.newest
+            newest = self.tracker.buffer.newest
             if newest is not None and newest > sweep.end + 1000 * _MS:
                 # the IMU has not jumped yet: what it said is of another time
                 self.tracker.reset()
 
     def poll(self, now: int) -> list[Deskewed]:
         """Return what is finished by ``now`` [ns], in order."""
-        released = self._sequencer.release(self.tracker.window.newest, now)
+        released = self._sequencer.release(self.tracker.buffer.newest, now)
         return [self._process(release) for release in released]
 
     def _process(self, release: Release) -> Deskewed:
         sweep = release.sweep
-        path, quality = self.tracker.path(sweep.start, sweep.end)
+        trajectory, quality = self.tracker.trajectory(sweep.start, sweep.end)
         if release.reason is Reason.CLOCK_JUMP:
             quality = replace(quality, flags=(*quality.flags, Flag.CLOCK_JUMP))
         deskews = Flag.NO_IMU not in quality.flags
-        stamp, points, problems = self._assemble(sweep, path if deskews else None)
+        stamp, points, problems = self._assemble(sweep, trajectory if deskews else None)
         if problems:
             quality = replace(quality, flags=(*quality.flags, Flag.FILTER_LEFT_OUT))
             self.problems = problems
         self._count(quality)
         return Deskewed(stamp, points, sweep, quality, release.waited_ns)
 
-    def _assemble(self, sweep: Sweep, path: Path | None) -> tuple[HostNs, NDArray[np.void], str]:
+    def _assemble(
+        self, sweep: Sweep, trajectory: SweepTrajectory | None
+    ) -> tuple[HostNs, NDArray[np.void], str]:
         """Filter, deskew, filter again; return stamp, points to publish, what went wrong.
 
-        Without a path the points stay as they are and keep their times.
+        Without a trajectory the points stay as they are and keep their times.
         """
         chain = self._config.filters
         before, problem = self._kept(sweep.points, chain.filters_before)
         points = sweep.points if len(before) == len(sweep.points) else sweep.points[before]
-        reference = self._config.deskew.reference if path is not None else "start"
+        reference = self._config.deskew.reference if trajectory is not None else "start"
         stamp = _instant(reference, sweep, points)
-        moved = deskew(points, sweep.start, path, stamp) if path is not None else points
+        moved = (
+            deskew(points, sweep.start, trajectory, stamp) if trajectory is not None else points
+        )
         after, another = self._kept(moved, chain.filters_after)
         if len(after) < len(moved):
             points, moved = points[after], moved[after]
             if _instant(reference, sweep, points) != stamp:
                 stamp = _instant(reference, sweep, points)
-                moved = deskew(points, sweep.start, path, stamp) if path is not None else points
+                moved = (
+                    deskew(points, sweep.start, trajectory, stamp)
+                    if trajectory is not None
+                    else points
+                )
         times = points["time"]
         # a constant time ends some consumers
         keeps = (
-            (self._config.deskew.keep_time or path is None)
+            (self._config.deskew.keep_time or trajectory is None)
             and len(times) > 0
             and bool(np.ptp(times) > 0.0)
         )

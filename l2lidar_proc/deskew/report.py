@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from l2lidar_proc.deskew.pipeline import PipelineCounts
-from l2lidar_proc.motion.attitude import Attitude
-from l2lidar_proc.motion.imu_buffer import WindowCounts
+from l2lidar_proc.motion.imu_buffer import ImuCounts
 from l2lidar_proc.motion.tracker import Flag, Quality
+from l2lidar_proc.motion.twist_filter import TwistFilter
 
 
 class Level(IntEnum):
@@ -63,8 +63,8 @@ def of_period(
     before: PipelineCounts,
     after: PipelineCounts,
     last: Report | None,
-    window: WindowCounts,
-    attitude: Attitude | None,
+    imu: ImuCounts,
+    motion: TwistFilter | None,
     refused: dict[str, int],
     *,
     is_levelled: bool,
@@ -77,8 +77,8 @@ def of_period(
     before, after : PipelineCounts
     last : Report or None
         Of the newest sweep.
-    window : WindowCounts
-    attitude : Attitude or None
+    imu : ImuCounts
+    motion : TwistFilter or None
     refused : dict
         Clouds that could not be used, by reason.
     is_levelled : bool
@@ -94,17 +94,17 @@ def of_period(
         "passed on as they came": str(after.passed_on),
         "not covered by the IMU in time": str(after.uncovered),
         "clock jumps": str(after.jumps),
-        "IMU samples": str(window.accepted),
-        "IMU samples put in order": str(window.reordered),
-        "IMU samples refused: duplicate": str(window.duplicate),
-        "IMU samples refused: impossible": str(window.invalid),
-        "IMU samples refused: too old": str(window.stale),
+        "IMU samples": str(imu.accepted),
+        "IMU samples put in order": str(imu.reordered),
+        "IMU samples refused: duplicate": str(imu.duplicate),
+        "IMU samples refused: impossible": str(imu.invalid),
+        "IMU samples refused: too old": str(imu.stale),
         **{f"clouds refused: {reason}": str(count) for reason, count in refused.items()},
         **({f"last: {name}": value for name, value in last.values.items()} if last else {}),
     }
-    if attitude is not None:
-        values["gyro bias uncertainty [rad/s]"] = f"{attitude.bias_sigma:.4f}"
-        values["gravity [m/s^2]"] = f"{attitude.gravity:.2f}"
+    if motion is not None:
+        values["gyro bias uncertainty [rad/s]"] = f"{motion.gyro_bias_sigma:.4f}"
+        values["gravity [m/s^2]"] = f"{motion.gravity:.2f}"
     if is_levelled:
         text = "the clouds come levelled (imu_adjust), so deskewing makes them wrong"
         return Report(Level.ERROR, text, values)

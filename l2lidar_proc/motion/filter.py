@@ -1,41 +1,43 @@
-"""Carries pose, velocity, IMU biases and gravity through time: an error-state Kalman filter.
+"""Error-state Kalman filter of the IMU's pose, velocity, biases and gravity.
 
-The errors are ordered turn (3, sensor axes), position, velocity (map frame), gyro bias,
-accelerometer bias (sensor axes) and gravity (map frame): 18 numbers. The map's frame is fixed by
-the first pose, so gravity is estimated in it like a bias instead of being its axis (as Xu et al.
-2022, FAST-LIO2).
+The 18 errors are ordered rotation (3, sensor axes), position, velocity (map axes), gyro bias,
+accelerometer bias (sensor axes) and gravity (map axes). The first pose fixes the map frame, so
+gravity is a state in it rather than its axis (as in FAST-LIO2, Xu et al. 2022). Measurements are a
+twist, a zero velocity, and a scan alignment in information form; notation and error definition
+follow Sola (2017), boxplus and boxminus Hertzberg et al. (2013).
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from filterpy.kalman import predict, update
+from filterpy.kalman import predict as kalman_predict
+from filterpy.kalman import update as kalman_update
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations
-from l2lidar_proc.motion.preintegration import Increments, Track
+from l2lidar_proc import rotations, tuning
+from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration
 
 F64 = NDArray[np.float64]
 
-TURN: Final = slice(0, 3)
+ROTATION: Final = slice(0, 3)
 POSITION: Final = slice(3, 6)
 VELOCITY: Final = slice(6, 9)
 GYRO_BIAS: Final = slice(9, 12)
 ACCEL_BIAS: Final = slice(12, 15)
 GRAVITY: Final = slice(15, 18)
+POSE: Final = slice(ROTATION.start, POSITION.stop)
 ERRORS: Final = 18
-
-_STRIDES: Final = 6  # steps of the covariance per prediction; the mean takes every sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InertialState:
-    """Where the IMU is, how it moves and what is wrong with it.
+    """Pose, velocity, biases and gravity of the IMU at one instant.
 
     Attributes
     ----------
@@ -58,11 +60,11 @@ class InertialState:
     accel_bias: F64
     gravity: F64
 
-    def moved(self, error: F64) -> InertialState:
-        """Return the state that is off by an error, shape (18,)."""
+    def boxplus(self, error: F64) -> InertialState:
+        """Return ``state boxplus error``, the error of shape (18,)."""
         return InertialState(
             self.stamp,
-            self.rotation @ rotations.matrices(rotations.exp(error[TURN])),
+            self.rotation @ rotations.matrices(rotations.exp(error[ROTATION])),
             self.position + error[POSITION],
             self.velocity + error[VELOCITY],
             self.gyro_bias + error[GYRO_BIAS],
@@ -70,8 +72,8 @@ class InertialState:
             self.gravity + error[GRAVITY],
         )
 
-    def minus(self, other: InertialState) -> F64:
-        """Return the error by which the other state is off this one, shape (18,)."""
+    def boxminus(self, other: InertialState) -> F64:
+        """Return the error (18,) with ``other boxplus error == self``."""
         turn = rotations.log(rotations.from_matrix(other.rotation.T @ self.rotation))
         return np.concatenate(
             (
@@ -84,24 +86,32 @@ class InertialState:
             )
         )
 
-    def at(self, seen: Increments, knot: int) -> InertialState:
-        """Return the state at a knot; this one belongs to the anchor of the increments."""
-        dt = float(seen.stamps[knot] - seen.stamps[seen.anchor]) * 1e-9
+    def at(self, preintegrated: Preintegration, knot: int) -> InertialState:
+        """Return the state at a knot; this one belongs to the anchor of the preintegration."""
+        anchor = preintegrated.stamps[preintegrated.anchor]
+        dt = float(preintegrated.stamps[knot] - anchor) * 1e-9
         return dataclasses.replace(
             self,
-            stamp=HostNs(int(seen.stamps[knot])),
-            rotation=self.rotation @ rotations.matrices(seen.rotations_wxyz[knot]),
+            stamp=HostNs(int(preintegrated.stamps[knot])),
+            rotation=self.rotation @ rotations.matrices(preintegrated.rotations_wxyz[knot]),
             position=self.position
             + dt * self.velocity
             + 0.5 * dt * dt * self.gravity
-            + self.rotation @ seen.positions[knot],
-            velocity=self.velocity + dt * self.gravity + self.rotation @ seen.velocities[knot],
+            + self.rotation @ preintegrated.positions[knot],
+            velocity=self.velocity
+            + dt * self.gravity
+            + self.rotation @ preintegrated.velocities[knot],
         )
+
+    @property
+    def rest_force(self) -> F64:
+        """Specific force of a sensor at rest in this attitude, without bias [m/s^2], (3,)."""
+        return np.asarray(-self.rotation.T @ self.gravity)
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """How much a prediction is worth; densities of white noise, per axis.
+    """Process noise: densities of white noise, per axis.
 
     Attributes
     ----------
@@ -121,26 +131,30 @@ class Noise:
     accel_walk: float
 
 
-# where nothing is measured a carrier may turn and speed up like this: per sqrt(Hz), as densities
-BLIND_GYRO: Final = 0.5
-BLIND_ACCEL: Final = 1.0
-BLIND_TURN: Final = (
-    0.6  # [sqrt(s)] and by this part of the rate that is held: what shakes turns back
-)
+class Update(NamedTuple):
+    """Outcome of a measurement.
 
-# a velocity less certain than the first is drawn towards rest, as if that were measured with an
-# error of the second once a second [m/s]
-SLOW_FROM: Final = 0.2
-SLOW_SPEED: Final = 1.0
+    Attributes
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    nis : float
+        Normalized innovation squared before the update; its mean is the number of components.
+    """
 
-_OWN_POSE: Final = 1e-3  # [m, rad] of the pose with which a new map begins
+    state: InertialState
+    covariance: F64
+    nis: float
 
 
-def predicted(
+# ---- prediction
+
+
+def predict(
     state: InertialState,
     covariance: F64,
-    felt: Track,
-    seen: Increments,
+    imu: ImuSegment,
+    preintegrated: Preintegration,
     knot: int,
     noise: Noise,
     blind_forces: bool = False,
@@ -150,57 +164,81 @@ def predicted(
     Parameters
     ----------
     state : InertialState
-        At the anchor of ``seen``.
+        At the anchor of ``preintegrated``.
     covariance : ndarray, shape (18, 18)
-    felt : Track
-    seen : Increments
-        Of the same track.
+    imu : ImuSegment
+    preintegrated : Preintegration
+        Of the same segment.
     knot : int
         Not before the anchor.
     noise : Noise
     blind_forces : bool
         The forces were not used.
     """
-    edges = np.unique(np.linspace(seen.anchor, knot, _STRIDES + 1).astype(int))
+    edges = np.unique(
+        np.linspace(preintegrated.anchor, knot, tuning.COVARIANCE_STEPS + 1).astype(int)
+    )
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        at = state.at(seen, first)
-        dt = float(seen.stamps[last] - seen.stamps[first]) * 1e-9
-        spans = np.diff(felt.stamps[first : last + 1])
-        blind = float(spans[felt.missing[first:last]].sum()) / float(spans.sum())
-        held = float(np.abs(seen.rates[first : last + 1]).max())
-        gyro2 = (1.0 - blind) * noise.gyro**2 + blind * (BLIND_GYRO**2 + (BLIND_TURN * held) ** 2)
+        at = state.at(preintegrated, first)
+        dt = float(preintegrated.stamps[last] - preintegrated.stamps[first]) * 1e-9
+        spans = np.diff(imu.stamps[first : last + 1])
+        blind = float(spans[imu.missing[first:last]].sum()) / float(spans.sum())
+        held = float(np.abs(preintegrated.rates[first : last + 1]).max())
+        unmeasured = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
+        gyro2 = (1.0 - blind) * noise.gyro**2 + blind * unmeasured
         blind = 1.0 if blind_forces else blind
-        accel2 = (1.0 - blind) * noise.accel**2 + blind * BLIND_ACCEL**2
-        turn = rotations.matrices(seen.rotations_wxyz[[first, last]])
-        force = turn[0].T @ (seen.velocities[last] - seen.velocities[first]) / dt
-        transition = _transition(at.rotation, turn[0].T @ turn[1], force, dt)
-        walk = _process(gyro2, accel2, noise, dt)
-        _, covariance = predict(np.zeros(ERRORS), covariance, transition, walk)
-    return state.at(seen, knot), covariance
+        accel2 = (1.0 - blind) * noise.accel**2 + blind * tuning.BLIND_ACCEL**2
+        turn = rotations.matrices(preintegrated.rotations_wxyz[[first, last]])
+        gained = preintegrated.velocities[last] - preintegrated.velocities[first]
+        f = transition(at.rotation, turn[0].T @ turn[1], turn[0].T @ gained / dt, dt)
+        q = process_noise(gyro2, accel2, noise, dt)
+        _, covariance = kalman_predict(np.zeros(ERRORS), covariance, f, q)
+    return state.at(preintegrated, knot), covariance
 
 
-def _transition(rotation: F64, turn: F64, force: F64, dt: float) -> F64:
-    """Return how errors at one instant become errors ``dt`` later, shape (18, 18)."""
+def transition(rotation: F64, turn: F64, force: F64, dt: float) -> F64:
+    """Return the derivatives (18, 18) of the errors ``dt`` later by the errors now.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (3, 3)
+        Attitude at the beginning.
+    turn : ndarray, shape (3, 3)
+        Axes at the end to axes at the beginning.
+    force : ndarray, shape (3,)
+        Mean specific force without bias, axes of the beginning [m/s^2].
+    dt : float
+        [s]
+    """
     lean = -rotation @ skew(force)
     eye = np.eye(3)
     f = np.eye(ERRORS)
-    f[TURN, TURN] = turn.T
-    f[TURN, GYRO_BIAS] = -dt * eye
-    f[VELOCITY, TURN] = dt * lean
+    f[ROTATION, ROTATION] = turn.T
+    f[ROTATION, GYRO_BIAS] = -dt * eye
+    f[VELOCITY, ROTATION] = dt * lean
     f[VELOCITY, ACCEL_BIAS] = -dt * rotation
     f[VELOCITY, GRAVITY] = dt * eye
-    f[POSITION, TURN] = 0.5 * dt * dt * lean
+    f[POSITION, ROTATION] = 0.5 * dt * dt * lean
     f[POSITION, VELOCITY] = dt * eye
     f[POSITION, ACCEL_BIAS] = -0.5 * dt * dt * rotation
     f[POSITION, GRAVITY] = 0.5 * dt * dt * eye
     return f
 
 
-def _process(gyro2: float, accel2: float, noise: Noise, dt: float) -> F64:
-    """Return the covariance that a step adds, shape (18, 18)."""
+def process_noise(gyro2: float, accel2: float, noise: Noise, dt: float) -> F64:
+    """Return the covariance (18, 18) that a step of ``dt`` [s] adds.
+
+    Parameters
+    ----------
+    gyro2, accel2 : float
+        Squared densities of gyro [(rad/s)^2/Hz] and accelerometer [(m/s^2)^2/Hz] in the step.
+    noise : Noise
+        Gives the random walks of the biases.
+    dt : float
+    """
     q = np.zeros((ERRORS, ERRORS))
     eye = np.eye(3)
-    q[TURN, TURN] = gyro2 * dt * eye
+    q[ROTATION, ROTATION] = gyro2 * dt * eye
     q[VELOCITY, VELOCITY] = accel2 * dt * eye
     q[POSITION, POSITION] = accel2 * dt**3 / 3.0 * eye
     q[POSITION, VELOCITY] = q[VELOCITY, POSITION] = accel2 * dt * dt / 2.0 * eye
@@ -209,8 +247,34 @@ def _process(gyro2: float, accel2: float, noise: Noise, dt: float) -> F64:
     return q
 
 
-def corrected(
-    prior: InertialState, covariance: F64, at: InertialState, information: F64, pull: F64
+# ---- updates
+
+
+def update(
+    state: InertialState, covariance: F64, innovation: F64, jacobian: F64, noise: F64
+) -> Update:
+    """Return the posterior of a measurement.
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    innovation : ndarray, shape (M,)
+        Measured minus predicted.
+    jacobian : ndarray, shape (M, 18)
+        Derivatives of the predicted measurement by the errors.
+    noise : ndarray, shape (M, M)
+        Covariance of the measurement.
+    """
+    spread = jacobian @ covariance @ jacobian.T + noise
+    nis = float(innovation @ np.linalg.solve(spread, innovation))
+    error, posterior = kalman_update(np.zeros(ERRORS), covariance, innovation, noise, jacobian)
+    symmetric = 0.5 * (posterior + posterior.T)
+    return Update(state.boxplus(np.asarray(error)), symmetric, nis)
+
+
+def update_with_information(
+    prior: InertialState, covariance: F64, at: InertialState, information: F64, gradient: F64
 ) -> tuple[InertialState, F64]:
     """Return the posterior of one iteration of the iterated Kalman update.
 
@@ -220,46 +284,159 @@ def corrected(
     covariance : ndarray, shape (18, 18)
         Of the prior.
     at : InertialState
-        Where the measurement was linearised.
+        Where the measurement was linearized.
     information : ndarray, shape (18, 18)
         Sum of h^T w h over all residuals, h their derivatives by the errors of ``at``.
-    pull : ndarray, shape (18,)
+    gradient : ndarray, shape (18,)
         Sum of -h^T w r over all residuals r.
     """
-    # thousands of residuals say no more than these 18 with unit noise (a square root of the
+    # thousands of residuals carry no more than these 18 with unit noise (a square root of the
     # information)
     strength, directions = np.linalg.eigh(information)
-    known = strength > 1e-9 * max(float(strength[-1]), 1e-300)
-    root = np.sqrt(strength[known])
-    h = root[:, None] * directions[:, known].T
-    z = (directions[:, known].T @ pull) / root
-    error, posterior = update(-at.minus(prior), covariance, z, np.eye(len(z)), h)
-    return at.moved(np.asarray(error)), 0.5 * (posterior + posterior.T)
+    observed = strength > 1e-9 * max(float(strength[-1]), 1e-300)
+    root = np.sqrt(strength[observed])
+    h = root[:, None] * directions[:, observed].T
+    z = (directions[:, observed].T @ gradient) / root
+    error, posterior = kalman_update(-at.boxminus(prior), covariance, z, np.eye(len(z)), h)
+    return at.boxplus(np.asarray(error)), 0.5 * (posterior + posterior.T)
 
 
-def slowed(state: InertialState, covariance: F64, seconds: float) -> tuple[InertialState, F64]:
-    """Return state and covariance with the velocity, where hardly known, drawn towards rest.
+def twist_jacobian(state: InertialState, lever: F64) -> F64:
+    """Return the derivatives (3, 18) of :func:`body_velocity` by the errors."""
+    h = np.zeros((3, ERRORS))
+    h[:, ROTATION] = skew(state.rotation.T @ state.velocity)
+    h[:, VELOCITY] = state.rotation.T
+    h[:, GYRO_BIAS] = -skew(lever)
+    return h
 
-    Carriers are slow: it is as if a velocity of zero were measured all the time, but so coarsely
-    that it counts only where nothing else tells the velocity.
+
+def body_velocity(state: InertialState, rate: F64, lever: F64) -> F64:
+    """Return the velocity of the cloud frame's origin in sensor axes [m/s], shape (3,).
+
+    Parameters
+    ----------
+    state : InertialState
+    rate : ndarray, shape (3,)
+        Angular velocity as measured, bias included [rad/s].
+    lever : ndarray, shape (3,)
+        Place of the IMU in the cloud frame [m], sensor axes.
+    """
+    turning = rate - state.gyro_bias
+    return np.asarray(state.rotation.T @ state.velocity - rotations.cross(turning, lever))
+
+
+def update_twist(
+    state: InertialState, covariance: F64, measured: F64, noise: F64, rate: F64, lever: F64
+) -> Update:
+    """Return the posterior of a measured velocity of the cloud frame's origin.
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    measured : ndarray, shape (3,)
+        Over the ground, sensor axes [m/s].
+    noise : ndarray, shape (3, 3)
+        Its covariance.
+    rate, lever : ndarray, shape (3,)
+        As in :func:`body_velocity`.
+    """
+    innovation = measured - body_velocity(state, rate, lever)
+    return update(state, covariance, innovation, twist_jacobian(state, lever), noise)
+
+
+def update_static(
+    state: InertialState,
+    covariance: F64,
+    samples: Samples,
+    noise: Noise,
+    use_forces: bool,
+    *,
+    levels: bool = False,
+) -> tuple[InertialState, F64]:
+    """Return state and covariance after samples of a sensor at rest: a zero-velocity update.
+
+    The mean rate measures the gyro bias, the mean force gravity plus the accelerometer bias.
+
+    Parameters
+    ----------
+    state : InertialState
+        Its position stays, its velocity becomes zero.
+    covariance : ndarray, shape (18, 18)
+    samples : ndarray, shape (N,), dtype IMU_SAMPLE
+        Since this was done last, sensor axes.
+    noise : Noise
+    use_forces : bool
+    levels : bool
+        The force corrects roll and pitch as well; otherwise the whole pose stays.
+    """
+    if len(samples) < 2:
+        return state, covariance
+    seconds = float(samples["stamp"][-1] - samples["stamp"][0]) * 1e-9
+    covariance = covariance.copy()
+    covariance[GYRO_BIAS, GYRO_BIAS] += noise.gyro_walk**2 * seconds * np.eye(3)
+    covariance[ACCEL_BIAS, ACCEL_BIAS] += noise.accel_walk**2 * seconds * np.eye(3)
+    jacobian = np.zeros((9, ERRORS))
+    jacobian[:3, GYRO_BIAS] = np.eye(3)
+    jacobian[3:6, VELOCITY] = np.eye(3)
+    worth = np.repeat((seconds / noise.gyro**2, 1.0 / tuning.ZERO_VELOCITY**2, 0.0), 3)
+    innovation = np.zeros(9)
+    innovation[:3] = samples["angular_velocity"].mean(axis=0) - state.gyro_bias
+    innovation[3:6] = -state.velocity
+    if use_forces:
+        jacobian[6:, ACCEL_BIAS] = np.eye(3)
+        jacobian[6:, GRAVITY] = -state.rotation.T
+        if levels:
+            jacobian[6:, ROTATION] = skew(state.rest_force)
+        worth[6:] = seconds / noise.accel**2
+        force = samples["linear_acceleration"].mean(axis=0)
+        innovation[6:] = force - state.accel_bias - state.rest_force
+    weighted = jacobian.T * worth
+    better, covariance = update_with_information(
+        state, covariance, state, weighted @ jacobian, weighted @ innovation
+    )
+    return (
+        dataclasses.replace(
+            state,
+            rotation=better.rotation if levels else state.rotation,
+            velocity=np.zeros(3),
+            gyro_bias=better.gyro_bias,
+            accel_bias=better.accel_bias,
+            gravity=better.gravity,
+        ),
+        covariance,
+    )
+
+
+def apply_zero_velocity_prior(
+    state: InertialState, covariance: F64, seconds: float
+) -> tuple[InertialState, F64]:
+    """Return state and covariance with a velocity that is hardly known drawn towards zero.
+
+    Carriers are slow: a velocity of zero is measured all the time, but so coarsely that it only
+    counts where nothing else measures the velocity.
 
     Parameters
     ----------
     state : InertialState
     covariance : ndarray, shape (18, 18)
     seconds : float
-        How much time has passed since this was done last.
+        Time since this was done last.
     """
-    if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < SLOW_FROM**2:
+    known = np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < tuning.PRIOR_FROM_SIGMA**2
+    if known or seconds <= 0.0:
         return state, covariance
-    information = np.zeros_like(covariance)
-    information[VELOCITY, VELOCITY] = seconds / SLOW_SPEED**2 * np.eye(3)
-    return corrected(
-        state, covariance, state, information, -information[:, VELOCITY] @ state.velocity
-    )
+    jacobian = np.zeros((3, ERRORS))
+    jacobian[:, VELOCITY] = np.eye(3)
+    noise = tuning.PRIOR_SPEED**2 / seconds * np.eye(3)
+    found = update(state, covariance, -state.velocity, jacobian, noise)
+    return found.state, found.covariance
 
 
-def loosened(covariance: F64, errors: slice, sigma: float) -> F64:
+# ---- changes of what is known
+
+
+def decorrelated(covariance: F64, errors: slice, sigma: float) -> F64:
     """Return a covariance (18, 18) in which three errors are independent of all others."""
     out = covariance.copy()
     out[errors, :] = 0.0
@@ -268,32 +445,38 @@ def loosened(covariance: F64, errors: slice, sigma: float) -> F64:
     return out
 
 
-def at_origin(covariance: F64) -> F64:
+def at_map_origin(covariance: F64) -> F64:
     """Return a covariance (18, 18) in which the pose is known: a new map begins with it."""
-    for errors in (TURN, POSITION):
-        covariance = loosened(covariance, errors, _OWN_POSE)
+    for errors in (ROTATION, POSITION):
+        covariance = decorrelated(covariance, errors, tuning.MAP_ORIGIN_SIGMA)
     return covariance
 
 
-def same_bias(
+def with_gyro_bias_of(
     state: InertialState, covariance: F64, before: InertialState, covariance_before: F64
 ) -> tuple[InertialState, F64]:
-    """Return state and covariance (18, 18) with the gyro's bias as it was known before.
+    """Return state and covariance (18, 18) with the gyro bias as it was known before.
 
-    Without samples it stood for what the rate had changed by.
+    Without samples it stood for the change of the rate.
     """
-    covariance = loosened(covariance, GYRO_BIAS, 0.0)
+    covariance = decorrelated(covariance, GYRO_BIAS, 0.0)
     covariance[GYRO_BIAS, GYRO_BIAS] = covariance_before[GYRO_BIAS, GYRO_BIAS]
     return dataclasses.replace(state, gyro_bias=before.gyro_bias), covariance
 
 
-def interrupted(state: InertialState, covariance: F64, stamp: HostNs) -> tuple[InertialState, F64]:
-    """Return state and covariance (18, 18) at an instant about which no more is known than before.
+def after_time_jump(
+    state: InertialState, covariance: F64, stamp: HostNs
+) -> tuple[InertialState, F64]:
+    """Return state and covariance (18, 18) at the first instant of a new time line.
 
-    The sensor may have been moved meanwhile, but hardly far; how it moves now is not known.
+    The sensor may have been moved meanwhile, but hardly far; its motion is unknown.
     """
-    for errors, sigma in ((TURN, 0.1), (POSITION, 0.5), (VELOCITY, 1.0)):
-        covariance = loosened(covariance, errors, sigma)
+    for errors, sigma in (
+        (ROTATION, tuning.TIME_JUMP_ROTATION),
+        (POSITION, tuning.TIME_JUMP_POSITION),
+        (VELOCITY, tuning.TIME_JUMP_VELOCITY),
+    ):
+        covariance = decorrelated(covariance, errors, sigma)
     return dataclasses.replace(state, stamp=stamp, velocity=np.zeros(3)), covariance
 
 

@@ -1,26 +1,22 @@
-"""Keeps the recent IMU samples in order of time, whatever order and state they come in."""
+"""IMU buffer: the recent samples in order of time, whatever order and state they arrive in."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_proc import tuning
 
 Samples = NDArray[np.void]
 """Array of dtype IMU_SAMPLE, shape (N,)."""
 
 
-_MOST_RATE: Final = 100.0  # [rad/s] no gyro measures more
-_MOST_FORCE: Final = 5000.0  # [m/s^2] no accelerometer
-
-
 @dataclass(frozen=True, slots=True)
-class WindowCounts:
-    """What has come into a window since it was made.
+class ImuCounts:
+    """Counts of what has come into a buffer since it was made.
 
     Attributes
     ----------
@@ -35,7 +31,7 @@ class WindowCounts:
     stale : int
         Samples older than everything that is kept; refused.
     jumps : int
-        Times the clock went back, or far ahead, and the window was emptied.
+        Times the clock went back, or far ahead, and the buffer was emptied.
     """
 
     accepted: int = 0
@@ -46,7 +42,7 @@ class WindowCounts:
     jumps: int = 0
 
 
-class ImuWindow:
+class ImuBuffer:
     """Samples of the last seconds in strictly ascending order of time.
 
     Parameters
@@ -54,7 +50,7 @@ class ImuWindow:
     length_s : float
         How much is kept behind the newest sample [s].
     jump_s : float
-        A sample this much behind the newest one, or ahead of it, means a changed clock: the window
+        A sample this much behind the newest one, or ahead of it, means a changed clock: the buffer
         starts afresh with it [s].
     """
 
@@ -64,12 +60,12 @@ class ImuWindow:
         self._buffer = np.empty(2048, dtype=IMU_SAMPLE)
         self._head = 0
         self._tail = 0
-        self._tally = dict.fromkeys(WindowCounts.__dataclass_fields__, 0)
+        self._tally = dict.fromkeys(ImuCounts.__dataclass_fields__, 0)
 
     @property
-    def counts(self) -> WindowCounts:
+    def counts(self) -> ImuCounts:
         """What came in so far."""
-        return WindowCounts(**self._tally)
+        return ImuCounts(**self._tally)
 
     @property
     def samples(self) -> Samples:
@@ -96,6 +92,12 @@ class ImuWindow:
         last = int(np.searchsorted(stamps, end, side="left")) + 1
         return self.samples[first:last].copy()
 
+    def turn(self, rotation: NDArray[np.float64]) -> None:
+        """Turn rates and forces of all samples by a rotation matrix (3, 3)."""
+        kept = self.samples
+        for name in ("angular_velocity", "linear_acceleration"):
+            kept[name] = kept[name] @ rotation.T
+
     def push(self, samples: Samples) -> Samples:
         """Take samples in any order.
 
@@ -106,11 +108,11 @@ class ImuWindow:
         Returns
         -------
         ndarray, shape (M,), dtype IMU_SAMPLE
-            Those that continue the window in order: what a filter that runs along may use.
+            Those that continue the buffer in order: what a filter that runs along may use.
         """
         # NaN compares as false
-        possible = (np.abs(samples["angular_velocity"]) <= _MOST_RATE).all(axis=1)
-        possible &= (np.abs(samples["linear_acceleration"]) <= _MOST_FORCE).all(axis=1)
+        possible = (np.abs(samples["angular_velocity"]) <= tuning.MAX_RATE).all(axis=1)
+        possible &= (np.abs(samples["linear_acceleration"]) <= tuning.MAX_FORCE).all(axis=1)
         if not possible.all():
             self._tally["invalid"] += int((~possible).sum())
             samples = samples[possible]
@@ -126,7 +128,7 @@ class ImuWindow:
         return samples[in_order]
 
     def _push_one(self, sample: Samples) -> bool:
-        """Take one sample wherever it belongs; return whether it continues the window."""
+        """Take one sample wherever it belongs; return whether it continues the buffer."""
         stamp = int(sample["stamp"][0])
         newest = self.newest
         if newest is None or 0 < stamp - newest <= self._jump_ns:
@@ -165,3 +167,4 @@ class ImuWindow:
         self._tail += len(samples)
         oldest = int(self._buffer["stamp"][self._tail - 1]) - self._length_ns
         self._head += int(np.searchsorted(self.samples["stamp"], oldest))
+        self._head = max(self._head, self._tail - tuning.MAX_SAMPLES)

@@ -1,39 +1,34 @@
-"""Tells from the IMU alone whether the sensor stands still, in spite of its head turning.
+"""Static detection from IMU samples, despite the vibration of the spinning head.
 
-The head shakes gyro and accelerometer at its own frequency, by how much differs between units. So
-levels are learned at rest rather than prescribed: a first second in which nothing drifts becomes
-the reference, and whatever exceeds the spread seen there by several times is motion.
+The head shakes gyro and accelerometer at its own frequency, by an amount that differs between
+units. So levels are learned rather than prescribed: a first second in which no mean drifts becomes
+the reference, and whatever exceeds its spread by several times is motion.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.rotations import F64
 
-_BLOCK: Final = 25  # samples: 0.1 s, what a sudden start needs to be seen
-_SIGMAS: Final = 5.0
-# What counts as no change however quiet the sensor is.
-_RATE_FLOOR: Final = 0.005  # [rad/s]
-_FORCE_FLOOR: Final = 0.03  # [m/s^2]
-_RATE_SPREAD: Final = 0.5  # [rad/s] a shaking beyond this is no rest
-_FORCE_SPREAD: Final = 0.6  # [m/s^2]
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rest:
-    """What the IMU says while the sensor stands still.
+class StaticReference:
+    """Readings of the IMU of a sensor at rest.
 
     Attributes
     ----------
     rate, rate_spread : ndarray, shape (3,)
-        Mean, which is the bias, and standard deviation of the gyro [rad/s], IMU axes.
+        Mean, which is the bias, and standard deviation of the gyro [rad/s].
     force, force_spread : ndarray, shape (3,)
-        Mean and standard deviation of the accelerometer [m/s^2], IMU axes.
+        Mean and standard deviation of the accelerometer [m/s^2].
     """
 
     rate: F64
@@ -41,22 +36,94 @@ class Rest:
     force: F64
     force_spread: F64
 
+    def blended(self, newer: StaticReference, share: float) -> StaticReference:
+        """Return a reference whose means have moved towards newer ones; the spreads stay."""
+        return StaticReference(
+            self.rate + share * (newer.rate - self.rate),
+            self.rate_spread,
+            self.force + share * (newer.force - self.force),
+            self.force_spread,
+        )
 
-def at_rest(
-    samples: Samples, bias: F64, margin: float, *, sigmas: float = _SIGMAS, least: int = 100
-) -> Rest | None:
-    """Return what the IMU says at rest, None if it moved.
+    def matches(self, samples: Samples) -> bool:
+        """Return whether samples show no more than this reference.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (N,), dtype IMU_SAMPLE
+            Best a turn of the head or more; fewer than 25 samples never match.
+        """
+        return _matches(
+            samples["angular_velocity"], self.rate, self.rate_spread, tuning.STATIC_RATE_FLOOR
+        ) and _matches(
+            samples["linear_acceleration"],
+            self.force,
+            self.force_spread,
+            tuning.STATIC_FORCE_FLOOR,
+        )
+
+
+class StaticTest(NamedTuple):
+    """How much the means of parts of a static stretch may differ.
+
+    Attributes
+    ----------
+    parts : int
+        The stretch is split into so many.
+    rate, force : float
+        Largest difference between the means of two parts [rad/s, m/s^2],
+    sigmas : float
+        and so many standard deviations of that difference besides.
+    least : int
+        Samples needed.
+    """
+
+    parts: int
+    rate: float
+    force: float
+    sigmas: float
+    least: int
+
+
+LEARNING: Final = StaticTest(
+    4,
+    2.0 * tuning.STATIC_RATE_FLOOR,
+    2.0 * tuning.STATIC_FORCE_FLOOR,
+    tuning.STATIC_SIGMAS,
+    tuning.STATIC_SAMPLES,
+)
+"""Strict: what passes teaches the gyro bias."""
+
+PLAUSIBLE: Final = StaticTest(
+    6,
+    tuning.START_RATE_CHANGE,
+    tuning.START_FORCE_CHANGE,
+    tuning.STATIC_SIGMAS,
+    tuning.START_SAMPLES,
+)
+"""Loose: what passes may be at rest, and the clouds decide."""
+
+
+def static_reference(
+    samples: Samples,
+    bias: F64,
+    margin: float,
+    *,
+    sigmas: float = tuning.STATIC_SIGMAS,
+    least: int = LEARNING.least,
+) -> StaticReference | None:
+    """Return the readings of a sensor at rest, None if it moved.
 
     Parameters
     ----------
     samples : ndarray, shape (N,), dtype IMU_SAMPLE
         About a second.
     bias : ndarray, shape (3,)
-        What is known of the gyro's bias [rad/s].
+        Gyro bias as far as it is known [rad/s].
     margin : float
-        How wrong that may be [rad/s]: the mean rate may differ so much from it.
+        How wrong that may be [rad/s]: the mean rate may differ so much from it,
     sigmas : float
-        And so many standard deviations of the mean.
+        and so many standard deviations of the mean.
     least : int
         Fewer samples are not enough.
 
@@ -68,40 +135,67 @@ def at_rest(
     if len(samples) < least:
         return None
     rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
-    found = Rest(_hann_mean(rates), rates.std(axis=0), _hann_mean(forces), forces.std(axis=0))
-    if found.rate_spread.max() > _RATE_SPREAD or found.force_spread.max() > _FORCE_SPREAD:
-        return None
-    quarter = len(samples) // 4
-    if _drifts(rates, found.rate_spread, quarter, 2.0 * _RATE_FLOOR):
-        return None
-    if _drifts(forces, found.force_spread, quarter, 2.0 * _FORCE_FLOOR):
+    found = StaticReference(
+        _hann_mean(rates), rates.std(axis=0), _hann_mean(forces), forces.std(axis=0)
+    )
+    shakes = (
+        found.rate_spread.max() > tuning.STATIC_RATE_SPREAD
+        or found.force_spread.max() > tuning.STATIC_FORCE_SPREAD
+    )
+    if shakes or _drifts(samples, found.rate_spread, found.force_spread, LEARNING):
         return None
     limit = margin + sigmas * found.rate_spread * np.sqrt(1.5 / len(samples))
     return found if (np.abs(found.rate - bias) <= limit).all() else None
 
 
-def still_like(samples: Samples, rest: Rest) -> bool:
-    """Return whether samples say no more than those of a known rest did.
+def may_be_static(samples: Samples) -> bool:
+    """Return whether the first samples of all allow the sensor to be at rest.
 
     Parameters
     ----------
     samples : ndarray, shape (N,), dtype IMU_SAMPLE
-        Best a head turn or more; fewer than 25 samples never count as still.
-    rest : Rest
     """
-    return _agrees(
-        samples["angular_velocity"], rest.rate, rest.rate_spread, _RATE_FLOOR
-    ) and _agrees(samples["linear_acceleration"], rest.force, rest.force_spread, _FORCE_FLOOR)
-
-
-def blended(rest: Rest, newer: Rest, share: float) -> Rest:
-    """Return a rest whose means have moved towards newer ones; the spreads stay."""
-    return Rest(
-        rest.rate + share * (newer.rate - rest.rate),
-        rest.rate_spread,
-        rest.force + share * (newer.force - rest.force),
-        rest.force_spread,
+    if len(samples) < PLAUSIBLE.least:
+        return False
+    rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
+    return bool(
+        np.abs(rates.mean(axis=0)).max() < tuning.START_RATE
+        and not _drifts(samples, white_noise(rates), white_noise(forces), PLAUSIBLE)
     )
+
+
+def white_noise(values: F64) -> float:
+    """Return the standard deviation of the white part of samples (N, 3), despite slow motion.
+
+    From the second differences, whose variance is 1.5 times that of white noise; the median
+    ignores shocks.
+    """
+    if len(values) < 8:
+        return 0.0
+    bend = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
+    return float(np.median(bend, axis=0).max() * 1.4826 / np.sqrt(1.5))
+
+
+def gravity_is_plausible(samples: Samples, *, at_rest: bool) -> bool:
+    """Return whether the accelerometer of a unit is sound, judged by the size of its mean.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (N,), dtype IMU_SAMPLE
+        About a second; none is not plausible.
+    at_rest : bool
+        The mean force is gravity; otherwise the mean of the sizes is near it.
+    """
+    if not len(samples):
+        return False
+    forces = samples["linear_acceleration"]
+    if at_rest:
+        size = float(np.linalg.norm(forces.mean(axis=0)))
+        low, high = tuning.GRAVITY_AT_REST
+    else:
+        size = float(np.linalg.norm(forces, axis=1).mean())
+        low, high = tuning.GRAVITY_IN_MOTION
+    return low < size < high
 
 
 def _hann_mean(values: F64) -> F64:
@@ -109,21 +203,31 @@ def _hann_mean(values: F64) -> F64:
     return np.asarray(weights @ values / weights.sum())
 
 
-def _drifts(values: F64, spread: F64, quarter: int, floor: float) -> bool:
-    """Return whether the means of the quarters differ by more than chance lets them."""
-    means = values[: 4 * quarter].reshape(4, quarter, 3).mean(axis=1)
-    return bool((np.ptp(means, axis=0) > floor + _SIGMAS * spread * np.sqrt(2.0 / quarter)).any())
+def _drifts(
+    samples: Samples, rate_noise: F64 | float, force_noise: F64 | float, test: StaticTest
+) -> bool:
+    """Return whether the means of the parts differ by more than a test allows."""
+    for name, noise, floor in (
+        ("angular_velocity", rate_noise, test.rate),
+        ("linear_acceleration", force_noise, test.force),
+    ):
+        parts = np.array_split(samples[name], test.parts)
+        means = np.array([part.mean(axis=0) for part in parts])
+        chance = test.sigmas * noise * np.sqrt(2.0 * test.parts / len(samples))
+        if (np.ptp(means, axis=0) > floor + chance).any():
+            return True
+    return False
 
 
-def _agrees(values: F64, mean: F64, spread: F64, floor: float) -> bool:
-    blocks = len(values) // _BLOCK
+def _matches(values: F64, mean: F64, spread: F64, floor: float) -> bool:
+    size = tuning.STATIC_BLOCK
+    blocks = len(values) // size
     if not blocks:
         return False
-    if (
-        np.abs(values.mean(axis=0) - mean) > floor + _SIGMAS * spread / np.sqrt(len(values))
-    ).any():
+    chance = tuning.STATIC_SIGMAS * spread / np.sqrt(len(values))
+    if (np.abs(values.mean(axis=0) - mean) > floor + chance).any():
         return False
-    shaped = values[-blocks * _BLOCK :].reshape(blocks, _BLOCK, 3)
+    shaped = values[-blocks * size :].reshape(blocks, size, 3)
     # a line of the head moves the mean of a block by up to its amplitude, 1.4 times its spread
     if (np.abs(shaped.mean(axis=1) - mean) > 2.0 * (floor + spread)).any():
         return False

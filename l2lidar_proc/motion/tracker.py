@@ -1,24 +1,21 @@
-"""Knows how the sensor moved lately, and says so for any sweep, with how well it is known."""
+"""Motion tracker of the deskew: the trajectory of any sweep and its quality."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations
+from l2lidar_proc import rotations, tuning
 from l2lidar_proc.config import MotionConfig
-from l2lidar_proc.motion.attitude import AttitudeFilter
-from l2lidar_proc.motion.imu_buffer import ImuWindow, Samples
-from l2lidar_proc.motion.sweep_trajectory import Path, coverage, integrate, still_path
-from l2lidar_proc.motion.velocity import VelocityHistory
-
-_STILL_NS: Final = 500_000_000  # stillness is judged over two head turns at least
-_MEMORY_S: Final = 25.0  # the longest sweep that can be had, and more
+from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
+from l2lidar_proc.motion.preintegration import coverage
+from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory, still_trajectory
+from l2lidar_proc.motion.twist_filter import TwistFilter
+from l2lidar_proc.rotations import F64
 
 
 class Flag(Enum):
@@ -72,7 +69,9 @@ class Quality:
 
 
 class MotionTracker:
-    """IMU window, attitude filter and velocities, asked together.
+    """IMU buffer, static detector and error-state filter, asked together.
+
+    Deskew without odometry is this filter with updates from twists, or with none.
 
     Parameters
     ----------
@@ -82,22 +81,20 @@ class MotionTracker:
 
     Attributes
     ----------
-    window : ImuWindow
-    attitude : AttitudeFilter
-    velocities : VelocityHistory
+    buffer : ImuBuffer
+        Samples in cloud axes.
     """
 
     def __init__(self, config: MotionConfig, T_cloud_imu: rotations.F64 | None = None) -> None:
-        self._T_cloud_imu = config.T_cloud_imu if T_cloud_imu is None else T_cloud_imu
-        self.window = ImuWindow(_MEMORY_S)
-        self.attitude = AttitudeFilter(self._T_cloud_imu, config.max_gyro_bias)
-        self.velocities = VelocityHistory()
+        self._T_cloud_imu = np.array(config.T_cloud_imu if T_cloud_imu is None else T_cloud_imu)
+        self.buffer = ImuBuffer(tuning.TRACKER_MEMORY_S)
+        self.filter = TwistFilter(self.buffer, self._T_cloud_imu[:3, 3], config.max_gyro_bias)
         self.configure(config)
 
     def configure(self, config: MotionConfig) -> None:
         """Take new live settings."""
         self._config = config
-        self.velocities.max_age_ns = config.velocity_max_age_ms * 1_000_000
+        self.filter.uses_accelerometer = config.use_accelerometer
 
     def mount(self, T_cloud_imu: rotations.F64) -> bool:
         """Take the place of the IMU, shape (4, 4); return whether it is another one.
@@ -106,84 +103,90 @@ class MotionTracker:
         """
         if np.allclose(T_cloud_imu, self._T_cloud_imu, rtol=0.0, atol=1e-9):
             return False
-        self._T_cloud_imu = T_cloud_imu
-        self.attitude = AttitudeFilter(T_cloud_imu, self._config.max_gyro_bias)
+        self.buffer.turn(T_cloud_imu[:3, :3] @ self._T_cloud_imu[:3, :3].T)
+        self._T_cloud_imu = np.array(T_cloud_imu)
+        self.filter = TwistFilter(
+            self.buffer, self._T_cloud_imu[:3, 3], self._config.max_gyro_bias
+        )
+        self.configure(self._config)
         return True
 
     def reset(self) -> None:
         """Forget all motion, as after a jump of the clock."""
-        self.window.clear()
-        self.attitude.reset()
-        self.velocities.clear()
+        self.buffer.clear()
+        self.filter.reset()
 
     def imu(self, samples: Samples) -> bool:
         """Take IMU samples in any order and state; return whether the clock jumped with them."""
-        jumps = self.window.counts.jumps
-        fresh = self.window.push(samples)
-        jumped = self.window.counts.jumps > jumps
+        jumps = self.buffer.counts.jumps
+        self.buffer.push(turned(samples, self._T_cloud_imu[:3, :3]))
+        jumped = self.buffer.counts.jumps > jumps
         if jumped:
-            self.attitude.reset()
-            self.velocities.clear()
-            fresh = self.window.samples.copy()
-        self.attitude.push(fresh, self.velocities)
+            self.filter.reset()
+        self.filter.follow()
         return jumped
 
-    def velocity(self, stamp: HostNs, velocity: ArrayLike, source: str) -> bool:
-        """Take a velocity, see :meth:`VelocityHistory.push`."""
-        return self.velocities.push(stamp, velocity, source)
+    def velocity(
+        self, stamp: HostNs, velocity: ArrayLike, source: str, covariance: F64 | None = None
+    ) -> bool:
+        """Take a velocity; one that is not finite or not later than the newest is refused.
 
-    def path(self, start: HostNs, end: HostNs) -> tuple[Path, Quality]:
-        """Return the path from ``start`` (or a little earlier) to ``end``, and how good it is.
-
-        A sensor at rest, or one without any IMU sample near, has a path that does not move.
+        Parameters
+        ----------
+        stamp : HostNs
+        velocity : array-like, shape (3,)
+            Of the cloud frame's origin over the ground, cloud axes [m/s].
+        source : str
+            Where it comes from, for reports; a new source voids the velocities of the old one.
+        covariance : ndarray, shape (3, 3), optional
+            Of the velocity.
         """
-        covered, gap = coverage(self.window.samples["stamp"], start, end)
+        return self.filter.take(stamp, velocity, source, covariance)
+
+    @property
+    def bias(self) -> F64:
+        """Gyro bias [rad/s], IMU axes, shape (3,); zero while nothing is known."""
+        return np.asarray(self.filter.gyro_bias @ self._T_cloud_imu[:3, :3])
+
+    def trajectory(self, start: HostNs, end: HostNs) -> tuple[SweepTrajectory, Quality]:
+        """Return the trajectory from ``start`` (or earlier) to ``end``, and how good it is.
+
+        A sensor at rest, or one without any IMU sample near, has a trajectory that does not move.
+        """
+        covered, gap = coverage(self.buffer.samples["stamp"], start, end)
         flags = self._flags(start, end, gap)
         if Flag.NO_IMU in flags:
-            return still_path(start, end), self._quality(covered, gap, still=False, flags=flags)
+            still = still_trajectory(start, end)
+            return still, self._quality(covered, gap, still=False, flags=flags)
         if self._is_still(start, end):
-            return still_path(start, end), self._quality(covered, gap, still=True, flags=flags)
-        velocities = self.velocities.around(start, end)
-        if not len(velocities):
+            still = still_trajectory(start, end)
+            return still, self._quality(covered, gap, still=True, flags=flags)
+        newest = self.filter.newest_twist
+        known = self.filter.knows_velocity(start, self._config.velocity_max_age_ms * 1_000_000)
+        if not known:
             flags = (*flags, Flag.NO_VELOCITY)
-        gravity = self.attitude.gravity_before(start) if self._config.use_accelerometer else None
-        if gravity is not None and gravity.stamp > end:
-            gravity = None
-        anchors = [gravity.stamp] if gravity is not None else []
-        anchors.extend(velocities["stamp"][:1].tolist())
-        origin = min([start, *anchors])
-        last = max([end, *velocities["stamp"][-1:].tolist()])
-        path = integrate(
-            self.window.between(origin, last),
-            origin,
-            last,
-            T_cloud_imu=self._T_cloud_imu,
-            bias=self.attitude.bias,
-            velocities=velocities,
-            gravity=gravity,
-            hold_ns=self._config.hold_ms * 1_000_000,
-        )
-        turned, moved = path.between(start, end)
-        return path, self._quality(
+        found = self.filter.trajectory(start, end, self._config.hold_ms * 1_000_000, known)
+        turned_by, moved_by = found.between(start, end)
+        return found, self._quality(
             covered,
             gap,
-            rotation=float(np.linalg.norm(rotations.log(turned))),
-            translation=float(np.linalg.norm(moved)),
-            age=max(int(end - velocities["stamp"][-1]), 0) if len(velocities) else None,
+            rotation=float(np.linalg.norm(rotations.log(turned_by))),
+            translation=float(np.linalg.norm(moved_by)),
+            age=max(int(end - newest), 0) if known and newest is not None else None,
             flags=flags,
         )
 
     def _is_still(self, start: HostNs, end: HostNs) -> bool:
-        velocity = self.velocities.at(end)
-        if velocity is not None and np.linalg.norm(velocity) > self._config.still_speed:
+        speed = self.filter.speed_near(end, self._config.velocity_max_age_ms * 1_000_000)
+        if speed is not None and speed > self._config.still_speed:
             return False
-        first = HostNs(min(start, end - _STILL_NS))
-        stamps = self.window.samples["stamp"]
+        first = HostNs(min(start, end - tuning.TRACKER_STILL_NS))
+        stamps = self.buffer.samples["stamp"]
         within = slice(*np.searchsorted(stamps, [first, end]))
-        return self.attitude.is_still(self.window.samples[within])
+        return self.filter.is_still(self.buffer.samples[within])
 
     def _flags(self, start: HostNs, end: HostNs, gap: int) -> tuple[Flag, ...]:
-        stamps = self.window.samples["stamp"]
+        stamps = self.buffer.samples["stamp"]
         hold = self._config.hold_ms * 1_000_000
         if not len(stamps) or stamps[-1] < start - hold or stamps[0] > end + hold:
             return (Flag.NO_IMU,)
@@ -194,8 +197,7 @@ class MotionTracker:
             flags.append(Flag.IMU_ENDS_EARLY)
         if gap > self._config.max_gap_ms * 1_000_000:
             flags.append(Flag.IMU_GAP)
-        state = self.attitude.latest
-        if state is not None and state.is_faulty:
+        if self.filter.is_faulty:
             flags.append(Flag.ACCELEROMETER_FAULT)
         return tuple(flags)
 
@@ -210,17 +212,42 @@ class MotionTracker:
         still: bool = False,
         flags: tuple[Flag, ...],
     ) -> Quality:
-        state = self.attitude.latest
-        x, y, z = self.attitude.bias.tolist()
+        x, y, z = self.bias.tolist()
         return Quality(
             imu_covered=covered,
             imu_gap_ns=gap,
             rotation_rad=rotation,
             translation_m=translation,
-            velocity_source=self.velocities.source if age is not None else "",
+            velocity_source=self.filter.source if age is not None else "",
             velocity_age_ns=age or 0,
             bias=(x, y, z),
             is_still=still,
-            is_gravity_trusted=state is not None and state.is_trusted,
+            is_gravity_trusted=self.filter.is_trusted,
             flags=flags,
         )
+
+
+def turned(samples: Samples, rotation: F64) -> Samples:
+    """Return samples with rates and forces in axes turned by a rotation matrix (3, 3)."""
+    if np.array_equal(rotation, np.eye(3)):
+        return samples
+    samples = samples.copy()
+    for name in ("angular_velocity", "linear_acceleration"):
+        samples[name] = samples[name] @ rotation.T
+    return samples
+
+
+def carried_over(linear: ArrayLike, angular: ArrayLike, T_cloud_body: F64) -> F64:
+    """Return the velocity of the cloud frame's origin in cloud axes [m/s], shape (3,).
+
+    Parameters
+    ----------
+    linear, angular : array-like, shape (3,)
+        Velocity [m/s] and rate [rad/s] of a body the sensor is fixed to, in the body's axes.
+    T_cloud_body : ndarray, shape (4, 4)
+        Body coordinates to cloud coordinates.
+    """
+    turn = T_cloud_body[:3, :3]
+    place_of_cloud = -turn.T @ T_cloud_body[:3, 3]
+    moved = np.asarray(linear, dtype=np.float64) + rotations.cross(angular, place_of_cloud)
+    return np.asarray(turn @ moved)

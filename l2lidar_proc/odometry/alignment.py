@@ -1,4 +1,4 @@
-"""Aligns a sweep with the map of surfaces: iterated update of the inertial filter, point to plane.
+"""Scan alignment: iterated update of the filter with point-to-plane residuals.
 
 The residual of a point y (deskewed to the reference, IMU axes) measured dt after the reference is
 ``n . (R y + p - m)``. It also depends on what deskewed the point, velocity, gravity and biases,
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations
+from l2lidar_proc import rotations, tuning
 from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
@@ -21,22 +21,14 @@ from l2lidar_proc.motion.filter import (
     GRAVITY,
     GYRO_BIAS,
     POSITION,
-    TURN,
+    ROTATION,
     VELOCITY,
     InertialState,
-    corrected,
+    update_with_information,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 F64 = NDArray[np.float64]
-
-_FIRST_REACH_M = 0.5  # farthest point from its plane in the first step; each step halves it
-_LAST_REACH_SCALES = 3.0  # down to this many outlier scales
-WEAK = 0.01  # share of points below which a direction counts as hardly observed
-_TILTED = 4  # one in so many matches stands for what is taken off for uncertain normals
-_SCATTER_SHARED = 3.0  # neighbours in a cell that is not flat err together
-_DONE = 2e-4  # a step below this, in radians and metres, is the last
-_FAR_NOISE = 0.00056  # range noise grows as this times range^1.25, measured on a real unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,14 +39,14 @@ class Source:
     ----------
     points : ndarray, shape (N, 3)
         Deskewed to the reference, from the IMU's origin, cloud axes [m].
-    since : ndarray, shape (N,)
+    times : ndarray, shape (N,)
         Instant of each point after the reference [s], negative before it.
     ranges : ndarray, shape (N,)
         [m]
     """
 
     points: F64
-    since: F64
+    times: F64
     ranges: F64
 
 
@@ -70,7 +62,7 @@ class Alignment:
         What the points alone say, at the last step.
     matched : int
         Points that took part in the last step.
-    agreement : float
+    inlier_ratio : float
         Share of the points at known surfaces that are near them, 0 to 1: unknown surroundings do
         not lower it, a wrong pose does.
     residual : float
@@ -82,7 +74,7 @@ class Alignment:
     covariance: F64
     information: F64
     matched: int
-    agreement: float
+    inlier_ratio: float
     residual: float
     steps: int
 
@@ -112,48 +104,51 @@ def align(
         Where to begin instead of the prior.
     """
     state = prior if start is None else start
-    noise2 = config.point_noise**2 + (2.0 * _FAR_NOISE * source.ranges**1.25) ** 2
+    far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * source.ranges
+    noise2 = config.point_noise**2 + far**2
     result = None
     for step in range(config.iterations):
-        error = state.minus(prior)
-        points = _redone(source, error, prior.rotation)
+        error = state.boxminus(prior)
+        points = _deskewed_again(source, error, prior.rotation)
         places = points @ state.rotation.T + state.position
         found = surfaces.match(places, narrow=True)
-        reach = max(_FIRST_REACH_M * 0.5**step, _LAST_REACH_SCALES * config.outlier_scale)
+        reach = max(
+            tuning.FIRST_REACH_M * 0.5**step, tuning.LAST_REACH_SCALES * config.outlier_scale
+        )
         spread = np.sqrt(config.outlier_scale**2 + found.scatter)
-        near = np.abs(found.distances) < np.maximum(reach, _LAST_REACH_SCALES * spread)
+        near = np.abs(found.distances) < np.maximum(reach, tuning.LAST_REACH_SCALES * spread)
         if np.count_nonzero(near) < least:
             return result
         index, normals, distances = found.index[near], found.normals[near], found.distances[near]
         spread = spread[near]
-        known2 = found.variances[near] + _SCATTER_SHARED * found.scatter[near]
-        weights = _trust(distances, spread) / (noise2[index] + known2)
-        h = _derivatives(points[index], source.since[index], normals, state.rotation)
+        known2 = found.variances[near] + tuning.SCATTER_SHARED * found.scatter[near]
+        weights = _robust_weights(distances, spread) / (noise2[index] + known2)
+        h = residual_jacobian(points[index], source.times[index], normals, state.rotation)
         weighted = h * weights[:, None]
         information = weighted.T @ h
-        some = np.flatnonzero(near)[::_TILTED]
+        some = np.flatnonzero(near)[:: tuning.TILT_SAMPLE]
         at = found.index[some]
         for axis in range(2):
-            tilted = _derivatives(
-                points[at], source.since[at], found.across[some, axis], state.rotation
+            tilted = residual_jacobian(
+                points[at], source.times[at], found.across[some, axis], state.rotation
             )
-            tilts = _TILTED * weights[::_TILTED] * found.tilts[some, axis]
+            tilts = tuning.TILT_SAMPLE * weights[:: tuning.TILT_SAMPLE] * found.tilts[some, axis]
             information -= (tilted * tilts[:, None]).T @ tilted
-        state, posterior = corrected(
+        state, posterior = update_with_information(
             prior, covariance, state, information, -(weighted.T @ distances)
         )
         residual = float(np.sqrt((weights * distances**2).sum() / weights.sum()))
-        agreement = np.count_nonzero(np.abs(distances) < 2.0 * spread) / len(near)
+        inlier_ratio = np.count_nonzero(np.abs(distances) < 2.0 * spread) / len(near)
         result = Alignment(
-            state, posterior, information, len(index), agreement, residual, step + 1
+            state, posterior, information, len(index), inlier_ratio, residual, step + 1
         )
-        change = state.minus(prior) - error
-        if np.abs(change[:6]).max() < _DONE:
+        change = state.boxminus(prior) - error
+        if np.abs(change[:6]).max() < tuning.CONVERGED:
             break
-    return None if result is None else _cautious(result, covariance)
+    return None if result is None else _limited_to_observed(result, covariance)
 
 
-def _cautious(found: Alignment, before: F64) -> Alignment:
+def _limited_to_observed(found: Alignment, before: F64) -> Alignment:
     """Return an alignment that claims less in directions for which only few points speak.
 
     The few that there are err together, and lie in parts of the map that were seen as seldom: what
@@ -161,7 +156,11 @@ def _cautious(found: Alignment, before: F64) -> Alignment:
     """
     strength, directions = np.linalg.eigh(found.information[POSITION, POSITION])
     share = strength / max(float(strength.sum()), 1e-12)
-    doubt = directions * np.sqrt(1.0 - np.clip(share / WEAK, 0.0, 1.0)) @ directions.T
+    doubt = (
+        directions
+        * np.sqrt(1.0 - np.clip(share / tuning.DEGENERATE_SHARE, 0.0, 1.0))
+        @ directions.T
+    )
     kept = np.zeros((ERRORS, ERRORS))
     kept[POSITION, POSITION] = kept[VELOCITY, VELOCITY] = kept[GRAVITY, GRAVITY] = doubt
     kept[ACCEL_BIAS, ACCEL_BIAS] = found.state.rotation.T @ doubt @ found.state.rotation
@@ -169,9 +168,9 @@ def _cautious(found: Alignment, before: F64) -> Alignment:
     return dataclasses.replace(found, covariance=covariance)
 
 
-def _redone(source: Source, error: F64, rotation: F64) -> F64:
+def _deskewed_again(source: Source, error: F64, rotation: F64) -> F64:
     """Return the points (N, 3) as a corrected motion deskews them, to first order."""
-    since = source.since[:, None]
+    since = source.times[:, None]
     turned = rotations.cross(-error[GYRO_BIAS] * since, source.points)
     moved = since * error[VELOCITY] + 0.5 * since**2 * error[GRAVITY]
     return np.asarray(
@@ -179,20 +178,20 @@ def _redone(source: Source, error: F64, rotation: F64) -> F64:
     )
 
 
-def _trust(distances: F64, scale: F64) -> F64:
+def _robust_weights(distances: F64, scale: F64) -> F64:
     """Return the weights (N,) of Geman and McClure: 1 for no distance, a quarter at the scale."""
     return np.asarray(1.0 / (1.0 + (distances / scale) ** 2) ** 2)
 
 
-def _derivatives(points: F64, since: F64, normals: F64, rotation: F64) -> F64:
+def residual_jacobian(points: F64, since: F64, normals: F64, rotation: F64) -> F64:
     """Return the derivatives of the residuals by the errors, shape (N, 18)."""
     dt = since[:, None]
     inner = normals @ rotation
     h = np.empty((len(points), ERRORS))
-    h[:, TURN] = rotations.cross(points, inner)
+    h[:, ROTATION] = rotations.cross(points, inner)
     h[:, POSITION] = normals
     h[:, VELOCITY] = dt * normals
-    h[:, GYRO_BIAS] = -dt * h[:, TURN]
+    h[:, GYRO_BIAS] = -dt * h[:, ROTATION]
     h[:, ACCEL_BIAS] = -0.5 * dt * dt * inner
     h[:, GRAVITY] = 0.5 * dt * dt * normals
     return h

@@ -77,7 +77,7 @@ class BaseFrame:
 
     def motion(self, estimate: OdometryEstimate) -> BaseMotion:
         """Return an estimate as one of the base frame."""
-        pose = estimate.T_odom_lidar
+        pose = estimate.T_map_lidar
         turn_odom = self.odom_from_map(pose)[:3, :3]
         arm = self.T_lidar_base[:3, 3]
         swing = np.eye(6)

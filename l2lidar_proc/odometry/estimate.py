@@ -40,11 +40,11 @@ class AlignmentQuality:
         Points that were to be aligned.
     matched : int
         Of these, points that met a surface of the map.
-    agreement : float
+    inlier_ratio : float
         Share of the points at known surfaces that are near them, 0 to 1; low at a wrong pose.
     residual_m : float
         Root mean square of their distances to it, outliers weighed down.
-    weakest : float
+    degeneracy_ratio : float
         Share of the points that speak for the least observed direction, 0 to 1/3.
     kiss_threshold_m : float
         How far predictions have lately been off, as KISS-ICP sees it.
@@ -54,9 +54,9 @@ class AlignmentQuality:
 
     points: int = 0
     matched: int = 0
-    agreement: float = 0.0
+    inlier_ratio: float = 0.0
     residual_m: float = 0.0
-    weakest: float = 0.0
+    degeneracy_ratio: float = 0.0
     kiss_threshold_m: float = 0.0
     map_cells: int = 0
 
@@ -69,8 +69,8 @@ class OdometryEstimate:
     ----------
     stamp : HostNs
         The instant that pose, velocity and cloud belong to: the reference of the sweep.
-    T_odom_lidar : ndarray, shape (4, 4)
-        Cloud coordinates to odometry coordinates. Where gravity is trusted z is up there.
+    T_map_lidar : ndarray, shape (4, 4)
+        Cloud coordinates to map coordinates. Where gravity is trusted z is up there.
     covariance : ndarray, shape (6, 6)
         Of x, y, z and of the turns about the axes of the odometry frame [m, rad], relative to the
         map, and from the first RESTARTED or LOST on what the map's own place is uncertain by.
@@ -93,7 +93,7 @@ class OdometryEstimate:
     """
 
     stamp: HostNs
-    T_odom_lidar: F64
+    T_map_lidar: F64
     covariance: F64
     velocity: F64
     angular_velocity: F64
@@ -115,7 +115,7 @@ class OdometryEstimate:
         return not {Status.PREDICTED, Status.REFUSED} & set(self.status)
 
 
-def weakest(information: F64) -> float:
+def degeneracy_ratio(information: F64) -> float:
     """Return the share of some information (3, 3) that its least observed direction has."""
     strength = np.linalg.eigvalsh(information)
     return float(strength[0] / max(float(strength.sum()), 1e-12))

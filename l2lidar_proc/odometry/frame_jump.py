@@ -1,20 +1,16 @@
-"""Remembers how far the map may have been moved against the odometry frame by what was lost."""
+"""Uncertainty of the map's own place in the odometry frame, after losses and jumps of time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc.motion.filter import POSITION, TURN, InertialState, skew
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import POSITION, ROTATION, InertialState, skew
 
 F64 = NDArray[np.float64]
-
-_UNSEEN_M: Final = 0.5  # a clock that went back may hide such a step,
-_UNSEEN_TURN: Final = 0.5  # [rad] such a turn,
-_UNSEEN_S: Final = 2.0  # and going on for so long
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +46,7 @@ class FrameJump:
         covariance : ndarray, shape (18, 18)
             Of the state, relative to the map before.
         """
-        errors = np.r_[POSITION, TURN]
+        errors = np.r_[POSITION, ROTATION]
         axes = np.eye(6)
         axes[3:, 3:] = state.rotation
         jump = axes @ covariance[np.ix_(errors, errors)] @ axes.T
@@ -58,6 +54,6 @@ class FrameJump:
 
     def unseen(self, state: InertialState) -> FrameJump:
         """Return this and what may have happened from a state on while no time was told."""
-        way = _UNSEEN_M + _UNSEEN_S * float(np.linalg.norm(state.velocity))
-        jump = np.diag(np.square([way] * 3 + [_UNSEEN_TURN] * 3))
+        way = tuning.UNSEEN_POSITION + tuning.UNSEEN_S * float(np.linalg.norm(state.velocity))
+        jump = np.diag(np.square([way] * 3 + [tuning.UNSEEN_ROTATION] * 3))
         return FrameJump(state.position, self.at(state.position) + jump)

@@ -19,6 +19,10 @@ from l2lidar_proc.config import OdometryConfig
 
 F64 = NDArray[np.float64]
 
+# odd multipliers of Fibonacci hashing and of splitmix64 (Steele et al. 2014)
+_ODD = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
+_SHIFT = np.uint64(7)
+
 LEAST_POINTS = 10  # kiss_icp aborts below 2; below this there is nothing to register
 
 
@@ -135,12 +139,22 @@ class PlainKiss:
         return np.asarray(self._kiss.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
 
 
-def thinned(points: F64, size: float) -> NDArray[np.intp]:
-    """Return which points (N, 3) KISS-ICP's voxelisation keeps: the first in each voxel [m]."""
+def thinned_indices(points: F64, size: float) -> NDArray[np.intp]:
+    """Return which points (N, 3) KISS-ICP's voxelization keeps: one in each voxel of a size [m].
+
+    KISS-ICP returns the points themselves, not their indices: they are found again by all three
+    coordinates. Of equal points one is named, once.
+    """
     if len(points) < LEAST_POINTS:
         return np.arange(len(points))
-    kept = voxel_down_sample(points, size)
-    # kiss_icp returns the points themselves, not which they were
-    order = np.argsort(points[:, 0], kind="stable")
-    place = np.searchsorted(points[order, 0], kept[:, 0])
-    return np.sort(order[np.minimum(place, len(points) - 1)])
+    every, kept = _hashes(points), _hashes(np.asarray(voxel_down_sample(points, size)))
+    order = np.argsort(every, kind="stable")
+    place = np.searchsorted(every, kept, sorter=order)
+    return np.unique(order[np.minimum(place, len(points) - 1)])
+
+
+def _hashes(points: F64) -> NDArray[np.uint64]:
+    """Return a number for each point (N, 3) that differs wherever a bit of it does."""
+    words = np.ascontiguousarray(points).view(np.uint64)
+    mixed = words * _ODD
+    return np.asarray(mixed[:, 0] ^ (mixed[:, 1] >> _SHIFT) ^ ((mixed[:, 2] >> _SHIFT) * _ODD[0]))

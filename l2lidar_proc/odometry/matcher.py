@@ -1,33 +1,26 @@
-"""Keeps the maps and matches sweeps with them."""
+"""Scan-to-map registration: the maps, and the matching of sweeps with them."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.config import OdometryConfig
-from l2lidar_proc.motion.filter import POSITION, TURN, InertialState, corrected
+from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.motion.filter import POSITION, ROTATION, InertialState, update_with_information
+from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment, Source, align
-from l2lidar_proc.odometry.estimate import AlignmentQuality, weakest
-from l2lidar_proc.odometry.kiss import KissMatcher, thinned
-from l2lidar_proc.odometry.relocalization import is_turned, likely_places
+from l2lidar_proc.odometry.estimate import AlignmentQuality, degeneracy_ratio
+from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
+from l2lidar_proc.odometry.relocalization import pose_hypotheses, rotation_is_loose
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
-
-_LOOSE_M: Final = 0.06  # a prediction less certain than this may be a surface off
-_AGREEMENT: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
-_OVERLAP: Final = (0.0, 0.25)  # likewise, share of points that must meet the map
-_MATCHED: Final = (0, 50)  # and how many: a few fit in many places
-_MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
-_YOUNG: Final = 12  # sweeps in a map before a sweep without surfaces around is remarkable
-_PLACED: Final = (0.03, 0.15)  # [rad, m] what KISS-ICP's registration by itself is worth
-_PRUNING: Final = 0.2  # the map is pruned whenever this part of its radius was travelled
 
 
 class Match(NamedTuple):
@@ -84,10 +77,14 @@ class SweepMatcher:
         self.surfaces.clear()
         self.kiss.clear()
 
+    def deskewed(self, sweep: Sweep, motion: SweepMotion) -> NDArray[np.void]:
+        """Return the points of a sweep as seen from the reference of a motion, shape (N,)."""
+        return deskew(sweep.points, sweep.start, motion.trajectory(self.lever), motion.state.stamp)
+
     def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
         """Return the points to align, deskewed along a predicted motion."""
-        points = xyz(motion.deskewed(sweep, self.lever))
-        chosen = thinned(points, self.config.surfaces.source_voxel)
+        points = xyz(self.deskewed(sweep, motion))
+        chosen = thinned_indices(points, self.config.surfaces.source_voxel)
         chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
         offset = (sweep.start - motion.state.stamp) * 1e-9
         return Source(
@@ -96,7 +93,7 @@ class SweepMatcher:
             np.linalg.norm(points[chosen], axis=1),
         )
 
-    def match(self, source: Source, motion: SweepMotion, *, opening: bool = False) -> Match:
+    def match(self, source: Source, motion: SweepMotion, *, initial: bool = False) -> Match:
         """Return the alignment that can be believed, if there is one.
 
         A prediction that may be a surface off is not the only one to begin from: KISS-ICP's
@@ -108,16 +105,16 @@ class SweepMatcher:
         source : Source
         motion : SweepMotion
             The one that deskewed the source.
-        opening : bool
+        initial : bool
             The map has only just begun: it cannot be searched, and wrong results are sorted out
             later.
         """
         if len(source.points) < self.config.min_points or not len(self.surfaces):
             return Match(None, False)
         sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
-        loose = sigma > _LOOSE_M or is_turned(motion.covariance)
-        young = self._sweeps < _YOUNG
-        strict = loose and not opening and not young
+        loose = sigma > tuning.LOOSE_POSITION or rotation_is_loose(motion.covariance)
+        young = self._sweeps < tuning.YOUNG_SWEEPS
+        strict = loose and not initial and not young
         found = self._align(source, motion, motion.state)
         if not loose or (strict and _believable(found, source, strict)):
             if _believable(found, source, strict):
@@ -125,15 +122,15 @@ class SweepMatcher:
             return Match(None, young and not loose and found is None)
         starts = [self._registered(source, motion.state)]
         if strict:
-            starts += likely_places(motion.state, motion.covariance, source, self.surfaces)
+            starts += pose_hypotheses(motion.state, motion.covariance, source, self.surfaces)
         others = [found, *(self._align(source, motion, start) for start in starts)]
         good = [other for other in others if other and _believable(other, source, strict)]
-        best = max(good, key=lambda other: other.agreement * other.matched, default=None)
-        if best is None and motion.felt.missing.all():
+        best = max(good, key=lambda other: other.inlier_ratio * other.matched, default=None)
+        if best is None and motion.imu.missing.all():
             # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
             best = self._placed(source, motion, np.inf)
         elif best is None and young and found is None:
-            best = self._placed(source, motion, _PLACED[1])
+            best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         return Match(best, False)
 
     def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> None:
@@ -152,7 +149,10 @@ class SweepMatcher:
         points = xyz(moved) - self.lever
         self.surfaces.add(points @ state.rotation.T + state.position)
         self.kiss.update(points, _pose(state), _pose(guess))
-        if np.linalg.norm(state.position - self._pruned_at) > _PRUNING * self.config.max_range:
+        if (
+            np.linalg.norm(state.position - self._pruned_at)
+            > tuning.PRUNE_SHARE * self.config.max_range
+        ):
             self.surfaces.forget(state.position, self.config.max_range)
             self._pruned_at = state.position
 
@@ -166,15 +166,15 @@ class SweepMatcher:
         return dataclasses.replace(
             quality,
             matched=found.matched,
-            agreement=found.agreement,
+            inlier_ratio=found.inlier_ratio,
             residual_m=found.residual,
-            weakest=weakest(found.information[POSITION, POSITION]),
+            degeneracy_ratio=degeneracy_ratio(found.information[POSITION, POSITION]),
         )
 
     def _align(
         self, source: Source, motion: SweepMotion, start: InertialState
     ) -> Alignment | None:
-        share, enough = _MEETING
+        share, enough = tuning.MEETING
         least = min(enough, max(self.config.min_points // 2, round(share * len(source.points))))
         return align(
             motion.state,
@@ -190,10 +190,12 @@ class SweepMatcher:
         """Return what the place that KISS-ICP's registration finds is worth by itself."""
         place = self._registered(source, motion.state, most)
         information = np.zeros_like(motion.covariance)
-        information[TURN, TURN] = np.eye(3) / _PLACED[0] ** 2
-        information[POSITION, POSITION] = np.eye(3) / _PLACED[1] ** 2
+        information[ROTATION, ROTATION] = np.eye(3) / tuning.KISS_SIGMA[0] ** 2
+        information[POSITION, POSITION] = np.eye(3) / tuning.KISS_SIGMA[1] ** 2
         still = np.zeros(len(information))
-        state, covariance = corrected(motion.state, motion.covariance, place, information, still)
+        state, covariance = update_with_information(
+            motion.state, motion.covariance, place, information, still
+        )
         return Alignment(state, covariance, information, 0, 0.0, 0.0, 1)
 
     def _registered(
@@ -214,8 +216,9 @@ def xyz(points: NDArray[np.void]) -> F64:
 def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
     return (
         found is not None
-        and found.agreement >= _AGREEMENT[strict]
-        and found.matched >= max(_OVERLAP[strict] * len(source.points), _MATCHED[strict])
+        and found.inlier_ratio >= tuning.INLIER_RATIO[strict]
+        and found.matched
+        >= max(tuning.OVERLAP[strict] * len(source.points), tuning.MATCHED[strict])
     )
 
 

@@ -108,6 +108,6 @@ class OdometryPipeline:
                 if Status.REFUSED in estimate.status:
                     continue
                 self.last = estimate
-                self.trajectory.append(estimate.stamp, estimate.T_odom_lidar)
+                self.trajectory.append(estimate.stamp, estimate.T_map_lidar)
                 estimates.append(estimate)
         return estimates

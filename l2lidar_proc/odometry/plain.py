@@ -82,12 +82,12 @@ class PlainOdometry:
         velocity, rate = np.zeros(3), np.zeros(3)
         if self._last is not None:
             dt = (stamp - self._last.stamp) * 1e-9
-            moved = np.linalg.inv(self._last.T_odom_lidar) @ pose
+            moved = np.linalg.inv(self._last.T_map_lidar) @ pose
             velocity = moved[:3, :3].T @ moved[:3, 3] / dt
             rate = rotations.log(rotations.from_matrix(moved[:3, :3])) / dt
         return OdometryEstimate(
             stamp=stamp,
-            T_odom_lidar=pose.copy(),
+            T_map_lidar=pose.copy(),
             covariance=_UNKNOWN * np.eye(6),
             velocity=velocity,
             angular_velocity=rate,

@@ -1,33 +1,19 @@
-"""Looks for the place where a sweep fits the map when the prediction is not good enough."""
+"""Relocalization: searches poses at which a sweep fits the map around a loose prediction."""
 
 from __future__ import annotations
-
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations
-from l2lidar_proc.motion.filter import ERRORS, POSITION, TURN, InertialState
+from l2lidar_proc import rotations, tuning
+from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
 from l2lidar_proc.odometry.alignment import Source
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 F64 = NDArray[np.float64]
 
-LOOSE_TURN: Final = 0.03  # [rad] a prediction less certain than this may be turned too far
 
-_STEP_M: Final = 0.3  # between places that are tried
-_NEAR_M: Final = 0.15  # a point this near a surface speaks for a place
-_RADIUS_M: Final = (0.3, 4.0)  # least and most to search about the prediction
-_MOST_TURN: Final = 1.0  # [rad] as far as turns are tried about each axis
-_MOST_PLACES: Final = 1200
-_POINTS: Final = 200
-_REFINED: Final = 24  # of the attitudes drawn, so many are varied again,
-_FINER: Final = 4.0  # by so much less
-_ARM_M: Final = 3.0  # at which a turn counts like the way it makes there
-
-
-def likely_places(
+def pose_hypotheses(
     state: InertialState, covariance: F64, source: Source, surfaces: SurfelMap, count: int = 3
 ) -> list[InertialState]:
     """Return states nearby at which most points lie on surfaces, best first.
@@ -47,20 +33,25 @@ def likely_places(
         Largest number of states to return.
     """
     errors = _grid(covariance)
-    if is_turned(covariance):
+    if rotation_is_loose(covariance):
         seed = abs(int(state.stamp))  # so that each sweep tries others
-        errors = _drawn(covariance, np.zeros((1, ERRORS)), _MOST_PLACES, seed)
-        scores = _scores(state, errors, source, surfaces, _POINTS // 2)
-        likely = errors[np.argsort(-scores, kind="stable")[:_REFINED]]
-        errors = _drawn(covariance / _FINER**2, likely, _MOST_PLACES // _REFINED, seed)
-    scores = _scores(state, errors, source, surfaces, _POINTS)
+        errors = _drawn(covariance, np.zeros((1, ERRORS)), tuning.SEARCH_PLACES, seed)
+        scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS // 2)
+        likely = errors[np.argsort(-scores, kind="stable")[: tuning.SEARCH_REFINED]]
+        errors = _drawn(
+            covariance / tuning.SEARCH_FINER**2,
+            likely,
+            tuning.SEARCH_PLACES // tuning.SEARCH_REFINED,
+            seed,
+        )
+    scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS)
     best: list[F64] = []
     for index in np.argsort(-scores, kind="stable").tolist():
-        if all(_apart(errors[index], other) > 2.0 * _STEP_M for other in best):
+        if all(_apart(errors[index], other) > 2.0 * tuning.SEARCH_STEP_M for other in best):
             best.append(errors[index])
         if len(best) == count:
             break
-    return [state.moved(error) for error in best]
+    return [state.boxplus(error) for error in best]
 
 
 def _scores(
@@ -68,23 +59,23 @@ def _scores(
 ) -> NDArray[np.int64]:
     """Return how many of some points lie on surfaces for each error (N, 18) of the state."""
     points = source.points[:: max(len(source.points) // count, 1)]
-    turns = state.rotation @ rotations.matrices(rotations.exp(errors[:, TURN]))
+    turns = state.rotation @ rotations.matrices(rotations.exp(errors[:, ROTATION]))
     seen = np.einsum("kij,nj->kni", turns, points)
     seen += (state.position + errors[:, POSITION])[:, None]
     found = surfaces.match(seen.reshape(-1, 3))
-    near = np.abs(found.distances) < _NEAR_M
+    near = np.abs(found.distances) < tuning.SEARCH_NEAR_M
     return np.bincount(found.index[near] // len(points), minlength=len(errors))
 
 
-def is_turned(covariance: F64) -> bool:
+def rotation_is_loose(covariance: F64) -> bool:
     """Return whether the attitude is so uncertain that other attitudes have to be tried."""
-    return bool(np.linalg.eigvalsh(covariance[TURN, TURN])[-1] > LOOSE_TURN**2)
+    return bool(np.linalg.eigvalsh(covariance[ROTATION, ROTATION])[-1] > tuning.LOOSE_ROTATION**2)
 
 
 def _apart(one: F64, other: F64) -> float:
     difference = one - other
-    turn, way = np.linalg.norm(difference[TURN]), np.linalg.norm(difference[POSITION])
-    return float(way + _ARM_M * turn)
+    turn, way = np.linalg.norm(difference[ROTATION]), np.linalg.norm(difference[POSITION])
+    return float(way + tuning.SEARCH_ARM_M * turn)
 
 
 def _drawn(covariance: F64, middles: F64, count: int, seed: int) -> F64:
@@ -99,22 +90,26 @@ def _drawn(covariance: F64, middles: F64, count: int, seed: int) -> F64:
         How many to draw about each.
     seed : int
     """
-    both = slice(TURN.start, POSITION.stop)
+    both = slice(ROTATION.start, POSITION.stop)
     strength, axes = np.linalg.eigh(covariance[both, both])
     normal = np.random.default_rng(seed).standard_normal((len(middles), count, len(strength)))
     normal[:, 0] = 0.0
     errors = np.repeat(middles[:, None], count, axis=1)
     errors[..., both] += normal * np.sqrt(np.maximum(strength, 0.0)) @ axes.T
-    errors[..., TURN] = np.clip(errors[..., TURN], -_MOST_TURN, _MOST_TURN)
-    errors[..., POSITION] = np.clip(errors[..., POSITION], -_RADIUS_M[1], _RADIUS_M[1])
+    errors[..., ROTATION] = np.clip(
+        errors[..., ROTATION], -tuning.SEARCH_ROTATION, tuning.SEARCH_ROTATION
+    )
+    errors[..., POSITION] = np.clip(
+        errors[..., POSITION], -tuning.SEARCH_RADIUS_M[1], tuning.SEARCH_RADIUS_M[1]
+    )
     return np.asarray(errors.reshape(-1, ERRORS))
 
 
 def _grid(covariance: F64) -> F64:
     """Return errors (N, 18) of the place that fill an ellipsoid of three sigma."""
-    radius = np.clip(3.0 * np.sqrt(np.diag(covariance)[POSITION]), *_RADIUS_M)
+    radius = np.clip(3.0 * np.sqrt(np.diag(covariance)[POSITION]), *tuning.SEARCH_RADIUS_M)
     volume = 4.0 / 3.0 * np.pi * float(radius.prod())
-    step = max(_STEP_M, (volume / _MOST_PLACES) ** (1.0 / 3.0))
+    step = max(tuning.SEARCH_STEP_M, (volume / tuning.SEARCH_PLACES) ** (1.0 / 3.0))
     axes = [step * np.arange(-np.ceil(r / step), np.ceil(r / step) + 1.0) for r in radius]
     offsets = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     offsets = offsets[((offsets / radius) ** 2).sum(axis=1) <= 1.0]

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations
-from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, TURN, VELOCITY, InertialState
-from l2lidar_proc.odometry.alignment import WEAK
+from l2lidar_proc import rotations, tuning
+from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState
+from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry.frame_jump import FrameJump
-from l2lidar_proc.odometry.sweep_motion import SweepMotion
 
 F64 = NDArray[np.float64]
 
@@ -25,9 +24,9 @@ def cloud_pose(state: InertialState, lever: F64) -> F64:
 
 def gaps_in(motion: SweepMotion) -> list[Status]:
     """Return what is to be said of the IMU samples of a motion."""
-    if motion.felt.missing.all():
+    if motion.imu.missing.all():
         return [Status.NO_IMU]
-    return [Status.IMU_GAP] if motion.felt.missing.any() else []
+    return [Status.IMU_GAP] if motion.imu.missing.any() else []
 
 
 def estimate_of(
@@ -57,11 +56,11 @@ def estimate_of(
         What the map's own place adds to the covariance.
     """
     state, p = motion.state, motion.covariance
-    if quality.matched and quality.weakest < WEAK:
+    if quality.matched and quality.degeneracy_ratio < tuning.DEGENERATE_SHARE:
         status = (*status, Status.DEGENERATE)
     pose = np.zeros((6, 18))
     pose[:3, POSITION] = np.eye(3)
-    pose[3:, TURN] = state.rotation
+    pose[3:, ROTATION] = state.rotation
     twist = np.zeros((6, 18))
     twist[:3, VELOCITY] = state.rotation.T
     twist[3:, GYRO_BIAS] = np.eye(3)
@@ -70,7 +69,7 @@ def estimate_of(
     rate = motion.rate
     return OdometryEstimate(
         stamp=state.stamp,
-        T_odom_lidar=cloud_pose(state, lever),
+        T_map_lidar=cloud_pose(state, lever),
         covariance=pose @ p @ pose.T + jump.at(state.position),
         velocity=state.rotation.T @ state.velocity - rotations.cross(rate, lever),
         angular_velocity=rate,

@@ -16,6 +16,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_proc import tuning
+
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -40,14 +42,6 @@ _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _BITS: Final = 21
 _MASK: Final = (1 << _BITS) - 1
 _HALF: Final = 1 << (_BITS - 1)
-_ELONGATED: Final = 9.0  # a surface is at least 3 times wider than it is thick
-_WIDTH: Final = 0.08  # and, in its shorter direction, this part of its cell (1 sigma)
-_NARROW: Final = (
-    0.16  # largest scatter that tells a place, by the cell's edge; evenly filled: 0.29
-)
-_NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is narrow as well
-_EDGES: Final = 0.4  # part of the points that may lack a flat surface where flat ones abound
-_GROWTH: Final = 1.12  # of the points before a cell is fitted again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +134,7 @@ class SurfelMap:
             known = cell >= 0
             found.append(_distances(points, left[known], level.cells[cell[known]], 0))
             left = left[~known]
-        narrow &= len(left) > _EDGES * len(points)
+        narrow &= len(left) > tuning.EDGE_SHARE * len(points)
         for level in self._levels if narrow else ():
             cell = level.narrow_at(points[left])
             known = cell >= 0
@@ -268,7 +262,9 @@ class _Level:
 
     def _fit(self, rows: I64, middles: F64) -> None:
         count = self._count[rows]
-        enough = (count >= self._least) & (count >= _GROWTH * self.cells["fitted"][rows])
+        enough = (count >= self._least) & (
+            count >= tuning.REFIT_GROWTH * self.cells["fitted"][rows]
+        )
         rows, middles = rows[enough], middles[enough]
         if not len(rows):
             return
@@ -281,15 +277,15 @@ class _Level:
             covariance[:, j, i] = covariance[:, i, j]
         spread, axes = np.linalg.eigh(covariance)
         spread = np.maximum(spread, 1e-8)
-        wide = np.maximum(_ELONGATED * spread[:, 0], (_WIDTH * self._size) ** 2)
+        wide = np.maximum(tuning.ELONGATED * spread[:, 0], (tuning.FLAT_WIDTH * self._size) ** 2)
         flat = (spread[:, 0] < self._thickness**2) & (spread[:, 1] > wide)
         self.cells["mean"][rows] = mean + middles
         self.cells["axes"][rows] = np.swapaxes(axes, 1, 2)
         self.cells["spread"][rows] = spread
         self.cells["flat"][rows] = flat
         self._flat[rows] = flat
-        close = spread[:, :2] < (_NARROW * self._size) ** 2
-        close &= (self.cells["sweeps"][rows] >= _NARROW_SWEEPS)[:, None] & ~flat[:, None]
+        close = spread[:, :2] < (tuning.NARROW * self._size) ** 2
+        close &= (self.cells["sweeps"][rows] >= tuning.NARROW_SWEEPS)[:, None] & ~flat[:, None]
         self.cells["narrow"][rows] = close.sum(axis=1)
         self._narrow[rows] = close[:, 0]
         self.cells["fitted"][rows] = count[:, 0]

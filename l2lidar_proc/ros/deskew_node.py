@@ -25,7 +25,7 @@ from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
-from l2lidar_proc.motion.velocity import carried_over
+from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
@@ -190,8 +190,8 @@ class DeskewNode(Node):
             self._before,
             self._pipeline.counts,
             self._last,
-            tracker.window.counts,
-            tracker.attitude.latest,
+            tracker.buffer.counts,
+            tracker.filter,
             self._refused,
             is_levelled=self._levelling.is_levelled,
             untied=self._untied,

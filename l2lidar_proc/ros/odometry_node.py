@@ -162,7 +162,7 @@ class OdometryNode(Node):
             self._tf.publish(TFMessage(transforms=[self._transform(motion.T_odom_base, estimate)]))
         self._extend_path(motion.T_odom_base, estimate)
         if self._registered.get_subscription_count():
-            pose = self._base.odom_from_map(estimate.T_odom_lidar) @ estimate.T_odom_lidar
+            pose = self._base.odom_from_map(estimate.T_map_lidar) @ estimate.T_map_lidar
             points = messages.moved(estimate.points, pose)
             self._registered.publish(to_cloud(points, stamp, odom))
 
@@ -210,7 +210,7 @@ class OdometryNode(Node):
 
     def _map_points(self, last: OdometryEstimate) -> rotations.F64:
         """Return the local map in the odometry frame [m], shape (N, 3)."""
-        turn = self._base.odom_from_map(last.T_odom_lidar)
+        turn = self._base.odom_from_map(last.T_map_lidar)
         return self._pipeline.odometry.map_points() @ turn[:3, :3].T + turn[:3, 3]
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -15,7 +15,7 @@ from l2lidar_proc.cloud import CloudError, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.frames import FrameTree
-from l2lidar_proc.motion.velocity import carried_over
+from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError

@@ -7,18 +7,15 @@ import pytest
 
 from l2lidar_proc import rotations
 from l2lidar_proc.deskew.deskew import deskew
-from l2lidar_proc.motion.sweep_trajectory import integrate, still_path
-from tests.l2lidar_proc.motion.analytic import T_CLOUD_IMU, Motion, at, rms, seen, xyz
-from tests.l2lidar_proc.motion.test_sweep_trajectory import gravity, velocity
+from l2lidar_proc.motion.sweep_trajectory import still_trajectory
+from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz
+from tests.l2lidar_proc.motion.test_sweep_trajectory import trajectory
 
 START, END = 0.3, 0.53
 
 
 def path_of(motion: Motion):
-    return integrate(
-        motion.imu(0, 1), at(START), at(END), T_cloud_imu=T_CLOUD_IMU, bias=np.zeros(3),
-        velocities=velocity(motion, START), gravity=gravity(motion, START),
-    )  # fmt: skip
+    return trajectory(motion, START, END, START)
 
 
 @pytest.mark.parametrize("reference", [START, (START + END) / 2, END])
@@ -64,15 +61,8 @@ def test_the_points_at_the_reference_stay():
 def test_a_still_sensor_changes_no_bit():
     points, _ = seen(Motion(), START, END, START)
     points["x"][:3] = (-0.0, 0.0, np.float32(1e-40))
-    still = integrate(
-        np.repeat(Motion().imu(0, 0), 1),
-        at(START),
-        at(END),
-        T_cloud_imu=T_CLOUD_IMU,
-        bias=np.zeros(3),
-    )
-    for path in (still, still_path(at(START), at(END))):
-        assert deskew(points, at(START), path, at(END)).tobytes() == points.tobytes()
+    still = still_trajectory(at(START), at(END))
+    assert deskew(points, at(START), still, at(END)).tobytes() == points.tobytes()
 
 
 def test_the_input_is_left_alone_and_nothing_is_enough():

@@ -146,7 +146,7 @@ def test_disorder_in_the_samples_changes_nothing():
     shuffled[300] = shuffled[299]
     shuffled["angular_velocity"][400] = np.nan
     pipeline, done = run(WALK, 3.0, samples=shuffled)
-    counts = pipeline.tracker.window.counts
+    counts = pipeline.tracker.buffer.counts
     assert counts.reordered > 100
     assert (counts.duplicate, counts.invalid) == (1, 1)
     for a, b in zip(expected, done, strict=True):
@@ -160,7 +160,7 @@ def test_a_clock_that_jumps_back_loses_no_sweep():
     pipeline.sweep(sweep_at(WALK, 2.0), 1)
     (old,) = pipeline.poll(2)
     assert Flag.CLOCK_JUMP in old.quality.flags
-    assert len(pipeline.tracker.window) == 0
+    assert len(pipeline.tracker.buffer) == 0
     pipeline.imu(WALK.imu(1.9, 2.3))
     (new,) = pipeline.poll(3)
     assert new.quality.flags == (Flag.NO_VELOCITY,)

@@ -7,7 +7,7 @@ import pytest
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import PipelineCounts
 from l2lidar_proc.deskew.report import Level
-from l2lidar_proc.motion.imu_buffer import WindowCounts
+from l2lidar_proc.motion.imu_buffer import ImuCounts
 from l2lidar_proc.motion.tracker import Flag, Quality
 
 
@@ -41,7 +41,7 @@ def period(
     before: int, after: int, last, *, is_levelled: bool = False, untied: str = ""
 ) -> report.Report:
     return report.of_period(
-        PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, WindowCounts(), None,
+        PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, ImuCounts(), None,
         {"no time field": 3}, is_levelled=is_levelled, untied=untied,
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
-from l2lidar_proc.motion.imu_buffer import ImuWindow
+from l2lidar_proc.motion.imu_buffer import ImuBuffer
 
 MS = 1_000_000
 BASE = 10**18
@@ -18,7 +18,7 @@ def samples(*milliseconds: float):
     return made
 
 
-def kept(window: ImuWindow) -> list[float]:
+def kept(window: ImuBuffer) -> list[float]:
     rates = window.samples["orientation_wxyz"][:, 0].tolist()
     assert ((window.samples["stamp"] - BASE) / MS).tolist() == rates, (
         "stamp and value belong together"
@@ -28,7 +28,7 @@ def kept(window: ImuWindow) -> list[float]:
 
 def test_any_order_ends_up_in_order():
     order = np.random.default_rng(3).permutation(60) * 4.0
-    one_by_one, at_once = ImuWindow(), ImuWindow()
+    one_by_one, at_once = ImuBuffer(), ImuBuffer()
     one_by_one.push(samples(-1.0))
     at_once.push(samples(-1.0))
     for value in order:
@@ -40,7 +40,7 @@ def test_any_order_ends_up_in_order():
 
 
 def test_push_returns_only_what_continues_the_window():
-    window = ImuWindow()
+    window = ImuBuffer()
     window.push(samples(0, 4))
     fresh = window.push(samples(12, 8, 16))
     assert fresh["orientation_wxyz"][:, 0].tolist() == [12.0, 16.0]
@@ -48,7 +48,7 @@ def test_push_returns_only_what_continues_the_window():
 
 
 def test_duplicates_invalid_and_stale_samples_are_refused_and_counted():
-    window = ImuWindow()
+    window = ImuBuffer()
     window.push(samples(0, 4, 8))
     window.push(samples(4))
     window.push(samples(8))
@@ -63,7 +63,7 @@ def test_duplicates_invalid_and_stale_samples_are_refused_and_counted():
 
 
 def test_a_jump_of_the_clock_starts_afresh():
-    window = ImuWindow(jump_s=1.0)
+    window = ImuBuffer(jump_s=1.0)
     window.push(samples(10_000, 10_004))
     window.push(samples(100, 104))
     assert kept(window) == [100, 104]
@@ -73,7 +73,7 @@ def test_a_jump_of_the_clock_starts_afresh():
 
 
 def test_between_includes_a_neighbour_on_either_side():
-    window = ImuWindow()
+    window = ImuBuffer()
     window.push(samples(0, 4, 8, 12, 16))
 
     def span(start: float, end: float) -> list[float]:
@@ -88,7 +88,7 @@ def test_between_includes_a_neighbour_on_either_side():
 
 
 def test_memory_is_bounded_and_old_samples_go():
-    window = ImuWindow(length_s=1.0)
+    window = ImuBuffer(length_s=1.0)
     for first in range(0, 60_000, 400):
         window.push(samples(*range(first, first + 400, 4)))
     assert len(window) == 251

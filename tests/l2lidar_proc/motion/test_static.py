@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from l2lidar_proc.motion.static import at_rest, still_like
+from l2lidar_proc.motion.static import static_reference
 from tests.l2lidar_proc.motion.analytic import Motion, noisy
 
 LEVELS = {"quiet": (0.0, 0.0, 0.0), "usual": (0.03, 0.03, 0.06), "rough": (0.1, 0.2, 0.1)}
@@ -24,7 +24,7 @@ def still(level, seconds: float = 20.0):
 
 def test_a_still_sensor_is_found_at_rest_with_its_bias(level):
     samples = still(level)
-    found = [at_rest(samples[i : i + 250], UNKNOWN, 0.1) for i in range(0, 4750, 250)]
+    found = [static_reference(samples[i : i + 250], UNKNOWN, 0.1) for i in range(0, 4750, 250)]
     assert all(found)
     biases = np.array([rest.rate for rest in found])
     assert np.abs(biases.mean(axis=0) - BIAS).max() < 0.05 * (level[0] + level[1]) + 1e-6
@@ -33,8 +33,8 @@ def test_a_still_sensor_is_found_at_rest_with_its_bias(level):
 
 def test_it_is_still_still_in_every_head_turn(level):
     samples = still(level)
-    rest = at_rest(samples[:250], UNKNOWN, 0.1)
-    assert all(still_like(samples[i : i + 60], rest) for i in range(250, 4900, 60))
+    rest = static_reference(samples[:250], UNKNOWN, 0.1)
+    assert all(rest.matches(samples[i : i + 60]) for i in range(250, 4900, 60))
 
 
 @pytest.mark.parametrize(
@@ -42,22 +42,22 @@ def test_it_is_still_still_in_every_head_turn(level):
     [Motion(turn=0.5), Motion(turn=3.0), Motion(speed=0.7, nod=0.05), Motion(speed=1.2, turn=0.5)],
 )
 def test_motion_is_neither_rest_nor_still(level, motion):
-    rest = at_rest(still(level)[:250], UNKNOWN, 0.1)
+    rest = static_reference(still(level)[:250], UNKNOWN, 0.1)
     samples = noisy(motion.imu(0, 10, BIAS), *level)
     for i in range(0, 2250, 250):
-        assert at_rest(samples[i : i + 250], UNKNOWN, 0.1) is None
-        assert at_rest(samples[i : i + 250], rest.rate, 0.01) is None
-    fraction = np.mean([still_like(samples[i : i + 60], rest) for i in range(0, 2400, 60)])
+        assert static_reference(samples[i : i + 250], UNKNOWN, 0.1) is None
+        assert static_reference(samples[i : i + 250], rest.rate, 0.01) is None
+    fraction = np.mean([rest.matches(samples[i : i + 60]) for i in range(0, 2400, 60)])
     assert fraction == 0.0
 
 
 def test_a_known_bias_forbids_a_slow_turn_to_pass_for_rest():
     slow = noisy(Motion(turn=0.08).imu(0, 2, BIAS))
-    assert at_rest(slow[:250], UNKNOWN, 0.2) is not None
-    assert at_rest(slow[:250], np.array(BIAS), 0.01) is None
+    assert static_reference(slow[:250], UNKNOWN, 0.2) is not None
+    assert static_reference(slow[:250], np.array(BIAS), 0.01) is None
 
 
 def test_too_few_samples_prove_nothing():
     samples = still((0, 0, 0), 1.0)
-    assert at_rest(samples[:99], UNKNOWN, 0.1) is None
-    assert not still_like(samples[:20], at_rest(samples, UNKNOWN, 0.1))
+    assert static_reference(samples[:99], UNKNOWN, 0.1) is None
+    assert not static_reference(samples, UNKNOWN, 0.1).matches(samples[:20])

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import SettingError, build
 from l2lidar_proc import rotations
 from l2lidar_proc.config import MotionConfig
 from l2lidar_proc.deskew.deskew import deskew
-from l2lidar_proc.motion.tracker import Flag, MotionTracker
+from l2lidar_proc.motion.tracker import Flag, MotionTracker, carried_over
 from tests.l2lidar_proc.motion.analytic import (
     EPOCH,
     T_CLOUD_IMU,
@@ -41,10 +42,10 @@ def tracked(samples, motion=None, config=None) -> MotionTracker:
 
 def test_a_walk_with_a_velocity_from_before_the_sweep():
     tracker = tracked(WALK.imu(0, END + 0.01), WALK)
-    path, quality = tracker.path(at(START), at(END))
+    trajectory, quality = tracker.trajectory(at(START), at(END))
     points, truth = seen(WALK, START, END, START)
     assert rms(xyz(points) - truth) > 0.3
-    assert rms(xyz(deskew(points, at(START), path, at(START))) - truth) < 0.004
+    assert rms(xyz(deskew(points, at(START), trajectory, at(START))) - truth) < 0.004
     assert quality.flags == ()
     assert quality.velocity_source == "odometry"
     assert quality.velocity_age_ns == pytest.approx(0.35e9, abs=0.06e9)
@@ -61,17 +62,19 @@ def test_the_accelerometer_makes_the_difference():
     errors = []
     for use in (True, False):
         config = replace(MotionConfig(), use_accelerometer=use)
-        path, _ = tracked(WALK.imu(0, END + 0.01), WALK, config).path(at(START), at(END))
-        errors.append(rms(xyz(deskew(points, at(START), path, at(START))) - truth))
+        trajectory, _ = tracked(WALK.imu(0, END + 0.01), WALK, config).trajectory(
+            at(START), at(END)
+        )
+        errors.append(rms(xyz(deskew(points, at(START), trajectory, at(START))) - truth))
     assert errors[0] < errors[1] / 3
 
 
 def test_without_velocity_rotation_only_and_it_says_so():
-    path, quality = tracked(WALK.imu(0, END + 0.01)).path(at(START), at(END))
+    trajectory, quality = tracked(WALK.imu(0, END + 0.01)).trajectory(at(START), at(END))
     assert quality.flags == (Flag.NO_VELOCITY,)
     assert quality.translation_m == 0.0
     assert quality.rotation_rad > 0.2
-    assert not path.positions.any()
+    assert not trajectory.positions.any()
 
 
 def test_a_sensor_at_rest_has_a_path_that_does_not_move():
@@ -80,16 +83,16 @@ def test_a_sensor_at_rest_has_a_path_that_does_not_move():
         (tracked(samples), (START, END)),
         (tracked(samples[:60]), (0.0, 0.23)),
     ):
-        path, quality = tracker.path(at(start), at(end))
+        trajectory, quality = tracker.trajectory(at(start), at(end))
         assert quality.is_still
         assert quality.flags == ()
         points, _ = seen(Motion(), start, end, start)
-        assert deskew(points, at(start), path, at(end)).tobytes() == points.tobytes()
+        assert deskew(points, at(start), trajectory, at(end)).tobytes() == points.tobytes()
 
 
 def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise():
     samples = noisy(Motion().imu(0, END + 0.01))
-    _, quality = tracked(samples, Motion(speed=0.5)).path(at(START), at(END))
+    _, quality = tracked(samples, Motion(speed=0.5)).trajectory(at(START), at(END))
     assert not quality.is_still
     assert quality.translation_m == pytest.approx(0.115, abs=0.02)
 
@@ -108,18 +111,18 @@ def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise():
 def test_missing_samples_are_reported(keep, flags, covered):
     samples = WALK.imu(0, END + 0.01)
     samples = samples[keep((samples["stamp"] - EPOCH) * 1e-9)]
-    path, quality = tracked(samples).path(at(START), at(END))
+    trajectory, quality = tracked(samples).trajectory(at(START), at(END))
     assert tuple(flag for flag in quality.flags if flag is not Flag.NO_VELOCITY) == flags
     assert quality.imu_covered == pytest.approx(covered, abs=0.03)
-    assert np.isfinite(path.rotations_wxyz).all()
-    assert (path.rates.any() or path.positions.any()) == (Flag.NO_IMU not in flags)
+    assert np.isfinite(trajectory.rotations_wxyz).all()
+    assert (trajectory.rates.any() or trajectory.positions.any()) == (Flag.NO_IMU not in flags)
 
 
 def test_a_faulty_accelerometer_is_reported_and_left_alone():
     samples = Motion(turn=1.0, speed=1.0).imu(0, END + 0.01)
     samples["linear_acceleration"] *= 2.0
     tracker = tracked(samples, Motion(turn=1.0, speed=1.0))
-    _, quality = tracker.path(at(START), at(END))
+    _, quality = tracker.trajectory(at(START), at(END))
     assert quality.flags == (Flag.ACCELEROMETER_FAULT,)
     assert not quality.is_gravity_trusted
     assert quality.translation_m == pytest.approx(0.23, abs=0.02)
@@ -128,9 +131,9 @@ def test_a_faulty_accelerometer_is_reported_and_left_alone():
 def test_a_jump_of_the_imu_clock_forgets_what_was():
     tracker = tracked(WALK.imu(0, 3), WALK)
     assert tracker.imu(WALK.imu(10, 10.5))
-    assert tracker.window.samples["stamp"][0] == at(10)
-    assert tracker.velocities.at(at(2.9)) is None
-    _, quality = tracker.path(at(10.1), at(10.3))
+    assert tracker.buffer.samples["stamp"][0] == at(10)
+    assert tracker.filter.newest_twist is None
+    _, quality = tracker.trajectory(at(10.1), at(10.3))
     assert quality.flags == (Flag.NO_VELOCITY,)
 
 
@@ -146,3 +149,11 @@ def test_the_mount_of_the_imu():
     np.testing.assert_allclose(rotations.from_matrix(both), (0.5, 0.5, 0.5, 0.5), atol=1e-12)
     with pytest.raises(SettingError, match="imu_xyz"):
         build(MotionConfig, {"imu_xyz": [1.0]})
+
+
+def test_velocity_of_a_mounted_sensor():
+    """A sensor one meter ahead of a body that turns left moves to the left as well."""
+    mount = rotations.transform([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)], (1.0, 0.0, 0.2))
+    velocity = carried_over((0.5, 0, 0), (0, 0, 2.0), rotations.inverse(mount))
+    expected = Rotation.from_euler("z", -90, degrees=True).apply((0.5, 2.0, 0))
+    np.testing.assert_allclose(velocity, expected, atol=1e-12)

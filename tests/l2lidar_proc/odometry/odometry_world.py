@@ -45,7 +45,7 @@ def drive(run: Run, cut: str = "turn", config: OdometryConfig | None = None, imu
 
 def errors(run: Run, estimates: list[OdometryEstimate]) -> NDArray[np.float64]:
     """Return distances from the truth after a rigid alignment [m], shape (N,)."""
-    found = np.array([item.T_odom_lidar[:3, 3] for item in estimates])
+    found = np.array([item.T_map_lidar[:3, 3] for item in estimates])
     true, _ = truth(run, np.array([item.stamp for item in estimates]))
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, _, vt = np.linalg.svd(b.T @ a)

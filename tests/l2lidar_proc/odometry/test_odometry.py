@@ -93,7 +93,7 @@ def test_the_cloud_is_the_one_of_the_stamp():
 def test_standing_still_stays_there():
     run = recording("room", "still", 3.0)
     estimates = drive(run)
-    way = np.array([item.T_odom_lidar[:3, 3] for item in estimates])
+    way = np.array([item.T_map_lidar[:3, 3] for item in estimates])
     assert np.abs(way - way[0]).max() < 0.008
     assert np.abs(estimates[-1].velocity).max() < 0.02
 
@@ -184,7 +184,7 @@ def test_clock_that_goes_back_keeps_pose_and_map():
     ]
     estimates = feed(odometry, run, late, imu)
     assert Status.RESTARTED in estimates[0].status
-    assert np.abs(estimates[-1].T_odom_lidar[:3, 3]).max() < 0.02
+    assert np.abs(estimates[-1].T_map_lidar[:3, 3]).max() < 0.02
     assert estimates[-1].is_aligned
     # the hour between may have hidden a step
     assert np.sqrt(np.diag(estimates[-1].covariance)).min() > 0.3
@@ -231,7 +231,7 @@ def test_equal_times_and_numbers_that_are_not_finite_do_no_harm():
         if k == 6:
             points["time"] = 0.0
         estimates = feed(odometry, run, [dataclasses.replace(one, points=points)])
-    assert np.isfinite(estimates[-1].T_odom_lidar).all()
+    assert np.isfinite(estimates[-1].T_map_lidar).all()
     assert estimates[-1].is_aligned
 
 
@@ -242,7 +242,7 @@ def test_reset_begins_again():
     first = feed(odometry, run, some[:12])
     odometry.reset()
     again = feed(odometry, run, some[:12])
-    np.testing.assert_array_equal(again[-1].T_odom_lidar, first[-1].T_odom_lidar)
+    np.testing.assert_array_equal(again[-1].T_map_lidar, first[-1].T_map_lidar)
 
 
 def test_extrapolation_leads_to_the_next_sweep():
@@ -254,7 +254,7 @@ def test_extrapolation_leads_to_the_next_sweep():
     odometry.imu(run.imu[run.imu["stamp"] > some[19].end][:25])
     ahead = odometry.extrapolated(HostNs(last.stamp + 150_000_000))
     true, _ = truth(run, np.array([last.stamp, ahead.stamp]))
-    moved = np.linalg.norm(ahead.T_odom_lidar[:3, 3] - last.T_odom_lidar[:3, 3])
+    moved = np.linalg.norm(ahead.T_map_lidar[:3, 3] - last.T_map_lidar[:3, 3])
     assert moved == pytest.approx(np.linalg.norm(true[1] - true[0]), abs=0.01)
     assert np.trace(ahead.covariance) > np.trace(last.covariance)
 
@@ -272,7 +272,7 @@ def test_any_layout_with_times_will_do():
     assert plain[-1].points.dtype == np.dtype(layout)
     assert np.dtype(layout) != POINT
     full = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, list(sweeps(run, "turn"))[:10])
-    np.testing.assert_array_equal(plain[-1].T_odom_lidar, full[-1].T_odom_lidar)
+    np.testing.assert_array_equal(plain[-1].T_map_lidar, full[-1].T_map_lidar)
 
 
 def test_imu_axes_follow_the_extrinsic():

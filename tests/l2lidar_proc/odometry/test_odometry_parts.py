@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from l2lidar_node.settings import SettingError, build
-from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
+from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc import rotations
 from l2lidar_proc.config import OdometryConfig, OdometryNodeConfig
-from l2lidar_proc.motion.preintegration import integrate, track
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import Status
-from l2lidar_proc.odometry.kiss import thinned
+from l2lidar_proc.odometry.kiss import thinned_indices
 from l2lidar_proc.odometry.plain import PlainOdometry
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.recording.trajectory import Trajectory, kitti, levelled_start, tum
-from tests.l2lidar_proc.motion.analytic import EPOCH, G, Motion, at
+from tests.l2lidar_proc.motion.analytic import at
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 
@@ -71,33 +70,6 @@ def test_far_cells_are_forgotten_and_the_rest_stays():
     assert len(surfaces) == count
 
 
-def test_sums_of_samples_lead_along_the_motion():
-    motion = Motion(turn=1.0, nod=0.1, speed=1.0)
-    samples = motion.imu(0.0, 0.4)
-    marks = [at(0.05), at(0.35)]
-    felt = track(samples, marks, 20_000_000, np.zeros(3))
-    seen = integrate(felt, 0, np.zeros(3), np.zeros(3), np.zeros(3))
-    turn = motion.rotation(np.array([0.05, 0.35]))
-    found = rotations.log(seen.rotations_wxyz[-1])
-    np.testing.assert_allclose(found, (turn[0].inv() * turn[1]).as_rotvec(), atol=2e-4)
-    back = seen.seen_from(len(seen.stamps) - 1).seen_from(0)
-    np.testing.assert_allclose(back.positions, seen.positions, atol=1e-12)
-    assert not felt.missing.any()
-
-
-def test_gaps_hold_rate_and_speed():
-    samples = np.zeros(101, IMU_SAMPLE)
-    samples["stamp"] = EPOCH + np.arange(101) * 4_000_000
-    samples["angular_velocity"] = [0.0, 0.0, 0.5]
-    samples["linear_acceleration"] = [0.0, 0.0, G]
-    holed = np.delete(samples, np.arange(40, 70))
-    felt = track(holed, [at(0.0), at(0.6)], 50_000_000, np.array([0.0, 0.0, 0.5]))
-    assert felt.missing.any()
-    seen = integrate(felt, 0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, G]))
-    assert rotations.log(seen.rotations_wxyz[-1])[2] == pytest.approx(0.3, abs=1e-6)
-    np.testing.assert_allclose(seen.velocities[-1], [0.0, 0.0, 0.6 * G], atol=1e-6)
-
-
 def test_trajectory_files_keep_nanoseconds():
     pose = np.eye(4)
     pose[:3, 3] = [1.0, -2.0, 0.5]
@@ -139,10 +111,19 @@ def test_base_frame_moves_with_the_arm():
 
 def test_thinning_keeps_one_point_per_voxel_and_says_which():
     points = wall()
-    kept = thinned(points, 0.5)
+    kept = thinned_indices(points, 0.5)
     assert len(set(kept.tolist())) == len(kept)
     cells = {tuple(cell) for cell in np.floor(points / 0.5).astype(int).tolist()}
     assert len(kept) == len(cells)
+
+
+def test_thinning_of_a_wall_at_one_x_names_every_point_it_keeps():
+    rng = np.random.default_rng(RNG_SEED)
+    points = rng.uniform((2.0, -3.0, 0.0), (2.0, 3.0, 3.0), (4000, 3))
+    kept = thinned_indices(points, 0.2)
+    cells = np.floor(points / 0.2).astype(int)
+    assert len(kept) == len({tuple(cell) for cell in cells.tolist()})
+    assert len({tuple(cell) for cell in cells[kept].tolist()}) == len(kept)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 11])
@@ -157,7 +138,7 @@ def test_plain_mode_survives_what_aborts_kiss_icp(count):
     later = Sweep(HostNs(whole.start + 10**9), HostNs(whole.end + 10**9), points, 0, 0)
     (estimate,) = odometry.register(later)
     assert (Status.SPARSE in estimate.status) == (count < 10)
-    assert np.isfinite(estimate.T_odom_lidar).all()
+    assert np.isfinite(estimate.T_map_lidar).all()
 
 
 def test_plain_mode_leaves_out_points_with_their_times():

@@ -10,8 +10,8 @@ import pytest
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc.config import OdometryConfig, SurfaceConfig
-from l2lidar_proc.motion.filter import ERRORS, POSITION, TURN, InertialState
-from l2lidar_proc.motion.initialization import opening
+from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
+from l2lidar_proc.motion.initialization import initial_state
 from l2lidar_proc.odometry.alignment import Source, align
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.matcher import xyz
@@ -104,7 +104,7 @@ def test_a_long_blindness_ends_where_the_sensor_is():
 
 def _placed(estimate: OdometryEstimate):
     """Return the points of an estimate in the odometry frame, shape (N, 3)."""
-    pose = estimate.T_odom_lidar
+    pose = estimate.T_map_lidar
     return xyz(estimate.points) @ pose[:3, :3].T + pose[:3, 3]
 
 
@@ -127,7 +127,7 @@ def test_noise_does_not_tell_the_place_along_a_corridor():
         HostNs(0), np.eye(3), zero, zero, zero, zero, np.array([0.0, 0.0, -9.80665])
     )
     sigma = np.full(ERRORS, 0.01)
-    sigma[POSITION], sigma[TURN] = 0.1, 0.02
+    sigma[POSITION], sigma[ROTATION] = 0.1, 0.02
     points = _corridor(rng, 1500)
     source = Source(points, rng.uniform(-0.1, 0.1, len(points)), np.linalg.norm(points, axis=1))
     found = align(state, np.diag(sigma**2), source, surfaces, SurfaceConfig(), 100)
@@ -163,11 +163,11 @@ def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise, seed):
     some = run.imu[:230].copy()
     some["angular_velocity"] += noise * rng.standard_normal((230, 3))
     some["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
-    assert opening(some, HostNs(int(some["stamp"][100]))).at_rest
+    assert initial_state(some, HostNs(int(some["stamp"][100]))).at_rest
     moving = run.imu[900:1130].copy()
     moving["angular_velocity"] += noise * rng.standard_normal((230, 3))
     moving["linear_acceleration"] += 2.0 * noise * rng.standard_normal((230, 3))
-    assert not opening(moving, HostNs(int(moving["stamp"][100]))).at_rest
+    assert not initial_state(moving, HostNs(int(moving["stamp"][100]))).at_rest
 
 
 def test_a_map_begun_again_is_a_new_one_in_the_same_memory():

@@ -23,13 +23,13 @@ RESTED = 2.0  # [s] at the beginning of every recording
 
 def way(estimates: list[OdometryEstimate]) -> NDArray[np.float64]:
     """Return how far each pose is from the first [m]."""
-    places = np.array([one.T_odom_lidar[:3, 3] for one in estimates])
+    places = np.array([one.T_map_lidar[:3, 3] for one in estimates])
     return np.linalg.norm(places - places[0], axis=1)
 
 
 def turned(estimates: list[OdometryEstimate]) -> NDArray[np.float64]:
     """Return by how much each pose is turned against the first [rad]."""
-    turns = np.array([one.T_odom_lidar[:3, :3] for one in estimates])
+    turns = np.array([one.T_map_lidar[:3, :3] for one in estimates])
     cosines = (np.einsum("ij,nij->n", turns[0], turns) - 1.0) / 2.0
     return np.arccos(np.clip(cosines, -1.0, 1.0))
 

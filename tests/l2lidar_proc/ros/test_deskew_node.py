@@ -45,7 +45,7 @@ class DeskewBench(Bench):
         self.until(self.node._statistics.get_subscription_count)
 
     def send_imu(self, samples, frame: str = IMU_FRAME) -> None:
-        window = self.node._pipeline.tracker.window
+        window = self.node._pipeline.tracker.buffer
         for sample in samples:
             self.send_sample(sample, frame)
             last = int(sample["stamp"])
@@ -60,7 +60,7 @@ class DeskewBench(Bench):
         self.odometry_out.publish(message)
 
     def known(self, seconds: float) -> bool:
-        return self.node._pipeline.tracker.velocities.newest == at(seconds)
+        return self.node._pipeline.tracker.filter.newest_twist == at(seconds)
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def test_mounts_come_from_tf(bench):
     assert "'nowhere' is not tied" in bench.node._untied
     bench.send_odometry(3.0, (1.0, 0.0, 0.0), frame="base_link")
     bench.until(lambda: bench.known(3.0))
-    assert len(bench.node._pipeline.tracker.velocities._stamps) == 2
+    assert bench.node._pipeline.tracker.filter.newest_twist == at(3.0)
     assert not bench.node._untied
 
 
@@ -180,7 +180,7 @@ def test_velocity_from_a_twist(bench):
     bench.until(bench.twist_out.get_subscription_count)
     bench.twist_out.publish(message)
     bench.until(lambda: bench.known(1.5))
-    assert bench.node._pipeline.tracker.velocities.source == "twist"
+    assert bench.node._pipeline.tracker.filter.source == "twist"
 
 
 @pytest.mark.parametrize(

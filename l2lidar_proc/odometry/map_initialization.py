@@ -1,0 +1,273 @@
+"""Initialization of the map: the first sweeps are held and solved together.
+
+Half a turn of the head does not meet what the other half saw, and a map whose first sweep was
+taken for still is smeared if the sensor moved. So the first sweeps are tried as those of a sensor
+at rest, where the IMU allows it, and otherwise in rounds: the velocity that the later sweeps show
+deskews the first one better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import HostNs, Sweep
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.initialization import InitialState, initial_state
+from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
+
+F64 = NDArray[np.float64]
+
+
+class Trial(NamedTuple):
+    """Outcome of one way to begin the map.
+
+    Attributes
+    ----------
+    motions : list of SweepMotion
+        One for each sweep; empty if the sweeps contradict it.
+    met : bool
+        Whether any sweep saw what those before it saw.
+    """
+
+    motions: list[SweepMotion]
+    met: bool
+
+
+class Begun(NamedTuple):
+    """A map that has begun.
+
+    Attributes
+    ----------
+    motions : list of SweepMotion
+        One for each of :attr:`sweeps`.
+    sweeps : list of Sweep
+        Those held, short ones joined.
+    seed : int
+        The first of them in the map; those before it were not whole.
+    """
+
+    motions: list[SweepMotion]
+    sweeps: list[Sweep]
+    seed: int
+
+
+class MapInitializer:
+    """Collects the first sweeps and begins the map with them.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    matcher : SweepMatcher
+        Its maps are filled.
+    zero_velocity : ZeroVelocityTest
+        Anchored where the sensor turns out to be at rest.
+    min_points : int
+        A fullest sweep with fewer points cannot begin a map.
+
+    Attributes
+    ----------
+    held : list of Sweep
+        Sweeps without an estimate so far, oldest first.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        matcher: SweepMatcher,
+        zero_velocity: ZeroVelocityTest,
+        min_points: int,
+    ) -> None:
+        self._predictor = predictor
+        self._matcher = matcher
+        self._zero_velocity = zero_velocity
+        self._min_points = min_points
+        self.held: list[Sweep] = []
+
+    def add(self, sweep: Sweep) -> Begun | None:
+        """Hold a sweep; return the map if it can begin now."""
+        held = self.held
+        if held and not 0 < sweep.start - held[-1].start < tuning.LONG_GAP_NS:
+            held.clear()
+        held.append(sweep)
+        if held[-1].end - held[0].start < tuning.INITIAL_NS:
+            return None
+        whole = joined(held, tuning.INITIAL_SWEEP_NS)
+        if len(whole) < 2 or whole[-1].end < sweep.end:
+            return None
+        # the very first sweep is seldom whole
+        most = max(len(one.points) for one in whole)
+        seed = next(
+            k for k, one in enumerate(whole) if len(one.points) >= tuning.INITIAL_WHOLE * most
+        )
+        if seed == len(whole) - 1 and most:
+            return None
+        enough = most > self._min_points
+        motions = self.begin(whole[seed:], held[0].start) if enough else []
+        if motions is None:
+            return None
+        if not motions:
+            del held[0]
+            return None
+        return Begun([motions[0]] * seed + motions, whole, seed)
+
+    def begin(
+        self, sweeps: list[Sweep], since: HostNs, may_rest: bool = True
+    ) -> list[SweepMotion] | None:
+        """Begin the map with sweeps.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+        since : HostNs
+            The first motion reaches back to it.
+        may_rest : bool
+            False where the sensor is known to move, however quiet the IMU is.
+
+        Returns
+        -------
+        list of SweepMotion or None
+            One for each sweep; empty if they do not fit; None while it is too early to tell, as
+            where little comes back and it takes many sweeps at rest before one meets another.
+        """
+        late = sweeps[-1].end - since >= tuning.INITIAL_MAX_NS
+        initial = self._initial(sweeps, since, may_rest)
+        start = self._at_cloud_origin(initial)
+        self._zero_velocity.clear()
+        if initial.at_rest:
+            if self._zero_velocity.anchored(start, self._samples(sweeps, since)):
+                trial = self._at_rest(sweeps, since, start, initial.covariance)
+                if trial.motions:
+                    return trial.motions if trial.met or late else None
+                self._zero_velocity.clear()
+            trial = self._in_motion(sweeps, since, initial)
+            if trial.motions:
+                return trial.motions if trial.met or late else None
+            initial = self._initial(sweeps, since, may_rest=False)
+        trial = self._in_motion(sweeps, since, initial)
+        return trial.motions if trial.met or late or not trial.motions else None
+
+    def _samples(self, sweeps: list[Sweep], since: HostNs) -> NDArray[np.void]:
+        until = min(sweeps[-1].end, since + tuning.INITIAL_IMU_NS)
+        return self._predictor.samples(since - tuning.INITIAL_NS, until)
+
+    def _initial(self, sweeps: list[Sweep], since: HostNs, may_rest: bool) -> InitialState:
+        reference = self._predictor.reference(sweeps[0])
+        initial = initial_state(self._samples(sweeps, since), reference, may_rest)
+        self._predictor.trusts_gravity = initial.gravity_trusted
+        return initial
+
+    def _at_cloud_origin(self, initial: InitialState) -> InertialState:
+        """Return the first state: the map begins at the cloud's origin, the state is the IMU's."""
+        place = initial.state.rotation @ self._matcher.lever
+        return dataclasses.replace(initial.state, position=place)
+
+    def _at_rest(
+        self, sweeps: list[Sweep], since: HostNs, state: InertialState, covariance: F64
+    ) -> Trial:
+        """Add sweeps to an empty map where they are at rest, as long as they agree."""
+        matcher = self._matcher
+        matcher.clear()
+        motions: list[SweepMotion] = []
+        met = False
+        for sweep in sweeps:
+            before = motions[-1].state if motions else state
+            reach = None if motions else since
+            predicted = self._predictor.over_sweep(sweep, before, covariance, reach)
+            motion = predicted.at_rest(state, covariance)
+            if motions:
+                source = matcher.source(sweep, motion)
+                trial = motion.at_rest(state, free_pose())
+                found, uncharted = matcher.match(source, trial, initial=True)
+                met |= found is not None
+                if not (uncharted if found is None else self._zero_velocity.stays(found)):
+                    return Trial([], False)
+            motions.append(motion)
+            matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
+        return Trial(motions, met)
+
+    def _in_motion(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
+        """Begin the map in rounds, each with the velocity that the round before has shown."""
+        start = self._at_cloud_origin(initial)
+        trial = Trial([], False)
+        for _ in range(tuning.INITIAL_ROUNDS):
+            trial = self._round(sweeps, since, start, initial)
+            if not trial.motions:
+                return trial
+            velocity = trial.motions[1].state_at(start.stamp).velocity
+            if initial.at_rest and np.linalg.norm(velocity) > tuning.INITIAL_REST_SPEED:
+                return Trial([], False)
+            if not trial.met or np.linalg.norm(velocity - start.velocity) < tuning.INITIAL_STEP:
+                break
+            start = dataclasses.replace(start, velocity=velocity)
+        return trial
+
+    def _round(
+        self, sweeps: list[Sweep], since: HostNs, start: InertialState, initial: InitialState
+    ) -> Trial:
+        matcher = self._matcher
+        matcher.clear()
+        first = self._predictor.over_sweep(sweeps[0], start, initial.covariance, since)
+        motions = [first]
+        matcher.extend(matcher.deskewed(sweeps[0], first), first, first.state)
+        met = False
+        for sweep in sweeps[1:]:
+            motion = self._predictor.over_sweep(sweep, motions[-1].state, motions[-1].covariance)
+            source = matcher.source(sweep, motion)
+            found, uncharted = matcher.match(source, motion, initial=True)
+            if found is not None:
+                motion = motion.with_state(found.state, found.covariance)
+                met = True
+            elif not (uncharted and initial.at_rest):
+                return Trial([], False)
+            motions.append(motion)
+            matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
+        return Trial(motions, met)
+
+
+def joined(sweeps: list[Sweep], least_ns: int) -> list[Sweep]:
+    """Return sweeps that last at least so long; a last one that is shorter is left out.
+
+    Parameters
+    ----------
+    sweeps : list of Sweep
+        Ascending, with the same fields.
+    least_ns : int
+    """
+    out: list[Sweep] = []
+    some: list[Sweep] = []
+    for sweep in sweeps:
+        some.append(sweep)
+        if sweep.end - some[0].start >= least_ns:
+            out.append(some[0] if len(some) == 1 else _one(some))
+            some = []
+    return out
+
+
+def cropped(sweep: Sweep, nearest: float, farthest: float) -> Sweep:
+    """Return the sweep without points that are not finite or out of a range [m]."""
+    points = sweep.points
+    squared = sum(points[axis].astype(np.float64) ** 2 for axis in "xyz")
+    inside = (squared >= nearest**2) & (squared <= farthest**2) & np.isfinite(points["time"])
+    return sweep if inside.all() else dataclasses.replace(sweep, points=points[inside])
+
+
+def _one(sweeps: list[Sweep]) -> Sweep:
+    points = np.concatenate([sweep.points for sweep in sweeps])
+    shift = [(sweep.start - sweeps[0].start) * 1e-9 for sweep in sweeps]
+    counts = [len(sweep.points) for sweep in sweeps]
+    points["time"] += np.repeat(shift, counts).astype(points["time"].dtype)
+    return Sweep(
+        sweeps[0].start,
+        sweeps[-1].end,
+        points,
+        sum(sweep.packets for sweep in sweeps),
+        sum(sweep.missing for sweep in sweeps),
+    )
