@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import Stream
+from tests.support.clock_loads import Load, LoadedPath
 
 EVENT: Final = np.dtype(
     [
@@ -72,6 +73,8 @@ class Scenario:
         it does that it will; negative: it never does.
     delays : tuple of (float, float, float)
         From when to when, and by how many seconds, packets leave later; they keep their order.
+    loads : tuple of Load
+        What delays packets meanwhile; those of one path keep their order.
     silences : tuple of (float, float)
         From when to when nothing arrives, and what is sent is lost.
     imu_noise_us : float
@@ -109,6 +112,7 @@ class Scenario:
     notice_ms: float = -1.0
     delays: tuple[tuple[float, float, float], ...] = ()
     silences: tuple[tuple[float, float], ...] = ()
+    loads: tuple[Load, ...] = ()
     imu: bool = True
     imu_noise_us: float = 0.0
     stamp_step: int = 1
@@ -251,6 +255,12 @@ def _travel(
         arrival[held] += by * 1e9
     if scenario.fifo or scenario.delays:
         arrival = np.maximum.accumulate(arrival)
+    if scenario.loads:
+        path = LoadedPath(scenario.loads, int(rng.integers(1 << 32)))
+        is_imu = packets["kind"] == IMU
+        order = np.argsort(arrival, kind="stable")
+        for at in order.tolist():
+            arrival[at] = path.deliver(int(arrival[at]), bool(is_imu[at]))
     late = rng.random(count) < scenario.reorder
     arrival[late] += scenario.reorder_ms * _MS
     packets["arrival"] = arrival
