@@ -1,8 +1,8 @@
 """Maps device stamps to host stamps; says when it is locked and what happened to either clock.
 
-Two lines, one after the other: :class:`DeviceLine` takes the steps out of the stamps, so that both
-streams lie on one even device line whatever syncs and reboots do; :class:`HostLine` lays that line
-below the arrivals (see :mod:`l2lidar_node.clock.envelope` for the estimator and why it is not a
+Two lines, one after the other: :class:`DeviceClockModel` takes the steps out of the stamps, so that both
+streams lie on one even device line whatever syncs and reboots do; :class:`HostClockModel` lays that line
+below the arrivals (see :mod:`l2lidar_node.clock.lower_envelope` for the estimator and why it is not a
 Kalman filter).
 """
 
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from l2lidar_node.clock.device_line import DeviceLine, Step
-from l2lidar_node.clock.host_line import HostLine
+from l2lidar_node.clock.device_clock_model import DeviceClockModel, Step
+from l2lidar_node.clock.host_clock_model import HostClockModel
 from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import DeviceNs, HostNs, Stream
@@ -144,8 +144,8 @@ class DeviceClock:
 
     def reset(self) -> None:
         """Forget the device; stamps still never go backwards."""
-        self._host = HostLine(self._guess)
-        self._device = DeviceLine(self._guess, self._host.lateness)
+        self._host = HostClockModel(self._guess)
+        self._device = DeviceClockModel(self._guess, self._host.lateness)
         self._restarts = 0
         self._schedule.reset()
         self._last_u: int | None = None

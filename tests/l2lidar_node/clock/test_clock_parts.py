@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2lidar_node.clock.cadence import Cadence
-from l2lidar_node.clock.envelope import supporting_line
+from l2lidar_node.clock.lower_envelope import supporting_line
 from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import HostNs

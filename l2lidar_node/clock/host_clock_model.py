@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from l2lidar_node.clock.envelope import (
+from l2lidar_node.clock.lower_envelope import (
     BLOCK_NS,
-    Envelope,
+    LowerEnvelope,
     Line,
     is_credible,
     supporting_line,
@@ -34,7 +34,7 @@ _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clo
 _PATIENCE_BLOCKS: Final = 600  # who is so long late, and the clock was not set, is so for good
 
 
-class HostLine:
+class HostClockModel:
     """Maps the device line to the host's clock.
 
     Attributes
@@ -96,7 +96,7 @@ class HostLine:
         """Forget everything but the ratio, as a guess."""
         self.ready = False
         self.late_ns = 0
-        self._envelope: Envelope | None = None
+        self._envelope: LowerEnvelope | None = None
         self._packets: list[tuple[int, int]] = []
         self._suspects: list[tuple[int, int]] = []
         self._late_blocks = 0
@@ -176,7 +176,7 @@ class HostLine:
             return
         if span < _LOCK_NS and line.excess > _QUIET_NS:
             return
-        self._envelope = Envelope(line, packets)
+        self._envelope = LowerEnvelope(line, packets)
         self._packets = []
         self._go(u, line.at(u) - self.advance_ns, line.ratio)
         self.line = line
@@ -187,7 +187,7 @@ class HostLine:
         if span >= _LOCK_NS:
             del self._packets[: len(self._packets) // 2]
 
-    def _follow(self, envelope: Envelope, u: int) -> None:
+    def _follow(self, envelope: LowerEnvelope, u: int) -> None:
         low, self._low = self._low, None
         if low is not None and not self._stepped(envelope, u):
             envelope.close(self._low_at, u)
@@ -197,7 +197,7 @@ class HostLine:
         pull = (line.at(u) - self.advance_ns - host) / _SETTLE_NS
         self._go(u, host, ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
 
-    def _stepped(self, envelope: Envelope, u: int) -> bool:
+    def _stepped(self, envelope: LowerEnvelope, u: int) -> bool:
         """Look for a step of the host's clock; return whether the block was dealt with."""
         line = envelope.line
         off = self._low_at[1] - line.at(self._low_at[0])
@@ -228,7 +228,7 @@ class HostLine:
             self._go(u, envelope.line.at(u) - self.advance_ns, envelope.line.ratio)
         return True
 
-    def _is_late(self, envelope: Envelope) -> bool:
+    def _is_late(self, envelope: LowerEnvelope) -> bool:
         """Count a late block; after many, lay the fit below it, on which stamps then close in."""
         self._suspects.clear()
         self._late_blocks += 1

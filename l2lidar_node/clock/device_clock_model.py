@@ -79,7 +79,7 @@ class _Track:
         self.suspect: tuple[int, int] | None = None  # number and stamp that nothing explains
 
 
-class DeviceLine:
+class DeviceClockModel:
     """Places stamps on the device line.
 
     Parameters

@@ -12,7 +12,7 @@ Why not a Kalman filter (filterpy): it averages, so for one-sided delays its ans
 their mean, by milliseconds when the network gets busy, and gets better with the square root of the
 number of packets; the envelope moves with their minimum, and gets better with their number. No
 noise level has to be known, and slope and offset come out together. Its one weakness, a curved
-line (drifting rate), is met by the length of the window, see :class:`Envelope`.
+line (drifting rate), is met by the length of the window, see :class:`LowerEnvelope`.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def supporting_line(packets: list[tuple[int, int]], guess: float) -> Line | None
     return Line(u0, h0 + round(ay - slope * ax), ratio, heights[len(heights) // 2])
 
 
-class Envelope:
+class LowerEnvelope:
     """Keeps the least delayed packet of every block and fits the line through the latest of them.
 
     Parameters
