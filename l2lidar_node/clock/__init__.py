@@ -6,10 +6,11 @@ and returns the host instant of the stamp. ``docs/clock.md`` explains how, and h
 """
 
 from l2lidar_node.clock.device_clock import (
+    UNCERTAIN_NS,
     ClockEvent,
     ClockEventKind,
     ClockStatus,
     DeviceClock,
 )
 
-__all__ = ["ClockEvent", "ClockEventKind", "ClockStatus", "DeviceClock"]
+__all__ = ["UNCERTAIN_NS", "ClockEvent", "ClockEventKind", "ClockStatus", "DeviceClock"]

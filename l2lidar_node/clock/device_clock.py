@@ -1,9 +1,9 @@
 """Maps device stamps to host stamps; says when it is locked and what happened to either clock.
 
-Two lines, one after the other: :class:`DeviceClockModel` takes the steps out of the stamps, so that both
-streams lie on one even device line whatever syncs and reboots do; :class:`HostClockModel` lays that line
-below the arrivals (see :mod:`l2lidar_node.clock.lower_envelope` for the estimator and why it is not a
-Kalman filter).
+Two models, one after the other. :class:`DeviceClockModel` takes the steps out of the stamps, so
+that both streams share one even device time whatever syncs and reboots do. :class:`HostClockModel`
+maps that to the host's clock (:mod:`l2lidar_node.clock.lower_envelope` has the estimator, and why
+it is not a Kalman filter).
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 
+UNCERTAIN_NS: Final = 1_000_000
+"""Uncertainty from which users should know: at 1 m/s it moves points by 1 mm."""
+
 _SILENCE_NS: Final = 1_000_000_000
 _ROUND_TRIPS: Final = 16
 _EVENTS: Final = 64
@@ -32,6 +35,8 @@ class ClockEventKind(Enum):
     FOREIGN_SYNC = "foreign sync"
     HOST_STEP = "host step"
     EARLIER = "earlier arrivals"
+    CORRECTED = "correction"
+    UNCERTAIN = "uncertain"
     SILENCE = "silence"
     LOST = "lost"
 
@@ -60,6 +65,9 @@ class ClockStatus:
         Host time minus device stamp of the latest packet.
     residual_ns : int
         Median height of the fitted packets above the line: how much arrivals vary.
+    uncertainty_ns : int
+        By how much stamps may be off, the constant part of the path delay aside; grows while the
+        path delays every packet.
     late_ns : int
         How late even the least delayed of the latest packets was, beyond the path's constant part.
     path_delay_ns : int
@@ -81,6 +89,7 @@ class ClockStatus:
     ratio: float
     offset_ns: int
     residual_ns: int
+    uncertainty_ns: int
     late_ns: int
     path_delay_ns: int
     synced: bool
@@ -149,6 +158,7 @@ class DeviceClock:
         self._restarts = 0
         self._schedule.reset()
         self._last_u: int | None = None
+        self._is_certain = True
         self._offset = 0
         self._round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
 
@@ -233,7 +243,7 @@ class DeviceClock:
         if by_ns:
             self._schedule.host_stepped(by_ns)
             self._device.host_stepped(by_ns, at)
-            self._report_step(by_ns)
+            self._report_step(by_ns, is_told=False)
         self._host.stepped(by_ns, at)
 
     def sync_due(self, now: HostNs) -> bool:
@@ -256,6 +266,7 @@ class DeviceClock:
             ratio=line.ratio,
             offset_ns=self._offset,
             residual_ns=round(line.excess),
+            uncertainty_ns=round(self._host.uncertainty_ns),
             late_ns=self._host.late_ns,
             path_delay_ns=self._host.advance_ns,
             synced=self._schedule.in_force,
@@ -294,12 +305,8 @@ class DeviceClock:
             self._report(ClockEventKind.SILENCE, f"device was silent for {seconds:.1f} s")
         self._last_u = u
         while host.steps:
-            step = host.steps.popleft()
-            if host.is_told:
-                text = f"packets come {-step * 1e-9:.3f} s earlier than before{_hold(step)}"
-                self._report(ClockEventKind.EARLIER, text)
-            else:
-                self._report_step(step)
+            self._report_step(host.steps.popleft(), is_told=host.is_told)
+        self._watch_uncertainty()
         self._notice()
 
     def _notice(self) -> None:
@@ -323,9 +330,27 @@ class DeviceClock:
             self._host.reset()
             self._last_u = None
 
-    def _report_step(self, step: int) -> None:
-        text = f"host clock stepped by {step * 1e-9:+.3f} s{_hold(step)}"
-        self._report(ClockEventKind.HOST_STEP, text)
+    def _watch_uncertainty(self) -> None:
+        """Report when stamps become uncertain, once until they are certain again."""
+        uncertainty = self._host.uncertainty_ns
+        if self._is_certain and uncertainty > UNCERTAIN_NS:
+            self._is_certain = False
+            text = f"every packet is delayed, stamps may be {uncertainty * 1e-6:.1f} ms off"
+            self._report(ClockEventKind.UNCERTAIN, text)
+        elif uncertainty < 0.5 * UNCERTAIN_NS:
+            self._is_certain = True
+
+    def _report_step(self, step: int, *, is_told: bool) -> None:
+        """Report a step of published stamps; where steps are told, arrivals show only delays."""
+        if not is_told:
+            text = f"host clock stepped by {step * 1e-9:+.3f} s{_hold(step)}"
+            self._report(ClockEventKind.HOST_STEP, text)
+        elif step < 0:
+            text = f"packets come {-step * 1e-9:.3f} s earlier than before{_hold(step)}"
+            self._report(ClockEventKind.EARLIER, text)
+        else:
+            text = f"stamps were {step * 1e-6:.1f} ms too early because of delayed packets"
+            self._report(ClockEventKind.CORRECTED, text)
 
     def _report(self, kind: ClockEventKind, text: str) -> None:
         self._counts[kind] += 1

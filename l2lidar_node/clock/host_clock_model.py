@@ -1,4 +1,4 @@
-"""Lays the device line onto the host's clock: locks, follows smoothly, notices steps."""
+"""Host clock model: maps device time to the host's clock, smoothly, and detects its steps."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _SETTLE_NS: Final = 500.0 * _MS  # time constant with which what is published fo
 _SLEW: Final = 0.002  # at most by that much faster or slower
 _SEGMENTS: Final = 8
 
-_STEP_NS: Final = 5 * _MS  # arrivals off by more, and for long enough: the host's clock was set
+# Published stamps jump by more than this instead of closing in: the rest is gone after a second.
+_STEP_NS: Final = 1_500_000
 _EARLY_NS: Final = 300_000  # a single block earlier than that is an error, more of them are news
-_SPREADS: Final = 10.0  # these margins grow by that many times the usual delay
+_SPREADS: Final = 2.0  # these margins grow by that many times the uncertainty
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
 _BACKWARD_BLOCKS: Final = 2  # early ones cannot
 _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
-_PATIENCE_BLOCKS: Final = 600  # who is so long late, and the clock was not set, is so for good
 
 
 class HostClockModel:
@@ -45,7 +45,9 @@ class HostClockModel:
         Place on the device line at which :meth:`update` wants to be called.
     steps : deque of int
         Steps of what is published that arrivals made necessary [ns]: the host's clock was set, or
-        if that ``is_told``, packets come earlier than thought; whoever reads it takes it out.
+        if that ``is_told``, load had hidden the true delay; whoever reads it takes it out.
+    uncertainty_ns : float
+        By how much stamps may be off [ns], the constant part of the path delay aside.
     late_ns : int
         How late the least delayed packet of the last 100 ms was, against the fit.
     is_told : bool
@@ -67,7 +69,6 @@ class HostClockModel:
         "_envelope",
         "_from",
         "_host",
-        "_late_blocks",
         "_low",
         "_low_at",
         "_packets",
@@ -82,6 +83,7 @@ class HostClockModel:
         "line",
         "ready",
         "steps",
+        "uncertainty_ns",
     )
 
     def __init__(self, ratio: float) -> None:
@@ -96,10 +98,10 @@ class HostClockModel:
         """Forget everything but the ratio, as a guess."""
         self.ready = False
         self.late_ns = 0
+        self.uncertainty_ns = 0.0
         self._envelope: LowerEnvelope | None = None
         self._packets: list[tuple[int, int]] = []
         self._suspects: list[tuple[int, int]] = []
-        self._late_blocks = 0
         self._segments: deque[tuple[int, int, float]] = deque(maxlen=_SEGMENTS)
         self._u = self._host = 0
         self._slope = self.line.ratio
@@ -176,10 +178,11 @@ class HostClockModel:
             return
         if span < _LOCK_NS and line.excess > _QUIET_NS:
             return
-        self._envelope = LowerEnvelope(line, packets)
+        self._envelope = LowerEnvelope(line, packets, is_told=self.is_told)
         self._packets = []
         self._go(u, line.at(u) - self.advance_ns, line.ratio)
         self.line = line
+        self.uncertainty_ns = self._envelope.uncertainty_ns
         self.ready = True
 
     def _drop_first_half(self, span: int) -> None:
@@ -189,52 +192,55 @@ class HostClockModel:
 
     def _follow(self, envelope: LowerEnvelope, u: int) -> None:
         low, self._low = self._low, None
-        if low is not None and not self._stepped(envelope, u):
+        before = envelope.line.at(u)
+        moves = envelope.moves
+        if low is not None and envelope.begins_anew(self._low_at):
+            self._suspects.clear()
+        elif low is not None and not self._stepped(envelope, u):
             envelope.close(self._low_at, u)
         self.line = line = envelope.line
+        self.uncertainty_ns = envelope.uncertainty_ns
+        wanted = line.at(u) - self.advance_ns
         host = self.at(u)
-        ratio = line.ratio
-        pull = (line.at(u) - self.advance_ns - host) / _SETTLE_NS
-        self._go(u, host, ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
+        if envelope.moves != moves:
+            off = wanted - host if self.is_told else line.at(u) - before
+            if abs(off) > _STEP_NS:
+                self.steps.append(off)
+                self._go(u, wanted, line.ratio)
+                return
+        self.uncertainty_ns += abs(wanted - host)
+        pull = (wanted - host) / _SETTLE_NS
+        self._go(u, host, line.ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
 
     def _stepped(self, envelope: LowerEnvelope, u: int) -> bool:
         """Look for a step of the host's clock; return whether the block was dealt with."""
         line = envelope.line
         off = self._low_at[1] - line.at(self._low_at[0])
         self.late_ns = max(off, 0)
-        spread = _SPREADS * line.excess
+        margin = _SPREADS * envelope.uncertainty_ns
         suspects = self._suspects
-        if -_EARLY_NS - spread <= off <= _STEP_NS + spread:
+        is_early = off < -_EARLY_NS - margin
+        # Bounds of a known ratio keep late blocks from doing harm.
+        is_late = off > _STEP_NS + margin and not (self.is_told and envelope.is_known)
+        if not is_early and not is_late:
             suspects.clear()
-            self._late_blocks = 0
             return False
-        if off > 0 and self.is_told:
-            return self._is_late(envelope)
-        if suspects and (suspects[-1][1] < line.at(suspects[-1][0])) != (off < 0):
+        if suspects and (suspects[-1][1] < line.at(suspects[-1][0])) != is_early:
             suspects.clear()
         suspects.append(self._low_at)
-        if len(suspects) < (_BACKWARD_BLOCKS if off < 0 else _FORWARD_BLOCKS):
+        if len(suspects) < (_BACKWARD_BLOCKS if is_early else _FORWARD_BLOCKS):
             return True
         first, last = suspects[0], suspects[-1]
         if last[1] - first[1] < _FLOWING * (last[0] - first[0]) * line.ratio:
             del suspects[0]
             return True
-        before = self.at(u) + self.advance_ns if self.is_told else line.at(u)
+        heights = [host - line.at(at) for at, host in suspects]
+        if is_late and (self.is_told or max(heights) - min(heights) > _STEP_NS + margin):
+            envelope.extend(suspects[:-1])  # a loaded path; no step varies so much
+            suspects.clear()
+            return False
         envelope.move(suspects)
         suspects.clear()
-        step = envelope.line.at(u) - before
-        if step < -_STEP_NS or (step > _STEP_NS and not self.is_told):
-            self.steps.append(step)
-            self._go(u, envelope.line.at(u) - self.advance_ns, envelope.line.ratio)
-        return True
-
-    def _is_late(self, envelope: LowerEnvelope) -> bool:
-        """Count a late block; after many, lay the fit below it, on which stamps then close in."""
-        self._suspects.clear()
-        self._late_blocks += 1
-        if self._late_blocks >= _PATIENCE_BLOCKS:
-            self._late_blocks = 0
-            envelope.move([self._low_at])
         return True
 
     def _go(self, u: int, host: int, slope: float) -> None:

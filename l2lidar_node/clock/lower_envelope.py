@@ -1,34 +1,62 @@
-"""Fits the line from device time to host time that no packet can have arrived before.
+"""Lower envelope of the delays: the line from device time to host time below all arrivals.
 
 A packet arrives when it was measured plus a delay that is never below the constant part of the
-path. So in the plane of device time and arrival all packets lie on or above the wanted line, many
-close to it, some far above: a lower envelope. Of all lines with no packet below,
-:func:`supporting_line` returns the one with the least sum of distances to the packets. It is the
-edge of the lower convex hull that spans their mean device time (Moon, Skelly and Towsley,
-"Estimation and removal of clock skew from network delay measurements", INFOCOM 1999, who solve the
-same linear programme).
+path. In the plane of device time and arrival all packets therefore lie on or above the wanted
+line. :func:`supporting_line` returns the line below all of them with the least sum of distances,
+an edge of their lower convex hull (Moon, Skelly and Towsley, "Estimation and removal of clock skew
+from network delay measurements", INFOCOM 1999; Zhang, Liu and Xia, "Clock synchronization
+algorithms for network measurements", INFOCOM 2002). :class:`LowerEnvelope` keeps such a line up to
+date.
 
-Why not a Kalman filter (filterpy): it averages, so for one-sided delays its answer moves with
-their mean, by milliseconds when the network gets busy, and gets better with the square root of the
-number of packets; the envelope moves with their minimum, and gets better with their number. No
-noise level has to be known, and slope and offset come out together. Its one weakness, a curved
-line (drifting rate), is met by the length of the window, see :class:`LowerEnvelope`.
+A Kalman filter would average. Delays are one-sided, so its answer moves with their mean, by
+milliseconds when the network gets busy. The envelope moves with their minimum, needs no noise
+model, and yields ratio and offset together. Its weakness is that the minimum itself may change:
+under load even the least delayed packet is late. Three rules keep that out of the estimate.
+
+* The ratio moves within bounds that only evidence narrows and that time widens no faster than a
+  crystal can drift. A change of the delays cannot tilt the line by more.
+* Each block of packets carries an error bound, as in the clock filter of NTP (RFC 5905, section
+  10): its height above the line plus a dispersion that grows with its age. Only the blocks with
+  the least bounds select the edge, so packets of a loaded path do not outvote those of a quiet
+  one before or after it.
+* The least of these bounds is the stated uncertainty. It grows under load.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Final, NamedTuple
 
 _BLOCK_S: Final = 0.1
 SHORT_BLOCKS: Final = 30
-LONG_BLOCKS: Final = 160
-_QUIET_NS: Final = 20_000.0  # excess of the block minima at which the short window starts to grow
+# About a minute: longer than the loads that a link recovers from, and short enough for the
+# dispersion, 2 ms by then, to be useful.
+_LONG_BLOCKS: Final = 640
+_QUIET_NS: Final = 20_000.0  # median height of the blocks at which the short window starts to grow
 _MIN_SPAN_NS: Final = 1_400_000_000  # [ns host] shorter data say nothing about the ratio
 _RATIOS: Final = (0.45, 3.3)
-_FORGET: Final = (
-    2 * LONG_BLOCKS
-)  # [blocks] a packet this old is no longer used, however few there are
+_FORGET: Final = 2 * _LONG_BLOCKS  # [blocks] older ones are not used, however few there are
+
+# AT-cut crystals change by up to about 1 ppm/K away from their turning point, and no housing of a
+# sensor warms up by more than 1 K/s.
+_DRIFT_PER_S: Final = 1e-6
+# How far a ratio may always be from the best estimate, as a share. Two crystals: a draft of cold
+# air. A host that does not tell of its adjustments: 500 ppm (adjtimex(2)), and the crystals.
+_LEAST_WIDTH: Final = 5e-6
+_UNTOLD_WIDTH: Final = 600e-6
+
+_VOTERS: Final = 8  # blocks that suffice to select an edge: two lie on it, the others confirm it
+_LEVEL: Final = 4.0  # blocks with bounds up to this many times the least ones are used as well
+_PARTS: Final = 4  # of the data, compared to see how well the minimum repeats
+_RESOLUTION_NS: Final = 10_000.0  # to which the minimum of a quiet path repeats, block by block
+# Measured on simulated loads: the error of a ratio stays within three times the error of the
+# minimum over the span.
+_SAFETY: Final = 3.0
+_KNOWN: Final = 50e-6  # a ratio is known when it is known to what crystals differ by
+_TIGHT: Final = 200e-6  # the latest blocks alone say as much only after a load has ended
+_BETTER: Final = 8.0  # and must repeat so much better than those that a known ratio comes from
+_WRONG: Final = 0.02  # a ratio found under load can be off by that; a backlog that drains is more
 
 BLOCK_NS: Final = int(_BLOCK_S * 1e9)
 """Length of a block [ns host]: of the packets in one, only the least delayed one is kept."""
@@ -51,7 +79,7 @@ class Line(NamedTuple):
     ratio : float
         Host nanoseconds per device nanosecond.
     excess : float
-        Median height [ns host] of the packets that were fitted above the line.
+        Median height [ns host] of the fitted packets above the line.
     """
 
     u: int
@@ -81,6 +109,17 @@ def supporting_line(packets: list[tuple[int, int]], guess: float) -> Line | None
     """
     u0, h0 = packets[0]
     points = [(float(u - u0), (h - h0) - guess * (u - u0)) for u, h in packets]
+    hull = _lower_hull(points)
+    if len(hull) < 2:
+        return None
+    mean = sum(x for x, _ in points) / len(points)
+    base, slope = _edge(hull, mean)
+    heights = sorted(y - base - slope * x for x, y in points)
+    return Line(u0, h0 + round(base), guess + slope, heights[len(heights) // 2])
+
+
+def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the vertices of the lower convex hull of points that ascend in x."""
     hull: list[tuple[float, float]] = []
     for x, y in points:
         while len(hull) > 1:
@@ -93,15 +132,15 @@ def supporting_line(packets: list[tuple[int, int]], guess: float) -> Line | None
                 continue
             hull.pop()
         hull.append((x, y))
-    if len(hull) < 2:
-        return None
-    mean = sum(x for x, _ in points) / len(points)
-    right = next(i for i, (x, _) in enumerate(hull) if i and (x >= mean or i == len(hull) - 1))
+    return hull
+
+
+def _edge(hull: list[tuple[float, float]], at: float) -> tuple[float, float]:
+    """Return height at 0 and slope of the edge of a hull that spans a place."""
+    right = next(i for i, (x, _) in enumerate(hull) if i and (x >= at or i == len(hull) - 1))
     (ax, ay), (bx, by) = hull[right - 1], hull[right]
     slope = (by - ay) / (bx - ax)
-    heights = sorted(y - ay - slope * (x - ax) for x, y in points)
-    ratio = guess + slope
-    return Line(u0, h0 + round(ay - slope * ax), ratio, heights[len(heights) // 2])
+    return ay - slope * ax, slope
 
 
 class LowerEnvelope:
@@ -113,22 +152,87 @@ class LowerEnvelope:
         The first fit, from all packets since the start.
     packets : list of (int, int)
         Those packets: device time and arrival [ns], ascending in device time.
+    is_told : bool
+        Whether the host tells when its clock is adjusted, so that the ratio is that of two
+        crystals.
+
+    Attributes
+    ----------
+    line : Line
+    moves : int
+        How often the line was laid elsewhere at once, instead of following the blocks.
+    uncertainty_ns : float
+        By how much the line may be off [ns host], the constant part of the path delay aside.
 
     Notes
     -----
     A long window averages better, a short one follows a drifting rate better: a drift of a per
     second makes an error of a T^2 / 8 over a window T. The window is 3 s while the network is
     quiet (the median block minimum lies less than 20 us above the line) and grows with the square
-    root of that excess up to 16 s, one block at a time so the line never jumps because of it.
+    root of that excess up to a minute, one block at a time: its beginning stays where it is
+    while a load lasts.
+
+    While the ratio is not known, as under a load that lasts since the start, all blocks count, and
+    the line may be off by as much as the least delay varies. The first quiet blocks then begin
+    a new line.
     """
 
-    __slots__ = ("_blocks", "_low", "_low_at", "_reach", "_start", "line")
+    __slots__ = ("_blocks", "_evidence", "_fitted_u", "_hi", "_latest", "_lo", "_reach", "is_told",
+                 "line", "moves", "uncertainty_ns")  # fmt: skip
 
-    def __init__(self, line: Line, packets: list[tuple[int, int]]) -> None:
+    def __init__(self, line: Line, packets: list[tuple[int, int]], *, is_told: bool) -> None:
         self.line = line
-        self._blocks: deque[tuple[int, int]] = deque(maxlen=LONG_BLOCKS)
+        self.is_told = is_told
+        self._blocks: deque[tuple[int, int]] = deque(maxlen=_LONG_BLOCKS)
+        self._latest: deque[tuple[int, int]] = deque(maxlen=_VOTERS)
+        self.moves = 0
         self._reach = SHORT_BLOCKS
+        self._fitted_u = packets[-1][0]
+        u0, h0 = packets[0]
+        points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in packets]
+        self._lo, self._hi = _RATIOS
+        self._evidence = math.inf
+        self._learn(points, float(line.host - h0), 0.0)
+        self.uncertainty_ns = self._error(points, float(line.host - h0), 0.0)
         self._restart(packets)
+
+    def begins_anew(self, low: tuple[int, int]) -> bool:
+        """Begin a new line if the latest blocks contradict a ratio that is not known.
+
+        Parameters
+        ----------
+        low : (int, int)
+            The least delayed packet of the block that just ended.
+
+        Returns
+        -------
+        bool
+            Whether it did; the block has been used then.
+        """
+        self._latest.append(low)
+        if len(self._latest) < _VOTERS:
+            return False
+        recent = sorted(self._latest)
+        ratio = self.line.ratio
+        line = supporting_line(recent, ratio)
+        if line is None or abs(line.ratio - ratio) > _WRONG * ratio:
+            return False
+        u0, h0 = recent[0]
+        points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]
+        error = self._error(points, float(line.host - h0), 0.0)
+        width = self._width(points, error)
+        if width > _TIGHT or abs(line.ratio - ratio) < width * ratio:
+            return False
+        if self.is_known and _BETTER * error > self._evidence:
+            return False
+        self._blocks.clear()
+        self._blocks.extend(recent)
+        self._reach = SHORT_BLOCKS
+        self.moves += 1
+        self.line = line
+        self._lo, self._hi = _RATIOS
+        self._learn(points, float(line.host - h0), 0.0)
+        return True
 
     def close(self, low: tuple[int, int], now: int) -> None:
         """Add the least delayed packet of a block that ends at ``now``, and fit."""
@@ -137,32 +241,123 @@ class LowerEnvelope:
         oldest = now - _FORGET * BLOCK_NS / self.line.ratio
         while blocks[0][0] < oldest and len(blocks) > 1:
             blocks.popleft()
+        self._age(now)
         recent = sorted(list(blocks)[-self._reach :])
-        ratio = self.line.ratio
-        if (recent[-1][0] - recent[0][0]) * ratio < _MIN_SPAN_NS:
-            self._shift(recent)
-            return
-        line = supporting_line(recent, ratio)
-        if line is None or not is_credible(line.ratio):
-            return
-        self.line = line
-        wanted = SHORT_BLOCKS * (max(line.excess, 0.0) / _QUIET_NS) ** 0.5
-        if self._reach < min(wanted, LONG_BLOCKS):
+        self._fit(recent)
+        wanted = SHORT_BLOCKS * (max(self.line.excess, 0.0) / _QUIET_NS) ** 0.5
+        if self._reach < min(wanted, _LONG_BLOCKS):
             self._reach += 1
         elif self._reach > max(wanted, SHORT_BLOCKS):
             self._reach -= 1
 
     def move(self, lows: list[tuple[int, int]]) -> None:
-        """Forget all packets but these and lay the line, its ratio unchanged, below them."""
+        """Forget all packets but these and lay the line, its ratio unchanged, below them.
+
+        The bounds of the ratio widen by what the move says about the line so far.
+        """
+        span = max((lows[-1][0] - self._blocks[0][0]) * self.line.ratio, float(BLOCK_NS))
         self._blocks.clear()
         self._blocks.extend(lows)
         self._reach = SHORT_BLOCKS
-        self._shift(lows)
+        self.moves += 1
+        before = self.line
+        self._shift(sorted(lows))
+        off = abs(self.line.host - before.host)
+        self._lo -= before.ratio * off / span
+        self._hi += before.ratio * off / span
+
+    def extend(self, lows: list[tuple[int, int]]) -> None:
+        """Add blocks that were held back; the next fit uses them."""
+        self._blocks.extend(lows)
 
     def host_stepped(self, by_ns: int) -> None:
         """Move everything to another host time."""
+        self._latest.clear()
         self.line = self.line._replace(host=self.line.host + by_ns)
-        self._blocks = deque(((u, host + by_ns) for u, host in self._blocks), maxlen=LONG_BLOCKS)
+        self._blocks = deque(((u, host + by_ns) for u, host in self._blocks), maxlen=_LONG_BLOCKS)
+
+    def _fit(self, recent: list[tuple[int, int]]) -> None:
+        """Lay the line below the blocks along the edge that the best of them select."""
+        guess = self.line.ratio
+        u0, h0 = recent[0]
+        points = [(float(u - u0), (h - h0) - guess * (u - u0)) for u, h in recent]
+        hull = _lower_hull(points)
+        end = points[-1][0]
+        base = min(y for _, y in hull)
+        bounds = self._bounds(points, base, end)
+        least = sorted(bounds)
+        level = least[min(_VOTERS, len(least)) - 1]
+        used = points
+        if self.is_known:
+            cut = _LEVEL * level + _RESOLUTION_NS
+            used = [point for point, bound in zip(points, bounds, strict=True) if bound <= cut]
+        slope = 0.0
+        span = (used[-1][0] - used[0][0]) * guess
+        if len(hull) > 1 and span >= _MIN_SPAN_NS:
+            _, slope = _edge(hull, sum(x for x, _ in used) / len(used))
+            slope = min(max(slope, self._lo - guess), self._hi - guess)
+            base = min(y - slope * x for x, y in hull)
+        heights = sorted(y - base - slope * x for x, y in points)
+        self.line = Line(u0, h0 + round(base), guess + slope, heights[len(heights) // 2])
+        if span >= _MIN_SPAN_NS:
+            self._learn(points, base, slope)
+        self.uncertainty_ns = level if self.is_known else self._error(points, base, slope)
+
+    def _bounds(self, points: list[tuple[float, float]], base: float, end: float) -> list[float]:
+        """Return the error bound of every block: height plus dispersion."""
+        ratio = self.line.ratio
+        spread = max(self._hi - ratio, ratio - self._lo) if self.is_known else 0.0
+        bend = 0.5 * _DRIFT_PER_S * ratio * ratio * 1e-9
+        return [y - base + (spread + bend * (end - x)) * (end - x) for x, y in points]
+
+    def _error(self, points: list[tuple[float, float]], base: float, slope: float) -> float:
+        """Return how well the minimum of points above a line repeats [ns host].
+
+        The least height of each quarter of the time says so. Where heights vary much and quarters
+        have few points, that may be chance.
+        """
+        end = points[-1][0]
+        least = [math.inf] * _PARTS
+        heights = []
+        for x, y in points:
+            part = min(int(_PARTS * x / end), _PARTS - 1) if end else 0
+            height = y - base - slope * x
+            heights.append(height)
+            least[part] = min(least[part], height)
+        worst = max(height for height in least if height < math.inf)
+        heights.sort()
+        chance = heights[len(heights) // 2] * _PARTS / len(heights)
+        return max(worst, 0.0) + chance + _RESOLUTION_NS
+
+    def _width(self, points: list[tuple[float, float]], error: float) -> float:
+        """Return to which share a ratio is known from points whose minimum repeats so well."""
+        span = points[-1][0] * self.line.ratio
+        return _SAFETY * error / span if span > 0.0 else 1.0
+
+    def _learn(self, points: list[tuple[float, float]], base: float, slope: float) -> None:
+        """Narrow the bounds of the ratio to what a fit says, if it says enough."""
+        error = self._error(points, base, slope)
+        width = self._width(points, error)
+        if width > _KNOWN:
+            return
+        width = max(width, _LEAST_WIDTH if self.is_told else _UNTOLD_WIDTH)
+        ratio = self.line.ratio
+        self._evidence = error if not self.is_known else min(error, self._evidence)
+        self._lo = max(self._lo, ratio * (1.0 - width))
+        self._hi = min(self._hi, ratio * (1.0 + width))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the ratio is known so well that the bounds count."""
+        return self._hi - self._lo <= 4.0 * _KNOWN * self.line.ratio
+
+    def _age(self, now: int) -> None:
+        """Widen the bounds of the ratio by what crystals may have drifted."""
+        ratio = self.line.ratio
+        drift = _DRIFT_PER_S * ratio * max(now - self._fitted_u, 0) * ratio * 1e-9
+        self._fitted_u = now
+        self._lo -= drift
+        self._hi += drift
 
     def _shift(self, packets: list[tuple[int, int]]) -> None:
         line = self.line

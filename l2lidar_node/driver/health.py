@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from l2lidar_node.clock import ClockEventKind, ClockStatus
+from l2lidar_node.clock import UNCERTAIN_NS, ClockEventKind, ClockStatus
 from l2lidar_node.driver.counters import Counters
 from l2lidar_node.driver.device import DeviceState
 from l2lidar_node.driver.driver import Driver
@@ -37,6 +37,7 @@ _CLOCK_TROUBLES: Final = {
     ClockEventKind.FOREIGN_SYNC: "somebody else sets the device's clock",
     ClockEventKind.HOST_STEP: "this host's clock was stepped",
     ClockEventKind.EARLIER: "packets come earlier than before",
+    ClockEventKind.CORRECTED: "stamps had been too early and were corrected",
     ClockEventKind.SILENCE: "the device was silent",
     ClockEventKind.LOST: "the device's clock had been lost track of",
 }
@@ -227,6 +228,7 @@ def _clock(
         "ratio": f"{status.ratio:.7f}",
         "offset [s]": f"{status.offset_ns / 1e9:.6f}",
         "residual [ms]": f"{status.residual_ns / 1e6:.3f}",
+        "uncertainty [ms]": f"{status.uncertainty_ns / 1e6:.3f}",
         "latency [ms]": f"{status.late_ns / 1e6:.3f}",
         "path delay [ms]": f"{status.path_delay_ns / 1e6:.3f}",
         "epochs": str(status.epochs),
@@ -247,6 +249,9 @@ def _clock(
         for kind, text in _CLOCK_TROUBLES.items()
         if after.clock_events.get(kind, 0) > before.clock_events.get(kind, 0)
     ]
+    if status.uncertainty_ns > UNCERTAIN_NS:
+        uncertain_ms = status.uncertainty_ns / 1e6
+        troubles.append(f"every packet is delayed, stamps may be {uncertain_ms:.1f} ms off")
     if status.late_ns > _LATE_NS:
         troubles.append(f"packets come {status.late_ns / 1e9:.1f} s late, stamps allow for it")
     if troubles:

@@ -29,9 +29,11 @@ class Load:
     least_ms : float
         Delay of every packet.
     jitter_ms : float
-        Random delay, uniform from 0, one for each batch, or for each packet without batching.
+        Random delay, uniform from 0: one for each batch, or for each packet without batching.
     mean_ms : float
         Random delay, exponential with this mean, likewise.
+    per_packet : bool
+        Whether the packets of a batch are delayed each by itself.
     rising : float
         Share of the load over which these grow linearly from 0; 0 begins at full strength.
     stall_every_s, stall_ms : float
@@ -48,6 +50,7 @@ class Load:
     least_ms: float = 0.0
     jitter_ms: float = 0.0
     mean_ms: float = 0.0
+    per_packet: bool = False
     rising: float = 0.0
     stall_every_s: float = 0.0
     stall_ms: float = 0.0
@@ -120,7 +123,7 @@ class _Queue:
             length = round(load.batch_ms * _MS)
             batch = -(-arrival // length)
             arrival = batch * length
-        if batch != self._batch:
+        if batch != self._batch or load.per_packet:
             self._batch = batch
             self._random = self._rng.uniform(0.0, load.jitter_ms)
             self._random += self._rng.exponential(load.mean_ms) if load.mean_ms else 0.0
@@ -142,14 +145,21 @@ def _shape(*loads: Load) -> tuple[Load, ...]:
 
 
 SHAPES: Final[dict[str, tuple[Load, ...]]] = {
-    "20 ms batches + jitter, first 3 s": _shape(
-        Load(start=0, stop=3, batch_ms=20, jitter_ms=20)
-    ),
+    "20 ms batches + jitter, first 3 s": _shape(Load(start=0, stop=3, batch_ms=20, jitter_ms=20)),
     "20 ms batches + jitter, first 30 s": _shape(
         Load(start=0, stop=30, batch_ms=20, jitter_ms=20)
     ),
     "20 ms batches + jitter, mid-run 40 s": _shape(
         Load(start=8, stop=48, batch_ms=20, jitter_ms=20)
+    ),
+    "20 ms batches, jitter per packet, first 30 s": _shape(
+        Load(start=0, stop=30, batch_ms=20, jitter_ms=20, per_packet=True)
+    ),
+    "20 ms batches, jitter per packet, mid-run 40 s": _shape(
+        Load(start=8, stop=48, batch_ms=20, jitter_ms=20, per_packet=True)
+    ),
+    "20 ms batches, jitter per packet, first 3 s": _shape(
+        Load(start=0, stop=3, batch_ms=20, jitter_ms=20, per_packet=True)
     ),
     "20 ms batches, first 10 s": _shape(Load(start=0, stop=10, batch_ms=20)),
     "50 ms batches + jitter, mid-run 20 s": _shape(
@@ -160,9 +170,7 @@ SHAPES: Final[dict[str, tuple[Load, ...]]] = {
     ),
     "jitter 0-20 ms, mid-run 15 s": _shape(Load(start=8, stop=23, jitter_ms=20)),
     "jitter 0-20 ms, first 15 s": _shape(Load(start=0, stop=15, jitter_ms=20)),
-    "jitter rising to 40 ms over 20 s": _shape(
-        Load(start=5, stop=25, jitter_ms=40, rising=1.0)
-    ),
+    "jitter rising to 40 ms over 20 s": _shape(Load(start=5, stop=25, jitter_ms=40, rising=1.0)),
     "queue filling to 15 ms over 20 s": _shape(
         Load(start=5, stop=25, least_ms=15, mean_ms=0.3, rising=1.0)
     ),
@@ -172,12 +180,8 @@ SHAPES: Final[dict[str, tuple[Load, ...]]] = {
     "detour of 8 ms for 20 s": _shape(Load(start=8, stop=28, least_ms=8, mean_ms=0.1)),
     "detour of 4 ms for 20 s": _shape(Load(start=8, stop=28, least_ms=4, mean_ms=0.1)),
     "detour of 10 ms, first 20 s": _shape(Load(start=0, stop=20, least_ms=10, mean_ms=0.1)),
-    "Wi-Fi power save, mid-run 20 s": _shape(
-        Load(start=8, stop=28, batch_ms=102.4, mean_ms=3.0)
-    ),
-    "Wi-Fi power save, first 20 s": _shape(
-        Load(start=0, stop=20, batch_ms=102.4, mean_ms=3.0)
-    ),
+    "Wi-Fi power save, mid-run 20 s": _shape(Load(start=8, stop=28, batch_ms=102.4, mean_ms=3.0)),
+    "Wi-Fi power save, first 20 s": _shape(Load(start=0, stop=20, batch_ms=102.4, mean_ms=3.0)),
     "Wi-Fi contention, bursts of 2 s": _shape(
         Load(start=4, stop=40, least_ms=2, mean_ms=8.0, on_s=2.0, off_s=2.0)
     ),
