@@ -14,7 +14,7 @@ from rich.table import Table
 from l2lidar_node.cli.console import JsonOption, out, print_json, say, with_network
 from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.clock import ClockEvent
-from l2lidar_node.clock.envelope import supporting_line
+from l2lidar_node.clock.lower_envelope import supporting_line
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.protocol.framing import Frame, Framer

@@ -7,8 +7,8 @@ from typing import Final
 
 from l2lidar_node.clock.lower_envelope import (
     BLOCK_NS,
-    LowerEnvelope,
     Line,
+    LowerEnvelope,
     is_credible,
     supporting_line,
 )
@@ -30,7 +30,8 @@ _STEP_NS: Final = 1_500_000
 _EARLY_NS: Final = 300_000  # a single block earlier than that is an error, more of them are news
 _SPREADS: Final = 2.0  # these margins grow by that many times the uncertainty
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
-_BACKWARD_BLOCKS: Final = 2  # early ones cannot
+_LOADED_BLOCKS: Final = 3  # where steps are told, late packets that keep coming mean load
+_BACKWARD_BLOCKS: Final = 2  # early ones cannot have
 _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
 
 
@@ -192,7 +193,6 @@ class HostClockModel:
 
     def _follow(self, envelope: LowerEnvelope, u: int) -> None:
         low, self._low = self._low, None
-        before = envelope.line.at(u)
         moves = envelope.moves
         if low is not None and envelope.begins_anew(self._low_at):
             self._suspects.clear()
@@ -202,12 +202,11 @@ class HostClockModel:
         self.uncertainty_ns = envelope.uncertainty_ns
         wanted = line.at(u) - self.advance_ns
         host = self.at(u)
-        if envelope.moves != moves:
-            off = wanted - host if self.is_told else line.at(u) - before
-            if abs(off) > _STEP_NS:
-                self.steps.append(off)
-                self._go(u, wanted, line.ratio)
-                return
+        is_new = envelope.moves != moves or (self.is_told and not envelope.is_known)
+        if is_new and abs(wanted - host) > _STEP_NS:
+            self.steps.append(wanted - host)
+            self._go(u, wanted, line.ratio)
+            return
         self.uncertainty_ns += abs(wanted - host)
         pull = (wanted - host) / _SETTLE_NS
         self._go(u, host, line.ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
@@ -228,7 +227,11 @@ class HostClockModel:
         if suspects and (suspects[-1][1] < line.at(suspects[-1][0])) != is_early:
             suspects.clear()
         suspects.append(self._low_at)
-        if len(suspects) < (_BACKWARD_BLOCKS if is_early else _FORWARD_BLOCKS):
+        if is_early:
+            enough = _BACKWARD_BLOCKS
+        else:
+            enough = _LOADED_BLOCKS if self.is_told else _FORWARD_BLOCKS
+        if len(suspects) < enough:
             return True
         first, last = suspects[0], suspects[-1]
         if last[1] - first[1] < _FLOWING * (last[0] - first[0]) * line.ratio:

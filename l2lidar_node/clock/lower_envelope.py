@@ -55,7 +55,7 @@ _RESOLUTION_NS: Final = 10_000.0  # to which the minimum of a quiet path repeats
 _SAFETY: Final = 3.0
 _KNOWN: Final = 50e-6  # a ratio is known when it is known to what crystals differ by
 _TIGHT: Final = 200e-6  # the latest blocks alone say as much only after a load has ended
-_BETTER: Final = 8.0  # and must repeat so much better than those that a known ratio comes from
+_BETTER: Final = 4.0  # and must repeat so much better than those that a known ratio comes from
 _WRONG: Final = 0.02  # a ratio found under load can be off by that; a backlog that drains is more
 
 BLOCK_NS: Final = int(_BLOCK_S * 1e9)
@@ -192,8 +192,7 @@ class LowerEnvelope:
         points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in packets]
         self._lo, self._hi = _RATIOS
         self._evidence = math.inf
-        self._learn(points, float(line.host - h0), 0.0)
-        self.uncertainty_ns = self._error(points, float(line.host - h0), 0.0)
+        self.uncertainty_ns = self._learn(points, float(line.host - h0), 0.0)
         self._restart(packets)
 
     def begins_anew(self, low: tuple[int, int]) -> bool:
@@ -223,7 +222,7 @@ class LowerEnvelope:
         width = self._width(points, error)
         if width > _TIGHT or abs(line.ratio - ratio) < width * ratio:
             return False
-        if self.is_known and _BETTER * error > self._evidence:
+        if _BETTER * error > self._evidence:
             return False
         self._blocks.clear()
         self._blocks.extend(recent)
@@ -300,8 +299,10 @@ class LowerEnvelope:
         heights = sorted(y - base - slope * x for x, y in points)
         self.line = Line(u0, h0 + round(base), guess + slope, heights[len(heights) // 2])
         if span >= _MIN_SPAN_NS:
-            self._learn(points, base, slope)
-        self.uncertainty_ns = level if self.is_known else self._error(points, base, slope)
+            error = self._learn(points, base, slope)
+        else:
+            error = self._error(points, base, slope)
+        self.uncertainty_ns = level if self.is_known else error
 
     def _bounds(self, points: list[tuple[float, float]], base: float, end: float) -> list[float]:
         """Return the error bound of every block: height plus dispersion."""
@@ -334,17 +335,17 @@ class LowerEnvelope:
         span = points[-1][0] * self.line.ratio
         return _SAFETY * error / span if span > 0.0 else 1.0
 
-    def _learn(self, points: list[tuple[float, float]], base: float, slope: float) -> None:
-        """Narrow the bounds of the ratio to what a fit says, if it says enough."""
+    def _learn(self, points: list[tuple[float, float]], base: float, slope: float) -> float:
+        """Narrow the bounds of the ratio if a fit says enough; return the error of its minimum."""
         error = self._error(points, base, slope)
+        self._evidence = min(error, self._evidence) if self.is_known else error
         width = self._width(points, error)
-        if width > _KNOWN:
-            return
-        width = max(width, _LEAST_WIDTH if self.is_told else _UNTOLD_WIDTH)
-        ratio = self.line.ratio
-        self._evidence = error if not self.is_known else min(error, self._evidence)
-        self._lo = max(self._lo, ratio * (1.0 - width))
-        self._hi = min(self._hi, ratio * (1.0 + width))
+        if width <= _KNOWN:
+            width = max(width, _LEAST_WIDTH if self.is_told else _UNTOLD_WIDTH)
+            ratio = self.line.ratio
+            self._lo = max(self._lo, ratio * (1.0 - width))
+            self._hi = min(self._hi, ratio * (1.0 + width))
+        return error
 
     @property
     def is_known(self) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 _MS: Final = 1_000_000
 _S: Final = 1_000_000_000
@@ -138,6 +139,58 @@ class _Queue:
             gap = round(self._rng.exponential(load.stall_every_s) * _S)
             self._next_stall = self._stall_end + gap
         return max(arrival, self._stall_end)
+
+
+@dataclass(frozen=True, slots=True)
+class LoadErrors:
+    """How far stamps were off under load and after it, the constant path delay set aside.
+
+    Attributes
+    ----------
+    least_ms : float
+        What the load added to the path's least delay: the largest, over the load, of the least
+        delay in half a second. A clock that sees nothing but arrivals cannot know it.
+    during_ms : float
+        Largest error until the end of the load.
+    after_p99_ms, after_max_ms : float
+        Errors from one second after the end of the load.
+    """
+
+    least_ms: float
+    during_ms: float
+    after_p99_ms: float
+    after_max_ms: float
+
+
+def load_errors(
+    notes: NDArray[np.void], loads: Sequence[Load], begin: int, path_ns: int
+) -> LoadErrors:
+    """Return the errors of a run.
+
+    Parameters
+    ----------
+    notes : ndarray, shape (N,)
+        Every packet, with ``truth``, ``duration``, ``arrival`` and ``published`` [ns].
+    loads : sequence of Load
+    begin : int
+        Instant that the loads count from [ns].
+    path_ns : int
+        Delay of a packet without load [ns].
+    """
+    end = max(load.stop for load in loads)
+    at = (notes["arrival"] - begin) / _S
+    delays = (notes["arrival"] - notes["truth"] - notes["duration"] - path_ns) / _MS
+    halves = (at * 2.0).astype(np.int64)
+    least = [float(delays[halves == half].min()) for half in np.unique(halves[at < end]).tolist()]
+    stamped = notes["published"] != 0
+    errors = np.abs(notes["published"] - notes["truth"] - path_ns) / _MS
+    after = errors[stamped & (at > end + 1.0)]
+    return LoadErrors(
+        max(least),
+        float(errors[stamped & (at < end)].max(initial=0.0)),
+        float(np.percentile(after, 99)),
+        float(after.max()),
+    )
 
 
 def _shape(*loads: Load) -> tuple[Load, ...]:

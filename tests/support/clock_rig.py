@@ -25,6 +25,7 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType, WorkMode
 from l2lidar_node.settings import Value, build
 from l2lidar_node.types import DeviceNs, HostNs, Stream
+from tests.support.clock_loads import Load, LoadedPath
 
 NOTE: Final = np.dtype(
     [
@@ -59,6 +60,10 @@ class Case:
         ``off``, ``once`` or ``periodic`` (every 50 ms).
     crystal, faults : dict
         Further settings of the virtual L2.
+    loads : tuple of Load
+        What delays packets on their way, in seconds since power-on.
+    boot_scale : float
+        How long the unit takes to come up, against a real one; 0 streams at once.
     imu : bool
         Whether the IMU is on.
     latency : bool
@@ -71,6 +76,8 @@ class Case:
     sync: str
     crystal: dict[str, float] = field(default_factory=dict)
     faults: dict[str, Value] = field(default_factory=dict)
+    loads: tuple[Load, ...] = ()
+    boot_scale: float = 0.25
     imu: bool = True
     latency: bool = False
     seconds: float = 60.0
@@ -130,12 +137,20 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
     driver.host_stepped(0, HostNs(EPOCH_NS))  # nobody sets the host's clock, as a session knows
     rng = np.random.default_rng([seed, 106])
     commands: list[tuple[int, int, bytes]] = []
+    path = LoadedPath(case.loads, seed)
+    way: list[tuple[int, int, bytes]] = []
     count = 0
     for now in range(EPOCH_NS, EPOCH_NS + round(case.seconds * 1e9), _TICK_NS):
         while commands and commands[0][0] <= now:
             instant, _, data = heapq.heappop(commands)
             device.command(data, instant)
         for arrival, datagram in device.advance(now):
+            is_imu = len(datagram) < wire.FRAME_SIZES[PacketType.POINTS_3D]
+            late = EPOCH_NS + path.deliver(arrival - EPOCH_NS, is_imu)
+            heapq.heappush(way, (late, count, datagram))
+            count += 1
+        while way and way[0][0] <= now:
+            arrival, _, datagram = heapq.heappop(way)
             driver.receive(datagram, HostNs(arrival))
         driver.tick(HostNs(now))
         for data, _ in driver.outbox():
@@ -148,7 +163,7 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
 def _device(case: Case, seed: int) -> VirtualL2:
     mode = WorkMode(0) if case.imu else WorkMode.IMU_OFF
     config = DeviceConfig(
-        power=PowerConfig(boot_scale=0.25),
+        power=PowerConfig(boot_scale=case.boot_scale),
         identity=IdentityConfig(work_mode=int(mode)),
         crystal=build(CrystalConfig, {"clock_ratio": case.ratio, **case.crystal}),
         faults=build(FaultConfig, case.faults),

@@ -257,10 +257,8 @@ def _travel(
         arrival = np.maximum.accumulate(arrival)
     if scenario.loads:
         path = LoadedPath(scenario.loads, int(rng.integers(1 << 32)))
-        is_imu = packets["kind"] == IMU
-        order = np.argsort(arrival, kind="stable")
-        for at in order.tolist():
-            arrival[at] = path.deliver(int(arrival[at]), bool(is_imu[at]))
+        for at in np.argsort(arrival, kind="stable").tolist():
+            arrival[at] = path.deliver(int(arrival[at]), packets["kind"][at] == IMU)
     late = rng.random(count) < scenario.reorder
     arrival[late] += scenario.reorder_ms * _MS
     packets["arrival"] = arrival
