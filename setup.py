@@ -8,7 +8,7 @@ from setuptools import find_packages, setup
 HERE = Path(__file__).parent
 MANIFEST = ElementTree.parse(HERE / "package.xml").getroot()
 NAME = MANIFEST.findtext("name", "")
-SHARED_FOLDERS = ("config", "launch", "rviz", "urdf", "meshes")
+SHARED_FOLDERS = ("config", "environment", "launch", "rviz", "urdf", "meshes")
 
 
 def shared_files() -> list[tuple[str, list[str]]]:

@@ -4,9 +4,9 @@ import ast
 import importlib.metadata
 import os
 import re
-import shutil
 import subprocess
 import sys
+import sysconfig
 import time
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 NAME = "l2lidar_node"
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
-SHARED_FOLDERS = ("config", "launch", "rviz", "urdf", "meshes")
+SHARED_FOLDERS = ("config", "environment", "launch", "rviz", "urdf", "meshes")
 EXECUTABLES = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node", "l2lidar"}
 
 # Of ROS 2, by import name, where it is not the package's own.
@@ -79,7 +79,9 @@ def test_every_python_package_imported_is_declared() -> None:
     requirements = importlib.metadata.requires(NAME) or []
     declared = {re.match(r"[\w.-]+", line)[0] for line in requirements if "extra ==" not in line}
     optional = {
-        re.match(r"[\w.-]+", line)[0] for line in requirements if 'extra == "view"' in line
+        re.match(r"[\w.-]+", line)[0]
+        for line in requirements
+        if re.search(r"""extra == ["']view["']""", line)
     }
     used = {
         name for name in imported("l2lidar_node", "l2lidar_proc") if not ROS_MODULES.match(name)
@@ -114,22 +116,33 @@ def test_an_entry_point_leads_to_a_function(entry: importlib.metadata.EntryPoint
     assert callable(entry.load())
 
 
-def test_colcon_builds_the_package(tmp_path: Path) -> None:
-    """Executables, index entry and shared files are where ``ros2 run`` and launch files look."""
-    colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    if colcon is None:
-        pytest.skip("needs colcon")
-    command = [colcon, "--log-base", str(tmp_path / "log"), "build", "--base-paths", str(ROOT)]
-    command += [
-        "--build-base",
-        str(tmp_path / "build"),
-        "--install-base",
-        str(tmp_path / "install"),
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a workspace built as docs/install.md says: by the Python of a virtual environment.
 
-    prefix = tmp_path / "install" / NAME
+    This environment stands for the machine's packages, which the new one sees as it would see
+    those of Ubuntu.
+    """
+    pytest.importorskip("colcon_core", reason="needs colcon")
+    folder = tmp_path_factory.mktemp("workspace")
+    site = sysconfig.get_path("purelib")
+    environment = {**os.environ, "PYTHONPATH": site}
+    python = folder / ".venv/bin/python"
+    log = ["--log-base", str(folder / "log")]
+    for command in (
+        [sys.executable, "-m", "venv", "--system-site-packages", str(folder / ".venv")],
+        [str(python), "-m", "colcon", *log, "build", "--base-paths", str(ROOT)],
+    ):
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_colcon_builds_the_package(workspace: Path) -> None:
+    """Executables, index entry and shared files are where ``ros2 run`` and launch files look."""
+    prefix = workspace / "install" / NAME
     built = {path.name for path in (prefix / "lib" / NAME).iterdir() if os.access(path, os.X_OK)}
     assert built == EXECUTABLES
     assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
@@ -141,6 +154,30 @@ def test_colcon_builds_the_package(tmp_path: Path) -> None:
         for path in (ROOT / name).rglob("*.py")
     }
     assert {path.relative_to(installed) for path in installed.rglob("*.py")} >= packages
+
+
+@pytest.mark.parametrize("shell", ["sh", "bash"])
+def test_the_programs_are_on_the_path_and_run_by_the_environment(
+    workspace: Path, shell: str
+) -> None:
+    """After ``source install/setup.bash``, as docs/install.md says."""
+    script = f". install/setup.{shell} && command -v l2lidar_emulator && l2lidar --version"
+    environment = {
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(workspace),
+        "PYTHONPATH": sysconfig.get_path("purelib"),
+    }
+    done = subprocess.run(
+        [shell, "-c", script],
+        cwd=workspace, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    folder = workspace / "install" / NAME / "lib" / NAME
+    assert done.stdout.split() == [
+        str(folder / "l2lidar_emulator"), "l2lidar", str(MANIFEST.findtext("version")),
+    ]  # fmt: skip
+    first = (folder / "l2lidar").read_text().splitlines()[0]
+    assert first == f"#!{workspace}/.venv/bin/python"
 
 
 @pytest.mark.ros
