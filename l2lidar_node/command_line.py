@@ -8,11 +8,14 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import entry_points
 from types import UnionType
 from typing import Annotated, Any, Final, NamedTuple, Union, get_args, get_origin
+
+from l2lidar_node.programs import INTERRUPTED
 
 GROUP: Final = "l2lidar.verbs"
 """Entry point group by which other packages add verbs to the ``l2lidar`` command."""
@@ -58,7 +61,8 @@ class Verb(NamedTuple):
         import typer
 
         module, _, attribute = self.target.partition(":")
-        found = getattr(import_module(module), attribute)
+        with interruption_exits():
+            found = getattr(import_module(module), attribute)
         if isinstance(found, typer.Typer):
             return typer.main.get_command(found)
         single = typer.Typer(add_completion=False, rich_markup_mode="rich")
@@ -79,10 +83,22 @@ def registered_verbs() -> list[Verb]:
     return found
 
 
-def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command with ``X | None`` spelt ``Optional[X]``.
+@contextmanager
+def interruption_exits() -> Iterator[None]:
+    """Turn Ctrl-C into exit code 130; the click of Ubuntu 24.04 says "Aborted" and exits with 1."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        import typer
 
-    typer knows the former from 0.12.4 on; Ubuntu 24.04 has 0.9.
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command as any typer from 0.9 on, which Ubuntu 24.04 has, can run it.
+
+    ``X | None`` is spelt ``Optional[X]``: typer knows the former from 0.12.4 on. For Ctrl-C see
+    :func:`interruption_exits`.
     """
     signature = inspect.signature(command, eval_str=True)
     parameters = [
@@ -92,7 +108,8 @@ def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def run(*args: Any, **named: Any) -> Any:
-        return command(*args, **named)
+        with interruption_exits():
+            return command(*args, **named)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {item.name: item.annotation for item in parameters}

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 ROS = "needs the ros2 command line, which no registry has"
 SENSOR = "needs a sensor or its network"
@@ -17,9 +17,11 @@ ADMIN = "changes the machine"
 
 RUN_BY = {
     r"git clone .*": "CI, which starts in a fresh clone",
-    r"make (test|setup)\b.*": "CI itself",
+    r"make (test|setup|check|format|pytest|test-noble)\b.*": "CI itself",
+    r"PYTHON=.* make setup": "tests/test_setup.py",
+    r"(python3 -m venv|\.venv/bin/(pip|python -m colcon)) .*": "tests/test_packaging.py",
     r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
-    r"l2lidar (discover|info|set work-mode).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
+    r"l2lidar (discover|info|set \w+).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/recording/test_bag_readers.py",
     r"l2lidar deskew .*": "tests/l2lidar_proc/verbs/test_deskew.py",
@@ -31,15 +33,15 @@ RUN_BY = {
 """Commands that a test runs, itself or the file behind them, by the test."""
 
 NOT_RUN = {
-    r"ros2 (topic|service|param|run) .*": ROS,
+    r"ros2 (topic|service|param|run|bag) .*": ROS,
     r"source .*": ROS,
     r"rosdep .*": ROS,
-    r"colcon build .*": "tests/test_packaging.py looks at what is installed",
     r"mkdir -p ~/ros2_ws/src.*": ADMIN,
     r"cd .*": ADMIN,
-    r"pip install .*": ADMIN,
     r"sudo .*": ADMIN,
     r"nmcli .*": ADMIN,
+    r"(journalctl|pidstat) .*": ADMIN,
+    r"docker .*": "needs docker; CI builds and runs the image",
     r"ping .*": SENSOR,
     r"(rko_lio|genz_lio_pipeline) .*": "heavy, one of them GPL: run by hand, and by the bench",
 }

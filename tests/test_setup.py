@@ -10,13 +10,20 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
+NOWHERE = {
+    "PIP_INDEX_URL": "http://127.0.0.1:9/simple",
+    "PIP_RETRIES": "0",
+    "PIP_CONFIG_FILE": "/dev/null",
+}
+
+
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """Return a folder with what the set-up reads, beside an empty folder for replaced programs."""
     folder = tmp_path / "project"
     for name in ("scripts", "requirements"):
         shutil.copytree(ROOT / name, folder / name)
-    for name in ("setup.py", "setup.cfg", "package.xml"):
+    for name in ("setup.py", "setup.cfg", "package.xml", "Makefile"):
         shutil.copy(ROOT / name, folder)
     (tmp_path / "bin").mkdir()
     # Whatever happens, no test installs anything.
@@ -31,13 +38,14 @@ def replace_program(project: Path, name: str, script: str) -> None:
     program.chmod(0o755)
 
 
-def run(project: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(project: Path, *command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     # The interpreter this one was made from: it has the right version and no ROS 2 of its own.
-    environment |= {"PYTHON": sys._base_executable, "HOME": str(project.parent)}
+    environment = {"PYTHON": sys._base_executable, "HOME": str(project.parent)} | environment
     environment["PATH"] = f"{project.parent / 'bin'}:/usr/local/bin:/usr/bin:/bin"
     return subprocess.run(
-        [project / "scripts/setup.sh"],
+        command or [str(project / "scripts/setup.sh")],
         env=environment,
+        cwd=project,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -78,14 +86,30 @@ def test_an_unreachable_package_index_is_explained(project: Path) -> None:
     replace_program(
         project, "ldconfig", "printf '%s \\n' libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libgomp.so.1"
     )
-    nowhere = {
-        "PIP_INDEX_URL": "http://127.0.0.1:9/simple",
-        "PIP_RETRIES": "0",
-        "PIP_CONFIG_FILE": "/dev/null",
-    }
-    done = run(project, **nowhere)
+    done = run(project, **NOWHERE)
     assert done.returncode == 1
     assert "PIP_INDEX_URL" in done.stderr
     assert "setuptools" in done.stderr
     assert (project / ".venv/.setup/made").is_file()
     assert not (project / ".venv/.setup/ros").exists()
+
+
+@pytest.mark.parametrize("command", [(), ("make", "setup")], ids=["script", "make"])
+def test_an_interpreter_that_will_not_do_is_refused(project: Path, command) -> None:
+    """Named by PYTHON it is not passed over for another one, neither by make nor by the script."""
+    done = run(project, *command, PYTHON="/bin/false")
+    assert done.returncode != 0
+    assert "PYTHON is '/bin/false', which is not a Python 3.11 or 3.12" in done.stderr
+    assert not (project / ".venv").exists()
+
+
+def test_the_interpreter_chosen_once_is_kept(project: Path) -> None:
+    """A later command that leaves PYTHON out does not make .venv anew with another one."""
+    replace_program(
+        project, "ldconfig", "printf '%s \\n' libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libgomp.so.1"
+    )
+    first = run(project, "make", "setup", **NOWHERE)
+    assert f"making .venv with {sys._base_executable}" in first.stdout
+    again = run(project, "make", "setup", PYTHON="", **NOWHERE)
+    assert "PIP_INDEX_URL" in again.stderr
+    assert "making" not in again.stdout
