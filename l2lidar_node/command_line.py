@@ -61,8 +61,7 @@ class Verb(NamedTuple):
         import typer
 
         module, _, attribute = self.target.partition(":")
-        with interruption_exits():
-            found = getattr(import_module(module), attribute)
+        found = getattr(import_module(module), attribute)
         if isinstance(found, typer.Typer):
             return typer.main.get_command(found)
         single = typer.Typer(add_completion=False, rich_markup_mode="rich")
@@ -85,7 +84,7 @@ def registered_verbs() -> list[Verb]:
 
 @contextmanager
 def interruption_exits() -> Iterator[None]:
-    """Turn Ctrl-C into exit code 130; the click of Ubuntu 24.04 says "Aborted" and exits with 1."""
+    """Turn Ctrl-C into exit code 130; Ubuntu 24.04's click says "Aborted" and exits with 1."""
     try:
         yield
     except KeyboardInterrupt:

@@ -9,7 +9,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from l2lidar_node import __version__
-from l2lidar_node.command_line import DATA, UNIT, CommandError, Verb, registered_verbs
+from l2lidar_node.command_line import (
+    DATA,
+    UNIT,
+    CommandError,
+    Verb,
+    interruption_exits,
+    registered_verbs,
+)
 from l2lidar_node.programs import interruptible
 from l2lidar_node.settings import SettingError
 
@@ -109,6 +116,16 @@ class _Verbs(TyperGroup):
             self.commands[verb.name] = TyperCommand(
                 verb.name, help=verb.help, rich_help_panel=verb.panel
             )
+
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """Parse the arguments."""
+        with interruption_exits():
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, context: Any) -> Any:
+        """Run the verb."""
+        with interruption_exits():
+            return super().invoke(context)
 
     def resolve_command(self, context: Any, arguments: list[str]) -> Any:
         """Return the verb itself, imported now."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -54,7 +55,7 @@ def while_importing(process: subprocess.Popen[str]) -> None:
     """
     assert process.stdout is not None
     for line in process.stdout:
-        if line.startswith("import time:") and "numpy" in line:
+        if line.startswith("import time:") and re.search("numpy|typer", line):
             return
         assert "Traceback" not in line
     raise AssertionError("it imports nothing that takes long")
@@ -67,8 +68,9 @@ def test_a_signal_while_it_imports_ends_it_without_a_trace(module: str, number: 
     while_importing(process)
     process.send_signal(number)
     said, _ = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == -number
+    assert process.returncode in (-number, 128 + number)  # to a shell they are the same
     assert "Traceback" not in said
+    assert "Aborted" not in said
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
@@ -79,7 +81,7 @@ def test_an_installed_program_ends_so_too(entry: str) -> None:
     while_importing(process)
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == -signal.SIGINT
+    assert process.returncode in (-signal.SIGINT, 128 + signal.SIGINT)
     assert "Traceback" not in said
 
 
