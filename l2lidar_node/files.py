@@ -1,4 +1,4 @@
-"""Writes files that are complete or as they were before, whatever ends the program meanwhile."""
+"""Files that are complete or as they were before, and the one folder for those of services."""
 
 from __future__ import annotations
 
@@ -37,3 +37,63 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """Write a file's content, text as UTF-8."""
     with whole(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+class DataFolder:
+    """The folder that services of a node write to and read from.
+
+    Whoever is in the ROS domain can call a service and set a parameter, so the names that come
+    that way are names inside this folder, and nothing is overwritten unless the one who starts
+    the node allows it.
+
+    Parameters
+    ----------
+    path : str
+        ``~`` is the home folder; made when something is written.
+    overwrite : bool
+        Whether files may be replaced.
+    """
+
+    def __init__(self, path: str, overwrite: bool) -> None:
+        self.path = Path(path).expanduser()
+        self._overwrite = overwrite
+
+    def file(self, name: str) -> Path:
+        """Return the path of a file of this name.
+
+        Raises
+        ------
+        FileNameError
+            If it is not the name of a file in this folder.
+        """
+        if name in ("", ".", "..") or name != os.path.basename(name) or "\0" in name:
+            raise FileNameError(
+                f"{name!r} is not a file name: expected a name inside {self.path}, without folder"
+            )
+        return self.path / name
+
+    def new_files(self, *names: str) -> list[Path]:
+        """Return the paths of files to be written, their folder made.
+
+        Raises
+        ------
+        FileNameError
+            As :meth:`file`; or two names are the same; or one exists and must not be overwritten.
+        OSError
+            If the folder cannot be made.
+        """
+        paths = [self.file(name) for name in names]
+        if len(set(paths)) < len(paths):
+            raise FileNameError(f"{names[0]!r} would be written twice: expected another suffix")
+        for path in paths:
+            if path.is_dir() or (not self._overwrite and os.path.lexists(path)):
+                raise FileNameError(
+                    f"{path} exists: choose another name, move it away, or start the node with "
+                    "overwrite: true"
+                )
+        self.path.mkdir(parents=True, exist_ok=True)
+        return paths
+
+
+class FileNameError(ValueError):
+    """A name that must not be written to; the message says why and what would be right."""

@@ -47,6 +47,13 @@ FRAME: Final = Form(
     "letters, digits, '_', '-', '.' and '/', not starting with '/'",
 )
 
+FILE_NAME: Final = Form(
+    re.compile(r"\w[\w.-]{0,99}", re.ASCII),
+    "a file name",
+    "up to 100 letters, digits, '_', '-' and '.', the first a letter, digit or '_', no folder",
+)
+"""For files inside one folder: anybody in the ROS domain can set such a parameter."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:

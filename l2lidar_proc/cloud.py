@@ -14,6 +14,12 @@ TIME_FIELDS: Final = ("time", "t", "timestamp")
 _UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
 _NEAR_NS: Final = 2_000_000_000  # how far times may be from the stamp
 
+MAX_DURATION_NS: Final = 25_000_000_000
+"""Longest sweep: the driver's longest cloud has 20 s, 4000 packets take 18.5 s."""
+
+MAX_POINTS: Final = 2_000_000
+"""Largest sweep: the driver's largest cloud has 1.3 million points."""
+
 
 class CloudError(ValueError):
     """A cloud whose points' times cannot be told; the message says why."""
@@ -43,10 +49,13 @@ def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Swee
     Raises
     ------
     CloudError
-        If there is no time field, or several; if all times are equal; or if unit or origin are not
-        plain.
+        If there is no time field, or several; if all times are equal; if unit or origin are not
+        plain; or if there are more points or seconds than :data:`MAX_POINTS` and
+        :data:`MAX_DURATION_NS`.
     """
     cloud = cloud.reshape(-1)
+    if len(cloud) > MAX_POINTS:
+        raise CloudError(f"{len(cloud)} points are too many; a sweep has up to {MAX_POINTS}")
     name = _time_field(cloud.dtype)
     finite = np.isfinite(cloud[name])
     for axis in "xyz":
@@ -61,6 +70,12 @@ def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Swee
     if (np.diff(times) < 0).any():
         order = np.argsort(times, kind="stable")
         cloud, times = cloud[order], times[order]
+    lasts = (int(times[-1]) - min(int(times[0]), 0)) / 1e9
+    if lasts > MAX_DURATION_NS / 1e9:
+        raise CloudError(
+            f"a sweep that lasts {lasts:.6g} s is too long; up to {MAX_DURATION_NS / 1e9:g} s "
+            "can be used"
+        )
     before = min(int(times[0]), 0)
     points = _with_time(cloud, name, np.asarray((times - before) * 1e-9))
     points.flags.writeable = False
@@ -76,11 +91,20 @@ def without_time(points: NDArray[np.void]) -> NDArray[np.void]:
     return slim
 
 
+def position_problem(layout: np.dtype[Any]) -> str:
+    """Return what is wrong with the fields x, y and z of a cloud; empty if nothing is."""
+    for axis in "xyz":
+        if axis not in (layout.names or ()):
+            return f"field '{axis}' is missing"
+        if layout[axis].kind != "f" or layout[axis].shape:
+            return f"field '{axis}' is {layout[axis]}, not one floating-point number"
+    return ""
+
+
 def _time_field(layout: np.dtype[Any]) -> str:
     names = layout.names or ()
-    for axis in "xyz":
-        if axis not in names or layout[axis].kind != "f" or layout[axis].shape:
-            raise CloudError(f"field '{axis}' is missing or not a floating-point number")
+    if problem := position_problem(layout):
+        raise CloudError(problem)
     found = [name for name in TIME_FIELDS if name in names]
     if not found:
         raise CloudError(f"no time field; one of {', '.join(TIME_FIELDS)} is needed")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.clouds.layouts import LAYOUTS
-from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
+from l2lidar_node.settings import FILE_NAME, FRAME, TOPIC, SettingError, setting
 from l2lidar_proc import rotations
 from l2lidar_proc.rotations import F64
 
@@ -536,12 +536,6 @@ class OdometryTopics:
         hi=100_000,
         live=True,
     )
-    map_file: str = setting("map.ply", "file that ~/save_map writes, .ply or .pcd", live=True)
-    trajectory_file: str = setting(
-        "trajectory.tum",
-        "file that ~/save_trajectory writes in TUM format, with KITTI beside it",
-        live=True,
-    )
 
     def __post_init__(self) -> None:
         """Check what a single setting cannot."""
@@ -554,8 +548,6 @@ class OdometryTopics:
                 f"parameter 'odom_frame': {self.odom_frame!r} is not valid; expected a frame name "
                 "other than base_frame's"
             )
-        if not self.map_file.endswith((".ply", ".pcd")):
-            raise SettingError(f"parameter 'map_file': '{self.map_file}' is not a .ply or .pcd")
 
     @property
     def T_cloud_imu(self) -> NDArray[np.float64]:
@@ -566,8 +558,41 @@ class OdometryTopics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DataConfig:
+    """Files that services write, all of them in one folder."""
+
+    data_dir: str = setting(
+        "~/.ros/l2lidar", "folder for the files of services; nothing is written outside it"
+    )
+    overwrite: bool = setting(False, "let services replace files that exist")
+    map_file: str = setting(
+        "map.ply", "file that ~/save_map writes in data_dir, .ply or .pcd", form=FILE_NAME,
+        live=True,
+    )  # fmt: skip
+    trajectory_file: str = setting(
+        "trajectory.tum", "file that ~/save_trajectory writes in data_dir in TUM format, with "
+        "KITTI beside it", form=FILE_NAME, live=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        """Check the suffixes, which name the formats."""
+        if not self.data_dir.strip():
+            raise SettingError("parameter 'data_dir': '' is not a folder, expected its path")
+        if not self.map_file.endswith((".ply", ".pcd")):
+            raise SettingError(
+                f"parameter 'map_file': '{self.map_file}' is not valid; expected .ply or .pcd"
+            )
+        if self.trajectory_file.endswith(".kitti"):
+            raise SettingError(
+                f"parameter 'trajectory_file': '{self.trajectory_file}' is not valid; expected "
+                "another suffix, since the KITTI file beside it has this one"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNodeConfig:
     """Everything the odometry node can be told."""
 
     topics: OdometryTopics = field(default_factory=OdometryTopics)
+    files: DataConfig = field(default_factory=DataConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)

@@ -104,7 +104,8 @@ def _declaration(item: Setting) -> tuple[str, Any, ParameterDescriptor]:
     descriptor = ParameterDescriptor(
         description=f"{item.doc}{unit}",
         additional_constraints=f"one of {item.range_text}" if item.choices else "",
-        read_only=False,
+        # An empty list cannot be set after the declaration if it is read-only.
+        read_only=not item.live and item.type is not tuple,
         # A YAML file may say 100 for a float, and an empty list has no type of its own: the check
         # below takes both, rclpy alone would not.
         dynamic_typing=item.type in (float, tuple),

@@ -135,6 +135,16 @@ class Pipeline:
                 # the IMU has not jumped yet: what it said is of another time
                 self.tracker.reset()
 
+    def reset(self) -> None:
+        """Forget all motion: the next sweeps are of another time, or of another sensor."""
+        self.tracker.reset()
+        self._sequencer.jump()
+
+    def finish(self, now: int) -> list[Deskewed]:
+        """Return what waits, finished by ``now`` [ns] though the IMU may not cover it."""
+        self._sequencer.jump()
+        return self.poll(now)
+
     def poll(self, now: int) -> list[Deskewed]:
         """Return what is finished by ``now`` [ns], in order."""
         released = self._sequencer.release(self.tracker.buffer.newest, now)

@@ -1,39 +1,84 @@
-"""Knows rigid transforms between frames and finds the one between any two that are connected."""
+"""Static frame tree: rigid transforms of mounts, and the one between any two frames."""
 
 from __future__ import annotations
 
-from collections import deque
+import math
+from typing import Any, Final
 
 import numpy as np
 
-from l2lidar_proc.rotations import F64, inverse
+from l2lidar_proc.rotations import F64, inverse, normalised, transform
+
+_MAX_DISTANCE_M: Final = 1000.0  # between a frame and its parent
+_NORM_TOLERANCE: Final = 0.1  # of a quaternion; a driver's rounding stays far below
+_MAX_FRAMES: Final = 10_000
+_MAX_DEPTH: Final = 1000  # of a chain; a loop has no end
 
 
 class FrameTree:
-    """Frames that do not move against each other."""
+    """Frames that do not move against each other, each with one parent, as in tf2."""
 
     def __init__(self) -> None:
-        self._neighbours: dict[str, dict[str, F64]] = {}
+        self._parents: dict[str, tuple[str, F64]] = {}
+
+    def take(self, message: Any) -> list[str]:
+        """Take the transforms of a TFMessage; return which could not be used, and why."""
+        problems = []
+        for item in message.transforms:
+            parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
+            q, p = item.transform.rotation, item.transform.translation
+            problem = self._problem(parent, child, (q.w, q.x, q.y, q.z), (p.x, p.y, p.z))
+            if problem:
+                problems.append(f"transform from '{child}' to '{parent}' not used: {problem}")
+            else:
+                turn = normalised((q.w, q.x, q.y, q.z))
+                self.add(parent, child, transform(turn, (p.x, p.y, p.z)))
+        return problems
 
     def add(self, parent: str, child: str, T_parent_child: F64) -> None:
         """Take a transform, shape (4, 4), child coordinates to parent coordinates."""
-        T_parent_child = np.array(T_parent_child, dtype=np.float64)
-        self._neighbours.setdefault(parent, {})[child] = T_parent_child
-        self._neighbours.setdefault(child, {})[parent] = inverse(T_parent_child)
+        self._parents[child] = parent, np.array(T_parent_child, dtype=np.float64)
 
     def find(self, target: str, source: str) -> F64 | None:
         """Return what takes source coordinates to target coordinates, (4, 4), None if unknown."""
+        target, source = target.lstrip("/"), source.lstrip("/")
         if target == source:
             return np.eye(4)
-        reached = {target: np.eye(4)}
-        waiting = deque([target])
-        while waiting:
-            frame = waiting.popleft()
-            for neighbour, transform in self._neighbours.get(frame, {}).items():
-                if neighbour in reached:
-                    continue
-                reached[neighbour] = reached[frame] @ transform
-                if neighbour == source:
-                    return reached[neighbour]
-                waiting.append(neighbour)
+        ups = self._ancestors(source)
+        downs = self._ancestors(target)
+        for frame, T_frame_target in downs.items():
+            if frame in ups:
+                return np.asarray(inverse(T_frame_target) @ ups[frame])
         return None
+
+    def _ancestors(self, frame: str) -> dict[str, F64]:
+        """Return a frame and all above it, nearest first, each with the transform to it."""
+        found = {frame: np.eye(4)}
+        while frame in self._parents and len(found) < _MAX_DEPTH:
+            parent, T_parent_child = self._parents[frame]
+            if parent in found:  # a loop
+                break
+            found[parent] = T_parent_child @ found[frame]
+            frame = parent
+        return found
+
+    def _problem(
+        self,
+        parent: str,
+        child: str,
+        q_wxyz: tuple[float, float, float, float],
+        xyz: tuple[float, float, float],
+    ) -> str:
+        """Return why a transform cannot be that of a mount; empty if it can."""
+        if not all(math.isfinite(value) for value in (*q_wxyz, *xyz)):
+            return "it has a number that is not finite"
+        norm, distance = math.hypot(*q_wxyz), math.hypot(*xyz)
+        if abs(norm - 1.0) > _NORM_TOLERANCE:
+            return f"its quaternion has the norm {norm:.3g}, expected 1"
+        if distance > _MAX_DISTANCE_M:
+            return f"it is {distance:.3g} m long, expected up to {_MAX_DISTANCE_M:g} m"
+        if parent == child:
+            return "a frame cannot be its own parent"
+        if child not in self._parents and len(self._parents) >= _MAX_FRAMES:
+            return f"there are {_MAX_FRAMES} frames already"
+        return ""

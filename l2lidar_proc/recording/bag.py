@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final
@@ -28,7 +27,6 @@ from l2lidar_node.recording.bag import (
     unreadable as unreadable,
 )
 from l2lidar_node.types import IMU_SAMPLE, HostNs
-from l2lidar_proc.rotations import F64, normalised, transform
 
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
@@ -105,14 +103,6 @@ def twist_of(message: Any) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
         (linear.x, linear.y, linear.z),
         (angular.x, angular.y, angular.z),
     )
-
-
-def transforms_of(message: Any) -> Iterator[tuple[str, str, F64]]:
-    """Yield parent, child and transform (4, 4) of a TFMessage."""
-    for item in message.transforms:
-        q, p = item.transform.rotation, item.transform.translation
-        turn = normalised((q.w, q.x, q.y, q.z))
-        yield item.header.frame_id, item.child_frame_id, transform(turn, (p.x, p.y, p.z))
 
 
 class BagWriter:

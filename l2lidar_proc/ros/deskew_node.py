@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,22 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
 from l2lidar_node.clouds.layouts import LAYOUTS
-from l2lidar_node.ros.conversions import CloudTemplate, from_cloud, from_time, to_cloud
+from l2lidar_node.ros.conversions import (
+    CloudTemplate,
+    from_cloud,
+    from_time,
+    is_ros_time,
+    to_cloud,
+)
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.types import HostNs
-from l2lidar_proc.cloud import CloudError, to_sweep, without_time
+from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.tracker import carried_over
+from l2lidar_proc.ros.inputs import InputMonitor, steady_timer, sweep_in_range
 from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
@@ -55,15 +63,17 @@ class DeskewNode(Node):
         self._mounted: tuple[str, str, int] | None = None
         self._cloud_frame = ""
         self._template: tuple[tuple[np.dtype[np.void], str], CloudTemplate] | None = None
-        self._refused: Counter[str] = Counter()
+        topics = config.topics
+        velocity = [topics.velocity_topic] if topics.velocity_type != "none" else []
+        self._inputs = InputMonitor(self, (topics.cloud_topic, topics.imu_topic, *velocity))
         self._untied = ""
         self._last: report.Report | None = None
         self._before = self._pipeline.counts
         self._open(config)
         self._levelling = LevellingWatch(self, config.topics.cloud_topic)
-        self._overdue = self.create_timer(0.01, self._hand_out)
+        self._overdue = steady_timer(self, 0.01, self._guarded(self._hand_out))
         self._overdue.cancel()
-        self.create_timer(1.0, self._diagnose)
+        steady_timer(self, 1.0, self._guarded(self._diagnose))
 
     def _open(self, config: DeskewNodeConfig) -> None:
         topics = config.topics
@@ -74,13 +84,17 @@ class DeskewNode(Node):
         asked = _RELIABILITY[topics.input_reliability]
         listening = QoSProfile(depth=CLOUD_DEPTH, reliability=asked)
         often = QoSProfile(depth=IMU_DEPTH, reliability=asked)
-        self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
-        self._imu_input = self.create_subscription(Imu, topics.imu_topic, self._imu, often)
+        guarded, hear = self._guarded, self.create_subscription
+        hear(PointCloud2, topics.cloud_topic, guarded(self._cloud), listening)
+        self._imu_input = hear(Imu, topics.imu_topic, guarded(self._imu), often)
         velocities = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
-            self.create_subscription(Odometry, topics.velocity_topic, self._odometry, velocities)
+            hear(Odometry, topics.velocity_topic, guarded(self._odometry), velocities)
         elif topics.velocity_type == "twist":
-            self.create_subscription(TwistStamped, topics.velocity_topic, self._twist, velocities)
+            hear(TwistStamped, topics.velocity_topic, guarded(self._twist), velocities)
+
+    def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        return self._inputs.guarded(callback, self._pipeline.reset)
 
     def _configure(self, config: DeskewNodeConfig) -> None:
         self._pipeline.configure(config.proc)
@@ -91,6 +105,11 @@ class DeskewNode(Node):
             self._hand_out()
 
     def _take(self, message: Imu) -> None:
+        if not is_ros_time(from_time(message.header.stamp)):
+            self._inputs.refuse("IMU sample with a stamp that is out of range")
+            return
+        if not self._inputs.imu.takes(message.header.frame_id):
+            return
         self._mount(message.header.frame_id)
         self._pipeline.imu(to_sample(message))
 
@@ -106,24 +125,39 @@ class DeskewNode(Node):
                 self._pipeline.tracker.mount(T_cloud_imu)
 
     def _cloud(self, message: PointCloud2) -> None:
-        self._cloud_frame = message.header.frame_id
+        if not self._inputs.clouds.takes(message.header.frame_id):
+            return
+        self._follow(message.header.frame_id)
         stamp = from_time(message.header.stamp)
         try:
             points = from_cloud(message)
-        except ValueError as error:
-            self._refuse(error, "dropped")
-            return
-        try:
             sweep = to_sweep(points, stamp, self._settings.value.proc.deskew.time_unit)
+            if not sweep_in_range(sweep):
+                raise ValueError("the stamp is out of range")
         except CloudError as error:
+            if position_problem(points.dtype) or not is_ros_time(stamp):
+                self._refuse(error, "dropped")
+                return
             self._refuse(error, "passed on as it came, without times")
             self._output.publish(to_cloud(without_time(points), stamp, self._cloud_frame))
             return
+        except ValueError as error:
+            self._refuse(error, "dropped")
+            return
+        self._inputs.sweep(sweep)
         self._pipeline.sweep(sweep, time.monotonic_ns())
         self._hand_out()
 
+    def _follow(self, frame: str) -> None:
+        """Begin anew where clouds come in another frame than before."""
+        if self._cloud_frame not in ("", frame):
+            for item in self._pipeline.finish(time.monotonic_ns()):
+                self._publish(item)
+            self._pipeline.reset()
+        self._cloud_frame = frame
+
     def _refuse(self, error: ValueError, fate: str) -> None:
-        self._refused[str(error)] += 1
+        self._inputs.refuse(str(error))
         self.get_logger().warning(f"cloud {fate}: {error}", throttle_duration_sec=5.0)
 
     def _odometry(self, message: Odometry) -> None:
@@ -192,11 +226,15 @@ class DeskewNode(Node):
             self._last,
             tracker.buffer.counts,
             tracker.filter,
-            self._refused,
+            self._inputs.refused,
             is_levelled=self._levelling.is_levelled,
             untied=self._untied,
         )
         self._before = self._pipeline.counts
+        level, text = self._inputs.judge(judged.level, judged.message)
+        if self._frames is not None and self._frames.refused:
+            level, text = max(level, report.Level.WARN), f"{text}; {self._frames.refused}"
+        judged = replace(judged, level=report.Level(level), message=text)
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [self._status(judged, "deskew")]

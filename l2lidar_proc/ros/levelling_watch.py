@@ -6,9 +6,12 @@ from typing import Final
 
 from rcl_interfaces.srv import GetParameters
 from rclpy.client import Client
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.task import Future
 
+_MAX_CLIENTS: Final = 8
 _PARAMETER: Final = "imu_adjust"  # of the driver, and of upstream's
 
 
@@ -34,7 +37,7 @@ class LevellingWatch:
         self._topic = topic
         self._clients: dict[str, Client] = {}
         self._answers: dict[str, bool] = {}
-        node.create_timer(period_s, self._ask)
+        node.create_timer(period_s, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _ask(self) -> None:
         publishers = set()
@@ -43,10 +46,8 @@ class LevellingWatch:
         ):
             name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
             publishers.add(name)
-            if name not in self._clients:
-                self._clients[name] = self._node.create_client(
-                    GetParameters, f"{name}/get_parameters"
-                )
+            if name not in self._clients and not self._open(name):
+                continue
             client = self._clients[name]
             if client.service_is_ready():
                 future = client.call_async(GetParameters.Request(names=[_PARAMETER]))
@@ -55,6 +56,16 @@ class LevellingWatch:
             self._node.destroy_client(self._clients.pop(name))
             self._answers.pop(name, None)
         self._judge()
+
+    def _open(self, name: str) -> bool:
+        """Make a client for a publisher; return whether there is one."""
+        if len(self._clients) >= _MAX_CLIENTS:
+            return False
+        try:
+            self._clients[name] = self._node.create_client(GetParameters, f"{name}/get_parameters")
+        except NameValidationException:  # a program that is not ROS may be called anything
+            return False
+        return True
 
     def _answered(self, name: str, future: Future) -> None:
         response = future.result()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter, deque
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -18,8 +19,8 @@ from sensor_msgs.msg import Imu, PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from l2lidar_node.files import write_whole
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.files import DataFolder, FileNameError, write_whole
+from l2lidar_node.ros.conversions import from_cloud, from_time, is_ros_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_proc import rotations
@@ -32,6 +33,12 @@ from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import map_file, trajectory
 from l2lidar_proc.ros import odometry_messages as messages
+from l2lidar_proc.ros.inputs import (
+    InputMonitor,
+    answer_or_error,
+    steady_timer,
+    sweep_in_range,
+)
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
@@ -54,23 +61,27 @@ class OdometryNode(Node):
         config = self._settings.value
         topics = config.topics
         self._pipeline = OdometryPipeline(config.odometry, topics.T_cloud_imu, topics.imu_wait_ms)
+        self._folder = DataFolder(config.files.data_dir, config.files.overwrite)
         self._frames = StaticFrames(self) if topics.use_tf else None
         self._base = BaseFrame(np.eye(4))
         self._cloud_frame = ""
-        self._imu_frame = ""
-        self._mounted = -1
-        self._refused: Counter[str] = Counter()
+        self._mounted: tuple[int, str, str] | None = None
+        self._inputs = InputMonitor(self, (topics.cloud_topic, topics.imu_topic))
         self._looked_at = 0
         self._path: deque[PoseStamped] = deque(maxlen=topics.path_length)
         self._path_end = np.full((4, 4), np.inf)
         self._open(config)
-        self._overdue = self.create_timer(0.01, self._hand_out)
+        guarded = self._guarded
+        self._overdue = steady_timer(self, 0.01, guarded(self._hand_out))
         self._overdue.cancel()
-        self.create_timer(1.0, self._diagnose)
+        steady_timer(self, 1.0, guarded(self._diagnose))
         if topics.imu_rate > 0.0:
-            self.create_timer(1.0 / topics.imu_rate, self._carry_on)
+            steady_timer(self, 1.0 / topics.imu_rate, guarded(self._carry_on))
         if topics.map_period_s > 0.0:
-            self.create_timer(topics.map_period_s, self._show_map)
+            steady_timer(self, topics.map_period_s, guarded(self._show_map))
+
+    def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        return self._inputs.guarded(callback, self._begin_again)
 
     def _open(self, config: OdometryNodeConfig) -> None:
         topics = config.topics
@@ -87,11 +98,15 @@ class OdometryNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         listening = QoSProfile(depth=CLOUD_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         often = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, listening)
-        self._imu_input = self.create_subscription(Imu, topics.imu_topic, self._imu, often)
-        self.create_service(Trigger, "~/reset", self._reset)
-        self.create_service(Trigger, "~/save_map", self._save_map)
-        self.create_service(Trigger, "~/save_trajectory", self._save_trajectory)
+        guarded, hear = self._guarded, self.create_subscription
+        hear(PointCloud2, topics.cloud_topic, guarded(self._cloud), listening)
+        self._imu_input = hear(Imu, topics.imu_topic, guarded(self._imu), often)
+        for name, answer in (
+            ("reset", self._reset),
+            ("save_map", self._save_map),
+            ("save_trajectory", self._save_trajectory),
+        ):
+            self.create_service(Trigger, f"~/{name}", answer_or_error(self._inputs, answer))
 
     def _configure(self, config: OdometryNodeConfig) -> None:
         self._pipeline.configure(config.odometry)
@@ -102,28 +117,43 @@ class OdometryNode(Node):
             self._hand_out()
 
     def _take(self, message: Imu) -> None:
-        self._imu_frame = message.header.frame_id
-        self._pipeline.imu(to_sample(message))
+        if not is_ros_time(from_time(message.header.stamp)):
+            self._inputs.refuse("IMU sample with a stamp that is out of range")
+            return
+        if self._inputs.imu.takes(message.header.frame_id):
+            self._pipeline.imu(to_sample(message))
 
     def _cloud(self, message: PointCloud2) -> None:
-        self._cloud_frame = message.header.frame_id
+        frame = message.header.frame_id
+        if not self._inputs.clouds.takes(frame):
+            return
+        if self._cloud_frame not in ("", frame):  # another sensor: neither pose nor map are its
+            self._begin_again()
+        self._cloud_frame = frame
         try:
             sweep = to_sweep(from_cloud(message), from_time(message.header.stamp))
+            if not sweep_in_range(sweep):
+                raise CloudError("the stamp is out of range")
         except (CloudError, ValueError) as error:
-            self._refused[str(error)] += 1
+            self._inputs.refuse(str(error))
             self.get_logger().warning(f"cloud dropped: {error}", throttle_duration_sec=5.0)
             return
         self._mount()
+        self._inputs.sweep(sweep)
         self._pipeline.sweep(sweep, time.monotonic_ns())
         self._hand_out()
 
     def _mount(self) -> None:
         """Take the mounts from TF, as long as nothing depends on them yet or they changed."""
-        if self._frames is None or self._frames.version == self._mounted:
+        imu_frame = self._inputs.imu.name or ""
+        if self._frames is None:
             return
-        self._mounted = self._frames.version
-        if self._imu_frame and self._imu_frame != self._cloud_frame:
-            T_cloud_imu = self._frames.find(self._cloud_frame, self._imu_frame)
+        asked = (self._frames.version, self._cloud_frame, imu_frame)
+        if asked == self._mounted:
+            return
+        self._mounted = asked
+        if imu_frame and imu_frame != self._cloud_frame:
+            T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
             odometry = self._pipeline.odometry
             if (
                 T_cloud_imu is not None
@@ -215,41 +245,45 @@ class OdometryNode(Node):
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         del request
+        self._begin_again()
+        response.success, response.message = True, "a new map begins with the next clouds"
+        return response
+
+    def _begin_again(self) -> None:
         self._pipeline.reset()
         self._base.reset()
         self._path.clear()
         self._path_end = np.full((4, 4), np.inf)
         self._looked_at = 0
-        response.success, response.message = True, "a new map begins with the next clouds"
-        return response
 
     def _save_map(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         del request
         last = self._pipeline.last
-        path = FilePath(self._settings.value.topics.map_file)
         if last is None:
             response.success, response.message = False, "there is no map yet"
             return response
         try:
+            (path,) = self._folder.new_files(self._settings.value.files.map_file)
             count = map_file.save(path, self._map_points(last))
             response.success, response.message = True, f"{count} points in {path.absolute()}"
-        except OSError as error:
-            response.success, response.message = False, f"{path}: {error}"
+        except (OSError, FileNameError) as error:
+            response.success, response.message = False, str(error)
         return response
 
     def _save_trajectory(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         del request
-        path = FilePath(self._settings.value.topics.trajectory_file)
+        name = self._settings.value.files.trajectory_file
         poses = self._base.poses(self._pipeline.trajectory.poses)
         try:
+            path, beside = self._folder.new_files(name, f"{FilePath(name).stem}.kitti")
             write_whole(path, trajectory.tum(poses))
-            write_whole(path.with_suffix(".kitti"), trajectory.kitti(poses))
+            write_whole(beside, trajectory.kitti(poses))
             response.success = True
             response.message = f"{len(poses)} poses in {path.absolute()} and beside it"
-        except OSError as error:
-            response.success, response.message = False, f"{path}: {error}"
+        except (OSError, FileNameError) as error:
+            response.success, response.message = False, str(error)
         return response
 
     def _untied(self) -> str:
@@ -270,9 +304,12 @@ class OdometryNode(Node):
             self._pipeline.sweeps,
             since,
             self._pipeline.counts,
-            self._refused,
+            self._inputs.refused,
             self._untied(),
         )
+        level, text = self._inputs.judge(level, text)
+        if self._frames is not None and self._frames.refused:
+            level, text = max(level, health.WARN), f"{text}; {self._frames.refused}"
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [

@@ -1,4 +1,4 @@
-"""Follows ``/tf_static``, so that a node knows how its frames are mounted."""
+"""Static frames: how a node's frames are mounted, from ``/tf_static``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_proc.motion.frames import FrameTree
-from l2lidar_proc.rotations import F64, normalised, transform
+from l2lidar_proc.rotations import F64
 
 
 class StaticFrames:
@@ -22,26 +22,29 @@ class StaticFrames:
     ----------
     version : int
         Counts messages: what was looked up before the newest one may have changed.
+    refused : str
+        The last transform that could not be used, and why; empty if all could.
     """
 
     def __init__(self, node: Node) -> None:
         self.version = 0
+        self.refused = ""
+        self._node = node
         self._tree = FrameTree()
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(TFMessage, "/tf_static", self._take, latched)
 
     def find(self, target: str, source: str) -> F64 | None:
         """Return source coordinates to target coordinates, (4, 4), None if not known."""
-        return self._tree.find(target.lstrip("/"), source.lstrip("/"))
+        return self._tree.find(target, source)
 
     def _take(self, message: TFMessage) -> None:
-        for item in message.transforms:
-            q, p = item.transform.rotation, item.transform.translation
-            T_parent_child = transform(normalised((q.w, q.x, q.y, q.z)), (p.x, p.y, p.z))
-            self._tree.add(
-                item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/"), T_parent_child
-            )
-        self.version += 1
+        problems = self._tree.take(message)
+        if problems:
+            self.refused = f"/tf_static: {problems[-1]}"
+            self._node.get_logger().warning(self.refused, throttle_duration_sec=5.0)
+        if len(problems) < len(message.transforms):
+            self.version += 1
 
 
 def untied(frames: StaticFrames | None, target: str, source: str) -> str:

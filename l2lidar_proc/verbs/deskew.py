@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.ros.parameter_files import settings_for
-from l2lidar_proc.cloud import CloudError, to_sweep, without_time
+from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.frames import FrameTree
@@ -70,8 +70,8 @@ class _Deskewer:
         elif topic == self._topics.velocity:
             self._velocity(message)
         elif kind == bag.TRANSFORMS and topic.endswith("tf_static") and self._uses_tf:
-            for parent, child, transform in bag.transforms_of(message):
-                self._frames.add(parent, child, transform)
+            for problem in self._frames.take(message):
+                self._refuse(problem)
         self.finish(now)
 
     def _mount(self, imu_frame: str) -> None:
@@ -97,14 +97,19 @@ class _Deskewer:
         stamp = bag.stamp_of(message)
         try:
             points = bag.points_of(message)
-        except ValueError as error:
-            self.refused[str(error)] = self.refused.get(str(error), 0) + 1
-            return
-        try:
-            self.pipeline.sweep(to_sweep(points, stamp, self._unit), now)
+            sweep = to_sweep(points, stamp, self._unit)
         except CloudError as error:
-            self.refused[str(error)] = self.refused.get(str(error), 0) + 1
-            self._writer.cloud(self._output, now, without_time(points), stamp, self._cloud_frame)
+            self._refuse(str(error))
+            if not position_problem(points.dtype):
+                cloud = without_time(points)
+                self._writer.cloud(self._output, now, cloud, stamp, self._cloud_frame)
+        except ValueError as error:
+            self._refuse(str(error))
+        else:
+            self.pipeline.sweep(sweep, now)
+
+    def _refuse(self, reason: str) -> None:
+        self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def _velocity(self, message: Any) -> None:
         frame, linear, angular = bag.twist_of(message)

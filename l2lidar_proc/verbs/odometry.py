@@ -219,8 +219,7 @@ class _Listener:
             self._mount(message.header.frame_id)
             self.runner.take((now, bag.sample_of(message)))
         elif topic.endswith("tf_static") and self._config.topics.use_tf:
-            for parent, child, transform in bag.transforms_of(message):
-                self._frames.add(parent, child, transform)
+            self.runner.refused.update(self._frames.take(message))
 
     def _cloud(self, message: Any, now: int) -> None:
         self._cloud_frame = message.header.frame_id

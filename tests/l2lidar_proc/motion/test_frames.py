@@ -35,3 +35,23 @@ def test_a_newer_transform_replaces_the_older():
     tree.add("a", "b", pose((0, 0, 0), (2, 0, 0)))
     assert tree.find("a", "b")[0, 3] == 2
     assert tree.find("b", "a")[0, 3] == -2
+
+
+def test_a_frame_has_one_parent_the_newest():
+    tree = FrameTree()
+    tree.add("a", "b", pose((0, 0, 0), (1, 0, 0)))
+    tree.add("c", "b", pose((0, 0, 0), (2, 0, 0)))
+    assert tree.find("a", "b") is None
+    assert tree.find("c", "b")[0, 3] == 2
+
+
+def test_mounts_in_a_circle_and_long_chains_have_an_end():
+    tree = FrameTree()
+    for child, parent in ("ab", "bc", "ca"):
+        tree.add(parent, child, np.eye(4))
+    assert tree.find("a", "x") is None
+    np.testing.assert_array_equal(tree.find("a", "c"), np.eye(4))
+    for number in range(5000):
+        tree.add(f"{number + 1}", f"{number}", np.eye(4))
+    assert tree.find("5000", "0") is None
+    assert tree.find("900", "0") is not None

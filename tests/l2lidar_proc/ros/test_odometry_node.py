@@ -71,15 +71,14 @@ class OdometryBench(Bench):
 
 
 @pytest.fixture
-def bench(request):
-    made = OdometryBench(*getattr(request, "param", ()))
+def bench(request, tmp_path):
+    made = OdometryBench(f"data_dir:={tmp_path}", *getattr(request, "param", ()))
     yield made
     made.close()
 
 
 @pytest.mark.parametrize("bench", [("map_period_s:=0.2", "imu_rate:=50.0")], indirect=True)
-def test_everything_that_is_published(bench, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_everything_that_is_published(bench, tmp_path):
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))[:18]
     bench.send(run, some)
