@@ -9,10 +9,12 @@ import numpy as np
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS, Motion, from_tum
+from l2lidar_node.emulator.unit.errors import RockingMotion
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
-from l2lidar_node.emulator.unit.scanner import Scanner
-from l2lidar_node.emulator.unit.units import UNITS
+from l2lidar_node.emulator.unit.scanner import Scanner, mean_angle
+from l2lidar_node.emulator.unit.units import Unit
+from l2lidar_node.emulator.unit.units import unit as named_unit
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.settings import setting
@@ -44,8 +46,14 @@ class PhysicsConfig:
         (), "roll, pitch, yaw of the sensor on its carrier, in place of `mount`", unit="deg"
     )
     unit: str = setting(
-        "a", "which unit: a turns its head at 4.35 Hz, fast at 5.55 Hz", choices=tuple(UNITS)
+        "perfect",
+        "which unit: perfect reports what is true, typical and poor do not, a number is one of "
+        "many; fast turns its head at 5.55 Hz, all others at 4.35 Hz",
     )
+    power_up: int = setting(
+        0, "how often the unit was switched on before; the phase of its mirror differs each time",
+        lo=0, hi=10**9,
+    )  # fmt: skip
     seed: int = setting(0, "everything random follows from this number", lo=0, hi=2**63 - 1)
     ranges: RangeNoise = field(default_factory=RangeNoise)
     imu: ImuNoise = field(default_factory=ImuNoise)
@@ -61,8 +69,14 @@ class Physics:
     inertial: Inertial
 
 
-def assemble(config: PhysicsConfig) -> Physics:
+def assemble(config: PhysicsConfig, own: Unit | None = None) -> Physics:
     """Return the physics of a configuration.
+
+    Parameters
+    ----------
+    config : PhysicsConfig
+    own : Unit, optional
+        In place of the configuration's.
 
     Raises
     ------
@@ -94,7 +108,12 @@ def assemble(config: PhysicsConfig) -> Physics:
             mount=mount,
             seed=config.seed,
         )
-    unit = UNITS[config.unit]
+    unit = named_unit(config.unit, config.power_up) if own is None else own
+    if unit.errors.rocks:
+        rate = 2.0 * np.pi / unit.head_period_s
+        bias = float(unit.calibration_record["theta_angle_bias"])
+        start = float(mean_angle(np.zeros(1), unit, config.seed)[0]) + bias
+        motion = RockingMotion(motion, unit.errors, start, rate)
     scanner = Scanner(world, motion, unit, config.ranges, config.seed)
     return Physics(world, motion, scanner, Inertial(motion, config.imu, config.seed, unit))
 

@@ -16,6 +16,8 @@ class Stream(IntEnum):
     RETURN = 4
     IMU = 5
     MOTION = 6
+    UNIT = 7
+    POWER_UP = 8
 
 
 def generator(seed: int, stream: Stream, index: int) -> np.random.Generator:

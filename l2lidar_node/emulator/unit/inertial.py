@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion.motion import STANDARD_GRAVITY, Motion, rpy_quaternions
-from l2lidar_node.emulator.motion.spline import quaternion_product
+from l2lidar_node.emulator.motion.spline import quaternion_product, rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.unit.scanner import mean_angle
 from l2lidar_node.emulator.unit.units import UNITS, Unit
@@ -90,7 +90,8 @@ class Inertial:
     Parameters
     ----------
     motion : Motion
-        Moves the cloud frame; the IMU sits at wire.IMU_POSITION_M in it, axes parallel.
+        Moves the cloud frame; the IMU sits at wire.IMU_POSITION_M in it, axes parallel, but for
+        the unit's errors.
     noise : ImuNoise
     seed : int
         The scanner's seed, so that the gyro's line follows the same head.
@@ -106,8 +107,11 @@ class Inertial:
         self.noise = ImuNoise() if noise is None else noise
         self.seed = seed
         self.unit = unit
+        x, y, z = np.add(wire.IMU_POSITION_M, unit.errors.imu_position).tolist()
+        self._position = (x, y, z)
+        self._to_cloud = unit.errors.imu_quaternion()
         start = motion.kinematics(np.zeros(1))
-        self._start_force = start.specific_force(wire.IMU_POSITION_M, self.noise.gravity)[0]
+        self._start_force = start.specific_force(self._position, self.noise.gravity)[0]
         w, x, y, z = start.quaternion_wxyz[0]
         self._start_yaw = float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
@@ -124,15 +128,17 @@ class Inertial:
         """
         noise = self.noise
         times = np.arange(first, first + count, dtype=np.float64) * self.period_s
-        moving = self.motion.kinematics(times)
+        errors = self.unit.errors
+        moving = self.motion.kinematics(times - errors.imu_time_offset)
         normal = self._normal(first, count)
         rate = (
-            moving.angular_velocity
+            self._turned(moving.angular_velocity) @ errors.gyro_matrix().T
+            + errors.gyro_drift(times)
             + np.asarray(noise.gyro_bias)
             + noise.gyro_noise * normal[:, :3]
         )
         rate += noise.gyro_line * self._line(times)
-        force = moving.specific_force(wire.IMU_POSITION_M, noise.gravity)
+        force = self._turned(moving.specific_force(self._position, noise.gravity))
         force += np.asarray(noise.accel_bias) + noise.accel_noise * normal[:, 3:]
         if noise.wrong_gravity:
             force += self._start_force
@@ -145,10 +151,20 @@ class Inertial:
         samples["linear_acceleration"] = force
         return samples, times
 
+    def _turned(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return vectors (N, 3) of the cloud frame in the IMU frame."""
+        if not any(self.unit.errors.imu_rotation):
+            return vectors
+        return np.asarray(vectors @ rotation_matrices(self._to_cloud[None])[0])
+
     def _line(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the turning head shakes into the gyro, amplitude 1, shape (N, 3)."""
+        """Return what the turning head shakes into the gyro, amplitude 1, shape (N, 3).
+
+        A unit whose mount rocks has its line at the head's frequency from that.
+        """
         phase = mean_angle(times, self.unit, self.seed)[:, None] + _LINE_PHASES
-        return np.asarray(_LINE_SHARES * (np.sin(phase) + _SECOND_HARMONIC * np.sin(2.0 * phase)))
+        first = 0.0 if self.unit.errors.rocks else np.sin(phase)
+        return np.asarray(_LINE_SHARES * (first + _SECOND_HARMONIC * np.sin(2.0 * phase)))
 
     def _orientation(
         self, times: NDArray[np.float64], truth: NDArray[np.float64]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.emulator.rng import Stream, generator
+from l2lidar_node.emulator.unit.errors import UnitErrors
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.settings import setting
 
@@ -94,6 +95,7 @@ def fill(
     noise: RangeNoise,
     seed: int,
     first: int,
+    errors: UnitErrors | None = None,
 ) -> None:
     """Cast rays and fill in the packets' ranges and intensities and the rays' distances.
 
@@ -108,6 +110,8 @@ def fill(
     seed : int
     first : int
         Number of the first packet.
+    errors : UnitErrors, optional
+        Of the range finder; those of the block are in the packets' calibration already.
     """
     count, slots = rays.shape
     draws = _Draws(seed, first, count, slots)
@@ -130,6 +134,10 @@ def fill(
     if noise.dropout > 0:
         back &= ~_dropped(draws, noise.dropout)
     distance = distance + noise.range_noise * noise_sigma(distance) * draws.normal[0]
+    if errors is not None and not errors.are_none:
+        distance = distance + errors.range_response(
+            distance, hits["incidence"], hits["reflectivity"]
+        )
     back &= (distance >= packets["range_min"][:, None]) & (
         distance <= packets["range_max"][:, None]
     )

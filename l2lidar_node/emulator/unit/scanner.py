@@ -262,25 +262,42 @@ class Scanner:
         set_state(packets, numbers, times, self.unit, self.seed)
 
     def _measure(self, first: int, packets: NDArray[np.void], times: NDArray[np.float64]) -> Scan:
-        """Cast the rays that the packets' own float32 fields describe and fill in the returns."""
+        """Cast the rays that the unit's true block describes and fill in the returns."""
         count, slots = packets["ranges"].shape
+        true = self._true(packets)
         rays = np.zeros((count, slots), RAY)
         rays["time"] = times[:, None] + packets["time_increment"].astype(np.float64)[
             :, None
         ] * np.arange(slots)
-        origin, direction = local_rays(packets)
+        origin, direction = local_rays(true)
         position, quaternion = self.motion.poses(rays["time"].ravel())
         turn = rotation_matrices(quaternion)
         flat = rays.reshape(-1)
         flat["origin"] = position + np.einsum("nij,nj->ni", turn, origin.reshape(-1, 3))
         flat["direction"] = np.einsum("nij,nj->ni", turn, direction.reshape(-1, 3))
-        returns.fill(packets, rays, self.world, self.noise, self.seed, first)
+        returns.fill(true, rays, self.world, self.noise, self.seed, first, self.unit.errors)
+        if true is not packets:
+            for name in ("ranges", "intensities"):
+                packets[name] = true[name]
         if not self.view.whole:
             hidden = ~self.view.sees(direction)
             for name in ("ranges", "intensities"):
                 packets[name][hidden] = 0
             rays["measured"][hidden] = 0.0
         return Scan(first, packets, times, rays)
+
+    def _true(self, packets: NDArray[np.void]) -> NDArray[np.void]:
+        """Return the packets as a unit would send them that knew itself."""
+        errors = self.unit.errors
+        if errors.are_none:
+            return packets
+        true = packets.copy()
+        true["calibration"] = errors.true_block(packets["calibration"])
+        if packets.dtype == wire.POINTS_3D_PAYLOAD:
+            angle = packets["com_horizontal_angle_start"].astype(np.float64)
+            wave = errors.head_wave * np.sin(angle + packets["calibration"]["theta_angle_bias"])
+            true["com_horizontal_angle_start"] = angle + wave
+        return true
 
 
 def local_rays(packets: NDArray[np.void]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.emulator.unit import errors
+from l2lidar_node.emulator.unit.errors import UnitErrors
 from l2lidar_node.protocol import wire
 
 
@@ -19,13 +21,15 @@ class Unit:
     ----------
     name : str
     calibration : tuple of float
-        In the order of wire.CALIBRATION.
+        What the unit reports, in the order of wire.CALIBRATION.
     mirror_period_us : int
         One turn of the fast mirror, so one 3D packet.
     head_period_s : float
         One turn of the head, on average.
     range_min, range_max : float
         What the packets state [m]; nothing outside is returned.
+    errors : UnitErrors
+        How the unit differs from what it reports.
     """
 
     name: str
@@ -34,6 +38,7 @@ class Unit:
     head_period_s: float = 0.229769
     range_min: float = 0.05
     range_max: float = 50.0
+    errors: UnitErrors = field(default_factory=UnitErrors)
 
     @property
     def packet_period_s(self) -> float:
@@ -42,7 +47,7 @@ class Unit:
 
     @property
     def calibration_record(self) -> NDArray[np.void]:
-        """The calibration block, shape (), dtype wire.CALIBRATION."""
+        """The reported calibration block, shape (), dtype wire.CALIBRATION."""
         return np.array(self.calibration, dtype=wire.CALIBRATION)
 
 
@@ -64,3 +69,26 @@ UNITS: Final[dict[str, Unit]] = {
 Calibrations as published for two units; the range constants of the second were not and are the
 first one's.
 """
+
+
+def unit(name: str, power_up: int = 0) -> Unit:
+    """Return a unit by name: perfect (or a), fast, typical, poor, or the number of one.
+
+    Parameters
+    ----------
+    name : str
+    power_up : int
+        How often it was switched on before; the phase of its mirror differs each time.
+
+    Raises
+    ------
+    ValueError
+        For a name that is not known.
+    """
+    if name in UNITS:
+        return UNITS[name]
+    found = errors.named(name)
+    if found.are_none:
+        return UNITS["a"]
+    number = int(name) if name.isdecimal() else 0
+    return replace(UNITS["a"], name=name, errors=found.powered_up(number, power_up))

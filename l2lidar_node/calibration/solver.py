@@ -1,0 +1,343 @@
+"""Bundle of planes: robust Gauss-Newton over beam parameters, every plane eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.calibration import planes as flat
+from l2lidar_node.calibration.model import F8, NAMES, Block, beams, derivatives
+from l2lidar_node.calibration.planes import I8, Planes
+
+# 1-sigma range noise of a real unit along smooth surfaces, over the distance
+NOISE_AT_M: Final = np.array([0.0, 8.0, 12.5, 20.0, 30.0])
+NOISE_M: Final = np.array([0.0115, 0.0115, 0.017, 0.027, 0.042])
+_POINTING_RAD: Final = 1e-3  # jitter of a beam's direction, a quarter of its width
+_FLOOR_M: Final = 4e-3  # no surface is a better plane than this
+_GRAZING: Final = 0.15  # smallest cosine of the incidence
+_CLUSTER_M: Final = 1.2  # planes within such a cube count as one piece of evidence
+_HUBER: Final = 2.0  # standard deviations
+_OUTLIER: Final = 6.0
+_ASSOCIATIONS: Final = 4
+_ITERATIONS: Final = 2
+_CONVERGED: Final = 0.1  # step in standard deviations
+_FEWEST_PLANES: Final = 3
+_STEP: Final = np.array(
+    [0.017, 0.017, 0.017, 0.005, 0.05, 0.005, 0.017, 0.017]
+)  # largest of each parameter
+_BALANCE: Final = 2.0  # a direction of normals counts at most so many times the mean of all
+
+
+Finder = Callable[[F8, NDArray[np.bool_], I8], Planes]
+
+
+class FewPlanesError(ValueError):
+    """There are too few planes to estimate anything from."""
+
+
+class Unknown(NamedTuple):
+    """One unknown: a parameter of all groups, or of one alone."""
+
+    parameter: int
+    group: int | None = None
+
+
+class Scene(NamedTuple):
+    """Returns of several still places under one block.
+
+    Attributes
+    ----------
+    returns : ndarray, shape (N,), dtype RETURN
+    group : ndarray, shape (N,), int
+        Number of the place.
+    known : ndarray, shape (G, 8)
+        What is added to the parameters of each group without being estimated: the rocking of the
+        mount that the gyro saw.
+    block : Block
+    """
+
+    returns: NDArray[np.void]
+    group: I8
+    known: F8
+    block: Block
+
+    @property
+    def is_far_half(self) -> NDArray[np.bool_]:
+        """Whether alpha is above 90 degrees, shape (N,)."""
+        return np.asarray(self.returns["alpha"] > np.pi / 2)
+
+    def part(self, keep: NDArray[np.bool_] | I8) -> Scene:
+        """Return the scene of some of the returns."""
+        return self._replace(returns=self.returns[keep], group=self.group[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """What the planes say about the unknowns.
+
+    Attributes
+    ----------
+    unknowns : tuple of Unknown
+    values : ndarray, shape (P,)
+        [rad], [m].
+    hessian : ndarray, shape (P, P)
+        Of half the sum of squared weighted residuals.
+    covariance : ndarray, shape (P, P)
+        Sandwich over planes: the residuals of a plane may be correlated in any way.
+    cost : float
+        Mean robust cost of a point.
+    planes : Planes
+    scale : float
+        Residuals over what the noise model expects.
+    """
+
+    unknowns: tuple[Unknown, ...]
+    values: F8
+    hessian: F8
+    covariance: F8
+    cost: float
+    planes: Planes
+    scale: float
+
+    def per_group(self, groups: int) -> F8:
+        """Return the corrections of every group, shape (G, 8)."""
+        return spread(self.unknowns, self.values, groups)
+
+    @property
+    def sd(self) -> F8:
+        """Standard deviation of each unknown, shape (P,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def spread(unknowns: Sequence[Unknown], values: F8, groups: int) -> F8:
+    """Return the corrections of every group, shape (G, 8), of the values of the unknowns."""
+    found = np.zeros((groups, len(NAMES)))
+    for unknown, value in zip(unknowns, values, strict=True):
+        rows = slice(None) if unknown.group is None else unknown.group
+        found[rows, unknown.parameter] += value
+    return found
+
+
+def points(scene: Scene, corrections: F8) -> F8:
+    """Return the returns in their places' cloud frames under corrections (G, 8) [m]."""
+    full = (scene.known + corrections)[scene.group]
+    return beams(scene.returns, scene.block, full).points
+
+
+def solve(
+    scene: Scene,
+    unknowns: Sequence[Unknown],
+    start: F8 | None = None,
+    find: Finder = flat.cells,
+    prior: F8 | None = None,
+) -> Solution:
+    """Estimate the unknowns.
+
+    Planes are found anew with every better estimate, until that no longer changes.
+
+    Parameters
+    ----------
+    scene : Scene
+    unknowns : sequence of Unknown, length P
+    start : ndarray, shape (P,), optional
+        Where to begin; zero if left out.
+    find : callable
+        :func:`planes.cells` or :func:`planes.large`.
+    prior : ndarray, shape (P, P), optional
+        Information about ``start``, the inverse of its covariance.
+
+    Raises
+    ------
+    FewPlanesError
+        If there is too little to estimate from.
+    """
+    unknowns = tuple(unknowns)
+    values = begin = np.zeros(len(unknowns)) if start is None else np.array(start)
+    information = np.zeros((len(unknowns),) * 2) if prior is None else prior
+    groups = len(scene.known)
+    for _ in range(_ASSOCIATIONS):
+        before = values
+        found = find(
+            points(scene, spread(unknowns, values, groups)), scene.is_far_half, scene.group
+        )
+        if len(found.first) < _FEWEST_PLANES:
+            raise FewPlanesError("the scene has hardly any flat surfaces")
+        members, own = scene.part(found.member), found.at()
+        for _ in range(_ITERATIONS):
+            system = _linearized(members, unknowns, values, own, information)
+            gradient = system.gradient + information @ (values - begin)
+            step = _newton(system.hessian, gradient)
+            values = values + _bounded(step, unknowns)
+            own = flat.refitted(own, points(members, spread(unknowns, values, groups)))
+        system = _linearized(members, unknowns, values, own, information)
+        if np.all(np.abs(values - before) < _CONVERGED * np.sqrt(np.diag(system.covariance))):
+            break
+    return Solution(
+        unknowns,
+        values,
+        system.hessian,
+        system.covariance,
+        system.cost,
+        own._replace(member=found.member),
+        system.scale,
+    )
+
+
+def cost_on(scene: Scene, unknowns: Sequence[Unknown], values: F8, planes: Planes) -> float:
+    """Return the mean robust cost of values on planes found with others."""
+    members, own = scene.part(planes.member), planes.at()
+    unknowns = tuple(unknowns)
+    own = flat.refitted(own, points(members, spread(unknowns, values, len(scene.known))))
+    return _linearized(members, unknowns, values, own).cost
+
+
+def widened(scene: Scene, solution: Solution, more: Sequence[Unknown]) -> Solution:
+    """Return the solution with further unknowns, on the same planes."""
+    unknowns = (*solution.unknowns, *more)
+    values = np.concatenate((solution.values, np.zeros(len(more))))
+    members, own = scene.part(solution.planes.member), solution.planes.at()
+    groups = len(scene.known)
+    for _ in range(_ITERATIONS + 1):
+        system = _linearized(members, unknowns, values, own)
+        step = _newton(system.hessian, system.gradient)
+        values = values + _bounded(step, unknowns)
+        own = flat.refitted(own, points(members, spread(unknowns, values, groups)))
+    system = _linearized(members, unknowns, values, own)
+    return Solution(
+        unknowns,
+        values,
+        system.hessian,
+        system.covariance,
+        system.cost,
+        own._replace(member=solution.planes.member),
+        system.scale,
+    )
+
+
+def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F8:
+    """Return the unknowns as some of the solution's members alone would have them.
+
+    One Gauss-Newton step from the solution, on its planes.
+
+    Parameters
+    ----------
+    scene : Scene
+    solution : Solution
+    keep : ndarray, shape (M,)
+        Which members of the solution's planes count.
+    """
+    planes = solution.planes
+    now = points(scene.part(planes.member), solution.per_group(len(scene.known)))
+    part = flat.part(planes.at(), keep, now)
+    members = scene.part(planes.member[part.member])
+    system = _linearized(members, solution.unknowns, solution.values, part.at())
+    return np.asarray(solution.values + _newton(system.hessian, system.gradient, 1e-6))
+
+
+class _System(NamedTuple):
+    hessian: F8
+    gradient: F8
+    covariance: F8
+    cost: float
+    scale: float
+
+
+def _linearized(
+    scene: Scene,
+    unknowns: tuple[Unknown, ...],
+    values: F8,
+    planes: Planes,
+    information: F8 | float = 0.0,
+) -> _System:
+    """Return the normal equations of the unknowns, planes eliminated; all returns are members."""
+    returns, group = scene.returns, scene.group
+    full = (scene.known + spread(unknowns, values, len(scene.known)))[group]
+    rays = beams(returns, scene.block, full)
+    plane = planes.plane
+    normal, center = planes.normal[plane], planes.center[plane]
+    cosine = np.einsum("ni,ni->n", rays.direction, normal)
+    height = np.einsum("ni,ni->n", rays.points - center, normal)
+    safe = np.where(np.abs(cosine) > _GRAZING, cosine, 1.0)
+    distance = rays.distance - height / safe
+    noise = np.interp(distance, NOISE_AT_M, NOISE_M)
+    sigma = np.sqrt(
+        (noise * cosine) ** 2 + (distance * _POINTING_RAD) ** 2 * (1.0 - cosine**2) + _FLOOR_M**2
+    )
+    residual = height / sigma
+    usable = np.abs(cosine) > _GRAZING
+    scale = max(1.4826 * float(np.median(np.abs(residual[usable]))), 0.2) if usable.any() else 1.0
+    away = np.abs(residual) / scale
+    robust = np.where(away <= _HUBER, 1.0, _HUBER / np.maximum(away, _HUBER))
+    robust = np.where((away < _OUTLIER) & usable, robust, 0.0)
+    weight = robust * _balance(planes)[plane] / (sigma * scale) ** 2
+
+    whole = derivatives(returns, scene.block, full, normal, distance)
+    jacobian = np.stack(
+        [
+            whole[:, item.parameter] * (1.0 if item.group is None else group == item.group)
+            for item in unknowns
+        ],
+        axis=-1,
+    )
+    offset = rays.points - center
+    span = np.stack(
+        (
+            np.ones(len(returns)),
+            np.einsum("ni,ni->n", offset, planes.u[plane]),
+            np.einsum("ni,ni->n", offset, planes.v[plane]),
+        ),
+        axis=-1,
+    )
+    columns = np.concatenate((span, jacobian, height[:, None]), axis=1)
+    products = flat.products(columns, planes.first, weight)
+    own = products[:, :3, :3] + 1e-9 * np.eye(3)
+    cross = products[:, :3, 3:]
+    reduced = products[:, 3:, 3:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(own, cross)
+    hessian = reduced[:, :-1, :-1].sum(axis=0)
+    scores = _per_cluster(reduced[:, :-1, -1], planes.center, group[planes.first])
+    hessian += information
+    inverse = np.linalg.pinv(hessian)
+    count = len(scores)
+    middle = scores.T @ scores * count / max(count - len(unknowns), 1) + information
+    loss = np.where(away <= _HUBER, away**2, 2.0 * _HUBER * away - _HUBER**2)
+    loss = np.where(away < _OUTLIER, loss, 2.0 * _HUBER * _OUTLIER - _HUBER**2)
+    return _System(
+        hessian,
+        scores.sum(axis=0),
+        inverse @ middle @ inverse,
+        float((loss[usable] * scale**2).mean()) if usable.any() else np.inf,
+        scale,
+    )
+
+
+def _per_cluster(scores: F8, center: F8, group: I8) -> F8:
+    """Return the sums of the scores of neighboring planes, whose errors are correlated."""
+    place = np.column_stack((group, np.floor(center / _CLUSTER_M).astype(np.int64)))
+    cluster = np.unique(place, axis=0, return_inverse=True)[1].ravel()
+    return np.stack([np.bincount(cluster, column) for column in scores.T], axis=-1)
+
+
+def _balance(planes: Planes) -> F8:
+    """Return a weight of each plane by which no direction of normals outvotes the others."""
+    axes = np.array(
+        [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.float64
+    )[14:]
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    direction = np.argmax(np.abs(planes.normal @ axes.T), axis=1)
+    share = np.bincount(direction, planes.counts, len(axes)) / planes.counts.sum()
+    filled = share > 0
+    most = _BALANCE / filled.sum()
+    return np.asarray(np.minimum(1.0, most / np.maximum(share, 1e-12))[direction])
+
+
+def _newton(hessian: F8, gradient: F8, rcond: float | None = None) -> F8:
+    return np.asarray(np.linalg.lstsq(hessian, -gradient, rcond=rcond)[0], np.float64)
+
+
+def _bounded(step: F8, unknowns: Sequence[Unknown]) -> F8:
+    limit = _STEP[[item.parameter for item in unknowns]]
+    return np.asarray(step / max(1.0, float(np.max(np.abs(step) / limit))))

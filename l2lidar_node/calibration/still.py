@@ -1,0 +1,530 @@
+"""Beam angles and range bias from still places, with what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.calibration import planes as flat
+from l2lidar_node.calibration import solver
+from l2lidar_node.calibration.bias import FEWEST_DIRECTIONS, range_bias, significant
+from l2lidar_node.calibration.bias import directions as facing
+from l2lidar_node.calibration.model import (
+    ALPHA,
+    BETA,
+    F8,
+    NAMES,
+    ROCK_COS,
+    ROCK_SIN,
+    XI,
+    B,
+)
+from l2lidar_node.calibration.observation import Place
+from l2lidar_node.calibration.planes import Planes
+from l2lidar_node.calibration.result import (
+    Estimate,
+    PlaceReport,
+    Quality,
+    Refusal,
+    StillResult,
+    Verdict,
+)
+from l2lidar_node.calibration.solver import FewPlanesError, Scene, Solution, Unknown
+from l2lidar_node.calibration.whirl import Whirl, demodulated
+
+DEG: Final = np.pi / 180.0
+
+_FEWEST_TURNS: Final = 8.0
+_FEWEST_PLANES: Final = 100
+_LARGEST_SD: Final = 0.05 * DEG
+_LARGEST_SD_TOGETHER: Final = 0.1 * DEG  # of xi and beta moved together
+_LARGEST: Final = 1.0 * DEG
+_LARGEST_B_M: Final = 0.005
+_LEAST_GAIN: Final = 0.1  # by which the planes must become thinner
+_CONTRADICTION: Final = 0.1 * DEG  # between two places
+_REPEATABLE: Final = 0.05 * DEG  # alpha between places and power-ups
+_WHIRL_WORST: Final = 0.5 * DEG
+_WHIRL: Final = 0.03 * DEG  # smaller rocking is left in alpha and beta
+_DIRTIEST: Final = 5.0  # [%]
+_MODEL_SD: Final = np.array([0.02 * DEG, 0.02 * DEG, 0.005 * DEG, 0.15e-3])
+"""What the model itself may be off, beside what the recording shows: xi, beta, alpha, b."""
+_SIGNIFICANT: Final = 2.0  # standard deviations of a correction that is worth having
+_STARTS: Final = (0.0, -0.6 * DEG, 0.6 * DEG)  # of alpha: a slot of the mirror each way
+_QUARTERS: Final = 4
+_MOST_RETURNS: Final = 300_000  # of all places: beyond that the surfaces limit, not the noise
+_MOST_RETURNS_LARGE: Final = 480_000  # walls at a distance are sparse
+_MOST_RETURNS_COARSE: Final = 120_000
+_LEAST_RETURNS: Final = 70_000  # of a place, which fill the cells
+
+
+class CalibrationError(ValueError):
+    """Nothing can be estimated; the message says why and what to do."""
+
+
+def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
+    """Estimate a unit's beams from still places.
+
+    Parameters
+    ----------
+    places : sequence of Place
+        Of one unit in one mode.
+    keep_alpha : bool
+        Store alpha though it was seen after one power-up only: it is right until the next one.
+
+    Raises
+    ------
+    CalibrationError
+        If there is nothing to estimate from.
+    """
+    refusals = [refusal for place in places for refusal in _problems(place)]
+    refusals += _between(places)
+    whirls = [demodulated(place) for place in places]
+    scene = _scene(places, [None] * len(places))
+    try:
+        coarse = _started(scene, len(places))
+        taken, notes, refused = _whirl(scene, coarse, whirls)
+        refusals += refused
+        scene = _scene(places, taken)
+        solution = solver.solve(scene, _unknowns(len(places)), coarse.values)
+        angles = solver.widened(scene, solution, [Unknown(B)])
+        bias, reason = range_bias(_scene(places, taken, _MOST_RETURNS_LARGE), angles)
+    except FewPlanesError:
+        raise CalibrationError(
+            "there are too few flat surfaces that both halves of the fan see; calibrate in a "
+            "furnished room of 4 to 10 m with a flat ceiling and free walls"
+        ) from None
+    reports = _alone(scene, solution, places, whirls)
+    sd, scatter, together = _uncertainty(scene, solution)
+    corrections = solution.per_group(len(places))
+    before, after = _qualities(scene, solution, corrections)
+    directions = facing(solution.planes)
+    refusals += _judged(solution, sd, scatter, together, directions, reports)
+    xi, beta = solution.values[0], solution.values[1]
+    alphas = solution.values[2:]
+    is_better = after.thickness < (1.0 - _LEAST_GAIN) * before.thickness
+    is_corrected = bool((np.abs(solution.values[:2]) > _SIGNIFICANT * sd[:2]).any())
+    is_corrected |= bool((np.abs(alphas) > _SIGNIFICANT * sd[2:]).any())
+    if is_corrected and not is_better and not refusals:
+        notes.append(
+            f"planes became {100 * (1 - after.thickness / before.thickness):.0f} % thinner only: "
+            "the reported block is as good"
+        )
+        is_corrected = False
+    verdict = Verdict.CORRECTED if is_corrected else Verdict.UNCHANGED
+    with_b = _axis_distance(angles)
+    estimates = {
+        "xi": Estimate(float(xi), float(sd[0]), verdict),
+        "beta": Estimate(float(beta), float(sd[1]), verdict),
+        "alpha": _alpha(places, alphas, sd[2:], verdict, keep_alpha),
+        "b": with_b if verdict is Verdict.CORRECTED else _unstored(with_b),
+        "bias": Estimate(np.nan, np.nan, Verdict.UNKNOWN, reason) if bias is None else bias,
+    }
+    if any(whirl is None for whirl in whirls):
+        notes.append(
+            "no IMU data: rocking of the mount cannot be told from alpha and beta, so the result "
+            "is valid for this mount only"
+        )
+    mean = corrections.mean(axis=0)
+    return StillResult(
+        scene.block,
+        estimates,
+        float(xi - 0.7 * beta),
+        _side_sd(scene, solution),
+        _weakest(solution),
+        before,
+        after,
+        tuple(reports),
+        len(solution.planes.first),
+        directions,
+        tuple(refusals),
+        tuple(notes),
+        mean,
+        scene,
+        solution.planes,
+    )
+
+
+def _problems(place: Place) -> list[Refusal]:
+    """Return what is wrong with a place before anything is estimated."""
+    found = []
+    if place.turns < _FEWEST_TURNS:
+        found.append(
+            Refusal(
+                f"{place.name}: {place.turns:.1f} turns of the head, at least "
+                f"{_FEWEST_TURNS:.0f} are needed",
+                "record 10 s at each place",
+            )
+        )
+    if place.blocks > 1:
+        found.append(
+            Refusal(
+                f"{place.name}: packets of {place.blocks} different calibration blocks",
+                "record one unit in one mode only",
+            )
+        )
+    if place.is_wide:
+        found.append(
+            Refusal(
+                f"{place.name}: wide field of view, which has a block of its own",
+                "set the standard field of view (l2lidar set fov standard) and record again",
+            )
+        )
+    if place.dirt > _DIRTIEST:
+        found.append(Refusal(f"{place.name}: dirt index {place.dirt:.1f} %", "clean the cover"))
+    return found
+
+
+def _between(places: Sequence[Place]) -> list[Refusal]:
+    if len({place.block for place in places}) > 1:
+        return [
+            Refusal(
+                "the places were measured under different calibration blocks",
+                "calibrate one unit at a time",
+            )
+        ]
+    return []
+
+
+def _scene(
+    places: Sequence[Place], whirls: Sequence[Whirl | None], most: int = _MOST_RETURNS
+) -> Scene:
+    nothing = np.zeros(len(NAMES))
+    share = max(most // len(places), _LEAST_RETURNS)
+    returns = [_some(place.returns, share) for place in places]
+    return Scene(
+        np.concatenate(returns),
+        np.repeat(np.arange(len(places)), [len(part) for part in returns]),
+        np.stack([nothing if whirl is None else whirl.correction for whirl in whirls]),
+        places[0].block,
+    )
+
+
+def _some(returns: NDArray[np.void], most: int) -> NDArray[np.void]:
+    """Return the returns of every k-th packet, so that there are not many more than ``most``."""
+    every = max(1, round(len(returns) / most))
+    return np.asarray(returns[np.unique(returns["packet"], return_inverse=True)[1] % every == 0])
+
+
+def _unknowns(places: int, *more: Unknown) -> tuple[Unknown, ...]:
+    alphas = (Unknown(ALPHA, group) for group in range(places))
+    return (Unknown(XI), Unknown(BETA), *alphas, *more)
+
+
+def _started(scene: Scene, places: int) -> Solution:
+    """Return the best of the solutions from several starts, on a part of the returns.
+
+    There are minima a slot of the mirror away; the costs are compared on the same planes.
+    """
+    part = _thinned(scene)
+    unknowns = _unknowns(places)
+    found: list[Solution] = []
+    for alpha in _STARTS:
+        start = np.array([0.0, 0.0, *[alpha] * places])
+        try:
+            solution = solver.solve(part, unknowns, start)
+        except FewPlanesError:
+            continue
+        if not any(np.allclose(solution.values, other.values, atol=0.02 * DEG) for other in found):
+            found.append(solution)
+    if not found:
+        raise FewPlanesError
+    costs = [
+        sum(solver.cost_on(part, unknowns, item.values, other.planes) for other in found)
+        for item in found
+    ]
+    return found[int(np.argmin(costs))]
+
+
+def _thinned(scene: Scene) -> Scene:
+    """Return the scene of some of the packets, enough to tell minima apart."""
+    numbers = np.unique(scene.returns["packet"], return_inverse=True)[1]
+    every = max(2, round(len(scene.returns) / _MOST_RETURNS_COARSE))
+    return scene.part(np.asarray(numbers % every == 0))
+
+
+def _whirl(
+    scene: Scene, coarse: Solution, whirls: Sequence[Whirl | None]
+) -> tuple[list[Whirl | None], list[str], list[Refusal]]:
+    """Return the whirl to take out of each place, what to say, and why to refuse.
+
+    A gyro may show a line at the head's frequency that is not a motion. A real rocking is hardly
+    ever a circle: its part against the turning of the head shows in the cloud too.
+    """
+    taken: list[Whirl | None] = []
+    notes: list[str] = []
+    refusals: list[Refusal] = []
+    groups = len(scene.known)
+    more = [
+        Unknown(parameter, group) for group in range(groups) for parameter in (ROCK_COS, ROCK_SIN)
+    ]
+    rocks = None
+    if any(whirl is not None and max(whirl.forward, whirl.backward) > _WHIRL for whirl in whirls):
+        rocks = solver.widened(_thinned(scene), coarse, more)
+    for group, whirl in enumerate(whirls):
+        if whirl is None:
+            taken.append(None)
+            continue
+        name = f"place {group + 1}"
+        if not whirl.is_at_rest:
+            refusals.append(
+                Refusal(f"{name}: the IMU says that the sensor moved", "clamp it and record again")
+            )
+        if whirl.forward > _WHIRL_WORST or whirl.backward > _WHIRL_WORST:
+            refusals.append(
+                Refusal(
+                    f"{name}: the mount rocks by {whirl.forward / DEG:.2f} degrees with the head",
+                    "screw or clamp the sensor to something heavy",
+                )
+            )
+        if rocks is None or max(whirl.forward, whirl.backward) <= _WHIRL:
+            taken.append(None)
+            continue
+        at = len(coarse.values) + 2 * group
+        away = rocks.values[at : at + 2] - (whirl.rock_cos, whirl.rock_sin)
+        differs = float(np.hypot(*away))
+        unsure = float(np.hypot(*rocks.sd[at : at + 2]))
+        is_motion = differs < max(_WHIRL, 0.3 * whirl.backward, 3.0 * unsure)
+        if is_motion:
+            notes.append(
+                f"{name}: the mount rocks by {whirl.forward / DEG:.3f} degrees with the head; the "
+                "gyro's figure is taken out of alpha and beta"
+            )
+            taken.append(whirl)
+            continue
+        taken.append(None)
+        text = (
+            f"{name}: the gyro shows a rocking of {whirl.backward / DEG:.2f} degrees against the "
+            "head that the points do not"
+        )
+        if whirl.forward > _WHIRL:
+            refusals.append(
+                Refusal(
+                    f"{text}, so its {whirl.forward / DEG:.2f} degrees with the head cannot be "
+                    "trusted either",
+                    "screw or clamp the sensor to something heavy, so that the gyro is quiet",
+                )
+            )
+        else:
+            notes.append(f"{text}: a line of the gyro, not a motion")
+    return taken, notes, refusals
+
+
+def _alone(
+    scene: Scene,
+    solution: Solution,
+    places: Sequence[Place],
+    whirls: Sequence[Whirl | None],
+) -> list[PlaceReport]:
+    """Return what each place alone says: one step from the common solution."""
+    group = scene.group[solution.planes.member]
+    owner = group[solution.planes.first]
+    reports = []
+    for number, (place, whirl) in enumerate(zip(places, whirls, strict=True)):
+        values = solution.values
+        if len(places) > 1 and np.count_nonzero(owner == number) > 10:
+            values = solver.repeated(scene, solution, group == number)
+        reports.append(
+            PlaceReport(
+                place.name,
+                place.power_up,
+                place.turns,
+                int(np.count_nonzero(owner == number)),
+                float(values[0]),
+                float(values[1]),
+                float(values[2 + number]),
+                whirl,
+            )
+        )
+    return reports
+
+
+def _uncertainty(scene: Scene, solution: Solution) -> tuple[F8, F8, float]:
+    """Return standard deviations of the unknowns, scatter of quarters, and of xi and beta together.
+
+    The largest of what the planes, the quarters of the recording and near against far surfaces
+    say, and what the model itself may be off.
+    """
+    returns = scene.returns[solution.planes.member]
+    packets = np.array([scene.returns["packet"][scene.group == g].max() + 1
+                        for g in range(len(scene.known))])  # fmt: skip
+    quarter = returns["packet"] * _QUARTERS // packets[scene.group[solution.planes.member]]
+    parts = np.stack([solver.repeated(scene, solution, quarter == q) for q in range(_QUARTERS)])
+    scatter = parts.std(axis=0, ddof=1)
+    middle = np.median(returns["range"])
+    near = solver.repeated(scene, solution, returns["range"] <= middle)
+    far = solver.repeated(scene, solution, returns["range"] > middle)
+    both = np.zeros(len(solution.values))
+    both[:2] = 0.5
+    own = float(np.sqrt(both @ solution.covariance @ both))
+    together = float(max(own, abs(both @ (near - far)) / 2.0, both @ scatter / 2.0))
+    model = np.full(len(solution.values), _MODEL_SD[2])
+    model[:2] = _MODEL_SD[:2]
+    sd = np.hypot(np.maximum(solution.sd, scatter / 2.0), model)
+    sd[:2] = np.maximum(sd[:2], together)
+    return sd, scatter, together
+
+
+def _side_sd(scene: Scene, solution: Solution) -> float:
+    side = np.zeros(len(solution.values))
+    side[:2] = 1.0, -0.7
+    own = float(np.sqrt(side @ solution.covariance @ side))
+    return float(np.hypot(own, _MODEL_SD[0]))
+
+
+def _judged(
+    solution: Solution,
+    sd: F8,
+    scatter: F8,
+    together: float,
+    directions: int,
+    reports: Sequence[PlaceReport],
+) -> list[Refusal]:
+    """Return why the angles cannot be believed."""
+    found = []
+    room = "calibrate in a furnished room of 4 to 10 m with a flat ceiling and free walls"
+    planes = len(solution.planes.first)
+    if planes < _FEWEST_PLANES:
+        found.append(
+            Refusal(
+                f"{planes} flat patches that both halves see, {_FEWEST_PLANES} are needed", room
+            )
+        )
+    if directions < FEWEST_DIRECTIONS:
+        found.append(
+            Refusal(
+                f"the surfaces face {directions} directions, {FEWEST_DIRECTIONS} are needed", room
+            )
+        )
+    if together > _LARGEST_SD_TOGETHER:
+        found.append(
+            Refusal(
+                f"xi and beta moved together are uncertain by {together / DEG:.2f} degrees: "
+                "surfaces near the horizon and near the zenith tell them apart",
+                f"{room}, and add a place with the sensor tilted or on its side",
+            )
+        )
+    side = np.array([1.0, -0.7])
+    across = float(np.sqrt(side @ solution.covariance[:2, :2] @ side))
+    alphas = sd[2:]
+    for name, value in (("xi - 0.7 beta", across), ("alpha", float(alphas.max()))):
+        if value > _LARGEST_SD:
+            found.append(
+                Refusal(
+                    f"{name} is uncertain by {value / DEG:.2f} degrees",
+                    f"record 10 s more; {room}",
+                )
+            )
+    white = np.sqrt(np.diag(solution.covariance)) * 2.0  # a quarter has a quarter of the data
+    if (scatter > 3.0 * np.hypot(white, 0.02 * DEG)).any():
+        found.append(
+            Refusal(
+                "the quarters of the recording contradict each other: the sensor or the scene moved",
+                "clamp the sensor, keep people out, and record again",
+            )
+        )
+    if (np.abs(solution.values) > _LARGEST).any():
+        found.append(
+            Refusal(
+                "a correction of more than 1 degree: not a calibration error",
+                "check the mount, the cover, and that nothing hides half of the view",
+            )
+        )
+    sides = [report.xi - 0.7 * report.beta for report in reports]
+    if max(sides) - min(sides) > _CONTRADICTION:
+        found.append(
+            Refusal(
+                f"the places contradict each other by {(max(sides) - min(sides)) / DEG:.2f} "
+                "degrees in xi - 0.7 beta",
+                "clamp the sensor at every place and record again",
+            )
+        )
+    return found
+
+
+def _alpha(places: Sequence[Place], alphas: F8, sd: F8, verdict: Verdict, keep: bool) -> Estimate:
+    """Return alpha, stored only if it repeats after switching the unit off and on."""
+    value, uncertain = float(alphas.mean()), float(np.sqrt(np.mean(sd**2)))
+    spread = float(alphas.max() - alphas.min())
+    power_ups = {place.power_up for place in places}
+    if spread > _REPEATABLE:
+        where = "from power-up to power-up" if len(power_ups) > 1 else "from place to place"
+        reason = (
+            f"not repeatable: it differs by {spread / DEG:.2f} degrees {where}, so it is not a "
+            "constant of the unit"
+        )
+        return Estimate(value, max(uncertain, spread / 2.0), Verdict.SHOWN, reason)
+    if verdict is Verdict.CORRECTED and len(power_ups) < 2 and not keep:
+        reason = "seen after one power-up only; switch the unit off and on and record once more"
+        return Estimate(value, uncertain, Verdict.SHOWN, reason)
+    return Estimate(value, uncertain, verdict)
+
+
+def _unstored(estimate: Estimate) -> Estimate:
+    if estimate.verdict is not Verdict.CORRECTED:
+        return estimate
+    return Estimate(
+        estimate.value, estimate.sd, Verdict.SHOWN, "not stored without the beam angles"
+    )
+
+
+def _axis_distance(angles: Solution) -> Estimate:
+    """Return b."""
+    value = float(angles.values[-1])
+    sd = float(np.hypot(angles.sd[-1], _MODEL_SD[3]))
+    if abs(value) > _LARGEST_B_M:
+        return Estimate(value, sd, Verdict.SHOWN, "more than 5 mm: not the distance of the axes")
+    return significant(value, sd)
+
+
+def _qualities(scene: Scene, solution: Solution, corrections: F8) -> tuple[Quality, Quality]:
+    return (
+        quality(scene, solution.planes, np.zeros_like(corrections)),
+        quality(scene, solution.planes, corrections),
+    )
+
+
+def quality(scene: Scene, planes: Planes, corrections: F8) -> Quality:
+    """Return how thin planes are, and how far apart the halves, under corrections (G, 8).
+
+    The rocking of the mount is taken out in any case.
+    """
+    members = scene.part(planes.member)
+    now = solver.points(members, corrections)
+    own = flat.refitted(planes.at(), now)
+    height = own.heights(now)
+    far = members.is_far_half
+    thickness = np.sqrt(np.add.reduceat(height**2, own.first) / own.counts)
+    gap = _half_gaps(height, far, own)
+    return Quality(
+        float(np.median(thickness)),
+        float(np.sqrt(np.mean(height**2))),
+        float(np.median(gap)),
+        float(np.quantile(gap, 0.9)),
+    )
+
+
+def _half_gaps(height: F8, far: NDArray[np.bool_], planes: Planes) -> F8:
+    """Return the distance of the two halves' means on every plane [m], shape (K,)."""
+    counts = np.add.reduceat(far.astype(np.float64), planes.first)
+    others = planes.counts - counts
+    one = np.add.reduceat(height * far, planes.first) / np.maximum(counts, 1.0)
+    other = np.add.reduceat(height * ~far, planes.first) / np.maximum(others, 1.0)
+    return np.asarray(np.abs(one - other)[(counts > 0) & (others > 0)])
+
+
+def _weakest(solution: Solution) -> str:
+    """Return in words which combination of the angles is known worst."""
+    values, vectors = np.linalg.eigh(solution.covariance)
+    worst = vectors[:, -1]
+    sd = np.sqrt(values[-1]) / DEG
+    if np.abs(worst[:2]).max() > np.abs(worst[2:]).max():
+        if worst[0] * worst[1] > 0:
+            return (
+                f"xi and beta moved together (0.7 of each: {sd:.3f} degrees); surfaces near the "
+                "horizon and near the zenith tell them apart"
+            )
+        return f"xi against beta ({sd:.3f} degrees)"
+    return f"alpha ({sd:.3f} degrees)"
