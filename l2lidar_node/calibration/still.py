@@ -85,7 +85,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     scene = _scene(places, [None] * len(places))
     try:
         coarse = _started(scene, len(places))
-        taken, notes, refused = _whirl(scene, coarse, whirls)
+        taken, notes, refused = _whirl(scene, coarse, places, whirls)
         refusals += refused
         scene = _scene(places, taken)
         solution = solver.solve(scene, _unknowns(len(places)), coarse.values)
@@ -246,7 +246,10 @@ def _thinned(scene: Scene) -> Scene:
 
 
 def _whirl(
-    scene: Scene, coarse: Solution, whirls: Sequence[Whirl | None]
+    scene: Scene,
+    coarse: Solution,
+    places: Sequence[Place],
+    whirls: Sequence[Whirl | None],
 ) -> tuple[list[Whirl | None], list[str], list[Refusal]]:
     """Return the whirl to take out of each place, what to say, and why to refuse.
 
@@ -267,7 +270,7 @@ def _whirl(
         if whirl is None:
             taken.append(None)
             continue
-        name = f"place {group + 1}"
+        name = places[group].name
         if not whirl.is_at_rest:
             refusals.append(
                 Refusal(f"{name}: the IMU says that the sensor moved", "clamp it and record again")
@@ -342,10 +345,10 @@ def _alone(
 
 
 def _uncertainty(scene: Scene, solution: Solution) -> tuple[F8, F8, float]:
-    """Return standard deviations of the unknowns, scatter of quarters, and of xi and beta together.
+    """Return deviations of the unknowns, scatter of the quarters, and xi and beta together.
 
-    The largest of what the planes, the quarters of the recording and near against far surfaces
-    say, and what the model itself may be off.
+    A deviation is the largest of what the planes, the quarters of the recording and near against
+    far surfaces say, and what the model itself may be off.
     """
     returns = scene.returns[solution.planes.member]
     packets = np.array([scene.returns["packet"][scene.group == g].max() + 1
@@ -421,7 +424,8 @@ def _judged(
     if (scatter > 3.0 * np.hypot(white, 0.02 * DEG)).any():
         found.append(
             Refusal(
-                "the quarters of the recording contradict each other: the sensor or the scene moved",
+                "the quarters of the recording contradict each other: the sensor or the scene "
+                "moved",
                 "clamp the sensor, keep people out, and record again",
             )
         )
