@@ -9,14 +9,12 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from benchmarks.results import Target, machine
+from l2lidar_node.types import F64
 
 PAGE: Final = Path("docs") / "deskew.md"
 PICTURE: Final = Path("docs") / "deskew.png"
-
-F64 = NDArray[np.float64]
 
 
 def write(

@@ -11,16 +11,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs
+from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.preintegration import integrate, segment
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
-
-F64 = NDArray[np.float64]
 
 FOLDER: Final = Path(__file__).resolve().parents[2] / "shared" / "data" / "newer_college"
 BOUNDS_MM: Final = (31.0, 6.0, 20.0)  # what a fit with one constant rate and velocity leaves

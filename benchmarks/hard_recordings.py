@@ -24,9 +24,7 @@ from l2lidar_node.emulator.unit.other_sensors import CLOUD_POINT, SENSORS
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scanner
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64, IMU_SAMPLE, HostNs, Sweep
 
 FOLDER: Final = Path("out") / "recordings"
 EPOCH: Final = 1_700_000_000_000_000_000

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion import tours, trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS, Motion
@@ -18,8 +17,7 @@ from l2lidar_node.emulator.world.moving import Mover, MovingWorld
 from l2lidar_node.emulator.world.people import crowd
 from l2lidar_node.emulator.world.scene import Scene
 from l2lidar_node.emulator.world.world import World
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 SCENES: Final[dict[str, Callable[[int], Scene]]] = {
     "flat": buildings.flat,

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.hard_recordings import Recording
 from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node.types import F64
 
-F64 = NDArray[np.float64]
 Row = dict[str, Any]
 
 FAILED_SHARE: Final = 0.01  # of the way, at the end

@@ -25,7 +25,6 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 
 _RATIO: Final = 1.99866  # true seconds per second of a unit's clock
-_MODULUS: Final = 1025
 _VARIANTS: Final = 64  # different packets per stream, then they come again
 _STAMP: Final = struct.Struct("<I4xII")
 _LAST_SLOT_NS: Final = 150_000  # after the last slot a packet leaves
@@ -56,7 +55,7 @@ def _packets(kind: PacketType, rate: float, seconds: float) -> Iterator[tuple[in
     for number in range(round(seconds * _NS / period_ns)):
         frame = frames[number % _VARIANTS]
         stamp = round((_UPTIME_NS + number * period_ns) / _RATIO)
-        _STAMP.pack_into(frame, wire.HEADER.size, number % _MODULUS, *divmod(stamp, _NS))
+        _STAMP.pack_into(frame, wire.HEADER.size, number % wire.SEQ_MODULUS, *divmod(stamp, _NS))
         struct.pack_into("<I", frame, end, zlib.crc32(memoryview(frame)[wire.HEADER.size : end]))
         yield round(number * period_ns) + delay_ns, bytes(frame)
 

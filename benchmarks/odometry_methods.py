@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.config import DeskewConfig, OdometryConfig, ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.odometry.kiss import PlainKiss
@@ -23,8 +23,6 @@ from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.plain import PlainOdometry
 from tests.support import odometry_runs
 from tests.support.odometry_runs import Run
-
-F64 = NDArray[np.float64]
 
 OURS = "ours"
 PLAIN = "kiss-icp"

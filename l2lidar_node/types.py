@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import Final, NamedTuple, NewType, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+STANDARD_GRAVITY: Final = 9.80665
+"""Standard acceleration of gravity [m/s^2], ISO 80000-3."""
 
 HostNs = NewType("HostNs", int)
 """Nanoseconds since the Unix epoch on the host's clock."""
@@ -39,6 +46,15 @@ IMU_SAMPLE: Final = np.dtype(
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+
+
+class Level(IntEnum):
+    """Severity, with the numbers of ``diagnostic_msgs/DiagnosticStatus``."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
 
 
 class Stream(Enum):

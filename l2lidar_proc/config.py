@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.settings import FILE_NAME, FRAME, TOPIC, SettingError, setting
+from l2lidar_node.types import F64
 from l2lidar_proc import rotations
-from l2lidar_proc.rotations import F64
 
 AS_INPUT = "as_input"
 """Choice of a layout: whatever the input has."""

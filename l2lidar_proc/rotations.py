@@ -6,9 +6,9 @@ A quaternion ``q_a_b`` takes vectors of frame b to frame a, like the matrix of t
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 
 def multiply(a_wxyz: ArrayLike, b_wxyz: ArrayLike) -> F64:

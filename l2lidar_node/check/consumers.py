@@ -8,7 +8,6 @@ from typing import Final
 from l2lidar_node.check.requirements import (
     Consumer,
     Input,
-    Level,
     Order,
     Subscription,
     TimeField,
@@ -17,6 +16,7 @@ from l2lidar_node.check.requirements import (
 )
 from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.types import Level
 
 _F4: Final = ("f4",)
 _FLOATS: Final = ("f4", "f8")

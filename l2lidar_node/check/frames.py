@@ -6,15 +6,8 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from l2lidar_node.check.observation import Observation, Qos
-from l2lidar_node.check.requirements import (
-    Consumer,
-    Finding,
-    Level,
-    Subscription,
-    Use,
-    not_judged,
-    ok,
-)
+from l2lidar_node.check.requirements import Consumer, Finding, Subscription, Use, not_judged, ok
+from l2lidar_node.types import Level
 
 _FRAMES: Final = "frames"
 _QOS: Final = "qos"

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.check.observation import Observation
-from l2lidar_node.check.requirements import Consumer, Finding, Level, Use, not_judged, ok
-
-F64 = NDArray[np.float64]
+from l2lidar_node.check.requirements import Consumer, Finding, Use, not_judged, ok
+from l2lidar_node.types import F64, STANDARD_GRAVITY, Level
 
 _SUBJECT: Final = "imu"
-_G: Final = 9.80665
 _MAX_RATE: Final = 40.0  # rad/s; the L2's gyro ends at 2000 deg/s, which is 35
 _COVARIANCES: Final = (
     ("orientation", "roll_covar, pitch_covar and yaw_covar"),
@@ -48,7 +46,7 @@ def check(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
 def _check_acceleration(acceleration: F64, consumer: Consumer) -> Finding:
     norm = float(np.median(np.linalg.norm(acceleration, axis=1)))
     text = f"the acceleration's norm is {norm:.4g} in the median"
-    if abs(norm - _G) < 0.08 * _G:
+    if abs(norm - STANDARD_GRAVITY) < 0.08 * STANDARD_GRAVITY:
         return ok(_SUBJECT, "acceleration", f"{text}: m/s^2 with gravity")
     if 0.9 < norm < 1.1:
         level = Level.WARN if consumer.any_acceleration_unit else Level.ERROR

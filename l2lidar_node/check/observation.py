@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.clouds.fields import Field, fields_of, points_of
-from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
 
 COLUMNS: Final = 1800
 """``Horizon_SCAN`` of our configuration for LIO-SAM: 0.2 degrees each."""
@@ -33,8 +33,6 @@ def kept_share(ring: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.fl
     column %= COLUMNS
     return len(np.unique(ring * COLUMNS + column)) / len(ring)
 
-
-F64 = NDArray[np.float64]
 
 TIME_FIELDS: Final = ("t", "time", "timestamp", "time_stamp", "stamps")
 """Names that some consumer takes for a time."""

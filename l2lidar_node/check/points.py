@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node.check.imu import rotated, unit
 from l2lidar_node.check.observation import (
@@ -22,7 +21,6 @@ from l2lidar_node.check.requirements import (
     Consumer,
     Finding,
     Input,
-    Level,
     TimeField,
     Use,
     not_judged,
@@ -30,6 +28,7 @@ from l2lidar_node.check.requirements import (
 )
 from l2lidar_node.clouds.fields import OPTICAL_CENTRE_M, Field
 from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.types import F64, Level
 
 _SUBJECT = "cloud"
 
@@ -318,8 +317,6 @@ def _check_rings(inside: list[Contents], consumer: Consumer) -> Iterator[Finding
     else:
         yield ok(_SUBJECT, "ring-cells", text)
 
-
-F64 = NDArray[np.float64]
 
 _SUBJECT_LEVELED: Final = "cloud"
 _TILT_DEG: Final = 12.0

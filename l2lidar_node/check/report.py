@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from l2lidar_node.check import frames, imu, points, stamps, timing
 from l2lidar_node.check.observation import Observation, Topics
-from l2lidar_node.check.requirements import Consumer, Finding, Level, Use, worst
+from l2lidar_node.check.requirements import Consumer, Finding, Use, worst
+from l2lidar_node.types import Level
 
 _OVERLONG: Final = 1.25
 _LONGEST_S: Final = 20.0

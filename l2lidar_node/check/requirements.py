@@ -4,16 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import Enum
 from typing import Final, NamedTuple
 
-
-class Level(IntEnum):
-    """How bad a finding is."""
-
-    OK = 0
-    WARN = 1  # works, worse than it could
-    ERROR = 2  # does not work
+from l2lidar_node.types import Level
 
 
 class Finding(NamedTuple):

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node.check.observation import Observation
-from l2lidar_node.check.requirements import Consumer, Finding, Level, Use, not_judged, ok
-
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
+from l2lidar_node.check.requirements import Consumer, Finding, Use, not_judged, ok
+from l2lidar_node.types import F64, I64, Level
 
 _RATIO_MIN_S: Final = 1.0
 _RATIO_TOLERANCE: Final = 0.05

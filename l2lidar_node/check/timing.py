@@ -13,7 +13,6 @@ from l2lidar_node.check.points import reading, usual_format
 from l2lidar_node.check.requirements import (
     Consumer,
     Finding,
-    Level,
     Order,
     TimeField,
     TimeUnit,
@@ -21,8 +20,7 @@ from l2lidar_node.check.requirements import (
     not_judged,
     ok,
 )
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64, Level
 
 _NS_FROM_SPREAD: Final = 100.0  # RKO-LIO: a greater spread is in ns
 _NEAR_S: Final = 1e-3

@@ -23,10 +23,11 @@ from l2lidar_node.check.observation import (
     choose,
 )
 from l2lidar_node.check.report import as_data, judge, verdict
-from l2lidar_node.check.requirements import Consumer, Finding, Level, Use, worst
+from l2lidar_node.check.requirements import Consumer, Finding, Use, worst
 from l2lidar_node.cli.console import JsonOption, out, print_json
 from l2lidar_node.command_line import UsageError
 from l2lidar_node.recording import bag
+from l2lidar_node.types import Level
 
 if TYPE_CHECKING:
     from l2lidar_node.check.observation import Observation

@@ -26,6 +26,7 @@ from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver import health
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.metadata import metadata
+from l2lidar_node.types import Level
 
 _WAIT_S = 3.0
 
@@ -81,7 +82,7 @@ def monitor(
                         live.update(judgement(judged), refresh=True)
         except KeyboardInterrupt:
             pass
-    if any(check.level is health.Level.ERROR for check in judged):
+    if any(check.level is Level.ERROR for check in judged):
         raise typer.Exit(1)
 
 

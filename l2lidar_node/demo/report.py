@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
@@ -15,8 +14,7 @@ from l2lidar_node.demo import picture
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.emulator.truth.results import Results
 from l2lidar_node.protocol.wire import PacketType
-
-F8 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 
 class TrackError(NamedTuple):
@@ -37,11 +35,11 @@ class TrackError(NamedTuple):
     ate_m: float
     worst_m: float
     length_m: float
-    estimated: F8
-    true: F8
+    estimated: F64
+    true: F64
 
 
-def track_error(truth: Results, stamps: list[int], positions: F8) -> TrackError:
+def track_error(truth: Results, stamps: list[int], positions: F64) -> TrackError:
     """Return the error of estimated positions.
 
     Parameters
@@ -67,7 +65,7 @@ def track_error(truth: Results, stamps: list[int], positions: F8) -> TrackError:
     return TrackError(float(np.sqrt(np.mean(error**2))), float(error.max()), length, aligned, true)
 
 
-def stamp_errors_ms(truth: Results, packet_type: PacketType, stamps: list[int]) -> F8:
+def stamp_errors_ms(truth: Results, packet_type: PacketType, stamps: list[int]) -> F64:
     """Return how far stamps are from the nearest true instant of a packet of a type [ms].
 
     Packets are 4 ms and more apart, so the nearest is the right one for any error below 2 ms.

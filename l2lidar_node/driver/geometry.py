@@ -27,9 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import POINT
-
-F8 = NDArray[np.float64]
+from l2lidar_node.types import F64, POINT
 
 _TAYLOR_LIMIT_RAD: Final = 2e-3  # third-order remainder below 2e-9, 0.1 um at 50 m
 _BLOCK_SLOTS: Final = 19_200  # projected at once: 64 3D packets, whose work arrays fit the cache
@@ -77,10 +75,10 @@ class PointBatch:
 class _Table(NamedTuple):
     """What all packets of one calibration share; arrays over slots, shape (n,)."""
 
-    alpha: F8  # [rad]
-    u: F8  # multiplies D on the radial axis
-    v: F8  # multiplies D on the tangential axis
-    w: F8  # multiplies D on z
+    alpha: F64  # [rad]
+    u: F64  # multiplies D on the radial axis
+    v: F64  # multiplies D on the tangential axis
+    w: F64  # multiplies D on z
     a: float
     b: float
     theta_bias: float
@@ -95,9 +93,9 @@ class _Work(NamedTuple):
 
     grid: NDArray[np.void]  # dtype POINT
     keep: NDArray[np.bool_]
-    distance: F8
-    position: F8
-    lines: F8  # shape (P, 2, n): positions are lines over the distance, slope and offset
+    distance: F64
+    position: F64
+    lines: F64  # shape (P, 2, n): positions are lines over the distance, slope and offset
 
 
 class Projector:
@@ -130,10 +128,10 @@ class Projector:
     def points(
         self,
         payloads: Sequence[bytes],
-        start_s: F8,
+        start_s: F64,
         limits: RangeLimits | None = None,
         override: RangeCalibration | None = None,
-        rotations: F8 | None = None,
+        rotations: F64 | None = None,
     ) -> PointBatch:
         """Return the points of a batch of packets.
 
@@ -268,7 +266,7 @@ def _leave_out(unknown: NDArray[np.bool_], keep: NDArray[np.bool_]) -> int:
     return left_out
 
 
-def _place_2d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
+def _place_2d(raw: NDArray[np.void], table: _Table) -> tuple[F64, F64]:
     """Return weights and basis of 2D packets, see :func:`_fill_positions`."""
     basis = np.zeros((2, 2, len(table.alpha)))
     basis[0, 0] = np.cos(table.alpha)
@@ -279,7 +277,7 @@ def _place_2d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
     return weights, basis
 
 
-def _place_3d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
+def _place_3d(raw: NDArray[np.void], table: _Table) -> tuple[F64, F64]:
     """Return weights and basis of 3D packets, see :func:`_fill_positions`.
 
     The head angle of slot j is split into the packet's mid angle, j times the mean step of all
@@ -289,7 +287,7 @@ def _place_3d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
     step = raw["com_horizontal_angle_step"].astype(np.float64)
     start = raw["com_horizontal_angle_start"].astype(np.float64) + table.theta_bias
     middle = (len(table.u) - 1) / 2
-    j: F8 = np.arange(len(table.u), dtype=np.float64) - middle
+    j: F64 = np.arange(len(table.u), dtype=np.float64) - middle
     mean = float(step.mean())
     delta = step - mean
 
@@ -314,7 +312,7 @@ def _place_3d(raw: NDArray[np.void], table: _Table) -> tuple[F8, F8]:
     return weights, basis
 
 
-def _fill_positions(weights: F8, basis: F8, work: _Work) -> None:
+def _fill_positions(weights: F64, basis: F64, work: _Work) -> None:
     """Fill x, y and z.
 
     Each is a line over the distance: its slopes and offsets over the slots, shape (2, n), are a
@@ -329,7 +327,7 @@ def _fill_positions(weights: F8, basis: F8, work: _Work) -> None:
         work.grid[name] = work.position
 
 
-def _fill_times(start_s: F8, increment: F8, work: _Work) -> None:
+def _fill_times(start_s: F64, increment: F64, work: _Work) -> None:
     slots = np.arange(work.position.shape[1], dtype=np.float64)
     np.multiply.outer(increment, slots, out=work.position)
     np.add(work.position, start_s[:, None], out=work.position)

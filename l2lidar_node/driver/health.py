@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -16,9 +15,9 @@ from l2lidar_node.clock import UNCERTAIN_NS, ClockEventKind, ClockStatus
 from l2lidar_node.driver.counters import Counters
 from l2lidar_node.driver.device import DeviceState
 from l2lidar_node.driver.driver import Driver
-from l2lidar_node.driver.orientation import GRAVITY, GravityReport
+from l2lidar_node.driver.orientation import GravityReport
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import HostNs, Stream, Transport
+from l2lidar_node.types import STANDARD_GRAVITY, HostNs, Level, Stream, Transport
 
 POINTS_3D_HZ: Final = 1 / wire.MIRROR_PERIOD_S
 POINTS_2D_HZ: Final = 50.0
@@ -44,15 +43,6 @@ _CLOCK_TROUBLES: Final = {
 _LATE_NS: Final = 500_000_000  # whoever steers by these data should know
 _WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
 _MAX_TILT_DEG: Final = 10.0
-
-
-class Level(IntEnum):
-    """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-    STALE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +315,7 @@ def _imu(report: GravityReport) -> Check:
             "level at power-on; power it up level and still"
         )
         return Check("imu", Level.ERROR, message, values)
-    if abs(report.norm - GRAVITY) > _GRAVITY_TOLERANCE:
+    if abs(report.norm - STANDARD_GRAVITY) > _GRAVITY_TOLERANCE:
         return Check("imu", Level.WARN, f"|a| is {report.norm:.1f} m/s^2, not gravity", values)
     if report.tilt_deg > _MAX_TILT_DEG:
         message = f"the orientation is {report.tilt_deg:.0f} degrees off gravity"

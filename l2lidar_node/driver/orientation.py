@@ -112,9 +112,6 @@ def _without_yaw(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.array(rows).transpose(2, 0, 1) @ rotations)
 
 
-GRAVITY: Final = 9.80665  # [m/s^2]
-
-
 @dataclass(frozen=True, slots=True)
 class GravityReport:
     """What one period's samples say.

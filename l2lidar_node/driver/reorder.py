@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, TypeVar
 
 from l2lidar_node.driver.device import SILENCE_NS
+from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.packets import ImuPacket, PointPacket
 from l2lidar_node.types import HostNs, Stream
 
 T = TypeVar("T")
 
-FIRST_MODULUS: Final = 1025  # every published number is below it; corrected by what is seen
 _UNKNOWN: Final = 0
 _NUMBERS: Final = 1 << 32
 _LATE_REACH: Final = 64  # numbers this far behind are late ones, not a wrap
@@ -70,7 +70,7 @@ class SequenceOrder(Generic[T]):
         self.counts = SequenceCounts()
         self._window = window
         self._reach = 2 * window + _LATE_REACH
-        self._modulus = FIRST_MODULUS
+        self._modulus = wire.SEQ_MODULUS
         self._next: int | None = None
         self.waiting: dict[int, T] = {}
         self._given_up: set[int] = set()  # of the numbers within reach: tells late from duplicate

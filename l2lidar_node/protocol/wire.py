@@ -24,6 +24,9 @@ POINTS_PER_3D_PACKET: Final = 300
 POINTS_PER_2D_PACKET: Final = 1800
 MAX_DATAGRAM: Final = 1472  # the device never sends larger ones (no jumbo frames)
 
+SEQ_MODULUS: Final = 1025
+"""Sequence numbers of the units known so far count modulo this; readers learn the real one."""
+
 LIDAR_IP: Final = "192.168.1.62"
 LIDAR_PORT: Final = 6101
 HOST_IP: Final = "192.168.1.2"

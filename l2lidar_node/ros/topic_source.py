@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import rclpy
-from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -17,12 +16,12 @@ from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.check.observation import Gathering, Observation, Qos, SourceError, Topics, choose
+from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 
 _DISCOVERY_S: Final = 6.0
 _LOOK_S: Final = 0.1
 _ASK_AGAIN_S: Final = 1.0
 _IDLE: Final = 50  # turns of the executor without a message of before
-_LEVELLING: Final = "imu_adjust"  # the driver's parameter, and upstream's
 
 
 def observe(asked: Topics, needs_imu: bool, seconds: float) -> tuple[Observation, Topics]:
@@ -57,13 +56,13 @@ def _observe(
     topics = _found(node, asked, needs_imu)
     gathering = Gathering()
     ear = _Ear(node, topics, gathering)
-    gravity_alignment = _Levelling(node, topics.cloud)
+    imu_adjust = ImuAdjustClient(node, topics.cloud, _ASK_AGAIN_S)
     ear.listen(seconds)
     return (
         gathering.observation(
             cloud_qos=_offers(node, topics.cloud),
             imu_qos=_offers(node, topics.imu),
-            is_levelled=gravity_alignment.answer,
+            is_levelled=imu_adjust.answer,
         ),
         topics,
     )
@@ -144,43 +143,3 @@ def _offers(node: Node, topic: str) -> tuple[Qos, ...]:
         Qos(names.get(info.qos_profile.reliability, "unknown"), info.qos_profile.depth)
         for info in node.get_publishers_info_by_topic(topic)
     )
-
-
-class _Levelling:
-    """Asks the publishers of a topic whether they level their clouds.
-
-    Attributes
-    ----------
-    answer : bool or None
-        None while nobody has said.
-    """
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self.answer: bool | None = None
-        self._node = node
-        self._topic = topic
-        self._clients: dict[str, Any] = {}
-        self._answered_by: set[str] = set()
-        self._next_s = 0.0
-        self._timer = node.create_timer(_LOOK_S, self._ask)
-
-    def _ask(self) -> None:
-        for info in self._node.get_publishers_info_by_topic(self._topic):
-            name = f"{info.node_namespace.rstrip('/')}/{info.node_name}/get_parameters"
-            if name not in self._clients:
-                self._clients[name] = self._node.create_client(GetParameters, name)
-        if time.monotonic() < self._next_s:
-            return
-        for name, client in self._clients.items():
-            if name not in self._answered_by and client.service_is_ready():
-                # Again until it answers: who has not heard of this node yet cannot.
-                self._next_s = time.monotonic() + _ASK_AGAIN_S
-                future = client.call_async(GetParameters.Request(names=[_LEVELLING]))
-                future.add_done_callback(lambda done, name=name: self._answered(name, done))
-
-    def _answered(self, name: str, future: Any) -> None:
-        self._answered_by.add(name)
-        response = future.result()
-        for value in response.values if response else ():
-            if value.type:  # 0 where a node has no such parameter
-                self.answer = bool(self.answer) or bool(value.bool_value)

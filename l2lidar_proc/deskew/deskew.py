@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F32, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
-
-F32 = NDArray[np.float32]
 
 
 def deskew(

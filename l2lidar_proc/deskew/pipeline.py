@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.cloud import without_time
 from l2lidar_proc.config import ProcConfig
 from l2lidar_proc.deskew import filters
@@ -22,7 +22,6 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, MotionTracker, Quality
-from l2lidar_proc.rotations import F64
 
 _MS: Final = 1_000_000
 

@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
 
+from l2lidar_node.types import Level
 from l2lidar_proc.deskew.pipeline import PipelineCounts
 from l2lidar_proc.motion.imu_buffer import ImuCounts
 from l2lidar_proc.motion.tracker import Flag, Quality
 from l2lidar_proc.motion.twist_filter import TwistFilter
-
-
-class Level(IntEnum):
-    """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.preintegration import Preintegration
-from l2lidar_proc.rotations import F64
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,14 +8,13 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations, tuning
 from l2lidar_proc.config import MotionConfig
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.preintegration import coverage
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory, still_trajectory
 from l2lidar_proc.motion.twist_filter import TwistFilter
-from l2lidar_proc.rotations import F64
 
 
 class Flag(Enum):
@@ -85,7 +84,7 @@ class MotionTracker:
         Samples in cloud axes.
     """
 
-    def __init__(self, config: MotionConfig, T_cloud_imu: rotations.F64 | None = None) -> None:
+    def __init__(self, config: MotionConfig, T_cloud_imu: F64 | None = None) -> None:
         self._T_cloud_imu = np.array(config.T_cloud_imu if T_cloud_imu is None else T_cloud_imu)
         self.buffer = ImuBuffer(tuning.TRACKER_MEMORY_S)
         self.filter = TwistFilter(self.buffer, self._T_cloud_imu[:3, 3], config.max_gyro_bias)
@@ -96,7 +95,7 @@ class MotionTracker:
         self._config = config
         self.filter.uses_accelerometer = config.use_accelerometer
 
-    def mount(self, T_cloud_imu: rotations.F64) -> bool:
+    def mount(self, T_cloud_imu: F64) -> bool:
         """Take the place of the IMU, shape (4, 4); return whether it is another one.
 
         Then what was learned is void.

@@ -7,11 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
-
-F64 = NDArray[np.float64]
-
 
 STAMPED_POSE: Final = np.dtype([("stamp", "<i8"), ("pose", "<f8", (4, 4))])
 """Instant [ns], and coordinates of the moving frame to those of the fixed one."""

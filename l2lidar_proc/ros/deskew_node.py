@@ -25,16 +25,16 @@ from l2lidar_node.ros.conversions import (
     is_ros_time,
     to_cloud,
 )
+from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import HostNs, Level
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer, sweep_in_range
-from l2lidar_proc.ros.levelling_watch import LevellingWatch
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
@@ -70,7 +70,9 @@ class DeskewNode(Node):
         self._last: report.Report | None = None
         self._before = self._pipeline.counts
         self._open(config)
-        self._levelling = LevellingWatch(self, config.topics.cloud_topic)
+        self._imu_adjust = ImuAdjustClient(
+            self, config.topics.cloud_topic, on_leveling=self._warn_of_leveling
+        )
         self._overdue = steady_timer(self, 0.01, self._guarded(self._hand_out))
         self._overdue.cancel()
         steady_timer(self, 1.0, self._guarded(self._diagnose))
@@ -218,6 +220,13 @@ class DeskewNode(Node):
             self._template = kind, CloudTemplate(*kind)
         return self._template[1].serialize(points, stamp)
 
+    def _warn_of_leveling(self, publishers: list[str]) -> None:
+        self.get_logger().error(
+            f"{', '.join(publishers)} has imu_adjust on: it levels each packet, and deskewing "
+            "such clouds makes them wrong; set imu_adjust to false there",
+            throttle_duration_sec=30.0,
+        )
+
     def _diagnose(self) -> None:
         tracker = self._pipeline.tracker
         judged = report.of_period(
@@ -227,14 +236,14 @@ class DeskewNode(Node):
             tracker.buffer.counts,
             tracker.filter,
             self._inputs.refused,
-            is_levelled=self._levelling.is_levelled,
+            is_levelled=bool(self._imu_adjust.answer),
             untied=self._untied,
         )
         self._before = self._pipeline.counts
         level, text = self._inputs.judge(judged.level, judged.message)
         if self._frames is not None and self._frames.refused:
-            level, text = max(level, report.Level.WARN), f"{text}; {self._frames.refused}"
-        judged = replace(judged, level=report.Level(level), message=text)
+            level, text = max(level, Level.WARN), f"{text}; {self._frames.refused}"
+        judged = replace(judged, level=Level(level), message=text)
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [self._status(judged, "deskew")]

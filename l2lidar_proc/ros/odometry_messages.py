@@ -10,11 +10,9 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 
 from l2lidar_node.ros.conversions import to_time
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseMotion
-
-F64 = NDArray[np.float64]
 
 XYZ: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 

@@ -23,6 +23,7 @@ from l2lidar_node.files import DataFolder, FileNameError, write_whole
 from l2lidar_node.ros.conversions import from_cloud, from_time, is_ros_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
+from l2lidar_node.types import F64
 from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig
@@ -196,9 +197,7 @@ class OdometryNode(Node):
             points = messages.moved(estimate.points, pose)
             self._registered.publish(to_cloud(points, stamp, odom))
 
-    def _transform(
-        self, T_odom_base: rotations.F64, estimate: OdometryEstimate
-    ) -> TransformStamped:
+    def _transform(self, T_odom_base: F64, estimate: OdometryEstimate) -> TransformStamped:
         topics = self._settings.value.topics
         if topics.invert_tf:
             T_base_odom = rotations.inverse(T_odom_base)
@@ -207,7 +206,7 @@ class OdometryNode(Node):
             )
         return messages.transform(T_odom_base, estimate.stamp, topics.odom_frame, self._base_name)
 
-    def _extend_path(self, pose: rotations.F64, estimate: OdometryEstimate) -> None:
+    def _extend_path(self, pose: F64, estimate: OdometryEstimate) -> None:
         topics = self._settings.value.topics
         if not messages.are_apart(self._path_end, pose, *_PATH_STEP):
             return
@@ -238,7 +237,7 @@ class OdometryNode(Node):
             odom = self._settings.value.topics.odom_frame
             self._map.publish(to_cloud(points, last.stamp, odom))
 
-    def _map_points(self, last: OdometryEstimate) -> rotations.F64:
+    def _map_points(self, last: OdometryEstimate) -> F64:
         """Return the local map in the odometry frame [m], shape (N, 3)."""
         turn = self._base.odom_from_map(last.T_map_lidar)
         return self._pipeline.odometry.map_points() @ turn[:3, :3].T + turn[:3, 3]

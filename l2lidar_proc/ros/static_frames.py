@@ -6,8 +6,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node.types import F64
 from l2lidar_proc.motion.frames import FrameTree
-from l2lidar_proc.rotations import F64
 
 
 class StaticFrames:

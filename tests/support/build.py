@@ -31,7 +31,7 @@ IMU_PERIOD_NS = 4_000_000
 SLOT_NS = 7_731.667  # scan period / 600
 STEP_RAD = 2.114e-4  # head advance per slot
 TURN_PACKETS = 49.53  # 3D packets per head turn
-MODULUS = 1025
+MODULUS = wire.SEQ_MODULUS
 
 UNIT_A = {
     "a_axis_dist": 0.0445,

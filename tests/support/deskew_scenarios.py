@@ -14,12 +14,10 @@ from l2lidar_node.emulator.truth.results import undistorted
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scan, Scanner, local_rays
-from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
+from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs, Sweep
 
 EPOCH = 1_700_000_000_000_000_000
 TURN = 50  # packets: a little more than a turn of the head, 15,000 slots
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

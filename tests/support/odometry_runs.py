@@ -13,13 +13,11 @@ from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
+from l2lidar_node.types import F64, IMU_SAMPLE, HostNs, Sweep
 
 EPOCH = 1_700_000_000_000_000_000
 BATCH = 50
 CUTS = ("turn", "38 packets", "half turn")
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product, rotation_matrices
-
-STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
+from l2lidar_node.types import STANDARD_GRAVITY
 
 MOUNTS: Final[dict[str, tuple[float, float, float]]] = {
     "upright": (0.0, 0.0, 0.0),

@@ -8,14 +8,12 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion.motion import Motion, mount_quaternion, rpy_quaternions
 from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.world.scene import Scene
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 _RATE: Final = 200.0  # knots per second
 _PEAK: Final = 1.875  # peak rate over mean rate of a step with no jerk at its ends

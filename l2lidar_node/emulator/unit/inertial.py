@@ -8,13 +8,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.motion.motion import STANDARD_GRAVITY, Motion, rpy_quaternions
+from l2lidar_node.emulator.motion.motion import Motion, rpy_quaternions
 from l2lidar_node.emulator.motion.spline import quaternion_product, rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.unit.scanner import mean_angle
 from l2lidar_node.emulator.unit.units import UNITS, Unit
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import setting
+from l2lidar_node.types import STANDARD_GRAVITY
 
 _LINE_SHARES: Final = np.array(
     [0.5, 1.0, 0.3]

@@ -17,8 +17,7 @@ from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.world.world import World
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 CLOUD_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
 """A point in the sensor's frame [m], and seconds after the start of its sweep."""

@@ -106,9 +106,6 @@ def point_feeds(
     return feeds
 
 
-SEQ_MODULUS: Final = 1025  # what units show
-
-
 class Due(NamedTuple):
     """Consecutive packets that are due, arrays of the same length.
 
@@ -312,7 +309,7 @@ class Outbox:
 
     def _measured(self, packet_type: PacketType, due: Due) -> _Batch:
         packets = self._packets(packet_type, len(due.frames))
-        packets["seq"] = (self._seq[packet_type] + np.arange(len(packets))) % SEQ_MODULUS
+        packets["seq"] = (self._seq[packet_type] + np.arange(len(packets))) % wire.SEQ_MODULUS
         self._seq[packet_type] += len(packets)
         packets["index"] = due.numbers
         packets["stamp_ns"] = self._clock.stamps(due.start_ns)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.emulator.world.scene import Triangles, box, cone, ellipsoid
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.world.world import World
+from l2lidar_node.types import F64
 
-F64 = NDArray[np.float64]
 Poses = Callable[[F64], tuple[F64, F64]]
 """Positions (N, 3) [m] and quaternions w, x, y, z (N, 4), body to world, at instants (N,) [s]."""
 

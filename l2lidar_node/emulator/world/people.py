@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.world.moving import Mover, Poses
 from l2lidar_node.emulator.world.scene import Ground, Triangles, box, cone, ellipsoid
 from l2lidar_node.emulator.world.world import World
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 _KNOTS_PER_S: Final = 5.0
 _NEAREST_M: Final = 0.75  # nobody comes closer to the sensor

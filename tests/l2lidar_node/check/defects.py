@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.recfunctions import append_fields, drop_fields
 
 from l2lidar_node.check.imu import rotated
-from l2lidar_node.check.requirements import Level
+from l2lidar_node.types import Level
 from tests.l2lidar_node.check import recordings
 from tests.l2lidar_node.check.recordings import Recording
 

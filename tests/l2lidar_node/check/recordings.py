@@ -27,7 +27,7 @@ T: Any = TYPES.types
 NUMBERS = {code: number for number, code in fields.DATATYPES.items()}
 
 RELIABLE = ("fast_lio", "genz_icp", "dlio", "point_lio", "rtabmap", "autoware")
-DURATION_S = 2.2
+DURATION_S = 2.5
 TILT = 0.4  # rad
 
 
@@ -114,8 +114,7 @@ def good(consumer: str) -> Recording:
 
 @cache
 def sweeps() -> list[Sweep]:
-    made = build.sweeps(build.capture(DURATION_S), {"sweep_cut": "turn"})
-    return made[:-1]  # the last one is cut short
+    return build.sweeps(build.capture(DURATION_S), {"sweep_cut": "turn"})
 
 
 @cache

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import Gathering
 from l2lidar_node.check.report import judge
-from l2lidar_node.check.requirements import Level, worst
+from l2lidar_node.check.requirements import worst
 from l2lidar_node.clouds.fields import DATATYPES, points_of
+from l2lidar_node.types import Level
 from tests.l2lidar_node.check import recordings
 
 NAMES = ("x", "y", "z", "intensity", "ring", "time", "t", "timestamp", "time_stamp", "stamps", "")

@@ -12,9 +12,10 @@ import pytest
 import l2lidar_node.check
 from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.report import judge
-from l2lidar_node.check.requirements import Finding, Level, worst
+from l2lidar_node.check.requirements import Finding, worst
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import build, settings_of
+from l2lidar_node.types import Level
 from l2lidar_proc.config import DeskewNodeConfig
 from tests.l2lidar_node.check.defects import DEFECTS, Defect, damaged
 from tests.l2lidar_node.check.recordings import cloud, copied, good, points_of, stamp_of

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.driver.orientation import GRAVITY, GravityMonitor, GravityReport
-from l2lidar_node.types import HostNs, ImuSample
+from l2lidar_node.driver.orientation import GravityMonitor, GravityReport
+from l2lidar_node.types import STANDARD_GRAVITY, HostNs, ImuSample
 
-UP = (0.0, 0.0, GRAVITY)
+UP = (0.0, 0.0, STANDARD_GRAVITY)
 
 
 def sample(acceleration: Any = UP, rotation: Rotation | None = None) -> ImuSample:
@@ -35,7 +35,7 @@ def test_a_tilted_sensor_at_rest_agrees_with_gravity(angles: Any) -> None:
     rotation = Rotation.from_euler("ZYX", angles, degrees=True)
     found = report(sample(rotation.inv().apply(UP), rotation))
     assert found is not None
-    assert found.norm == pytest.approx(GRAVITY)
+    assert found.norm == pytest.approx(STANDARD_GRAVITY)
     assert found.tilt_deg == pytest.approx(0, abs=1e-4)
 
 
@@ -49,11 +49,11 @@ def test_an_orientation_that_is_off(degrees: int) -> None:
 def test_vibration_is_averaged_and_a_period_begins_anew() -> None:
     monitor = GravityMonitor()
     for sign in (1, -1) * 50:
-        monitor.add(sample((3.0 * sign, -2.0 * sign, GRAVITY + sign)))
+        monitor.add(sample((3.0 * sign, -2.0 * sign, STANDARD_GRAVITY + sign)))
     found = monitor.take()
     assert found is not None
     assert found.samples == 100
-    assert found.norm == pytest.approx(GRAVITY)
+    assert found.norm == pytest.approx(STANDARD_GRAVITY)
     assert monitor.take() is None
     monitor.add(sample((0.0, 0.0, 18.0)))
     found = monitor.take()

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2lidar_node.emulator.motion import trajectories
-from l2lidar_node.emulator.motion.motion import STANDARD_GRAVITY
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.units import UNITS
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.protocol import wire
+from l2lidar_node.types import STANDARD_GRAVITY
 
 ROOM = scenes.make("room")
 CLEAN = ImuNoise.clean()

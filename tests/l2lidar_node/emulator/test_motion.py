@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from l2lidar_node.emulator.motion import trajectories, tum
 from l2lidar_node.emulator.motion.motion import (
     MOUNTS,
-    STANDARD_GRAVITY,
     Motion,
     from_tum,
     mount_quaternion,
@@ -23,6 +22,7 @@ from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product, 
 from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
+from l2lidar_node.types import STANDARD_GRAVITY
 
 ROOM = scenes.make("room")
 

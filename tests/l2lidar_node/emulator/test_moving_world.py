@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
@@ -17,10 +16,10 @@ from l2lidar_node.emulator.world.moving import Mover, MovingWorld
 from l2lidar_node.emulator.world.people import crowd
 from l2lidar_node.emulator.world.scene import box, quad
 from l2lidar_node.emulator.world.world import World
+from l2lidar_node.types import F64
 
 pytest.importorskip("open3d")
 
-F64 = NDArray[np.float64]
 ROOM = World(box((-10.0, -10.0, -5.0), (10.0, 10.0, 5.0)))
 AHEAD = np.array([[1.0, 0.0, 0.0]])
 

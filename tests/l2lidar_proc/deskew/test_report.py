@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from l2lidar_node.types import Level
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import PipelineCounts
-from l2lidar_proc.deskew.report import Level
 from l2lidar_proc.motion.imu_buffer import ImuCounts
 from l2lidar_proc.motion.tracker import Flag, Quality
 

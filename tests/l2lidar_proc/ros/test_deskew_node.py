@@ -209,20 +209,20 @@ def test_filters_and_parameters_live(bench):
 
 def test_a_driver_that_levels_is_denounced(bench):
     bench.peer.declare_parameter("imu_adjust", True)
-    bench.node._levelling._ask()
-    bench.until(lambda: "/peer" in bench.node._levelling._clients)
+    bench.node._imu_adjust._ask()
+    bench.until(lambda: "/peer" in bench.node._imu_adjust._clients)
 
     def asked() -> bool:
-        bench.node._levelling._ask()
-        return bench.node._levelling.is_levelled
+        bench.node._imu_adjust._ask()
+        return bool(bench.node._imu_adjust.answer)
 
     bench.until(asked)
     bench.until(lambda: any("imu_adjust" in s.message for s in bench.diagnostics))
     bench.peer.set_parameters([Parameter("imu_adjust", value=False)])
 
     def retracted() -> bool:
-        bench.node._levelling._ask()
-        return not bench.node._levelling.is_levelled
+        bench.node._imu_adjust._ask()
+        return not bool(bench.node._imu_adjust.answer)
 
     bench.until(retracted)
 

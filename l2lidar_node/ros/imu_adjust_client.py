@@ -1,7 +1,8 @@
-"""Asks whoever publishes the clouds whether it levels them, which would make deskewing wrong."""
+"""Asks the publishers of a cloud topic whether `imu_adjust` is on there."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 from rcl_interfaces.srv import GetParameters
@@ -12,38 +13,48 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 _MAX_CLIENTS: Final = 8
-_PARAMETER: Final = "imu_adjust"  # of the driver, and of upstream's
+_PARAMETER: Final = "imu_adjust"  # of this driver, and of upstream's
 
 
-class LevellingWatch:
-    """Asks every few seconds; says loudly when the answer is yes.
+class ImuAdjustClient:
+    """Asks every publisher of a topic, again and again, as publishers come and go.
 
     Parameters
     ----------
     node : Node
     topic : str
-        Of the clouds.
+        Topic of the clouds.
     period_s : float
+        Time between two rounds of questions [s].
+    on_leveling : callable, optional
+        Called with the names of the publishers that level their clouds, after each answer while
+        there are any.
 
     Attributes
     ----------
-    is_levelled : bool
-        Whether a publisher of the clouds turns them into a levelled frame.
+    answer : bool or None
+        Whether a publisher levels its clouds; None until one has answered.
     """
 
-    def __init__(self, node: Node, topic: str, period_s: float = 5.0) -> None:
-        self.is_levelled = False
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        period_s: float = 5.0,
+        on_leveling: Callable[[list[str]], None] | None = None,
+    ) -> None:
+        self.answer: bool | None = None
         self._node = node
         self._topic = topic
+        self._on_leveling = on_leveling
         self._clients: dict[str, Client] = {}
         self._answers: dict[str, bool] = {}
         node.create_timer(period_s, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _ask(self) -> None:
         publishers = set()
-        for info in self._node.get_publishers_info_by_topic(
-            self._node.resolve_topic_name(self._topic)
-        ):
+        topic = self._node.resolve_topic_name(self._topic)
+        for info in self._node.get_publishers_info_by_topic(topic):
             name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
             publishers.add(name)
             if name not in self._clients and not self._open(name):
@@ -58,28 +69,23 @@ class LevellingWatch:
         self._judge()
 
     def _open(self, name: str) -> bool:
-        """Make a client for a publisher; return whether there is one."""
+        """Create a client for a publisher; return whether there is one."""
         if len(self._clients) >= _MAX_CLIENTS:
             return False
         try:
             self._clients[name] = self._node.create_client(GetParameters, f"{name}/get_parameters")
-        except NameValidationException:  # a program that is not ROS may be called anything
+        except NameValidationException:  # a program that is not ROS may have any name
             return False
         return True
 
     def _answered(self, name: str, future: Future) -> None:
         response = future.result()
-        # a parameter that a node does not have comes back as not set, which is false
+        # A parameter that the node does not have comes back as not set, which reads as false.
         self._answers[name] = bool(response and response.values and response.values[0].bool_value)
         self._judge()
 
     def _judge(self) -> None:
-        levelling = [name for name, levelled in self._answers.items() if levelled]
-        self.is_levelled = bool(levelling)
-        if levelling:
-            self._node.get_logger().error(
-                f"{', '.join(levelling)} has imu_adjust on: its clouds are turned into a levelled "
-                "frame, packet by packet, and deskewing them again makes them wrong; set "
-                "imu_adjust to false there",
-                throttle_duration_sec=30.0,
-            )
+        leveling = [name for name, is_leveling in self._answers.items() if is_leveling]
+        self.answer = bool(leveling) if self._answers else None
+        if leveling and self._on_leveling is not None:
+            self._on_leveling(leveling)
