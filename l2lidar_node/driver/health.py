@@ -160,10 +160,11 @@ def _measured(before: Period, after: Period) -> dict[Stream, int]:
 def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
     old, new = before.counters, after.counters
     values: dict[str, str] = {}
-    lost = 0
+    lost = stale = 0
     for stream, counts in new.sequence.items():
         lost += counts.lost - old.sequence[stream].lost
-        for name in ("lost", "late", "duplicates", "reordered", "restarts"):
+        stale += counts.stale - old.sequence[stream].stale
+        for name in ("lost", "late", "duplicates", "reordered", "restarts", "stale"):
             values[f"{stream.value} {name}"] = str(getattr(counts, name))
     for name, number in sorted(new.faults.items()):
         values[f"damaged: {name}"] = str(number)
@@ -183,6 +184,7 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
         for number, text in (
             (lost, f"{lost} packets lost" + (f" in {received + lost}" if is_grave else "")),
             (damaged, f"{damaged} damaged or impossible packets"),
+            (stale, f"{stale} packets from long ago dropped: a replay, or a second path?"),
             (drops, f"{drops} datagrams dropped by the kernel; raise receive_buffer_bytes"),
             (foreign, _of_strangers(foreign, seconds, after.stranger)),
             (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Generic, NamedTuple, TypeVar
 
 from l2lidar_node.driver.device import SILENCE_NS
@@ -33,6 +33,8 @@ class SequenceCounts:
         Packets that came after a later one and were put back into their place.
     restarts : int
         Times the numbers began anew.
+    stale : int
+        Packets from long ago that came between current ones; they are dropped.
     """
 
     lost: int = 0
@@ -40,6 +42,7 @@ class SequenceCounts:
     late: int = 0
     reordered: int = 0
     restarts: int = 0
+    stale: int = 0
 
 
 class SequenceOrder(Generic[T]):
@@ -84,6 +87,22 @@ class SequenceOrder(Generic[T]):
     def is_earlier(self, seq: int, than: int) -> bool:
         """Tell whether a number comes a little before another one that came lately."""
         return self._next is not None and self._ahead(seq) < self._ahead(than)
+
+    def is_near(self, seq: int) -> bool:
+        """Tell whether a number is one that can come now: a little late, or a little early."""
+        return self._next is None or self._ahead(seq) <= self._reach
+
+    def is_missing(self, seq: int, before: int) -> bool:
+        """Tell whether a number before another one has not come yet."""
+        if self._next is None:
+            return False
+        return seq in self._given_up or (
+            0 <= self._ahead(seq) < self._ahead(before) and seq not in self.waiting
+        )
+
+    def is_behind(self, seq: int) -> bool:
+        """Tell whether the place of a number has been passed a little while ago."""
+        return self._next is not None and self._ahead(seq) < 0
 
     def follows(self, seq: int) -> bool:
         """Take the next number while nothing waits; return whether it was that.
@@ -226,6 +245,8 @@ REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlie
 RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this began anew
 
 _FEW: Final = 8  # packets that may be late in a row
+_CONFIRMING: Final = 3  # packets in a row that show a restart, two of them could be stale
+_MOST_SUSPECTS: Final = 64
 
 # Bounds on how many packets can be missing between two: no stream is faster than 250 Hz, no clock
 # ratio is above 3, and a network holds packets back for a second before it delivers them at once.
@@ -248,13 +269,19 @@ Released = list[tuple[int, Timed]]
 
 @dataclass(slots=True)
 class _Lane:
-    """What is known of one stream."""
+    """What is known of one stream.
+
+    ``suspects`` are packets in a row that either begin a new sequence or come from long ago. The
+    next packets say which.
+    """
 
     order: SequenceOrder[Timed]
     newest: PointPacket | ImuPacket | None = None
     arrival: int = 0  # [ns] of the packet that came last
     released: Timed | None = None  # what came out last; None: the newest one
     fallen: int = 0  # packets in a row whose stamps fell
+    suspects: list[Timed] = field(default_factory=list)
+    withholds: bool = False  # the packet that came last is one of them
 
 
 class ReorderBuffer:
@@ -294,6 +321,8 @@ class ReorderBuffer:
         lane.arrival = arrival
         lane.released = None
         lane.fallen = 0
+        if lane.suspects:
+            _refute(lane)
         return True
 
     def begins_anew(
@@ -305,11 +334,24 @@ class ReorderBuffer:
         just set, but their numbers are earlier, they are few, and they come in company of later
         ones: after a pause nothing is late. An earlier number with a later stamp is not late
         either.
+
+        A packet whose stamp falls and whose number is far off may also be stale: from long ago, by
+        another path or from a replay. It is withheld until packets that continue it confirm a
+        restart, or a current one refutes it.
         """
         lane = self._lanes[stream]
         newest = lane.newest
         if newest is None:
             return False
+        if _is_suspect(lane, packet, arrival):
+            return _suspected(lane, Timed(packet, arrival))
+        if lane.suspects:
+            before = lane.suspects[-1].packet
+            is_next = 0 < packet.seq - before.seq <= _FEW  # the clock may have been set since
+            is_current = packet.stamp >= newest.stamp and lane.order.is_near(packet.seq)
+            if is_next and not is_current:
+                return True
+            _refute(lane)
         fall = newest.stamp - packet.stamp
         if fall > RESTART_NS:
             lane.fallen += 1
@@ -328,16 +370,23 @@ class ReorderBuffer:
         released = _bounded(lane, lane.order.restart())
         lane.newest = lane.released = None
         lane.fallen = 0
+        confirmed, lane.suspects = lane.suspects, []
+        for packet, arrival in confirmed:
+            released += self.push(stream, packet, arrival)
         return released
 
     def push(self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs) -> Released:
         """Return what a packet releases."""
         lane = self._lanes[stream]
+        if lane.withholds:
+            lane.withholds = False
+            return []
         order, newest, pause = lane.order, lane.newest, arrival - lane.arrival
         if lane.released is None and newest is not None:
             lane.released = Timed(newest, HostNs(lane.arrival))
         lane.arrival = arrival
-        if newest is None or lane.fallen == 0:
+        is_late = pause <= SILENCE_NS and order.is_behind(packet.seq)
+        if newest is None or (lane.fallen == 0 and not is_late):
             lane.newest = packet
         timed = Timed(packet, arrival)
         if newest is None:
@@ -379,6 +428,48 @@ class ReorderBuffer:
         """Take the next packet of each stream for the first one."""
         for lane in self._lanes.values():
             lane.newest = lane.released = None
+            lane.suspects = []
+
+
+def _is_suspect(lane: _Lane, packet: PointPacket | ImuPacket, arrival: HostNs) -> bool:
+    """Tell whether a packet is from long ago or begins anew, in a stream that is flowing."""
+    newest, order = lane.newest, lane.order
+    if newest is None or packet.stamp >= newest.stamp or arrival - lane.arrival > REORDER_NS:
+        return False
+    if newest.stamp - packet.stamp > RESTART_NS:
+        return not order.is_missing(packet.seq, newest.seq)
+    return not order.is_near(packet.seq)
+
+
+def _suspected(lane: _Lane, timed: Timed) -> bool:
+    """Withhold a packet; return whether it confirms that the stream began anew."""
+    suspects = lane.suspects
+    if suspects and not _continues(suspects[-1], timed.packet):
+        _refute(lane)
+        suspects = lane.suspects
+    if len(suspects) >= _CONFIRMING - 1:
+        elapsed = timed.arrival - suspects[0].arrival
+        # A burst of old packets comes faster than it was measured.
+        if elapsed >= timed.packet.stamp - suspects[0].packet.stamp or elapsed > REORDER_NS:
+            return True
+    if len(suspects) < _MOST_SUSPECTS:
+        suspects.append(timed)
+    lane.withholds = True
+    return False
+
+
+def _continues(before: Timed, packet: PointPacket | ImuPacket) -> bool:
+    """Tell whether a packet comes soon after another one, by number and stamp."""
+    return (
+        0 < packet.seq - before.packet.seq <= _FEW
+        and 0 < packet.stamp - before.packet.stamp < RESTART_NS
+    )
+
+
+def _refute(lane: _Lane) -> None:
+    """Drop what is withheld: packets of now have shown that it is from long ago."""
+    lane.order.counts.stale += len(lane.suspects)
+    lane.suspects = []
 
 
 def _bounded(lane: _Lane, released: Released) -> Released:

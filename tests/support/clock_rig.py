@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.clock import DeviceClock
+from l2lidar_node.clock import ClockEvent, DeviceClock
 from l2lidar_node.config import ClockConfig, DriverConfig
 from l2lidar_node.driver.driver import Driver
+from l2lidar_node.driver.reorder import SequenceCounts
 from l2lidar_node.emulator.config import (
     CrystalConfig,
     DeviceConfig,
@@ -62,6 +64,8 @@ class Case:
         Further settings of the virtual L2.
     loads : tuple of Load
         What delays packets on their way, in seconds since power-on.
+    stale : (float, float)
+        How many old packets a second come again, and how old they are [s].
     boot_scale : float
         How long the unit takes to come up, against a real one; 0 streams at once.
     imu : bool
@@ -77,6 +81,7 @@ class Case:
     crystal: dict[str, float] = field(default_factory=dict)
     faults: dict[str, Value] = field(default_factory=dict)
     loads: tuple[Load, ...] = ()
+    stale: tuple[float, float] = (0.0, 0.0)
     boot_scale: float = 0.25
     imu: bool = True
     latency: bool = False
@@ -84,12 +89,28 @@ class Case:
 
 
 class RecordingClock(DeviceClock):
-    """A clock that notes what it is asked and what it answers."""
+    """A clock that notes what it is asked and what it answers.
+
+    Attributes
+    ----------
+    reported : list of ClockEvent
+        Everything that happened, in order.
+    sequence : dict
+        What the driver counted by sequence numbers.
+    """
 
     def __init__(self, config: ClockConfig) -> None:
         super().__init__(config)
         self.notes: list[tuple[int, int, int, int, int, int, int]] = []
         self._sync = 0
+        self.reported: list[ClockEvent] = []
+        self.sequence: dict[Stream, SequenceCounts] = {}
+
+    def events(self) -> list[ClockEvent]:
+        """Return what happened since the last call, and note it."""
+        happened = super().events()
+        self.reported += happened
+        return happened
 
     def observe(
         self, stream: Stream, seq: int, stamp: DeviceNs, arrival: HostNs, duration_ns: int = 0
@@ -134,11 +155,14 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
     driver = Driver(build(DriverConfig, values))
     clock = RecordingClock(driver.config.clock)
     driver._clock = clock
+    clock.sequence = driver.counters.sequence
     driver.host_stepped(0, HostNs(EPOCH_NS))  # nobody sets the host's clock, as a session knows
     rng = np.random.default_rng([seed, 106])
     commands: list[tuple[int, int, bytes]] = []
     path = LoadedPath(case.loads, seed)
     way: list[tuple[int, int, bytes]] = []
+    old: deque[tuple[int, bytes]] = deque()
+    next_stale = EPOCH_NS
     count = 0
     for now in range(EPOCH_NS, EPOCH_NS + round(case.seconds * 1e9), _TICK_NS):
         while commands and commands[0][0] <= now:
@@ -149,6 +173,14 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
             late = EPOCH_NS + path.deliver(arrival - EPOCH_NS, is_imu)
             heapq.heappush(way, (late, count, datagram))
             count += 1
+            old.append((arrival, datagram))
+        if case.stale[0] and now >= next_stale:
+            next_stale += round(1e9 / case.stale[0])
+            while len(old) > 1 and old[0][0] < now - round(case.stale[1] * 1e9):
+                old.popleft()
+            if old and now - old[0][0] > 0.9e9 * case.stale[1]:
+                heapq.heappush(way, (now, count, old[0][1]))
+                count += 1
         while way and way[0][0] <= now:
             arrival, _, datagram = heapq.heappop(way)
             driver.receive(datagram, HostNs(arrival))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from l2lidar_node.clock import ClockEventKind
 from l2lidar_node.protocol.wire import PacketType
 from tests.support.clock_rig import Case, run
 
@@ -30,3 +31,20 @@ def test_the_measured_round_trip_takes_the_path_delay_off() -> None:
     assert clock.status().path_delay_ns > 100_000
     without = np.median(late["published"] - late["truth"]) + clock.status().path_delay_ns
     assert without == pytest.approx(150_000, abs=5_000)  # what the virtual unit needs to send
+
+
+@pytest.mark.parametrize("sync", ["once", "periodic"])
+@pytest.mark.parametrize(("rate", "age"), [(1.0, 1.5), (10.0, 1.0), (10.0, 4.1), (7.0, 9.0)])
+def test_stale_packets_are_refuted_by_the_current_ones(rate: float, age: float, sync: str) -> None:
+    case = Case(ratio=1.99866, sync=sync, stale=(rate, age), boot_scale=0.0, seconds=16.0)
+    notes, clock = run(case, seed=5)
+    stamped = notes[notes["published"] != 0]
+    errors = (stamped["published"] - stamped["truth"]) * 1e-6
+    locked = notes[notes["arrival"] > notes["arrival"][0] + 2 * 10**9]
+
+    assert [event.kind for event in clock.reported] == [ClockEventKind.LOCKED]
+    assert np.abs(errors - np.median(errors)).max() < 0.25
+    assert np.mean(locked["published"] != 0) > 0.999  # nothing current is lost
+    assert len(locked) > 14 * 460
+    stale = sum(counts.stale + counts.duplicates for counts in clock.sequence.values())
+    assert stale > 0.8 * rate * (16.0 - age - 0.1)

@@ -227,6 +227,39 @@ def test_a_far_number_adds_no_more_to_the_lost_than_time_allows(far: int) -> Non
     assert arriving.counts.lost <= 100
 
 
+@pytest.mark.parametrize("age", [300, 375, 700, 1020, 1100, 4000])
+def test_a_stale_packet_is_dropped_and_counted(age: int) -> None:
+    """One from ``age`` packets ago between the current ones, and after it a whole burst."""
+    arriving = Arriving(uptime_s=1000.0)
+    out = arriving.run(*range(5000, 5100))
+    for number in range(5100, 5300, 10):
+        out += arriving.run(number - age, *range(number, number + 10))
+    for number in range(5280 - age, 5300 - age):
+        arriving.now += 1 - PERIOD  # at once
+        out += arriving.run(number)
+    out += arriving.run(*range(5300, 5400))
+    assert out == [n % 1025 for n in range(5000, 5400)]
+    assert arriving.restarts == arriving.counts.lost == arriving.counts.late == 0
+    counts = arriving.counts
+    assert counts.stale + counts.duplicates == 40
+
+
+def test_a_reboot_in_bursts_loses_nothing() -> None:
+    """As behind an adapter that hands over what came in 100 ms."""
+    arriving = Arriving(uptime_s=1000.0)
+    arriving.run(*range(500))
+    arriving.clock_ns = 4 * S
+    out = []
+    for first in range(0, 75, 25):
+        arriving.now += 25 * PERIOD - 25
+        for number in range(first, first + 25):
+            arriving.now += 1 - PERIOD
+            out += arriving.run(number)
+    assert out == list(range(75))
+    assert arriving.restarts == 1
+    assert arriving.counts.stale == arriving.counts.lost == 0
+
+
 def test_what_is_forgotten_is_not_missed() -> None:
     arriving = Arriving()
     arriving.run(*range(100))
