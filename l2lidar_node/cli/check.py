@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.console import Console
@@ -12,98 +12,19 @@ from rich.text import Text
 
 from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import (
-    CLOUD,
-    IMU,
-    TRANSFORMS,
-    Gathering,
     Observation,
-    Qos,
     SourceError,
     Topics,
-    choose,
 )
 from l2lidar_node.check.report import as_data, judge, verdict
 from l2lidar_node.check.requirements import Consumer, Finding, Use, worst
 from l2lidar_node.cli.console import JsonOption, out, print_json
 from l2lidar_node.command_line import UsageError
-from l2lidar_node.recording import bag
+from l2lidar_node.recording.pcap import is_capture_file
 from l2lidar_node.types import Level
 
 if TYPE_CHECKING:
     from l2lidar_node.check.observation import Observation
-
-_KINDS: Final = (CLOUD, IMU, TRANSFORMS)
-
-
-def observe(
-    path: Path, asked: Topics, needs_imu: bool, seconds: float | None = None
-) -> tuple[Observation, Topics]:
-    """Return what a rosbag2 folder or an MCAP file holds.
-
-    Parameters
-    ----------
-    path : Path
-    asked : Topics
-    needs_imu : bool
-        Whether the consumer reads an IMU topic.
-    seconds : float, optional
-        How much of the recording to look at; all of it if left out.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read, or which topic to use is not plain.
-    """
-    try:
-        with bag.open_bag(path) as reader:
-            return _read(reader, asked, needs_imu, seconds)
-    except SourceError:
-        raise
-    except Exception as error:
-        # Of a damaged file, any byte may lead anywhere in its readers.
-        raise SourceError(str(bag.unreadable(path, error))) from None
-
-
-def _read(
-    reader: Any, asked: Topics, needs_imu: bool, seconds: float | None
-) -> tuple[Observation, Topics]:
-    connections = [item for item in reader.connections if item.msgtype in _KINDS]
-    topics = choose({item.topic: item.msgtype for item in reader.connections}, asked, needs_imu)
-    gathering = Gathering()
-    end = None
-    for connection, recorded_ns, data in bag.messages(reader):
-        if connection.msgtype not in _KINDS:
-            continue
-        if end is None and seconds is not None:
-            end = recorded_ns + round(seconds * 1e9)
-        if end is not None and recorded_ns > end:
-            break
-        if connection.topic == topics.cloud:
-            gathering.cloud(reader.deserialize(data, connection.msgtype), recorded_ns)
-        elif connection.topic == topics.imu:
-            gathering.imu(reader.deserialize(data, connection.msgtype), recorded_ns)
-        elif connection.msgtype == TRANSFORMS:
-            gathering.transforms(reader.deserialize(data, connection.msgtype))
-    return (
-        gathering.observation(
-            cloud_qos=_offers(connections, topics.cloud), imu_qos=_offers(connections, topics.imu)
-        ),
-        topics,
-    )
-
-
-def _offers(connections: list[Any], topic: str) -> tuple[Qos, ...]:
-    """Return the QoS that a topic's publishers offered when it was recorded."""
-    return tuple(
-        Qos(_reliability(profile.reliability.name), profile.depth)
-        for connection in connections
-        if connection.topic == topic
-        for profile in getattr(connection.ext, "offered_qos_profiles", ())
-    )
-
-
-def _reliability(name: str) -> str:
-    return name.lower() if name in ("RELIABLE", "BEST_EFFORT") else "unknown"
 
 
 _COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
@@ -130,9 +51,9 @@ def check(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="[TOPIC|BAG]",
-            help="A topic of clouds, live; or a rosbag2 folder or MCAP file. "
-            "The only live topic of clouds if left out.",
+            metavar="[TOPIC|FILE]",
+            help="A topic of clouds, live; a rosbag2 folder or MCAP file; or a capture (pcap), as "
+            "lio_input.launch.py would publish it. The only live topic of clouds if left out.",
         ),
     ] = "",
     cloud: Annotated[
@@ -176,9 +97,11 @@ def _observe(
     needs_imu = consumer.imu is not Use.IGNORED
     path = Path(source)
     if source and (path.exists() or not _TOPIC.fullmatch(source)):
-        from l2lidar_node.cli import check
+        from l2lidar_node.cli import recorded
 
-        return check.observe(path, asked, needs_imu, seconds)
+        if is_capture_file(path):
+            return recorded.observe_capture(path, consumer.name, seconds)
+        return recorded.observe_bag(path, asked, needs_imu, seconds)
     try:
         from l2lidar_node.ros import topic_source
     except ImportError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -55,9 +56,13 @@ def judgement(checks: Iterable[Check]) -> Table:
 
 
 def as_data(checks: Iterable[Check]) -> dict[str, Any]:
-    """Return checks as values for JSON."""
+    """Return checks as values for JSON: figures that are numbers are numbers in it."""
     return {
-        check.name: {"level": check.level.name, "message": check.message, **check.values}
+        check.name: {
+            "level": check.level.name,
+            "message": check.message,
+            **{name: _number(text) for name, text in check.values.items()},
+        }
         for check in checks
     }
 
@@ -72,6 +77,18 @@ def change(before: Mapping[str, object], after: Mapping[str, object]) -> Table:
         text = str(value)
         table.add_row(name, str(old), text if text == str(old) else f"[bold yellow]{text}[/]")
     return table
+
+
+def _number(text: str) -> int | float | str:
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    return number if math.isfinite(number) else text  # JSON knows no other numbers
 
 
 def _plain(values: Mapping[str, str]) -> Iterable[tuple[str, str]]:

@@ -32,7 +32,7 @@ VERBS: Final = (
         "info",
         f"{_CLI}.status:info",
         UNIT,
-        "Say what the unit is: versions, work mode, calibration, geometry, state.",
+        "Say what the unit is, or what a recording holds: versions, calibration, rates, losses.",
     ),
     Verb(
         "monitor",
@@ -131,7 +131,13 @@ class _Verbs(TyperGroup):
         """Return the verb itself, imported now."""
         name, command, rest = super().resolve_command(context, arguments)
         if command is not None and command.name in self._known:
-            command = self._known[command.name].load()
+            try:
+                command = self._known[command.name].load()
+            except ModuleNotFoundError as error:
+                raise CommandError(
+                    f"'{name}' needs the Python package '{error.name}', which is not installed; "
+                    "docs/install.md says how to add it"
+                ) from None
         return name, command, rest
 
 

@@ -6,10 +6,12 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.live import Live
+from rich.table import Table
 
 from l2lidar_node.cli.console import (
     JsonOption,
@@ -32,8 +34,25 @@ _WAIT_S = 3.0
 
 
 @with_network
-def info(network: NetworkConfig, json_: JsonOption = False) -> None:
-    """Say what the unit is: versions, work mode, calibration, scan geometry, and its state."""
+def info(
+    network: NetworkConfig,
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A file to describe instead of a unit: capture, MCAP file, rosbag2 folder, "
+            "calibration.",
+            show_default=False,
+        ),
+    ] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Say what the unit is: versions, work mode, calibration, scan geometry, and its state.
+
+    Of a file it says what is in it: from when, how long, how much, what was lost.
+    """
+    if file is not None:
+        _describe(file, network.l2_ip, json_)
+        return
     with Device(network) as device:
         if device.wait_for(lambda driver: driver.counters.frames.total() > 0, _WAIT_S) is None:
             raise DeviceError(f"nothing heard from the L2; {device.advice()}")
@@ -57,6 +76,44 @@ def info(network: NetworkConfig, json_: JsonOption = False) -> None:
         out.print(facts("\nCalibration", named))
     out.print()
     out.print(judgement(checks))
+
+
+def _describe(file: Path, l2_ip: str, json_: bool) -> None:
+    from l2lidar_node.cli import recorded
+
+    about = recorded.describe(file, l2_ip)
+    if json_:
+        print_json(about)
+        return
+    topics = about.pop("topics", None)
+    title = str(about.pop("kind")).capitalize()
+    flat = dict(_flat(about.pop("content", None) or about))
+    if "bytes" in flat:
+        flat["size"] = f"{flat.pop('bytes') / 1e6:.1f} MB"
+    shown = {
+        name.replace("_", " "): "not known" if value in ("", None) else _text(value)
+        for name, value in flat.items()
+    }
+    out.print(facts(title, shown))
+    if topics is not None:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("\nTopic", "\ntype", "\nmessages", "\nper s", "\nQoS"):
+            table.add_column(heading, overflow="fold")
+        for topic in topics:
+            rate = "" if topic["rate"] is None else f"{topic['rate']:g}"
+            qos = "; ".join(topic["qos"])
+            table.add_row(topic["name"], topic["type"], str(topic["messages"]), rate, qos)
+        out.print(table)
+
+
+def _flat(values: object, above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the leaves of nested mappings, each named by its path."""
+    if not isinstance(values, dict):
+        yield above or "content", values
+        return
+    for name, value in values.items():
+        if value != {}:
+            yield from _flat(value, f"{above} {name}".strip())
 
 
 @with_network

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import rclpy
+import typer
 from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
+from l2lidar_node.command_line import for_typer
 from l2lidar_node.demo.observer import Observer, TopicRecord, TopicRecorder
 from l2lidar_node.demo.processes import (
     ProgramError,
@@ -28,9 +30,54 @@ _START_TIMEOUT_S = 180.0  # on a slow machine
 _BOOT_SCALE = 0.05  # a real unit takes 25 s
 
 
-def main() -> int:
-    """Run the demo; return 0 if every figure is as it should be."""
-    options = _arguments()
+def demo(
+    duration: Annotated[
+        float, typer.Option(min=3.0, max=3600.0, metavar="S", help="Seconds to watch.")
+    ] = 20.0,
+    world: Annotated[
+        str, typer.Option(help="Scene of the virtual L2, or a mesh file; l2lidar_emulator --help")
+    ] = "room",
+    motion: Annotated[
+        str, typer.Option(help="still, spin, walk, trot, drone, or a TUM file.")
+    ] = "walk",
+    driver_only: Annotated[
+        bool, typer.Option("--driver-only", help="Leave deskew and odometry out.")
+    ] = False,
+    folder: Annotated[Path, typer.Option(help="Where pictures and truth go.")] = Path("out/demo"),
+    record: Annotated[
+        Path | None, typer.Option(help="Bag to write: FILE.mcap, or a folder for rosbag2.")
+    ] = None,
+) -> None:
+    """Show everything with a virtual L2: it streams over UDP into driver, deskew and odometry.
+
+    The exit code is 1 if a figure is not as it should be.
+    """
+    options = _Options(duration, world, motion, driver_only, folder, record)
+    code = _run(options)
+    if code:
+        raise typer.Exit(code)
+
+
+class _Options(NamedTuple):
+    """What the demo is to do."""
+
+    duration: float
+    world: str
+    motion: str
+    driver_only: bool
+    folder: Path
+    record: Path | None
+
+
+def main() -> None:
+    """Run the demo by itself, as ``make demo`` does."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(for_typer(demo))
+    app(prog_name="make demo")
+
+
+def _run(options: _Options) -> int:
+    """Return 0 if every figure is as it should be."""
     console = Console()
     isolate_ros()
     chain = "driver" if options.driver_only else "driver, deskew and odometry"
@@ -69,29 +116,7 @@ def main() -> int:
     return 1 if troubles else 0
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="make demo", description=__doc__)
-    parser.add_argument("--duration", type=float, default=20.0, help="seconds to watch (20)")
-    parser.add_argument(
-        "--world", default="room", help="room, corridor, yard or a mesh file (room)"
-    )
-    parser.add_argument(
-        "--motion", default="walk", help="still, spin, walk, trot, drone or a TUM file (walk)"
-    )
-    parser.add_argument("--driver-only", action="store_true", help="leave deskew and odometry out")
-    parser.add_argument(
-        "--folder", type=Path, default=Path("out/demo"), help="where pictures and truth go"
-    )
-    parser.add_argument(
-        "--record", type=Path, help="bag to write: FILE.mcap, or a folder for rosbag2"
-    )
-    options = parser.parse_args()
-    if not 3 <= options.duration <= 3600:
-        parser.error(f"--duration: {options.duration} is out of range, expected 3 to 3600 s")
-    return options
-
-
-def _start(programs: Programs, options: argparse.Namespace) -> None:
+def _start(programs: Programs, options: _Options) -> None:
     host_port, lidar_port = free_udp_ports(2)
     driver = {
         "l2_ip": "127.0.0.1",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -526,3 +528,71 @@ def test_times_that_no_stamp_can_hold_are_explained(
     assert not (tmp_path / "late.mcap").exists()
     data, _ = replayed(run, path, "--rate", "0")
     assert data == [entry.data for entry in capture[1]]  # it carries no stamps
+
+
+def test_info_describes_recordings(run: Run, capture, tmp_path: Path) -> None:
+    path, entries = capture
+    about = json.loads(run("info", str(path), "--json").out)
+    assert about["kind"] == "capture"
+    assert about["bytes"] == path.stat().st_size
+    assert about["seconds"] == pytest.approx((entries[-1].time - entries[0].time) / 1e9, abs=1e-3)
+    kinds = Counter(wire.HEADER.unpack(entry.data[:12])[1] for entry in entries)
+    assert about["packets"]["points_3d"] == kinds[wire.PacketType.POINTS_3D]
+    assert about["lost"] == {"points": 0, "imu": 0}
+    assert about["full_turns"] >= 1
+    assert about["unit"]["firmware"] == "2.8.11.1"
+    assert about["unit"]["calibration"]["range_bias"] == -365.625
+    assert run("convert", str(path), str(tmp_path / "run.mcap")).code == 0
+    about = json.loads(run("info", str(tmp_path / "run.mcap"), "--json").out)
+    (cloud,) = [topic for topic in about["topics"] if topic["name"] == "/points"]
+    assert cloud["type"] == "sensor_msgs/msg/PointCloud2"
+    assert cloud["messages"] >= 1
+    assert cloud["qos"] == ["best_effort, 10"]
+    said = run("info", str(path)).out
+    assert "full turns" in said
+    assert "MB" in said
+
+
+def test_info_of_a_calibration_says_what_is_in_it(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "unit.yaml"
+    path.write_text("serial: L2-7\ncorrections:\n  beta_angle: 0.25\n")
+    assert json.loads(run("info", str(path), "--json").out)["content"]["serial"] == "L2-7"
+    assert "corrections beta angle  0.25" in run("info", str(path)).out
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.pcap", b"", "not a capture file"),
+        ("a.mcap", b"nothing", "cannot be read as a recording"),
+        ("a.yaml", b"{", "a.yaml: while parsing"),
+        ("a.yaml", bytes([0xC3, 0x28]), "a.yaml: "),
+        ("nothing", None, "there is no such file"),
+    ],
+)
+def test_info_of_what_is_neither_says_so(run: Run, tmp_path, name, content, words) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    outcome = run("info", str(tmp_path / name))
+    assert outcome.code == 1
+    assert words in outcome.err
+    assert outcome.err.count("\n") == 1
+
+
+def test_check_judges_a_capture_as_the_consumer_would_get_it(run: Run, capture) -> None:
+    outcome = run("check", str(capture[0]), "--for", "lio_sam", "--json")
+    found = json.loads(outcome.out)
+    texts = [item["text"] for item in found["findings"]]
+    assert any("read with sensor: velodyne" in text for text in texts)  # by its driver.yaml
+    assert any("imu_adjust is false" in text for text in texts)
+    outcome = run("check", str(capture[0]), "--for", "kiss_icp")
+    assert "KISS-ICP" in outcome.out.splitlines()[-1]
+
+
+def test_figures_are_numbers_in_json(run: Run, unit: Unit) -> None:
+    about = json.loads(run("info", *unit.options, "--json").out)
+    device = about["health"]["device"]
+    assert isinstance(device["point packets [1/s]"], float)
+    assert isinstance(about["health"]["link"]["points lost"], int)
+    assert device["state"] == "streaming"
+    assert about["firmware"] == "2.8.11.1"

@@ -83,4 +83,4 @@ def test_a_wrong_option_is_explained() -> None:
     )
     assert result.returncode == 2
     assert "--duration" in result.stderr
-    assert "3 to 3600" in result.stderr
+    assert "3.0<=x<=3600.0" in result.stderr
