@@ -524,7 +524,11 @@ class OdometryTopics:
         50, "longest wait for IMU samples that cover the end of a sweep", unit="ms", lo=0, hi=1000
     )
     imu_rate: float = setting(
-        0.0, "rate of IMU-propagated odometry; 0 turns it off", unit="Hz", lo=0.0, hi=250.0
+        50.0,
+        "rate of IMU-propagated odometry and TF; 0 gives TF once per sweep",
+        unit="Hz",
+        lo=0.0,
+        hi=250.0,
     )
     map_period_s: float = setting(
         2.0, "period of local maps; 0 turns them off", unit="s", lo=0.0, hi=3600.0, live=True

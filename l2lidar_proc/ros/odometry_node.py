@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 from rclpy.node import Node
@@ -23,12 +23,14 @@ from l2lidar_node.files import DataFolder, FileNameError, write_whole
 from l2lidar_node.ros.conversions import from_cloud, from_time, is_ros_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import F64
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig
+from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.dead_reckoning import DeadReckoning
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
@@ -45,6 +47,9 @@ from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
+_JITTER_NS = 2_000_000  # a step may come by half an IMU period early, or it would miss one
+_MOST_SAMPLES = 250  # that wait for the next step of dead reckoning, whatever their stamps are
+_TIME_JUMP_NS = 1_000_000_000  # TF that is older than the last by more belongs to another time
 
 
 class OdometryNode(Node):
@@ -71,13 +76,14 @@ class OdometryNode(Node):
         self._looked_at = 0
         self._path: deque[PoseStamped] = deque(maxlen=topics.path_length)
         self._path_end = np.full((4, 4), np.inf)
+        self._reckoning = DeadReckoning(topics.T_cloud_imu)
+        self._samples: list[Samples] = []  # since the latest step of dead reckoning
+        self._reckoned_ns = self._transform_ns = 0
         self._open(config)
         guarded = self._guarded
         self._overdue = steady_timer(self, 0.01, guarded(self._hand_out))
         self._overdue.cancel()
         steady_timer(self, 1.0, guarded(self._diagnose))
-        if topics.imu_rate > 0.0:
-            steady_timer(self, 1.0 / topics.imu_rate, guarded(self._carry_on))
         if topics.map_period_s > 0.0:
             steady_timer(self, topics.map_period_s, guarded(self._show_map))
 
@@ -114,6 +120,7 @@ class OdometryNode(Node):
 
     def _imu(self, message: Imu) -> None:
         self._take(message)
+        self._carry_on()
         if self._pipeline.due_ns is not None:
             self._hand_out()
 
@@ -122,7 +129,10 @@ class OdometryNode(Node):
             self._inputs.refuse("IMU sample with a stamp that is out of range")
             return
         if self._inputs.imu.takes(message.header.frame_id):
-            self._pipeline.imu(to_sample(message))
+            sample = to_sample(message)
+            self._pipeline.imu(sample)
+            if self._settings.value.topics.imu_rate > 0.0:
+                self._samples.append(sample)
 
     def _cloud(self, message: PointCloud2) -> None:
         frame = message.header.frame_id
@@ -141,6 +151,9 @@ class OdometryNode(Node):
             return
         self._mount()
         self._inputs.sweep(sweep)
+        self._take_waiting()
+        # Whoever shows the deskewed cloud needs the transform up to its end, and needs it first.
+        self._carry_on(at_once=True)
         self._pipeline.sweep(sweep, time.monotonic_ns())
         self._hand_out()
 
@@ -162,6 +175,7 @@ class OdometryNode(Node):
                 and not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6)
             ):
                 self._pipeline.mount(T_cloud_imu)
+                self._reckoning = DeadReckoning(T_cloud_imu)
         base = self._settings.value.topics.base_frame
         if base and base != self._cloud_frame:
             T_cloud_base = self._frames.find(self._cloud_frame, base)
@@ -170,8 +184,7 @@ class OdometryNode(Node):
 
     def _hand_out(self) -> None:
         """Publish what is finished, and come back in time for what still waits."""
-        for message in waiting(self._imu_input, IMU_DEPTH):
-            self._take(message)
+        self._take_waiting()
         for estimate in self._pipeline.poll(time.monotonic_ns()):
             self._publish(estimate)
         due = self._pipeline.due_ns
@@ -179,6 +192,10 @@ class OdometryNode(Node):
         if due is not None:
             self._overdue.timer_period_ns = max(due - time.monotonic_ns(), 1_000_000)
             self._overdue.reset()
+
+    def _take_waiting(self) -> None:
+        for message in waiting(self._imu_input, IMU_DEPTH):
+            self._take(message)
 
     @property
     def _base_name(self) -> str:
@@ -189,22 +206,26 @@ class OdometryNode(Node):
         motion = self._base.motion(estimate)
         stamp, odom = estimate.stamp, topics.odom_frame
         self._odometry.publish(messages.odometry(motion, stamp, odom, self._base_name))
-        if topics.publish_tf:
-            self._tf.publish(TFMessage(transforms=[self._transform(motion.T_odom_base, estimate)]))
+        self._send_transform(motion.T_odom_base, stamp)
         self._extend_path(motion.T_odom_base, estimate)
         if self._registered.get_subscription_count():
             pose = self._base.odom_from_map(estimate.T_map_lidar) @ estimate.T_map_lidar
             points = messages.moved(estimate.points, pose)
             self._registered.publish(to_cloud(points, stamp, odom))
+        self._go_on_from_here()
 
-    def _transform(self, T_odom_base: F64, estimate: OdometryEstimate) -> TransformStamped:
+    def _send_transform(self, T_odom_base: F64, stamp: HostNs) -> None:
+        """Publish a pose on /tf, unless that already has a later one."""
         topics = self._settings.value.topics
+        is_late = 0 <= self._transform_ns - stamp < _TIME_JUMP_NS
+        if not topics.publish_tf or is_late:
+            return
+        self._transform_ns = stamp
+        frames = topics.odom_frame, self._base_name
         if topics.invert_tf:
-            T_base_odom = rotations.inverse(T_odom_base)
-            return messages.transform(
-                T_base_odom, estimate.stamp, self._base_name, topics.odom_frame
-            )
-        return messages.transform(T_odom_base, estimate.stamp, topics.odom_frame, self._base_name)
+            T_odom_base, frames = rotations.inverse(T_odom_base), frames[::-1]
+        made = messages.transform(T_odom_base, stamp, *frames)
+        self._tf.publish(TFMessage(transforms=[made]))
 
     def _extend_path(self, pose: F64, estimate: OdometryEstimate) -> None:
         topics = self._settings.value.topics
@@ -219,16 +240,32 @@ class OdometryNode(Node):
             path.header = self._path[-1].header
             self._path_publisher.publish(path)
 
-    def _carry_on(self) -> None:
-        """Publish where the IMU has led to since the latest sweep."""
+    def _go_on_from_here(self) -> None:
+        """Let dead reckoning go on from the latest sweep."""
         odometry, newest = self._pipeline.odometry, self._pipeline.newest_imu
-        if newest is None or not isinstance(odometry, Odometry):
+        if newest is not None and isinstance(odometry, Odometry):
+            self._reckoning.reset(odometry.extrapolated(newest))
+
+    def _carry_on(self, at_once: bool = False) -> None:
+        """Publish the pose at the newest IMU sample, ``imu_rate`` times a second of its time."""
+        if not self._samples:
             return
-        estimate = odometry.extrapolated(newest)
-        if estimate is not None:
-            motion = self._base.motion(estimate)
-            odom = self._settings.value.topics.odom_frame
-            self._fast.publish(messages.odometry(motion, newest, odom, self._base_name))
+        topics = self._settings.value.topics
+        since = int(self._samples[-1]["stamp"][0]) - self._reckoned_ns
+        is_due = not 0 <= since < round(1e9 / topics.imu_rate) - _JITTER_NS
+        if not (is_due or at_once or len(self._samples) >= _MOST_SAMPLES):
+            return
+        samples = np.concatenate(self._samples)
+        self._samples.clear()
+        self._reckoned_ns = int(samples["stamp"][-1])
+        estimate = self._reckoning.carry(samples)
+        if estimate is None:
+            return
+        motion = self._base.motion(estimate)
+        self._send_transform(motion.T_odom_base, estimate.stamp)
+        if self._fast.get_subscription_count():
+            odom = topics.odom_frame
+            self._fast.publish(messages.odometry(motion, estimate.stamp, odom, self._base_name))
 
     def _show_map(self) -> None:
         last = self._pipeline.last
@@ -251,6 +288,8 @@ class OdometryNode(Node):
     def _begin_again(self) -> None:
         self._pipeline.reset()
         self._base.reset()
+        self._reckoning.reset(None)
+        self._samples.clear()
         self._path.clear()
         self._path_end = np.full((4, 4), np.inf)
         self._looked_at = 0

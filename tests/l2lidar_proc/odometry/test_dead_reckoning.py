@@ -1,0 +1,134 @@
+"""Dead reckoning against the odometry's own extrapolation, its next estimate, and bad samples."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import IMU_SAMPLE
+from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.dead_reckoning import LONGEST_NS, DeadReckoning
+from l2lidar_proc.odometry.odometry import Odometry
+from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording
+from tests.support.odometry_runs import sweeps
+
+STEP = 5  # samples, 20 ms
+
+
+def track(run, most=40):
+    """Yield dead reckoning, extrapolation and the extrapolation after the sweep, of each sweep."""
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU)
+    first = 0
+    for sweep in list(sweeps(run, "turn"))[:most]:
+        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+        for begin in range(first, last, STEP):
+            samples = run.imu[begin : min(begin + STEP, last)]
+            odometry.imu(samples)
+            carried = reckoning.carry(samples)
+        first, newest = last, int(run.imu["stamp"][last - 1])
+        full = odometry.extrapolated(newest)
+        odometry.register(sweep)
+        corrected = odometry.extrapolated(newest)
+        if carried is not None:
+            assert carried.stamp == full.stamp == corrected.stamp == newest
+            yield carried, full, corrected
+        reckoning.reset(corrected)
+
+
+def turned_by(one, other):
+    between = one.T_map_lidar[:3, :3].T @ other.T_map_lidar[:3, :3]
+    return np.arccos(np.clip((np.trace(between) - 1.0) / 2.0, -1.0, 1.0))
+
+
+@pytest.mark.parametrize(("world", "motion"), [("room", "trot"), ("yard", "drone")])
+def test_it_is_as_good_as_every_sample_by_itself(world, motion):
+    found = list(track(recording(world, motion)))
+    assert len(found) >= 15
+    for carried, full, _ in found:
+        apart = carried.T_map_lidar[:3, 3] - full.T_map_lidar[:3, 3]
+        assert np.linalg.norm(apart) < 1e-3
+        assert turned_by(carried, full) < 1e-3
+        np.testing.assert_allclose(carried.velocity, full.velocity, atol=0.05)
+        sigmas = np.sqrt(np.diag(carried.covariance) / np.diag(full.covariance))
+        assert sigmas.min() > 0.6
+        assert sigmas.max() < 1.5
+
+
+@pytest.mark.parametrize(("world", "motion"), [("room", "walk"), ("room", "trot")])
+def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(world, motion):
+    corrections = np.array(
+        [
+            np.abs(corrected.T_map_lidar[:3, 3] - carried.T_map_lidar[:3, 3])
+            / np.sqrt(np.diag(carried.covariance)[:3])
+            for carried, _, corrected in track(recording(world, motion))
+        ]
+    )
+    assert len(corrections) >= 15
+    assert corrections.max() < 3.0
+
+
+@pytest.fixture(scope="module")
+def estimate():
+    *_, (carried, _, _) = track(recording("room", "walk"), most=8)
+    return carried
+
+
+def samples(start, count, **fields):
+    made = np.zeros(count, IMU_SAMPLE)
+    made["stamp"] = start + 4_000_000 * np.arange(1, count + 1)
+    made["linear_acceleration"] = [0.0, 0.0, 9.80665]
+    for name, value in fields.items():
+        made[name] = value
+    return made
+
+
+def test_nothing_comes_of_nothing(estimate):
+    reckoning = DeadReckoning(T_CLOUD_IMU)
+    assert reckoning.carry(samples(estimate.stamp, 5)) is None
+    reckoning.reset(estimate)
+    assert reckoning.carry(samples(estimate.stamp, 0)) is None
+
+
+def test_samples_that_are_damaged_or_late_move_nothing(estimate):
+    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning.reset(estimate)
+    good = reckoning.carry(samples(estimate.stamp, 5))
+    assert good is not None
+    assert reckoning.carry(samples(estimate.stamp, 5)) is None, "again"
+    bad = samples(good.stamp, 3, angular_velocity=np.nan)
+    assert reckoning.carry(bad) is None
+    shuffled = samples(good.stamp, 4)[::-1]  # of which only the first is later than all before
+    carried = reckoning.carry(shuffled)
+    assert carried.stamp == shuffled["stamp"][0]
+    assert np.isfinite(carried.T_map_lidar).all()
+
+
+@pytest.mark.parametrize("silence", [60_000_000, LONGEST_NS, 10**15])
+def test_it_ends_with_a_gap_and_begins_with_the_next_sweep(estimate, silence):
+    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning.reset(estimate)
+    assert reckoning.carry(samples(estimate.stamp + silence, 5)) is None
+    assert reckoning.carry(samples(estimate.stamp + silence + 20_000_000, 5)) is None
+    later = dataclasses.replace(estimate, stamp=estimate.stamp + silence + 40_000_000)
+    reckoning.reset(later)
+    assert reckoning.carry(samples(later.stamp, 5)) is not None
+
+
+def test_it_ends_a_second_after_the_latest_sweep(estimate):
+    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning.reset(estimate)
+    lasted = [
+        reckoning.carry(samples(estimate.stamp + 20_000_000 * n, 5)) is not None for n in range(60)
+    ]
+    assert lasted == [True] * 50 + [False] * 10
+
+
+def test_untrusted_gravity_holds_the_speed(estimate):
+    reckoning = DeadReckoning(np.eye(4))
+    reckoning.reset(dataclasses.replace(estimate, gravity=np.zeros(3)))
+    carried = reckoning.carry(samples(estimate.stamp, 10, linear_acceleration=[40.0, 0.0, 0.0]))
+    before = estimate.T_map_lidar[:3, :3] @ estimate.velocity
+    np.testing.assert_allclose(carried.T_map_lidar[:3, :3] @ carried.velocity, before, atol=1e-9)
