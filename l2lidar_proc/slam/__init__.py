@@ -1,0 +1,1 @@
+"""Submap SLAM on top of the odometry: loop closure, saved maps, localization."""

@@ -1,0 +1,150 @@
+"""Nodes of the map: submaps with their place in the odometry and the sweeps within them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import HostNs
+from l2lidar_proc.slam.candidates import odometry_covariance
+from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.se3 import SHIFT, TURN, error, inverse, leveled, magnitude
+from l2lidar_proc.slam.submap import Submap, SubmapBuilder
+from l2lidar_proc.trajectory import StampedPoses, Trajectory
+
+F64 = NDArray[np.float64]
+
+_TURN_ARM_M = 0.5  # a turn counts like the way it makes at this distance
+
+
+class Health(Enum):
+    """What the odometry says of a sweep."""
+
+    GOOD = "aligned"
+    DEGENERATE = "aligned, but the scene does not fix the pose in every direction"
+    PREDICTED = "not aligned: the pose is predicted"
+    CUT = "the motion since the sweep before is unknown"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometrySweep:
+    """A deskewed sweep with its place in the odometry.
+
+    Attributes
+    ----------
+    stamp : HostNs
+    T_odom_body : ndarray, shape (4, 4)
+        z of the odometry frame is up.
+    points : ndarray, shape (N, 3)
+        Body frame [m].
+    health : Health
+    covariance : ndarray, shape (6, 6)
+        Of x, y, z, then turns, odometry axes, as in nav_msgs/Odometry; used where the sweep is
+        not GOOD.
+    """
+
+    stamp: HostNs
+    T_odom_body: F64
+    points: F64
+    health: Health
+    covariance: F64
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """A submap in the graph.
+
+    Attributes
+    ----------
+    stamp : HostNs
+        Of the first sweep.
+    T_odom_node : ndarray, shape (4, 4)
+        z up.
+    submap : Submap or None
+        None where another one knows the place, or the file was damaged.
+    sweeps : ndarray of STAMPED_POSE
+        ``T_node_body`` of each sweep.
+    usable : bool
+        Whether loops may be sought: all sweeps were aligned and well fixed.
+    way : float
+        Of the odometry at its beginning [m].
+    """
+
+    stamp: HostNs
+    T_odom_node: F64
+    submap: Submap | None
+    sweeps: StampedPoses
+    usable: bool
+    way: float
+
+
+class OpenNode:
+    """A submap that still grows.
+
+    Parameters
+    ----------
+    first : OdometrySweep
+        Where it begins.
+    way : float
+        Of the odometry there [m].
+    config : SlamConfig
+    """
+
+    def __init__(self, first: OdometrySweep, way: float, config: SlamConfig) -> None:
+        self.T_odom_node = leveled(first.T_odom_body)
+        self._config = config
+        self._builder = SubmapBuilder(config.submaps.map_voxel_m, config.submaps.map_range_m)
+        self._stamp, self._began = first.stamp, way
+        self._sweeps = Trajectory()
+        self._latest = first.T_odom_body
+        self._usable = True
+        self._extra = np.zeros((6, 6))
+        self.way = 0.0
+        self.turn = 0.0
+
+    def add(self, sweep: OdometrySweep) -> None:
+        """Add a sweep."""
+        turn, way = magnitude(error(self._latest, sweep.T_odom_body))
+        self.way, self.turn, self._latest = self.way + way, self.turn + turn, sweep.T_odom_body
+        T_node_body = inverse(self.T_odom_node) @ sweep.T_odom_body
+        self._sweeps.append(sweep.stamp, T_node_body)
+        if sweep.health is Health.GOOD:
+            self._builder.add(T_node_body, sweep.points)
+            return
+        self._usable = False
+        turned = np.zeros((6, 6))
+        axes = self.T_odom_node[:3, :3]
+        turned[TURN, TURN] = axes.T @ sweep.covariance[3:, 3:] @ axes
+        turned[SHIFT, SHIFT] = axes.T @ sweep.covariance[:3, :3] @ axes
+        if np.isfinite(turned).all() and np.trace(turned) > np.trace(self._extra):
+            self._extra = turned
+        if sweep.health is Health.DEGENERATE:
+            self._builder.add(T_node_body, sweep.points)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether it is time for the next one."""
+        return self.way + _TURN_ARM_M * self.turn >= self._config.submaps.submap_length_m
+
+    def finish(self) -> Node:
+        """Return the node."""
+        submap = self._builder.finish()
+        return Node(
+            self._stamp,
+            self.T_odom_node,
+            submap if len(submap) else None,
+            self._sweeps.poses.copy(),
+            self._usable and len(submap) > 0,
+            self._began,
+        )
+
+    def covariance_to(self, following: F64) -> F64:
+        """Return the covariance (6, 6) of the edge to the next node's frame (4, 4) in odom."""
+        covariance = odometry_covariance(self.way, self.turn, self._extra, self._config)
+        turn = following[:3, :3].T @ self.T_odom_node[:3, :3]
+        for part in (TURN, SHIFT):
+            covariance[part, part] = turn @ covariance[part, part] @ turn.T
+        return covariance

@@ -1,0 +1,125 @@
+"""Search for a place in the whole map when nothing is known of where the sensor is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc.slam import places
+from l2lidar_proc.slam.config import LoopConfig
+from l2lidar_proc.slam.graph_nodes import Node
+from l2lidar_proc.slam.se3 import error, inverse, magnitude, planar
+from l2lidar_proc.slam.submap import SubmapView, structure_of
+from l2lidar_proc.slam.verification import Match, Window, verify
+
+F64 = NDArray[np.float64]
+
+_PEAKS: Final = 6  # places of the plan that are looked at closely
+_WINDOW: Final = Window(1.0, 0.8, np.radians(4.0))  # what the plan leaves open
+_NEAR_M: Final = 5.0  # submaps farther from a peak do not show it
+_STOREY_M: Final = 1.5  # nodes at one place in plan but this far apart are different floors
+_SAME: Final = (np.radians(4.0), 0.5)  # [rad, m]
+_CELL_M: Final = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A place in the map that a query fits.
+
+    Attributes
+    ----------
+    node : int
+    match : Match
+    T_map_query : ndarray, shape (4, 4)
+    """
+
+    node: int
+    match: Match
+    T_map_query: F64
+
+
+class PlaceSearch:
+    """Finds submaps in a map by their structure alone.
+
+    Parameters
+    ----------
+    view_of : callable
+        Returns the view of a node by its number.
+    """
+
+    def __init__(self, view_of: Callable[[int], SubmapView]) -> None:
+        self._view_of = view_of
+        self._structures: dict[int, F64] = {}
+
+    def find(
+        self,
+        query: SubmapView,
+        nodes: Sequence[Node],
+        poses: F64,
+        eligible: NDArray[np.bool_],
+        config: LoopConfig,
+    ) -> Found | str:
+        """Return the one place that fits, or why there is none.
+
+        Parameters
+        ----------
+        query : SubmapView
+        nodes : sequence of Node
+        poses : ndarray, shape (N, 4, 4)
+            Of the nodes in the map.
+        eligible : ndarray, shape (N,)
+            Nodes that belong to the map and have points.
+        config : LoopConfig
+        """
+        among = np.flatnonzero(eligible)
+        if not len(among):
+            return "no map"
+        structure = self._structure(nodes, poses, among)
+        found: list[Found] = []
+        refused = "no fit"
+        for peak in places.anywhere(query.structure, structure, _PEAKS):
+            for node in _around(peak, poses, among):
+                z = poses[node][2, 3]
+                guess = inverse(poses[node]) @ planar(peak.x, peak.y, peak.yaw, z)
+                match = verify(query, self._view_of(node), guess, _WINDOW, config)
+                if isinstance(match, str):
+                    refused = match
+                    continue
+                found.append(Found(node, match, poses[node] @ match.T_target_query))
+        if not found:
+            return refused
+        first = found[0]
+        for other in found[1:]:
+            turn, way = magnitude(error(first.T_map_query, other.T_map_query))
+            if turn > _SAME[0] or way > _SAME[1]:
+                return "ambiguous"
+        return max(found, key=lambda item: item.match.fit.overlap)
+
+    def _structure(self, nodes: Sequence[Node], poses: F64, among: NDArray[np.int64]) -> F64:
+        """Return the cells of upright structure of the whole map, shape (M, 2)."""
+        parts = []
+        for node in among.tolist():
+            submap = nodes[node].submap
+            if node not in self._structures and submap is not None:
+                self._structures[node] = structure_of(submap.xyz)
+            cells = self._structures[node]
+            parts.append(cells @ poses[node][:2, :2].T + poses[node][:2, 3])
+        cells = np.unique(np.floor(np.concatenate(parts) / _CELL_M), axis=0)
+        return np.asarray((cells + 0.5) * _CELL_M)
+
+
+def _around(peak: places.Place, poses: F64, among: NDArray[np.int64]) -> list[int]:
+    """Return the nearest node of each storey at a place."""
+    distance = np.hypot(poses[among, 0, 3] - peak.x, poses[among, 1, 3] - peak.y)
+    chosen: list[int] = []
+    for index in np.argsort(distance):
+        if distance[index] > _NEAR_M:
+            break
+        node = int(among[index])
+        if all(abs(poses[node][2, 3] - poses[other][2, 3]) > _STOREY_M for other in chosen):
+            chosen.append(node)
+    return chosen

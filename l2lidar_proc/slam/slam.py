@@ -1,0 +1,305 @@
+"""Mapping: submaps from the odometry, loops between them, one optimized pose graph."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc.slam import pose_graph
+from l2lidar_proc.slam.admission import LARGEST_DEVIATION, Admission, Loop
+from l2lidar_proc.slam.candidates import Graph
+from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.graph_nodes import Health, Node, OdometrySweep, OpenNode
+from l2lidar_proc.slam.place_search import PlaceSearch
+from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, GtsamMissingError
+from l2lidar_proc.slam.se3 import error, interpolated, inverse, magnitude, transformed
+from l2lidar_proc.slam.status import SlamState
+from l2lidar_proc.slam.submap import SubmapView, ViewCache, voxel_keys
+from l2lidar_proc.slam.verification import verify
+from l2lidar_proc.trajectory import STAMPED_POSE, StampedPoses
+
+F64 = NDArray[np.float64]
+
+_CUT_SIGMA: Final = (3.0, 1000.0)  # [rad, m] an edge that says nothing
+_DISAGREE: Final = (np.radians(1.0), 0.15)  # [rad, m] places one query may have at once
+_KNOWN_OVERLAP: Final = 0.85  # a closed submap that shows this little new keeps no points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Map:
+    """Nodes and edges, as they are saved.
+
+    Attributes
+    ----------
+    nodes : list of Node
+    poses : ndarray, shape (N, 4, 4)
+        ``T_map_node``.
+    edges : ndarray, shape (M,), dtype EDGE
+    """
+
+    nodes: list[Node]
+    poses: F64
+    edges: NDArray[np.void]
+
+
+class Slam:
+    """Builds a map from odometry sweeps.
+
+    Parameters
+    ----------
+    config : SlamConfig
+    saved : Map, optional
+        A map to extend: it stands still until the place in it is found.
+
+    Attributes
+    ----------
+    T_map_odom : ndarray, shape (4, 4), or None
+        None while the place in a saved map is unknown. Replaced, never changed in place.
+    state : SlamState
+    loops : list of tuple of int
+        Pairs of nodes in force: query, target.
+
+    Raises
+    ------
+    GtsamMissingError
+    """
+
+    def __init__(self, config: SlamConfig, saved: Map | None = None) -> None:
+        if not pose_graph.is_available():
+            raise GtsamMissingError
+        self.config = config
+        self.nodes: list[Node] = list(saved.nodes) if saved else []
+        self.poses = saved.poses.copy() if saved else np.zeros((0, 4, 4))
+        self.edges = saved.edges.copy() if saved else np.zeros(0, EDGE)
+        self.loops = [
+            (int(edge["second"]), int(edge["first"]))
+            for edge in self.edges[self.edges["kind"] == LOOP]
+        ]
+        self.state = SlamState.SEARCHING if saved else SlamState.LOCALIZED
+        self.T_map_odom: F64 | None = None if saved else np.eye(4)
+        self.admission = Admission(config.loop)
+        self._views = ViewCache()
+        self._search = PlaceSearch(self.view_of)
+        self._open: OpenNode | None = None
+        self._way = 0.0
+        self._join_by = CUT if saved else ODOMETRY
+        self._pending_edge: tuple[F64, F64, float] | None = None
+
+    # ---- input
+
+    def add(self, sweep: OdometrySweep) -> bool:
+        """Take a sweep, in order of time; return whether a submap was closed by it."""
+        closed = False
+        if self._open is not None and (sweep.health is Health.CUT or self._open.is_full):
+            self._close(sweep)
+            closed = True
+        if self._open is None:
+            self._open = OpenNode(sweep, self._way, self.config)
+        self._open.add(sweep)
+        return closed
+
+    def finish(self) -> None:
+        """Close the open submap: the recording is over."""
+        if self._open is not None:
+            self._append(self._open.finish(), self._open)
+            self._open = None
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Refused candidates by reason."""
+        return self.admission.rejected
+
+    # ---- steps
+
+    def _close(self, sweep: OdometrySweep) -> None:
+        """Turn the open submap into a node and look for loops."""
+        assert self._open is not None
+        open_node, self._open = self._open, None
+        self._append(open_node.finish(), open_node)
+        following = OpenNode(sweep, self._way, self.config)
+        if sweep.health is Health.CUT:
+            self._join_by = CUT
+            self.state = SlamState.LOST
+        covariance = open_node.covariance_to(following.T_odom_node)
+        T_node_next = inverse(open_node.T_odom_node) @ following.T_odom_node
+        self._pending_edge = T_node_next, covariance, open_node.way
+        self._open = following
+
+    def _append(self, node: Node, open_node: OpenNode) -> None:
+        self._way += open_node.way
+        number = len(self.nodes)
+        self.nodes.append(node)
+        if self._pending_edge is None and not number:
+            self.poses = node.T_odom_node[None].copy()
+        elif self._pending_edge is None:  # first of a session in a saved map
+            self._connect(number, inverse(self.poses[-1]) @ node.T_odom_node, _cut(), 0.0)
+        else:
+            self._connect(number, *self._pending_edge)
+        self._pending_edge = None
+        if self.config.loop.loops and node.usable:
+            self._look_for_loops(number)
+        self._publish()
+
+    def _connect(self, number: int, pose: F64, covariance: F64, way: float) -> None:
+        edge = np.zeros(1, EDGE)
+        kind, self._join_by = self._join_by, ODOMETRY
+        edge["first"], edge["second"], edge["kind"] = number - 1, number, kind
+        edge["pose"], edge["way"] = pose, way
+        edge["covariance"] = _cut() if kind == CUT else covariance
+        self.edges = np.concatenate((self.edges, edge))
+        self.poses = np.concatenate((self.poses, (self.poses[-1] @ pose)[None]))
+
+    def _look_for_loops(self, number: int) -> None:
+        graph = Graph(self.poses, self.edges, number, self.config)
+        verified = self._near(graph, number)
+        if not np.isfinite(graph.ways[0]):
+            verified += self._anywhere(graph, number)
+        if _contradict(self.poses, verified):
+            self.admission.rejected["ambiguous"] += len(verified)
+            return
+        for loop in verified:
+            known = np.isfinite(graph.ways[loop.target])
+            self.admission.judge(graph.relation(loop.target) if known else None, loop)
+        batch = self.admission.batch(self.poses)
+        if batch:
+            self._enter(batch)
+
+    def _near(self, graph: Graph, number: int) -> list[Loop]:
+        """Return verified pairs with the nodes that the odometry says may be near."""
+        eligible = np.array([node.usable and node.submap is not None for node in self.nodes])
+        query = self.view_of(number)
+        found = []
+        for target in graph.near(eligible):
+            if not self.admission.is_open(number, target):
+                continue
+            relation = graph.relation(target)
+            match = verify(
+                query,
+                self.view_of(target),
+                relation.T_first_second,
+                relation.window,
+                self.config.loop,
+            )
+            if isinstance(match, str):
+                self.admission.rejected[match] += 1
+            else:
+                found.append(Loop(number, target, match, self._way))
+        return found
+
+    def _anywhere(self, graph: Graph, number: int) -> list[Loop]:
+        """Return a verified pair with a place in a part of the map that nothing leads to."""
+        if self.config.localization.relocalize == "off":
+            return []
+        apart = ~np.isfinite(graph.ways)
+        eligible = apart & np.array([node.submap is not None for node in self.nodes])
+        found = self._search.find(
+            self.view_of(number), self.nodes, self.poses, eligible, self.config.loop
+        )
+        if isinstance(found, str):
+            self.admission.rejected[found] += 1
+            return []
+        if self.state is SlamState.SEARCHING:
+            self.state = SlamState.TENTATIVE
+        return [Loop(number, found.node, found.match, self._way)]
+
+    def _enter(self, batch: list[Loop]) -> None:
+        """Put loops into the graph, unless the optimized graph cannot hold them."""
+        edges = np.concatenate((self.edges, _edges_of(batch)))
+        anchors = np.zeros(1, np.int64)
+        poses = pose_graph.optimized(self.poses, edges, anchors)
+        if pose_graph.deviations(poses, edges).max() > LARGEST_DEVIATION:
+            self.admission.bar(batch)
+            return
+        self.poses, self.edges = poses, edges
+        self.admission.accept(batch)
+        self.loops += [loop.pair for loop in batch]
+        for loop in batch:
+            self._forget_points(loop)
+
+    def _forget_points(self, loop: Loop) -> None:
+        """Drop the points of a submap that shows next to nothing new."""
+        node, target = self.nodes[loop.query], self.nodes[loop.target]
+        if node.submap is None or target.submap is None:
+            return
+        seen = voxel_keys(target.submap.xyz, 0.5)
+        own = voxel_keys(transformed(loop.match.T_target_query, node.submap.xyz), 0.5)
+        if np.isin(own, seen).mean() > _KNOWN_OVERLAP:
+            node.submap = None
+
+    def _publish(self) -> None:
+        """Renew state and ``T_map_odom``."""
+        graph = Graph(self.poses, self.edges, len(self.nodes) - 1, self.config)
+        if np.isfinite(graph.ways[0]):
+            self.state = SlamState.LOCALIZED
+        if self.state in (SlamState.LOCALIZED, SlamState.LOST) and self.T_map_odom is not None:
+            self.T_map_odom = self.poses[-1] @ inverse(self.nodes[-1].T_odom_node)
+        elif self.state is SlamState.LOCALIZED:
+            self.T_map_odom = self.poses[-1] @ inverse(self.nodes[-1].T_odom_node)
+
+    # ---- results
+
+    def view_of(self, number: int) -> SubmapView:
+        """Return what registration needs of a node that has points."""
+        submap = self.nodes[number].submap
+        assert submap is not None
+        return self._views.of(number, submap)
+
+    def map(self) -> Map:
+        """Return the map as it is now."""
+        return Map(list(self.nodes), self.poses.copy(), self.edges.copy())
+
+
+def corrected_trajectory(built: Map) -> StampedPoses:
+    """Return the poses of all sweeps in the map frame.
+
+    Between two nodes the correction of the odometry is interpolated, so that the way has no steps
+    where submaps meet.
+    """
+    parts = []
+    for number, node in enumerate(built.nodes):
+        if not len(node.sweeps):
+            continue
+        here = built.poses[number] @ inverse(node.T_odom_node)
+        there = here
+        after = number + 1
+        edges = built.edges[(built.edges["first"] == number) & (built.edges["second"] == after)]
+        if len(edges) and edges["kind"][0] == ODOMETRY:
+            there = built.poses[after] @ inverse(built.nodes[after].T_odom_node)
+        in_odom = node.T_odom_node @ node.sweeps["pose"]
+        step = np.linalg.norm(np.diff(in_odom[:, :3, 3], axis=0), axis=1)
+        share = np.concatenate(([0.0], np.cumsum(step)))
+        share /= max(float(share[-1]), 1e-9)
+        # about the place itself: a correction turns the way about the far origin of odom
+        anchor = np.eye(4)
+        anchor[:3, 3] = in_odom[0, :3, 3]
+        corrections = interpolated(here @ anchor, there @ anchor, share) @ inverse(anchor)
+        rows = np.empty(len(in_odom), STAMPED_POSE)
+        rows["stamp"], rows["pose"] = node.sweeps["stamp"], corrections @ in_odom
+        parts.append(rows)
+    return np.concatenate(parts) if parts else np.empty(0, STAMPED_POSE)
+
+
+def _contradict(poses: F64, loops: list[Loop]) -> bool:
+    """Return whether loops of one query put it at different places."""
+    places = [poses[loop.target] @ loop.match.T_target_query for loop in loops]
+    for place in places[1:]:
+        turn, way = magnitude(error(places[0], place))
+        if turn > _DISAGREE[0] or way > _DISAGREE[1]:
+            return True
+    return False
+
+
+def _edges_of(loops: list[Loop]) -> NDArray[np.void]:
+    edges = np.zeros(len(loops), EDGE)
+    for edge, loop in zip(edges, loops, strict=True):
+        edge["first"], edge["second"], edge["kind"] = loop.target, loop.query, LOOP
+        edge["pose"], edge["covariance"] = loop.match.T_target_query, loop.match.covariance
+    return edges
+
+
+def _cut() -> F64:
+    return np.diag(np.repeat(np.square(_CUT_SIGMA), 3))

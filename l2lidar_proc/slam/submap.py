@@ -1,0 +1,271 @@
+"""Submaps: the points of a few meters of way, and what registration needs to know of them.
+
+A submap's frame stands at its first sweep with z up. It keeps one point per voxel as int16 steps
+of 2 mm and the number of the viewpoint that saw it: 7 bytes a point, +-65 m.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from l2lidar_proc.slam.se3 import error, magnitude, transformed
+from l2lidar_proc.surfels import SurfelMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+STEP_M: Final = 0.002
+"""Resolution of the stored points [m]."""
+
+SUBMAP_POINT: Final = np.dtype([("xyz", "<i2", (3,)), ("view", "u1")])
+"""Place in steps of :data:`STEP_M` in the submap's frame, and which viewpoint saw it."""
+
+STRUCTURE_CELL_M: Final = 0.25
+"""Edge of the cells of bird's-eye images [m]."""
+
+_STRUCTURE_HEIGHTS: Final = 3  # levels of the same height that make a cell a wall, not a floor
+_SURFACES: Final = (0.3, 0.6, 1.2)  # [m] voxel means are too sparse for finer cells
+_SURFACE_POINTS: Final = 6
+_SURFACE_THICKNESS: Final = 0.035
+_LYING: Final = 0.7  # cosine: surfaces flatter than 45 degrees are floors and ceilings
+_SPREAD_M: Final = 0.3  # distance between the points that are registered
+_FREE_CELL_M: Final = 0.3
+_FREE_STEP_M: Final = 0.3
+_FREE_SHORT_M: Final = 0.5  # a ray frees no space this close before its end
+_FREE_RAYS: Final = 4000
+_VIEW_STEP_M: Final = 0.5  # way between viewpoints
+_MOST_VIEWS: Final = 255
+_STILL: Final = (0.05, np.radians(4.0))  # [m, rad] moved less than this, a place is seen enough
+_STILL_SWEEPS: Final = 3  # after so many sweeps from there
+_COMPACT: Final = 200_000  # points after which an open submap is thinned
+_BITS: Final = 21
+_HALF: Final = 1 << (_BITS - 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submap:
+    """Points of some meters of way.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N,), dtype SUBMAP_POINT
+    views : ndarray, shape (V, 3), float32
+        Places the points were seen from [m], submap frame.
+    """
+
+    points: NDArray[np.void]
+    views: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points)
+
+    @property
+    def xyz(self) -> F64:
+        """Points [m], shape (N, 3), submap frame."""
+        return np.asarray(self.points["xyz"] * STEP_M)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory."""
+        return self.points.nbytes + self.views.nbytes
+
+
+class SubmapBuilder:
+    """Gathers the sweeps of a submap.
+
+    Parameters
+    ----------
+    voxel : float
+        Edge of the cubes of which one point is kept [m].
+    max_range : float
+        Farther points are left out [m].
+    """
+
+    def __init__(self, voxel: float, max_range: float) -> None:
+        self._voxel = voxel
+        self._max_range = max_range
+        self._parts: list[tuple[F64, F64, NDArray[np.uint8]]] = []
+        self._pending = 0
+        self._views: list[F64] = []
+        self._seen_from: F64 | None = None
+        self._sweeps_here = 0
+
+    def add(self, T_submap_body: F64, points: F64) -> None:
+        """Add the points (N, 3) [m] of a sweep, seen from and given in the body frame."""
+        if self._seen_from is not None:
+            turn, way = magnitude(error(self._seen_from, T_submap_body))
+            if way < _STILL[0] and turn < _STILL[1] and self._sweeps_here >= _STILL_SWEEPS:
+                return
+            self._sweeps_here += 1
+            if way >= _STILL[0] or turn >= _STILL[1]:
+                self._seen_from, self._sweeps_here = T_submap_body, 1
+        else:
+            self._seen_from, self._sweeps_here = T_submap_body, 1
+        place = T_submap_body[:3, 3]
+        far = not self._views or np.linalg.norm(place - self._views[-1]) > _VIEW_STEP_M
+        if far and len(self._views) < _MOST_VIEWS:
+            self._views.append(place.copy())
+        reach = min(self._max_range, (2**15 - 1) * STEP_M - float(np.abs(place).max()) - 1.0)
+        near = (points**2).sum(axis=1) < max(reach, 0.0) ** 2
+        placed = transformed(T_submap_body, points[near])
+        view = np.full(len(placed), len(self._views) - 1, np.uint8)
+        self._parts.append((placed, np.ones(len(placed)), view))
+        self._pending += len(placed)
+        if self._pending > _COMPACT:
+            self._parts = [self._thinned()]
+            self._pending = 0
+
+    def finish(self) -> Submap:
+        """Return the submap of what was added so far; more may be added afterwards."""
+        if not self._parts:
+            return Submap(np.empty(0, SUBMAP_POINT), np.zeros((0, 3), np.float32))
+        placed, _, view = self._thinned()
+        points = np.empty(len(placed), SUBMAP_POINT)
+        points["xyz"] = np.rint(placed / STEP_M)
+        points["view"] = view
+        return Submap(points, np.array(self._views, np.float32).reshape(-1, 3))
+
+    def _thinned(self) -> tuple[F64, F64, NDArray[np.uint8]]:
+        """Return the mean, weight and first view of each voxel."""
+        placed, weight, view = (
+            np.concatenate(column) for column in zip(*self._parts, strict=True)
+        )
+        keys, first, inverse = np.unique(
+            voxel_keys(placed, self._voxel), return_index=True, return_inverse=True
+        )
+        total = np.bincount(inverse, weight, len(keys))
+        mean = np.stack(
+            [np.bincount(inverse, weight * axis, len(keys)) / total for axis in placed.T], axis=1
+        )
+        return mean, total, view[first]
+
+
+class SubmapView:
+    """What registration needs of a submap: surfaces, neighbors, free space, vertical structure.
+
+    Parameters
+    ----------
+    submap : Submap
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        [m], submap frame.
+    surfaces : SurfelMap
+    tree : cKDTree
+        Of the points.
+    structure : ndarray, shape (M, 2)
+        Middles of the cells of 0.25 m that hold something upright [m], submap frame.
+    source : ndarray, shape (S, 3)
+        Points spread evenly over the surfaces, in random order: any first part is a fair sample.
+    is_upright : ndarray, shape (S,)
+        Which of these are not on a floor or ceiling; these tell places apart.
+    """
+
+    def __init__(self, submap: Submap) -> None:
+        self.points = submap.xyz
+        self.surfaces = SurfelMap(
+            _SURFACES, thickness=_SURFACE_THICKNESS, least=_SURFACE_POINTS, capacity=10_000
+        )
+        self.surfaces.add(self.points)
+        self.tree = cKDTree(self.points)
+        self.structure = structure_of(self.points)
+        self._free = _free_cells(submap)
+        self.source = _spread(self.points)
+        self.is_upright = np.ones(len(self.source), np.bool_)
+        on = self.surfaces.match(self.source)
+        self.is_upright[on.index] = np.abs(on.normals[:, 2]) < _LYING
+
+    def is_free(self, points: F64) -> NDArray[np.bool_]:
+        """Return which points (N, 3) lie where rays of the submap passed, shape (N,)."""
+        return _contained(voxel_keys(points, _FREE_CELL_M), self._free)
+
+
+class ViewCache:
+    """The latest views of submaps, by number.
+
+    Parameters
+    ----------
+    capacity : int
+        Views to keep: some 5 MB each.
+    """
+
+    def __init__(self, capacity: int = 24) -> None:
+        self._capacity = capacity
+        self._views: OrderedDict[int, SubmapView] = OrderedDict()
+
+    def of(self, number: int, submap: Submap) -> SubmapView:
+        """Return the view of a submap."""
+        if number in self._views:
+            self._views.move_to_end(number)
+            return self._views[number]
+        view = self._views[number] = SubmapView(submap)
+        if len(self._views) > self._capacity:
+            self._views.popitem(last=False)
+        return view
+
+
+def voxel_keys(points: F64, edge: float) -> I64:
+    """Return one integer for the voxel of each point (N, 3), shape (N,)."""
+    cell = np.floor(points * (1.0 / edge)).astype(np.int64) + _HALF
+    return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])
+
+
+def structure_of(points: F64) -> F64:
+    """Return the middles (M, 2) [m] of the cells in which points (N, 3) are at several heights."""
+    cells = _distinct(voxel_keys(points, STRUCTURE_CELL_M))
+    columns = cells >> _BITS  # the height is in the lowest bits
+    first = np.flatnonzero(np.r_[True, columns[1:] != columns[:-1]]) if len(cells) else cells
+    count = np.diff(np.r_[first, len(cells)])
+    tall = columns[first[count >= _STRUCTURE_HEIGHTS]]
+    cell = np.stack((tall >> _BITS, tall & (2 * _HALF - 1)), axis=1) - _HALF
+    return np.asarray((cell + 0.5) * STRUCTURE_CELL_M)
+
+
+def _spread(points: F64) -> F64:
+    """Return one point per voxel, shuffled."""
+    _, first = np.unique(voxel_keys(points, _SPREAD_M), return_index=True)
+    order = np.random.default_rng(0).permutation(len(first))
+    return np.asarray(points[first[order]])
+
+
+def _free_cells(submap: Submap) -> I64:
+    """Return the sorted keys of the cells that rays passed and no surface is next to."""
+    chosen = submap.points[:: max(-(-len(submap.points) // _FREE_RAYS), 1)]
+    ends = chosen["xyz"] * STEP_M
+    origins = submap.views[chosen["view"]].astype(np.float64)
+    way = ends - origins
+    length = np.linalg.norm(way, axis=1)
+    steps = np.maximum((length - _FREE_SHORT_M) / _FREE_STEP_M, 0.0).astype(np.int64)
+    ray = np.repeat(np.arange(len(ends)), steps)
+    along = (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)) * _FREE_STEP_M
+    passed = origins[ray] + way[ray] * (along / np.maximum(length[ray], 1e-9))[:, None]
+    free = _distinct(voxel_keys(passed, _FREE_CELL_M))
+    occupied = _distinct(voxel_keys(submap.xyz, _FREE_CELL_M))
+    shift = np.arange(-1, 2)
+    around = (
+        (shift[:, None, None] << 2 * _BITS) + (shift[None, :, None] << _BITS) + shift[None, None]
+    )
+    beside = _distinct((occupied[:, None] + around.reshape(1, -1)).ravel())
+    return free[~_contained(free, beside)]
+
+
+def _distinct(keys: I64) -> I64:
+    """Return the sorted distinct keys; ``numpy.unique`` hashes, which takes three times as long."""
+    keys = np.sort(keys)
+    return keys[np.r_[True, keys[1:] != keys[:-1]]] if len(keys) else keys
+
+
+def _contained(keys: I64, among: I64) -> NDArray[np.bool_]:
+    """Return which keys are among some sorted ones."""
+    if not len(among):
+        return np.zeros(len(keys), np.bool_)
+    place = np.minimum(np.searchsorted(among, keys), len(among) - 1)
+    return np.asarray(among[place] == keys)
