@@ -58,6 +58,7 @@ setup(
     ],
     extras_require={
         "bench": ["evo>=1.31"],
+        "slam": ["gtsam>=4.3,<5"],
         "view": ["rerun-sdk>=0.20"],
         "dev": [
             "hypothesis>=6.100",
@@ -82,6 +83,8 @@ setup(
         "l2lidar.verbs": [
             "deskew = l2lidar_proc.verbs:DESKEW",
             "odometry = l2lidar_proc.verbs:ODOMETRY",
+            "slam = l2lidar_proc.verbs:SLAM",
+            "export = l2lidar_proc.verbs:EXPORT",
         ],
     },
 )

@@ -90,9 +90,7 @@ class Graph:
     config : SlamConfig
     """
 
-    def __init__(
-        self, poses: F64, edges: NDArray[np.void], node: int, config: SlamConfig
-    ) -> None:
+    def __init__(self, poses: F64, edges: NDArray[np.void], node: int, config: SlamConfig) -> None:
         edges = edges[edges["kind"] != CUT]
         self._poses, self._edges, self._node, self._config = poses, edges, node, config
         ways = np.maximum(edges["way"], _NO_WAY_M)
@@ -123,7 +121,8 @@ class Graph:
         config = self._config
         distance = np.linalg.norm(self._poses[:, :2, 3] - self._poses[self._node, :2, 3], axis=1)
         drift = config.drift
-        allowed = self.ways * (drift.systematic_percent + 3.0 * drift.drift_percent) * 0.01
+        percent = drift.systematic_percent + 3.0 * drift.drift_percent
+        allowed = 0.01 * percent * self.ways
         reach = _REACH_M + np.minimum(allowed, _LARGEST_WINDOW[0])
         fit = eligible & np.isfinite(self.ways) & (distance < reach + _SLACK_M)
         fit &= self.ways >= config.loop.loop_min_way_m
@@ -132,7 +131,7 @@ class Graph:
         return [int(node) for node in order[:_MOST]]
 
     def relation(self, node: int) -> Relation:
-        """Return what is between another node and the one the ways begin at: first is the other."""
+        """Return what is between another node (first) and the one the ways begin at."""
         drift = self._config.drift
         covariance = np.zeros((6, 6))
         end = self._poses[self._node]

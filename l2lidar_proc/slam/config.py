@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
-from l2lidar_node.settings import setting
+from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,10 +31,18 @@ class DriftConfig:
         0.5, "standard deviation of an edge, part of its way", unit="%", lo=0.01, hi=10.0
     )
     turn_drift_deg: float = setting(
-        0.05, "standard deviation of an edge's rotation, per 10 m of way", unit="deg", lo=0.001, hi=5.0
+        0.05,
+        "standard deviation of an edge's rotation, per 10 m of way",
+        unit="deg",
+        lo=0.001,
+        hi=5.0,
     )
     systematic_percent: float = setting(
-        1.0, "drift in plan that may add up over the whole way since a place", unit="%", lo=0.0, hi=10.0
+        1.0,
+        "drift in plan that may add up over the whole way since a place",
+        unit="%",
+        lo=0.0,
+        hi=10.0,
     )
     systematic_height_percent: float = setting(
         0.3, "drift in height that may add up likewise", unit="%", lo=0.0, hi=10.0
@@ -75,8 +84,8 @@ class LocalizationConfig:
 
     relocalize: str = setting(
         "auto",
-        "auto: the place is searched for whenever it is unknown; service: on ~/relocalize; off: only "
-        "from an initial pose",
+        "auto: the place is searched for whenever it is unknown; service: on ~/relocalize; off: "
+        "only from an initial pose",
         choices=("auto", "service", "off"),
     )
     query_step_m: float = setting(
@@ -86,7 +95,11 @@ class LocalizationConfig:
         1.0, "a larger correction needs two looks that agree", unit="m", lo=0.05, hi=100.0
     )
     dead_reckoning_m: float = setting(
-        20.0, "way without a look that fits before DEAD_RECKONING is said", unit="m", lo=2.0, hi=1000.0
+        20.0,
+        "way without a look that fits before DEAD_RECKONING is said",
+        unit="m",
+        lo=2.0,
+        hi=1000.0,
     )
     lost_sigma_m: float = setting(
         2.0, "uncertainty of the place at which LOST is said", unit="m", lo=0.1, hi=100.0
@@ -106,3 +119,77 @@ class SlamConfig:
     drift: DriftConfig = field(default_factory=DriftConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlamTopics:
+    """Topics, frames and files of slam_node."""
+
+    odometry_topic: str = setting("odometry", "pose of the body for each sweep", form=TOPIC)
+    cloud_topic: str = setting(
+        "deskewed_points", "deskewed clouds in the body frame, stamped as the odometry", form=TOPIC
+    )
+    odometry_status_topic: str = setting(
+        "odometry_status", "what odometry_node remarks about each sweep", form=TOPIC
+    )
+    initial_pose_topic: str = setting(
+        "/initialpose", "where the sensor is in the map, as RViz sends it", form=TOPIC
+    )
+    pose_topic: str = setting("pose", "pose of the body in map_frame", form=TOPIC)
+    map_topic: str = setting("map_points", "points of the whole map in map_frame", form=TOPIC)
+    path_topic: str = setting("map_path", "corrected path in map_frame", form=TOPIC)
+    graph_topic: str = setting("graph", "submaps and loops as markers", form=TOPIC)
+    status_topic: str = setting("slam_status", "state of the back end", form=TOPIC)
+    map_frame: str = setting("map", "frame of the map", form=FRAME)
+    publish_tf: bool = setting(True, "publish the transform from odom to map_frame")
+    tf_rate: float = setting(
+        30.0, "rate of the transform and of the pose", unit="Hz", lo=1.0, hi=100.0
+    )
+    tf_tolerance_s: float = setting(
+        0.1, "how far ahead the transform is stamped", unit="s", lo=0.0, hi=1.0
+    )
+    map_period_s: float = setting(
+        5.0, "time between publications of map and path, 0 = none", unit="s", lo=0.0, hi=3600.0
+    )
+    data_dir: str = setting("maps", "folder in which maps are saved and looked for")
+    map_name: str = setting("map", "folder of the map within data_dir", live=True)
+    load_map: bool = setting(False, "begin with the saved map")
+    autosave_s: float = setting(
+        60.0, "time between saves of a growing map, 0 = none", unit="s", lo=0.0, hi=86400.0
+    )
+    initial_pose: tuple[float, ...] = setting(
+        (), "x, y [m] and yaw [deg] in the saved map at the start; empty if unknown"
+    )
+
+    def __post_init__(self) -> None:
+        """Check what a single setting cannot."""
+        if len(self.initial_pose) not in (0, 3):
+            raise SettingError(
+                f"parameter 'initial_pose': {list(self.initial_pose)} has "
+                f"{len(self.initial_pose)} numbers, expected x, y, yaw or none"
+            )
+        check_map_name(self.map_name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlamNodeConfig:
+    """Everything slam_node can be told."""
+
+    topics: SlamTopics = field(default_factory=SlamTopics)
+    slam: SlamConfig = field(default_factory=SlamConfig)
+
+
+def check_map_name(name: str) -> str:
+    """Return the name of a map's folder.
+
+    Raises
+    ------
+    SettingError
+        If it is not a plain name: a map is never written outside data_dir.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", name):
+        raise SettingError(
+            f"parameter 'map_name': {name!r} is not the name of a folder, expected at most 64 "
+            "letters, digits, '_', '-' and '.', not starting with '.' or '-'"
+        )
+    return name

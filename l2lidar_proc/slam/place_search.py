@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from l2lidar_proc.slam import places
 from l2lidar_proc.slam.config import LoopConfig
-from l2lidar_proc.slam.graph_nodes import Node
+from l2lidar_proc.slam.nodes import Node
 from l2lidar_proc.slam.se3 import error, inverse, magnitude, planar
 from l2lidar_proc.slam.submap import SubmapView, structure_of
 from l2lidar_proc.slam.verification import Match, Window, verify

@@ -7,7 +7,7 @@ and the verdict from registration.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +102,7 @@ def anywhere(query: F64, target: F64, count: int) -> list[Place]:
     return _distinct(_correlated(query, target, yaws, _GLOBAL_CELL_M), count)
 
 
-def _correlated(query: F64, target: F64, yaws: F64, cell: float) -> list[Place]:
+def _correlated(query: F64, target: F64, yaws: NDArray[Any], cell: float) -> list[Place]:
     """Return the places with the highest correlation at each yaw."""
     reach = float(np.linalg.norm(query, axis=1).max()) + cell
     low = target.min(axis=0) - reach
@@ -148,9 +148,7 @@ def _distinct(places: list[Place], count: int) -> list[Place]:
 
 def _apart(one: Place, other: Place) -> bool:
     turn = (one.yaw - other.yaw + np.pi) % (2.0 * np.pi) - np.pi
-    return bool(
-        np.hypot(one.x - other.x, one.y - other.y) > _APART[0] or abs(turn) > _APART[1]
-    )
+    return bool(np.hypot(one.x - other.x, one.y - other.y) > _APART[0] or abs(turn) > _APART[1])
 
 
 def _turned(points: F64, yaw: float) -> F64:

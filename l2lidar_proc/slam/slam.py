@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -13,37 +12,18 @@ from l2lidar_proc.slam import pose_graph
 from l2lidar_proc.slam.admission import LARGEST_DEVIATION, Admission, Loop
 from l2lidar_proc.slam.candidates import Graph
 from l2lidar_proc.slam.config import SlamConfig
-from l2lidar_proc.slam.graph_nodes import Health, Node, OdometrySweep, OpenNode
+from l2lidar_proc.slam.nodes import Health, Map, Node, OdometrySweep, OpenNode, SlamState
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, GtsamMissingError
-from l2lidar_proc.slam.se3 import error, interpolated, inverse, magnitude, transformed
-from l2lidar_proc.slam.status import SlamState
+from l2lidar_proc.slam.se3 import error, inverse, magnitude, transformed
 from l2lidar_proc.slam.submap import SubmapView, ViewCache, voxel_keys
 from l2lidar_proc.slam.verification import verify
-from l2lidar_proc.trajectory import STAMPED_POSE, StampedPoses
 
 F64 = NDArray[np.float64]
 
 _CUT_SIGMA: Final = (3.0, 1000.0)  # [rad, m] an edge that says nothing
 _DISAGREE: Final = (np.radians(1.0), 0.15)  # [rad, m] places one query may have at once
 _KNOWN_OVERLAP: Final = 0.85  # a closed submap that shows this little new keeps no points
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Map:
-    """Nodes and edges, as they are saved.
-
-    Attributes
-    ----------
-    nodes : list of Node
-    poses : ndarray, shape (N, 4, 4)
-        ``T_map_node``.
-    edges : ndarray, shape (M,), dtype EDGE
-    """
-
-    nodes: list[Node]
-    poses: F64
-    edges: NDArray[np.void]
 
 
 class Slam:
@@ -235,9 +215,9 @@ class Slam:
         graph = Graph(self.poses, self.edges, len(self.nodes) - 1, self.config)
         if np.isfinite(graph.ways[0]):
             self.state = SlamState.LOCALIZED
-        if self.state in (SlamState.LOCALIZED, SlamState.LOST) and self.T_map_odom is not None:
-            self.T_map_odom = self.poses[-1] @ inverse(self.nodes[-1].T_odom_node)
-        elif self.state is SlamState.LOCALIZED:
+        if (
+            self.state in (SlamState.LOCALIZED, SlamState.LOST) and self.T_map_odom is not None
+        ) or self.state is SlamState.LOCALIZED:
             self.T_map_odom = self.poses[-1] @ inverse(self.nodes[-1].T_odom_node)
 
     # ---- results
@@ -251,36 +231,6 @@ class Slam:
     def map(self) -> Map:
         """Return the map as it is now."""
         return Map(list(self.nodes), self.poses.copy(), self.edges.copy())
-
-
-def corrected_trajectory(built: Map) -> StampedPoses:
-    """Return the poses of all sweeps in the map frame.
-
-    Between two nodes the correction of the odometry is interpolated, so that the way has no steps
-    where submaps meet.
-    """
-    parts = []
-    for number, node in enumerate(built.nodes):
-        if not len(node.sweeps):
-            continue
-        here = built.poses[number] @ inverse(node.T_odom_node)
-        there = here
-        after = number + 1
-        edges = built.edges[(built.edges["first"] == number) & (built.edges["second"] == after)]
-        if len(edges) and edges["kind"][0] == ODOMETRY:
-            there = built.poses[after] @ inverse(built.nodes[after].T_odom_node)
-        in_odom = node.T_odom_node @ node.sweeps["pose"]
-        step = np.linalg.norm(np.diff(in_odom[:, :3, 3], axis=0), axis=1)
-        share = np.concatenate(([0.0], np.cumsum(step)))
-        share /= max(float(share[-1]), 1e-9)
-        # about the place itself: a correction turns the way about the far origin of odom
-        anchor = np.eye(4)
-        anchor[:3, 3] = in_odom[0, :3, 3]
-        corrections = interpolated(here @ anchor, there @ anchor, share) @ inverse(anchor)
-        rows = np.empty(len(in_odom), STAMPED_POSE)
-        rows["stamp"], rows["pose"] = node.sweeps["stamp"], corrections @ in_odom
-        parts.append(rows)
-    return np.concatenate(parts) if parts else np.empty(0, STAMPED_POSE)
 
 
 def _contradict(poses: F64, loops: list[Loop]) -> bool:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.slam.se3 import error, magnitude, transformed
-from l2lidar_proc.surfels import SurfelMap
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -144,7 +144,7 @@ class SubmapBuilder:
         mean = np.stack(
             [np.bincount(inverse, weight * axis, len(keys)) / total for axis in placed.T], axis=1
         )
-        return mean, total, view[first]
+        return mean, np.asarray(total, np.float64), np.asarray(view[first], np.uint8)
 
 
 class SubmapView:
@@ -219,7 +219,7 @@ def voxel_keys(points: F64, edge: float) -> I64:
 
 
 def structure_of(points: F64) -> F64:
-    """Return the middles (M, 2) [m] of the cells in which points (N, 3) are at several heights."""
+    """Return the middles (M, 2) [m] of the cells with points (N, 3) at several heights."""
     cells = _distinct(voxel_keys(points, STRUCTURE_CELL_M))
     columns = cells >> _BITS  # the height is in the lowest bits
     first = np.flatnonzero(np.r_[True, columns[1:] != columns[:-1]]) if len(cells) else cells

@@ -20,7 +20,6 @@ from l2lidar_proc.slam.places import Place
 from l2lidar_proc.slam.se3 import (
     SHIFT,
     TURN,
-    adjoint,
     error,
     exp,
     inverse,
@@ -50,7 +49,9 @@ _BOTH_WAYS: Final = (np.radians(0.3), 0.03)  # [rad, m] between the results of e
 _OBSERVED: Final = 0.01  # part of the points that must speak for a direction
 _UNOBSERVED_M: Final = 30.0
 _SHARED: Final = 20.0  # neighbors err together: so many points count as one
-_NOISE_M: Final = 0.03  # distance of a point from its surface, 1 sigma, drift in the submap included
+_NOISE_M: Final = (
+    0.03  # distance of a point from its surface, 1 sigma, drift in the submap included
+)
 _FLOOR: Final = (np.radians(0.05), 0.01)  # [rad, m] no loop is better than this
 
 REASONS: Final = ("overlap", "agreement", "free space", "one way", "ambiguous", "no fit")
@@ -219,9 +220,7 @@ def _starts(query: SubmapView, target: SubmapView, guess: F64, window: Window) -
     ]
 
 
-def _registered(
-    source: F64, target: SubmapView, start: F64, steps: int
-) -> tuple[F64, F64 | None]:
+def _registered(source: F64, target: SubmapView, start: F64, steps: int) -> tuple[F64, F64 | None]:
     """Return pose and information (6, 6) of points on surfaces; no information if few meet any."""
     pose, information = start, None
     for step in range(steps):
@@ -262,15 +261,9 @@ def _covariance(information: F64) -> tuple[F64, F64]:
     covariance = np.linalg.inv(sound)
     covariance[TURN, TURN] += np.eye(3) * _FLOOR[0] ** 2
     covariance[SHIFT, SHIFT] += np.eye(3) * _FLOOR[1] ** 2
-    return covariance, directions
+    return np.asarray(covariance), directions
 
 
 def _are_apart(one: F64, other: F64) -> bool:
     turn, way = magnitude(error(one, other))
     return turn > _SAME[0] or way > _SAME[1]
-
-
-def in_frame_of(covariance: F64, transform: F64) -> F64:
-    """Return a covariance (6, 6) in the axes of the outer frame of a transform."""
-    ad = adjoint(transform)
-    return np.asarray(ad @ covariance @ ad.T)

@@ -16,3 +16,15 @@ ODOMETRY: Final = Verb(
     DATA,
     "Estimate the trajectory of a recording, as odometry_node does live; with map and plot.",
 )
+SLAM: Final = Verb(
+    "slam",
+    "l2lidar_proc.verbs.slam:slam",
+    DATA,
+    "Build a map of a recording with loops closed, as slam_node does live.",
+)
+EXPORT: Final = Verb(
+    "export",
+    "l2lidar_proc.verbs.slam:export_map",
+    DATA,
+    "Write a map as g2o, TUM, KITTI, nav2, PLY, PCD, or for interactive_slam or QN.",
+)

@@ -27,7 +27,7 @@ from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig
 from l2lidar_proc.motion.frames import FrameTree
 from l2lidar_proc.odometry.base_frame import BaseFrame
-from l2lidar_proc.odometry.estimate import Status
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag, map_file
@@ -75,6 +75,9 @@ class OdometryRun:
         ]
 
 
+Observer = Callable[[OdometryEstimate, BaseFrame], None]
+"""Given every estimate, and the frame that is meant by its pose."""
+
 Event = tuple[int, Sweep | NDArray[np.void]]
 """Instant of arrival [ns], and a sweep or IMU samples."""
 
@@ -85,9 +88,12 @@ class OdometryRunner:
     Parameters
     ----------
     config : OdometryNodeConfig
+    observer : callable, optional
+        Given the estimates one by one.
     """
 
-    def __init__(self, config: OdometryNodeConfig) -> None:
+    def __init__(self, config: OdometryNodeConfig, observer: Observer | None = None) -> None:
+        self._observer = observer
         topics = config.topics
         self.pipeline = OdometryPipeline(config.odometry, topics.T_cloud_imu, topics.imu_wait_ms)
         self.base = BaseFrame(np.eye(4))
@@ -100,11 +106,16 @@ class OdometryRunner:
             self.pipeline.sweep(what, now)
         else:
             self.pipeline.imu(what)
-        self.pipeline.poll(now)
+        self._poll(now)
+
+    def _poll(self, now: int) -> None:
+        for estimate in self.pipeline.poll(now):
+            if self._observer is not None:
+                self._observer(estimate, self.base)
 
     def finish(self) -> OdometryRun:
         """Return what was found."""
-        self.pipeline.poll(_END_NS)
+        self._poll(_END_NS)
         found = self.pipeline.trajectory.poses
         poses = self.base.poses(found)
         points = self.pipeline.odometry.map_points()
@@ -114,9 +125,11 @@ class OdometryRunner:
         return OdometryRun(poses, points, self.pipeline.sweeps, self.pipeline.counts, self.refused)
 
 
-def run_events(events: Iterator[Event], config: OdometryNodeConfig) -> OdometryRun:
+def run_events(
+    events: Iterator[Event], config: OdometryNodeConfig, observer: Observer | None = None
+) -> OdometryRun:
     """Return what the odometry makes of sweeps and samples in the order of their arrival."""
-    runner = OdometryRunner(config)
+    runner = OdometryRunner(config, observer)
     for event in events:
         runner.take(event)
     return runner.finish()
@@ -127,6 +140,7 @@ def run_capture(
     config: OdometryNodeConfig,
     progress: Progress = lambda share: None,
     l2_ip: str = "",
+    observer: Observer | None = None,
 ) -> OdometryRun:
     """Return what the odometry makes of a capture, cut into sweeps of a full turn.
 
@@ -139,6 +153,8 @@ def run_capture(
         Told how far it is.
     l2_ip : str
         Whose packets; empty if the capture holds those of one unit.
+    observer : callable, optional
+        Given the estimates one by one.
 
     Raises
     ------
@@ -157,11 +173,14 @@ def run_capture(
                 else:
                     yield now, np.array([tuple(event)], IMU_SAMPLE)
 
-        return run_events(taken(), config)
+        return run_events(taken(), config, observer)
 
 
 def run_bag(
-    source: Path, config: OdometryNodeConfig, progress: Progress = lambda share: None
+    source: Path,
+    config: OdometryNodeConfig,
+    progress: Progress = lambda share: None,
+    observer: Observer | None = None,
 ) -> OdometryRun:
     """Return what the odometry makes of a bag.
 
@@ -173,6 +192,8 @@ def run_bag(
         As for the node. A topic that is not in the bag is replaced by the only one of its kind.
     progress : callable
         Told how far it is.
+    observer : callable, optional
+        Given the estimates one by one.
 
     Raises
     ------
@@ -186,7 +207,7 @@ def run_bag(
             imu = ""
             if config.odometry.mode == "inertial":
                 imu = bag.chosen(kinds, config.topics.imu_topic, bag.IMU, "imu_topic")
-            listener = _Listener(OdometryRunner(config), config, cloud, imu)
+            listener = _Listener(OdometryRunner(config, observer), config, cloud, imu)
             span = max(reader.end_time - reader.start_time, 1)
             for connection, now, data in bag.messages(reader):
                 if connection.topic in (cloud, imu) or connection.msgtype == bag.TRANSFORMS:

@@ -13,8 +13,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.scene import Builder, Opening, Point, Scene
-from l2lidar_node.emulator.shapes import box, cone, ellipsoid, placed, quad
+from l2lidar_node.emulator.world.scene import (
+    Builder,
+    Opening,
+    Point,
+    Scene,
+    box,
+    cone,
+    ellipsoid,
+    placed,
+    quad,
+)
 
 _BRICK, _PLASTER, _WOOD, _METAL, _LEAVES, _GLASS, _FLOOR = 0.5, 0.75, 0.45, 0.55, 0.5, 0.06, 0.4
 _CORRIDOR_H = 2.6

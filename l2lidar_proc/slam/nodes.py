@@ -1,7 +1,8 @@
-"""Nodes of the map: submaps with their place in the odometry and the sweeps within them."""
+"""What the back end is given and keeps: sweeps, nodes, the map, its states."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -9,11 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
+from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses, Trajectory
 from l2lidar_proc.slam.candidates import odometry_covariance
 from l2lidar_proc.slam.config import SlamConfig
-from l2lidar_proc.slam.se3 import SHIFT, TURN, error, inverse, leveled, magnitude
+from l2lidar_proc.slam.pose_graph import ODOMETRY
+from l2lidar_proc.slam.se3 import (
+    SHIFT,
+    TURN,
+    error,
+    interpolated,
+    inverse,
+    leveled,
+    magnitude,
+    transformed,
+)
 from l2lidar_proc.slam.submap import Submap, SubmapBuilder
-from l2lidar_proc.trajectory import StampedPoses, Trajectory
 
 F64 = NDArray[np.float64]
 
@@ -27,6 +40,16 @@ class Health(Enum):
     DEGENERATE = "aligned, but the scene does not fix the pose in every direction"
     PREDICTED = "not aligned: the pose is predicted"
     CUT = "the motion since the sweep before is unknown"
+
+
+class SlamState(Enum):
+    """Whether the place in the map is known; the value is for people."""
+
+    SEARCHING = "the place in the map is not known: it is searched for"
+    TENTATIVE = "a place fits: waiting for further looks to agree"
+    LOCALIZED = "the place in the map is known"
+    DEAD_RECKONING = "nothing has confirmed the place lately: the odometry carries it on"
+    LOST = "the place in the map is lost: the last one known is held"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +74,29 @@ class OdometrySweep:
     points: F64
     health: Health
     covariance: F64
+
+    @classmethod
+    def of(cls, estimate: OdometryEstimate, base: BaseFrame) -> OdometrySweep:
+        """Return an estimate of the odometry as a sweep of the base frame."""
+        motion = base.motion(estimate)
+        points = np.stack([estimate.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        return cls(
+            estimate.stamp,
+            motion.T_odom_base,
+            transformed(inverse(base.T_lidar_base), points),
+            health_of(status.name for status in estimate.status),
+            motion.covariance,
+        )
+
+
+def health_of(names: Iterable[str]) -> Health:
+    """Return what the names of an estimate's remarks mean for the map."""
+    remarks = set(names)
+    if remarks & {"LOST", "RESTARTED"}:
+        return Health.CUT
+    if "PREDICTED" in remarks:
+        return Health.PREDICTED
+    return Health.DEGENERATE if "DEGENERATE" in remarks else Health.GOOD
 
 
 @dataclass(slots=True, eq=False)
@@ -79,6 +125,60 @@ class Node:
     sweeps: StampedPoses
     usable: bool
     way: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Map:
+    """Nodes and edges, as they are saved.
+
+    Attributes
+    ----------
+    nodes : list of Node
+    poses : ndarray, shape (N, 4, 4)
+        ``T_map_node``.
+    edges : ndarray, shape (M,), dtype pose_graph.EDGE
+    """
+
+    nodes: list[Node]
+    poses: F64
+    edges: NDArray[np.void]
+
+    def points(self) -> F64:
+        """Return the points of all submaps [m], shape (N, 3), map frame."""
+        parts = [
+            transformed(pose, node.submap.xyz)
+            for node, pose in zip(self.nodes, self.poses, strict=True)
+            if node.submap is not None
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3))
+
+    def trajectory(self) -> StampedPoses:
+        """Return the poses of all sweeps in the map frame.
+
+        Between two nodes the correction of the odometry is interpolated, so that the way has no
+        steps where submaps meet.
+        """
+        parts = []
+        for number, node in enumerate(self.nodes):
+            if not len(node.sweeps):
+                continue
+            here = self.poses[number] @ inverse(node.T_odom_node)
+            there, after = here, number + 1
+            joined = (self.edges["first"] == number) & (self.edges["second"] == after)
+            if (self.edges["kind"][joined] == ODOMETRY).any():
+                there = self.poses[after] @ inverse(self.nodes[after].T_odom_node)
+            in_odom = node.T_odom_node @ node.sweeps["pose"]
+            step = np.linalg.norm(np.diff(in_odom[:, :3, 3], axis=0), axis=1)
+            share = np.concatenate(([0.0], np.cumsum(step)))
+            share /= max(float(share[-1]), 1e-9)
+            # about the place itself: otherwise a turn would swing the way about odom's origin
+            at = np.eye(4)
+            at[:3, 3] = in_odom[0, :3, 3]
+            corrections = interpolated(here @ at, there @ at, share) @ inverse(at)
+            rows = np.empty(len(in_odom), STAMPED_POSE)
+            rows["stamp"], rows["pose"] = node.sweeps["stamp"], corrections @ in_odom
+            parts.append(rows)
+        return np.concatenate(parts) if parts else np.empty(0, STAMPED_POSE)
 
 
 class OpenNode:

@@ -1,0 +1,312 @@
+"""Localization in a saved map: searches for the place, then keeps it; the map stays as it is.
+
+What is estimated is ``T_map_odom`` with its covariance. It grows with the odometry's way and
+shrinks with each look at the map that fits; along what a place does not fix it keeps growing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc.slam.candidates import odometry_covariance
+from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState
+from l2lidar_proc.slam.place_search import PlaceSearch
+from l2lidar_proc.slam.se3 import (
+    SHIFT,
+    TURN,
+    adjoint,
+    error,
+    exp,
+    inverse,
+    leveled,
+    magnitude,
+    planar,
+)
+from l2lidar_proc.slam.submap import SubmapBuilder, SubmapView, ViewCache
+from l2lidar_proc.slam.verification import Match, Window, verify
+
+F64 = NDArray[np.float64]
+
+_LOOK_BACK: Final = 2  # steps whose sweeps a look is made of
+_VOTES: Final = 3  # looks that must agree before a place is announced
+_AGREE: Final = (np.radians(2.0), 0.25)  # [rad, m] between looks that mean the same place
+_DRIFT: Final = 0.01  # part of the way by which they may differ more
+_NEAR_M: Final = 8.0
+_MOST_TARGETS: Final = 2
+_GATE: Final = 22.5  # chi2 of 6 degrees of freedom, 99.9 %
+_SHARE: Final = 0.1  # of a sweep's covariance: two seconds of bad sweeps add it once
+_BENT: Final = (np.radians(0.1), 0.02)  # [rad, m] a saved map is not exact either
+_GIVEN: Final = (np.radians(15.0), 1.0)  # [rad, m] of a pose that a person gives
+_JUMP: Final = np.radians(5.0)
+_FEWEST_SWEEPS: Final = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """A place in the map that fitted.
+
+    Attributes
+    ----------
+    T_map_odom : ndarray, shape (4, 4)
+    way : float
+        Of the odometry then [m].
+    """
+
+    T_map_odom: F64
+    way: float
+
+
+class Localizer:
+    """Finds and keeps the place in a saved map.
+
+    Parameters
+    ----------
+    config : SlamConfig
+    saved : Map
+
+    Attributes
+    ----------
+    T_map_odom : ndarray, shape (4, 4), or None
+        None while the place is unknown. Replaced, never changed in place.
+    state : SlamState
+    covariance : ndarray, shape (6, 6)
+        Of the body's pose in the map: turn, then translation, map axes.
+    counts : Counter of str
+        Looks that did not fit, by reason.
+    """
+
+    def __init__(self, config: SlamConfig, saved: Map) -> None:
+        self.config = config
+        self._map = saved
+        self.T_map_odom: F64 | None = None
+        self.state = SlamState.SEARCHING
+        self.covariance = np.zeros((6, 6))
+        self.counts: Counter[str] = Counter()
+        self._eligible = np.array([node.submap is not None for node in saved.nodes])
+        self._views = ViewCache()
+        self._search = PlaceSearch(self._view_of)
+        self._sweeps: deque[tuple[float, OdometrySweep]] = deque()
+        self._latest: OdometrySweep | None = None
+        self._way = 0.0
+        self._looked_at = 0.0
+        self._confirmed_at = 0.0
+        self._looks: list[Look] = []
+        self._jump: Look | None = None
+        self._may_search = config.localization.relocalize == "auto"
+
+    # ---- input
+
+    def add(self, sweep: OdometrySweep) -> bool:
+        """Take a sweep, in order of time; return whether the map was looked at."""
+        if sweep.health is Health.CUT:
+            self._cut()
+        elif self._latest is not None:
+            self._carry_on(self._latest, sweep)
+        self._latest = sweep
+        if sweep.health in (Health.GOOD, Health.DEGENERATE):
+            self._sweeps.append((self._way, sweep))
+        step = self.config.localization.query_step_m
+        while self._sweeps and self._way - self._sweeps[0][0] > _LOOK_BACK * step:
+            self._sweeps.popleft()
+        if self._way - self._looked_at < step or len(self._sweeps) < _FEWEST_SWEEPS:
+            return False
+        self._looked_at = self._way
+        self._look()
+        return True
+
+    def relocalize(self) -> None:
+        """Forget the place and search for it, whatever the setting says."""
+        self._forget()
+        self._may_search = True
+
+    def set_pose(self, x: float, y: float, yaw: float) -> bool:
+        """Take a pose of the body from a person; return False before the first sweep.
+
+        Height, roll and pitch come from the map and from gravity.
+        """
+        if self._latest is None:
+            return False
+        poses = self._map.poses
+        distance = np.hypot(poses[:, 0, 3] - x, poses[:, 1, 3] - y)
+        z = float(poses[int(np.argmin(distance)), 2, 3])
+        body = self._latest.T_odom_body
+        self._forget()
+        self.T_map_odom = planar(x, y, yaw, z) @ inverse(leveled(body))
+        self.covariance = np.diag(np.repeat(np.square(_GIVEN), 3))
+        self._confirmed_at = self._looked_at = self._way
+        self.state = SlamState.TENTATIVE
+        return True
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the place in its worst direction [m]."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[SHIFT, SHIFT])[-1]))
+
+    # ---- steps
+
+    def _carry_on(self, before: OdometrySweep, sweep: OdometrySweep) -> None:
+        _, way = magnitude(error(before.T_odom_body, sweep.T_odom_body))
+        self._way += way
+        if self.T_map_odom is None:
+            return
+        extra = np.zeros((6, 6))
+        if sweep.health is not Health.GOOD and np.isfinite(sweep.covariance).all():
+            extra[TURN, TURN] = sweep.covariance[3:, 3:]
+            extra[SHIFT, SHIFT] = sweep.covariance[:3, :3]
+        # a little at each sweep: as much as an edge of the whole step would have
+        step = self.config.localization.query_step_m
+        whole = odometry_covariance(step, 0.0, np.zeros((6, 6)), self.config)
+        self.covariance = self.covariance + whole * (way / step) + _SHARE * extra
+        unconfirmed = self._way - self._confirmed_at
+        if self.state is SlamState.LOCALIZED and (
+            unconfirmed > self.config.localization.dead_reckoning_m
+        ):
+            self.state = SlamState.DEAD_RECKONING
+        if self.sigma > self.config.localization.lost_sigma_m and self.state in (
+            SlamState.LOCALIZED,
+            SlamState.DEAD_RECKONING,
+        ):
+            self.state = SlamState.LOST
+            self._looks = []
+
+    def _cut(self) -> None:
+        """Begin again after the odometry lost its way: what was known is held, not believed."""
+        self._sweeps.clear()
+        self._looks = []
+        if self.T_map_odom is not None:
+            self.state = SlamState.LOST
+
+    def _forget(self) -> None:
+        self.T_map_odom, self.state = None, SlamState.SEARCHING
+        self._looks, self._jump = [], None
+
+    def _look(self) -> None:
+        origin, query = self._query()
+        if self.state in (SlamState.LOCALIZED, SlamState.DEAD_RECKONING) or (
+            self.T_map_odom is not None and self.state is SlamState.TENTATIVE
+        ):
+            self._keep(origin, query)
+        elif self._may_search:
+            self._find(origin, query)
+
+    def _query(self) -> tuple[F64, SubmapView]:
+        """Return the frame in odom and the view of what was seen over the last steps."""
+        submaps = self.config.submaps
+        builder = SubmapBuilder(submaps.map_voxel_m, submaps.map_range_m)
+        origin = leveled(self._sweeps[len(self._sweeps) // 2][1].T_odom_body)
+        for _, sweep in self._sweeps:
+            builder.add(inverse(origin) @ sweep.T_odom_body, sweep.points)
+        return origin, SubmapView(builder.finish())
+
+    def _keep(self, origin: F64, query: SubmapView) -> None:
+        """Correct a place that is known with what the map shows there."""
+        assert self.T_map_odom is not None
+        predicted = self.T_map_odom @ origin
+        places = self._map.poses[:, :3, 3]
+        distance = np.linalg.norm(places - predicted[:3, 3], axis=1)
+        near = np.flatnonzero(self._eligible & (distance < _NEAR_M))
+        window = self._window()
+        for target in near[np.argsort(distance[near])][:_MOST_TARGETS].tolist():
+            guess = inverse(self._map.poses[target]) @ predicted
+            match = verify(query, self._view_of(target), guess, window, self.config.loop)
+            if isinstance(match, str):
+                self.counts[match] += 1
+                continue
+            if self._correct(origin, predicted, target, match):
+                return
+
+    def _window(self) -> Window:
+        sigma = 3.0 * np.sqrt(np.diag(self.covariance))
+        return Window(
+            float(np.clip(np.hypot(sigma[3], sigma[4]), 0.5, 5.0)),
+            float(np.clip(sigma[5], 0.2, 1.0)),
+            float(np.clip(sigma[2], np.radians(1.0), np.radians(45.0))),
+        )
+
+    def _correct(self, origin: F64, predicted: F64, target: int, match: Match) -> bool:
+        """Apply a look to ``T_map_odom``; return whether it was believed."""
+        measured = self._map.poses[target] @ match.T_target_query
+        # both covariances in the axes of the map, about the place of the query
+        ad = adjoint(_only_turn(measured))
+        noise = ad @ match.covariance @ ad.T
+        noise += np.diag(np.repeat(np.square(_BENT), 3))
+        off = ad @ error(predicted, measured)
+        spread = self.covariance + noise
+        if self.state is not SlamState.TENTATIVE and off @ np.linalg.solve(spread, off) > _GATE:
+            self.counts["odometry"] += 1
+            return False
+        gain = self.covariance @ np.linalg.inv(spread)
+        change = gain @ off
+        moved = predicted @ exp(adjoint(_only_turn(predicted)).T @ change)
+        believed = Look(leveled(moved) @ inverse(origin), self._way)
+        turn, way = magnitude(off)
+        if self.state is not SlamState.TENTATIVE and (
+            way > self.config.localization.max_jump_m or turn > _JUMP
+        ):
+            waiting, self._jump = self._jump, believed
+            if waiting is None or not _same(waiting, believed, origin):
+                self.counts["jump waits"] += 1
+                return True
+        self._jump = None
+        self.T_map_odom = believed.T_map_odom
+        self.covariance = (np.eye(6) - gain) @ self.covariance
+        self.covariance = 0.5 * (self.covariance + self.covariance.T)
+        self._confirmed_at = self._way
+        if self.state is SlamState.TENTATIVE:
+            self._looks.append(believed)
+            if not _same(self._looks[0], believed, origin):
+                self._looks = [believed]
+            if len(self._looks) < _VOTES:
+                return True
+        self.state, self._looks = SlamState.LOCALIZED, []
+        return True
+
+    def _find(self, origin: F64, query: SubmapView) -> None:
+        """Search the whole map; announce a place when several looks agree."""
+        found = self._search.find(
+            query, self._map.nodes, self._map.poses, self._eligible, self.config.loop
+        )
+        if isinstance(found, str):
+            self.counts[found] += 1
+            if found == "ambiguous":
+                self._looks = []
+            return
+        look = Look(found.T_map_query @ inverse(origin), self._way)
+        if self._looks and not _same(self._looks[-1], look, origin):
+            self.counts["looks disagree"] += 1
+            self._looks = []
+        self._looks.append(look)
+        if self.state is SlamState.SEARCHING:
+            self.state = SlamState.TENTATIVE
+        if len(self._looks) < _VOTES:
+            return
+        self.T_map_odom = leveled(found.T_map_query) @ inverse(origin)
+        ad = adjoint(_only_turn(found.T_map_query))
+        self.covariance = ad @ found.match.covariance @ ad.T
+        self.covariance += np.diag(np.repeat(np.square(_BENT), 3))
+        self._confirmed_at, self._looks = self._way, []
+        self.state = SlamState.LOCALIZED
+
+    def _view_of(self, number: int) -> SubmapView:
+        submap = self._map.nodes[number].submap
+        assert submap is not None
+        return self._views.of(number, submap)
+
+
+def _same(one: Look, other: Look, at: F64) -> bool:
+    """Return whether two looks put a pose (4, 4) of the odometry at the same place."""
+    turn, way = magnitude(error(one.T_map_odom @ at, other.T_map_odom @ at))
+    between = abs(other.way - one.way)
+    return bool(turn < _AGREE[0] and way < _AGREE[1] + _DRIFT * between)
+
+
+def _only_turn(pose: F64) -> F64:
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3]
+    return out
