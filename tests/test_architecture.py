@@ -22,6 +22,7 @@ FILE_FORMATS = {
     "l2lidar_node/emulator/truth/results.py",
     "l2lidar_node/emulator/motion/tum.py",
     "l2lidar_proc/recording/bag.py",
+    "l2lidar_proc/slam/atlas.py",
 }
 
 

@@ -90,7 +90,7 @@ def test_every_python_package_imported_is_declared() -> None:
     optional = {
         re.match(r"[\w.-]+", line)[0]
         for line in requirements
-        if re.search(r"""extra == ["']view["']""", line)
+        if re.search(r"""extra == ["'](view|slam)["']""", line)
     }
     used = {
         name for name in imported("l2lidar_node", "l2lidar_proc") if not ROS_MODULES.match(name)

@@ -25,7 +25,10 @@ class PhysicsConfig:
     """Where the virtual L2 is, how it moves and what is imperfect about it."""
 
     world: str = setting(
-        "room", "built-in scene (box, room, corridor, yard) or path of a mesh file (PLY, STL, OBJ)"
+        "room",
+        "built-in scene (box, room, corridor, yard, or for mapping: street_block, office_ring, "
+        "furnished_office, warehouse, car_park, garages, bare_corridor) or path of a mesh file "
+        "(PLY, STL, OBJ)",
     )
     motion: str = setting(
         "walk",
@@ -83,7 +86,7 @@ def assemble(config: PhysicsConfig, own: Unit | None = None) -> Physics:
     ValueError
         For a scene, motion or file that cannot be used; the message names it.
     """
-    if config.world in scenes.SCENES:
+    if config.world in scenes.NAMES:
         scene = scenes.make(config.world)
         world = World(scene.triangles, scene.reflectivity)
     elif _is_path(config.world):

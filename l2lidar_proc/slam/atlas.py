@@ -149,7 +149,7 @@ def load(folder: Path) -> tuple[Map, list[str]]:
                 row["T_odom_node"].copy(),
                 submap,
                 sweeps[ends[number] - row["sweeps"] : ends[number]].copy(),
-                bool(row["usable"]) and submap is not None,
+                bool(row["usable"]),
                 float(row["way"]),
             )
         )

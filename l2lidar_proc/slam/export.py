@@ -15,7 +15,7 @@ from l2lidar_proc.recording import map_file, trajectory
 from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses
 from l2lidar_proc.slam.nodes import Map
 from l2lidar_proc.slam.pose_graph import CUT, LOOP
-from l2lidar_proc.slam.se3 import transformed
+from l2lidar_proc.slam.se3 import inverse, transformed
 
 F64 = NDArray[np.float64]
 
@@ -238,8 +238,17 @@ def _node_poses(built: Map) -> StampedPoses:
 
 
 def _points(built: Map, number: int) -> F64:
+    """Return the points (N, 3) of a node, or those of the nearest one that has any, its frame."""
     submap = built.nodes[number].submap
-    return np.zeros((0, 3)) if submap is None else submap.xyz
+    if submap is not None:
+        return submap.xyz
+    distance = np.linalg.norm(built.poses[:, :3, 3] - built.poses[number, :3, 3], axis=1)
+    distance[[node.submap is None for node in built.nodes]] = np.inf
+    nearest = int(np.argmin(distance))
+    other = built.nodes[nearest].submap
+    if other is None:
+        return np.zeros((0, 3))
+    return transformed(inverse(built.poses[number]) @ built.poses[nearest], other.xyz)
 
 
 def _numbers(pose: F64) -> str:

@@ -33,8 +33,9 @@ from l2lidar_proc.slam.verification import Match, Window, verify
 
 F64 = NDArray[np.float64]
 
-_LOOK_BACK: Final = 2  # steps whose sweeps a look is made of
+_LOOK_BACK: Final = 3  # steps whose sweeps a look is made of
 _VOTES: Final = 3  # looks that must agree before a place is announced
+_LOOKS_WITHIN_M: Final = 10.0  # of way; older looks no longer count
 _AGREE: Final = (np.radians(2.0), 0.25)  # [rad, m] between looks that mean the same place
 _DRIFT: Final = 0.01  # part of the way by which they may differ more
 _NEAR_M: Final = 8.0
@@ -274,10 +275,9 @@ class Localizer:
         )
         if isinstance(found, str):
             self.counts[found] += 1
-            if found == "ambiguous":
-                self._looks = []
             return
         look = Look(found.T_map_query @ inverse(origin), self._way)
+        self._looks = [old for old in self._looks if look.way - old.way <= _LOOKS_WITHIN_M]
         if self._looks and not _same(self._looks[-1], look, origin):
             self.counts["looks disagree"] += 1
             self._looks = []

@@ -114,7 +114,7 @@ class Node:
     sweeps : ndarray of STAMPED_POSE
         ``T_node_body`` of each sweep.
     usable : bool
-        Whether loops may be sought: all sweeps were aligned and well fixed.
+        Whether all sweeps were aligned and well fixed: otherwise it closes no loop.
     way : float
         Of the odometry at its beginning [m].
     """
@@ -125,6 +125,11 @@ class Node:
     sweeps: StampedPoses
     usable: bool
     way: float
+
+    @property
+    def is_comparable(self) -> bool:
+        """Whether it may take part in loops."""
+        return self.usable and self.submap is not None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,7 +242,7 @@ class OpenNode:
             self.T_odom_node,
             submap if len(submap) else None,
             self._sweeps.poses.copy(),
-            self._usable and len(submap) > 0,
+            self._usable,
             self._began,
         )
 

@@ -14,7 +14,7 @@ from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.nodes import Node
 from l2lidar_proc.slam.se3 import error, inverse, magnitude, planar
 from l2lidar_proc.slam.submap import SubmapView, structure_of
-from l2lidar_proc.slam.verification import Match, Window, verify
+from l2lidar_proc.slam.verification import Match, Window, likeness, verify
 
 F64 = NDArray[np.float64]
 
@@ -92,12 +92,13 @@ class PlaceSearch:
                 found.append(Found(node, match, poses[node] @ match.T_target_query))
         if not found:
             return refused
-        first = found[0]
-        for other in found[1:]:
-            turn, way = magnitude(error(first.T_map_query, other.T_map_query))
-            if turn > _SAME[0] or way > _SAME[1]:
+        best = max(found, key=lambda item: item.match.fit.agreement)
+        for other in found:
+            turn, way = magnitude(error(best.T_map_query, other.T_map_query))
+            alike = likeness(other.match.fit.agreement, best.match.fit.agreement)
+            if (turn > _SAME[0] or way > _SAME[1]) and alike > config.max_second_best:
                 return "ambiguous"
-        return max(found, key=lambda item: item.match.fit.overlap)
+        return best
 
     def _structure(self, nodes: Sequence[Node], poses: F64, among: NDArray[np.int64]) -> F64:
         """Return the cells of upright structure of the whole map, shape (M, 2)."""

@@ -15,7 +15,7 @@ from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.nodes import Health, Map, Node, OdometrySweep, OpenNode, SlamState
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, GtsamMissingError
-from l2lidar_proc.slam.se3 import error, inverse, magnitude, transformed
+from l2lidar_proc.slam.se3 import adjoint, error, inverse, magnitude, transformed
 from l2lidar_proc.slam.submap import SubmapView, ViewCache, voxel_keys
 from l2lidar_proc.slam.verification import verify
 
@@ -40,6 +40,8 @@ class Slam:
     T_map_odom : ndarray, shape (4, 4), or None
         None while the place in a saved map is unknown. Replaced, never changed in place.
     state : SlamState
+    covariance : ndarray, shape (6, 6)
+        Of the newest node in the map: turn, then translation, map axes.
     loops : list of tuple of int
         Pairs of nodes in force: query, target.
 
@@ -61,6 +63,7 @@ class Slam:
         ]
         self.state = SlamState.SEARCHING if saved else SlamState.LOCALIZED
         self.T_map_odom: F64 | None = None if saved else np.eye(4)
+        self.covariance = np.zeros((6, 6))
         self.admission = Admission(config.loop)
         self._views = ViewCache()
         self._search = PlaceSearch(self.view_of)
@@ -120,7 +123,7 @@ class Slam:
         else:
             self._connect(number, *self._pending_edge)
         self._pending_edge = None
-        if self.config.loop.loops and node.usable:
+        if self.config.loop.loops and node.is_comparable:
             self._look_for_loops(number)
         self._publish()
 
@@ -150,7 +153,7 @@ class Slam:
 
     def _near(self, graph: Graph, number: int) -> list[Loop]:
         """Return verified pairs with the nodes that the odometry says may be near."""
-        eligible = np.array([node.usable and node.submap is not None for node in self.nodes])
+        eligible = np.array([node.is_comparable for node in self.nodes])
         query = self.view_of(number)
         found = []
         for target in graph.near(eligible):
@@ -175,7 +178,7 @@ class Slam:
         if self.config.localization.relocalize == "off":
             return []
         apart = ~np.isfinite(graph.ways)
-        eligible = apart & np.array([node.submap is not None for node in self.nodes])
+        eligible = apart & np.array([node.is_comparable for node in self.nodes])
         found = self._search.find(
             self.view_of(number), self.nodes, self.poses, eligible, self.config.loop
         )
@@ -215,6 +218,10 @@ class Slam:
         graph = Graph(self.poses, self.edges, len(self.nodes) - 1, self.config)
         if np.isfinite(graph.ways[0]):
             self.state = SlamState.LOCALIZED
+            turned = np.eye(4)
+            turned[:3, :3] = self.poses[-1][:3, :3]
+            ad = adjoint(turned)
+            self.covariance = ad @ graph.relation(0).covariance @ ad.T
         if (
             self.state in (SlamState.LOCALIZED, SlamState.LOST) and self.T_map_odom is not None
         ) or self.state is SlamState.LOCALIZED:

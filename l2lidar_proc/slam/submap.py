@@ -219,7 +219,7 @@ def voxel_keys(points: F64, edge: float) -> I64:
 
 
 def structure_of(points: F64) -> F64:
-    """Return the middles (M, 2) [m] of the cells with points (N, 3) at several heights."""
+    """Return the middles (M, 2) [m] of cells with points (N, 3) at several heights."""
     cells = _distinct(voxel_keys(points, STRUCTURE_CELL_M))
     columns = cells >> _BITS  # the height is in the lowest bits
     first = np.flatnonzero(np.r_[True, columns[1:] != columns[:-1]]) if len(cells) else cells
@@ -258,7 +258,7 @@ def _free_cells(submap: Submap) -> I64:
 
 
 def _distinct(keys: I64) -> I64:
-    """Return the sorted distinct keys; ``numpy.unique`` hashes, which takes three times as long."""
+    """Return the sorted distinct keys; ``numpy.unique`` hashes, which is slower."""
     keys = np.sort(keys)
     return keys[np.r_[True, keys[1:] != keys[:-1]]] if len(keys) else keys
 

@@ -28,6 +28,8 @@ from l2lidar_node.emulator.world.scene import (
 _BRICK, _PLASTER, _WOOD, _METAL, _LEAVES, _GLASS, _FLOOR = 0.5, 0.75, 0.45, 0.55, 0.5, 0.06, 0.4
 _CORRIDOR_H = 2.6
 _STOREY_M: Final = 3.2
+_ROUTE_STEP_M: Final = 0.8  # between corners of a route: curves through fewer swing out
+_ROUND_M: Final = 2.4  # of way over which a corner is rounded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,8 +202,42 @@ MAPPING_SCENES: Final[dict[str, Callable[[], MappingScene]]] = {
 def _finished(
     builder: Builder, way: list[tuple[float, float, float]], headroom: float
 ) -> MappingScene:
-    route: list[Point] = [(x, y) for x, y, _ in way]
-    return MappingScene(builder.finish(route, route[0], headroom), np.array(way, np.float64))
+    corners = np.array(way, np.float64)
+    places, _ = along_way(corners, 1.0, _ROUTE_STEP_M)
+    route: list[Point] = [(float(x), float(y)) for x, y in places[:, :2]]
+    return MappingScene(builder.finish(route, route[0], headroom), corners)
+
+
+def along_way(
+    way: NDArray[np.float64], laps: float, step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places (N, 3) [m] along a closed way, corners rounded, and headings (N,) [rad].
+
+    Parameters
+    ----------
+    way : ndarray, shape (M, 3)
+        Corners of one lap.
+    laps : float
+        How often it is gone round; may end within one.
+    step : float
+        Distance between places [m].
+    """
+    corners = np.vstack([np.tile(way, (int(np.ceil(laps)) + 1, 1))])
+    edges = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    distance = np.concatenate(([0.0], np.cumsum(edges)))
+    lap = float(distance[len(way)])
+    fine = np.arange(-_ROUND_M, lap * laps + _ROUND_M, 0.05)
+    wrapped = np.mod(fine, lap)
+    places = np.stack([np.interp(wrapped, distance, corners[:, i]) for i in range(3)], axis=1)
+    width = round(_ROUND_M / 0.05) | 1
+    kernel = np.hanning(width + 2)[1:-1]
+    kernel /= kernel.sum()
+    smooth = np.stack([np.convolve(places[:, i], kernel, "valid") for i in range(3)], axis=1)
+    ahead = np.gradient(smooth, axis=0)
+    heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    chosen = np.arange(0, round(lap * laps / step)) * round(step / 0.05) + width // 2
+    chosen = chosen[chosen < len(smooth)]
+    return smooth[chosen], heading[chosen]
 
 
 def _turned(triangles: NDArray[np.float64], turn: int) -> NDArray[np.float64]:

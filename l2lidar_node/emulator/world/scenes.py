@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from l2lidar_node.emulator.world.indoors import corridor, empty_box, room
+from l2lidar_node.emulator.world.mapping_scenes import MAPPING_SCENES
 from l2lidar_node.emulator.world.outdoors import yard
 from l2lidar_node.emulator.world.scene import Scene
 from l2lidar_node.emulator.world.world import World
@@ -18,7 +19,10 @@ SCENES: Final[dict[str, Callable[[], Scene]]] = {
     "corridor": corridor,
     "yard": yard,
 }
-"""Scenes by name; all are the same at every call."""
+"""Small scenes by name; all are the same at every call."""
+
+NAMES: Final = (*SCENES, *MAPPING_SCENES)
+"""Names of all built-in scenes: these, and the large ones for mapping."""
 
 _EYE_M: Final = 1.0  # height at which of_world looks around
 
@@ -31,8 +35,10 @@ def make(name: str) -> Scene:
     ValueError
         For a name that is not known.
     """
+    if name in MAPPING_SCENES:
+        return MAPPING_SCENES[name]().scene
     if name not in SCENES:
-        raise ValueError(f"scene '{name}' is not known, expected one of {', '.join(SCENES)}")
+        raise ValueError(f"scene '{name}' is not known, expected one of {', '.join(NAMES)}")
     return SCENES[name]()
 
 

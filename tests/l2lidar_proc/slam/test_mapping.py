@@ -1,0 +1,215 @@
+"""Admission, the pose graph, and whole maps of walks with drift."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from l2lidar_node.emulator.world.mapping_scenes import office_ring
+from l2lidar_proc.slam import se3
+from l2lidar_proc.slam.admission import Admission, Loop
+from l2lidar_proc.slam.candidates import Graph
+from l2lidar_proc.slam.config import LoopConfig, SlamConfig
+from l2lidar_proc.slam.nodes import Health, SlamState
+from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, deviations, optimized
+from l2lidar_proc.slam.se3 import F64
+from l2lidar_proc.slam.slam import Slam
+from l2lidar_proc.slam.verification import Fit, Match
+from tests.l2lidar_proc.slam.conftest import STEP
+from tests.support.mapping_runs import MappingRun, ate, drifting, scan, walk
+
+TIGHT = np.diag(np.repeat((1e-3**2, 0.01**2), 3))
+FIT = Fit(0.9, 0.99, 0.0)
+
+
+def ring(count: int, radius: float) -> F64:
+    """Return poses around a circle, one lap."""
+    angle = np.arange(count) / count * 2.0 * np.pi
+    return np.stack(
+        [
+            se3.planar(radius * np.cos(a), radius * np.sin(a), a + np.pi / 2.0)
+            for a in angle.tolist()
+        ]
+    )
+
+
+def chain(poses: F64, covariance: F64) -> np.ndarray:
+    """Return the odometry's edges between poses."""
+    edges = np.zeros(len(poses) - 1, EDGE)
+    edges["first"], edges["second"] = np.arange(len(poses) - 1), np.arange(1, len(poses))
+    edges["pose"] = se3.inverse(poses[:-1]) @ poses[1:]
+    edges["covariance"], edges["way"] = covariance, 5.0
+    return edges
+
+
+def loop_of(poses: F64, query: int, target: int, off: tuple[float, ...] = (0.0,) * 6) -> Loop:
+    """Return a verified pair, right but for an error."""
+    pose = se3.inverse(poses[target]) @ poses[query] @ se3.exp(off)
+    return Loop(query, target, Match(pose, TIGHT, FIT, 0.1, True), 5.0 * query)
+
+
+def test_a_loop_alone_waits_and_three_that_agree_enter_together() -> None:
+    poses = np.concatenate((ring(40, 30.0), ring(40, 30.0)[:10]))
+    admission = Admission(LoopConfig())
+
+    admission.judge(None, loop_of(poses, 40, 0))
+    admission.judge(None, loop_of(poses, 40, 1))
+    admission.judge(None, loop_of(poses, 41, 1))
+    assert admission.batch(poses) == []
+    admission.judge(None, loop_of(poses, 42, 2))
+
+    assert {loop.query for loop in admission.batch(poses)} == {40, 41, 42}
+
+
+def test_loops_that_do_not_agree_never_enter() -> None:
+    poses = np.concatenate((ring(40, 30.0), ring(40, 30.0)[:10]))
+    admission = Admission(LoopConfig())
+    for number in range(8):  # each 3 m from where the others say
+        off = (0.0, 0.0, 0.0, 3.0 * number, 0.0, 0.0)
+        admission.judge(None, loop_of(poses, 40 + number, number, off))
+
+    assert admission.batch(poses) == []
+
+
+def test_a_barred_pair_is_not_looked_at_again() -> None:
+    poses = ring(40, 30.0)
+    admission = Admission(LoopConfig())
+    lie = loop_of(poses, 39, 0)
+    admission.judge(None, lie)
+    admission.bar([lie])
+
+    assert not admission.is_open(39, 0)
+    assert admission.waiting == 0
+    assert admission.rejected["optimization"] == 1
+
+
+def test_the_odometry_bars_a_place_three_meters_above_within_a_kilometer() -> None:
+    poses = ring(80, 64.0)  # 400 m around
+    edges = chain(poses, np.diag(np.repeat((5e-4**2, 0.025**2), 3)))
+    relation = Graph(poses, edges, 79, SlamConfig()).relation(0)
+
+    assert relation.way == pytest.approx(395.0)
+    assert relation.admits(np.array([0.0, 0.0, 0.01, 2.0, 1.0, 0.3]))
+    assert not relation.admits(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0]))
+    assert not relation.admits(np.array([0.0, 0.0, 0.0, 15.0, 0.0, 0.0]))
+
+
+def test_ways_lead_through_loops_and_never_through_cuts() -> None:
+    poses = ring(40, 30.0)
+    edges = chain(poses, TIGHT)
+    loop = np.zeros(1, EDGE)
+    loop["first"], loop["second"], loop["kind"] = 0, 39, LOOP
+    loop["pose"], loop["covariance"] = se3.inverse(poses[0]) @ poses[39], TIGHT
+    short = Graph(poses, np.concatenate((edges, loop)), 39, SlamConfig())
+    edges["kind"][20] = CUT
+    apart = Graph(poses, edges, 39, SlamConfig())
+
+    assert short.ways[1] < 6.0
+    assert np.isinf(apart.ways[:21]).all()
+    assert np.isfinite(apart.ways[21:]).all()
+
+
+def test_the_graph_takes_a_ring_s_drift_out_and_shows_a_lie() -> None:
+    pytest.importorskip("gtsam")
+    truth = ring(60, 40.0)
+    steps = se3.inverse(truth[:-1]) @ truth[1:]
+    noise = np.random.default_rng(2).normal(0.0, (0, 0, 2e-3, 0.03, 0.03, 0.02), (59, 6))
+    drift = [truth[0]]
+    for step, off in zip(steps, se3.exp(noise), strict=True):
+        drift.append(drift[-1] @ step @ off)
+    poses = np.stack(drift)
+    edges = chain(poses, np.diag(np.repeat((2e-3**2, 0.03**2), 3)))
+    loops = np.zeros(3, EDGE)
+    for row, query in zip(loops, (57, 58, 59), strict=True):
+        row["first"], row["second"], row["kind"] = query - 57, query, LOOP
+        row["pose"] = se3.inverse(truth[query - 57]) @ truth[query]
+        row["covariance"] = TIGHT
+    edges = np.concatenate((edges, loops))
+
+    solved = optimized(poses, edges, np.zeros(1, np.int64))
+    lie = edges.copy()
+    lie["pose"][-1] = lie["pose"][-1] @ se3.exp((0.0, 0.0, 0.0, 5.0, 0.0, 0.0))
+    bent = optimized(poses, lie, np.zeros(1, np.int64))
+
+    assert ate(solved, truth) < 0.5 * ate(poses, truth)
+    assert deviations(solved, edges).max() < 3.0
+    assert deviations(bent, lie).max() > 3.0
+
+
+def test_a_lap_and_a_third_closes_right_loops_and_mends_the_drift(
+    office: MappingRun, mapped: Slam
+) -> None:
+    odometry = drifting(office.truth, 0.5, 1, STEP)
+    corrected = mapped.map().trajectory()["pose"]
+
+    assert len(mapped.loops) >= 3
+    assert ate(corrected, office.truth) < 0.5 * ate(odometry, office.truth)
+    true = [se3.leveled(office.true_pose(node.stamp)) for node in mapped.nodes]
+    for edge in mapped.edges[mapped.edges["kind"] == LOOP]:
+        expected = se3.inverse(true[edge["first"]]) @ true[edge["second"]]
+        turn, way = se3.magnitude(se3.error(expected, edge["pose"]))
+        assert way < 0.05
+        assert np.degrees(turn) < 0.5
+
+
+def test_without_drift_the_map_is_as_good_as_the_odometry(office: MappingRun) -> None:
+    pytest.importorskip("gtsam")
+    slam = Slam(SlamConfig())
+    for sweep in office.sweeps(drifting(office.truth, 0.0, 0, STEP)):
+        slam.add(sweep)
+    slam.finish()
+
+    assert ate(slam.map().trajectory()["pose"], office.truth) < 0.015
+
+
+def test_degenerate_and_predicted_sweeps_close_nothing(office: MappingRun) -> None:
+    pytest.importorskip("gtsam")
+    slam = Slam(SlamConfig())
+    for health in (Health.DEGENERATE, Health.PREDICTED):
+        for sweep in office.sweeps(drifting(office.truth, 0.5, 1, STEP), health):
+            slam.add(sweep)
+    slam.finish()
+
+    assert slam.loops == []
+    assert not any(node.usable for node in slam.nodes)
+
+
+def test_after_a_cut_the_place_is_lost_until_the_map_knows_it_again(office: MappingRun) -> None:
+    pytest.importorskip("gtsam")
+    slam = Slam(SlamConfig())
+    lap = round(len(office.truth) / 1.35)
+    odometry = drifting(office.truth, 0.0, 0, STEP)
+    jump = se3.planar(20.0, -7.0, 2.0)
+    states = []
+    for number, sweep in enumerate(office.sweeps(odometry)):
+        if number >= lap - 10:  # carried away unseen: the odometry goes on from elsewhere
+            health = Health.CUT if number == lap - 10 else Health.GOOD
+            sweep = dataclasses.replace(sweep, T_odom_body=jump @ sweep.T_odom_body, health=health)
+        slam.add(sweep)
+        states.append(slam.state)
+    slam.finish()
+
+    assert states[lap - 11] is SlamState.LOCALIZED
+    assert SlamState.LOST in states
+    kinds = slam.edges["kind"]
+    assert (kinds == CUT).sum() == 1
+    assert (kinds == ODOMETRY).sum() == len(slam.nodes) - 2
+    if slam.state is SlamState.LOCALIZED:  # found again: it has to be right
+        assert ate(slam.map().trajectory()["pose"], office.truth) < 0.1
+
+
+def test_a_ring_of_identical_doors_never_gets_a_wrong_loop() -> None:
+    pytest.importorskip("gtsam")
+    scene = office_ring()
+    run = scan(scene, walk(scene, 1.3, step=STEP), step=STEP, rays=3000)
+    slam = Slam(SlamConfig())
+    for sweep in run.sweeps(drifting(run.truth, 1.0, 3, STEP)):
+        slam.add(sweep)
+    slam.finish()
+
+    true = [se3.leveled(run.true_pose(node.stamp)) for node in slam.nodes]
+    for edge in slam.edges[slam.edges["kind"] == LOOP]:
+        expected = se3.inverse(true[edge["first"]]) @ true[edge["second"]]
+        assert se3.magnitude(se3.error(expected, edge["pose"]))[1] < 0.3

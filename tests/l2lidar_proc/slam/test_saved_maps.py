@@ -1,0 +1,256 @@
+"""Saved maps, exports, and localization in them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2lidar_node.emulator.world.mapping_scenes import furnished_office, street_block
+from l2lidar_proc.slam import atlas, export, se3
+from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
+from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.localization import Localizer
+from l2lidar_proc.slam.nodes import SlamState
+from l2lidar_proc.slam.slam import Slam
+from tests.l2lidar_proc.slam.conftest import STEP
+from tests.support.mapping_runs import MappingRun, drifting, scan, walk
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_saved_map_comes_back_and_saves_to_the_same_bytes(mapped: Slam, tmp_path: Path) -> None:
+    built = mapped.map()
+    AtlasWriter(tmp_path / "one").save(built)
+
+    loaded, warnings = atlas.load(tmp_path / "one")
+    AtlasWriter(tmp_path / "two").save(loaded)
+
+    assert warnings == []
+    np.testing.assert_array_equal(loaded.poses, built.poses)
+    np.testing.assert_array_equal(loaded.trajectory(), built.trajectory())
+    np.testing.assert_array_equal(loaded.points(), built.points())
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_saving_again_replaces_and_leaves_nothing_behind(mapped: Slam, tmp_path: Path) -> None:
+    writer = AtlasWriter(tmp_path / "map")
+    built = mapped.map()
+    half = type(built)(built.nodes[:5], built.poses[:5], built.edges[built.edges["second"] < 5])
+    writer.save(built)
+    first = contents(tmp_path / "map")
+    size = writer.save(half)
+
+    left = contents(tmp_path / "map")
+    assert len(left) < len(first)
+    assert size == sum(map(len, left.values()))
+    assert len(atlas.load(tmp_path / "map")[0].nodes) == 5
+
+
+def test_whatever_is_cut_off_while_saving_the_map_before_is_whole(
+    mapped: Slam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = mapped.map()
+    half = type(built)(built.nodes[:5], built.poses[:5], built.edges[built.edges["second"] < 5])
+    write = atlas.write_whole
+    for allowed in range(8):  # as if killed after so many files
+        monkeypatch.setattr(atlas, "write_whole", write)
+        folder, count = tmp_path / str(allowed), 0
+        AtlasWriter(folder).save(half)
+
+        def dying(path: Path, content: bytes | str, allowed: int = allowed) -> None:
+            nonlocal count
+            count += 1
+            if count > allowed:
+                raise KeyboardInterrupt
+            write(path, content)
+
+        monkeypatch.setattr(atlas, "write_whole", dying)
+        with pytest.raises(KeyboardInterrupt):
+            AtlasWriter(folder).save(built)
+
+        loaded, warnings = atlas.load(folder)
+        assert warnings == []
+        assert len(loaded.nodes) == 5
+
+
+def test_a_damaged_submap_is_left_out_with_a_warning(mapped: Slam, tmp_path: Path) -> None:
+    AtlasWriter(tmp_path).save(mapped.map())
+    body = json.loads((tmp_path / atlas.MANIFEST).read_text())["map"]
+    number, name = next((i, name) for i, name in enumerate(body["submaps"]) if name)
+    content = bytearray((tmp_path / name).read_bytes())
+    content[len(content) // 2] ^= 0x40
+    (tmp_path / name).write_bytes(bytes(content))
+
+    loaded, warnings = atlas.load(tmp_path)
+
+    assert len(warnings) == 1
+    assert f"submap {number} is left out" in warnings[0]
+    assert loaded.nodes[number].submap is None
+    assert len(loaded.nodes) == len(mapped.nodes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda folder: (folder / atlas.MANIFEST).unlink(), "not a saved map"),
+        (lambda folder: (folder / atlas.MANIFEST).write_text("{"), "cannot be read"),
+        (lambda folder: (folder / atlas.MANIFEST).write_text("[1]"), "not the list"),
+        (lambda folder: edit(folder, "version", 9), "version 9 is not known"),
+        (lambda folder: edit(folder, "submaps", ["../../etc/passwd"]), "checksum is wrong"),
+        (lambda folder: next(folder.glob("graph-*")).write_bytes(b"PK"), "damaged"),
+    ],
+)
+def test_what_is_not_a_map_is_refused_with_a_reason(
+    mapped: Slam, tmp_path: Path, change: object, message: str
+) -> None:
+    AtlasWriter(tmp_path).save(mapped.map())
+    assert callable(change)
+    change(tmp_path)
+
+    with pytest.raises(AtlasError, match=message):
+        atlas.load(tmp_path)
+
+
+def edit(folder: Path, key: str, value: object) -> None:
+    read = json.loads((folder / atlas.MANIFEST).read_text())
+    read["map"][key] = value
+    (folder / atlas.MANIFEST).write_text(json.dumps(read))
+
+
+def test_a_folder_with_other_files_is_not_written_to(mapped: Slam, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+
+    with pytest.raises(AtlasError, match="holds files that are not a map"):
+        AtlasWriter(tmp_path).save(mapped.map())
+
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_gtsam_reads_the_g2o_file_back(mapped: Slam, tmp_path: Path) -> None:
+    gtsam = pytest.importorskip("gtsam")
+    built = mapped.map()
+    (path,) = export.write(built, "g2o", tmp_path)
+
+    graph, values = gtsam.readG2o(str(path), True)
+
+    assert graph.size() == len(built.edges)
+    found = np.stack([values.atPose3(n).matrix() for n in range(len(built.nodes))])
+    np.testing.assert_allclose(found, built.poses, atol=1e-6)
+
+
+def test_every_format_writes_files_that_hold_something(mapped: Slam, tmp_path: Path) -> None:
+    for kind in export.FORMATS:
+        files = export.write(mapped.map(), kind, tmp_path / kind)
+        assert files
+        assert all(path.stat().st_size > 0 for path in files)
+    submaps = len(mapped.nodes)
+    assert len(list((tmp_path / "qn" / "scans").glob("*.pcd"))) == submaps
+    assert len(list((tmp_path / "interactive_slam").glob("0*/cloud.pcd"))) == submaps
+    tum = (tmp_path / "tum" / "trajectory.tum").read_text().splitlines()
+    assert len(tum) == sum(len(node.sweeps) for node in mapped.nodes)
+
+
+def test_the_occupancy_map_is_free_along_the_way_and_has_walls_beside_it(mapped: Slam) -> None:
+    built = mapped.map()
+    image, (x0, y0) = export.occupancy(built, 0.05)
+    way = built.trajectory()["pose"][:, :2, 3]
+    index = np.floor((way - (x0, y0)) / 0.05).astype(int)
+    along = image[::-1][index[:, 1], index[:, 0]]
+
+    assert (along == 254).mean() > 0.9
+    assert (along == 0).sum() == 0
+    assert set(np.unique(image)) == {0, 205, 254}
+    assert 0.01 < (image == 0).mean() < 0.5
+
+
+def test_a_kidnapped_start_is_found_and_kept(mapped: Slam) -> None:
+    scene = furnished_office()
+    truth = walk(scene, 0.45, step=STEP, seed=4, backwards=True)
+    run = scan(scene, truth, step=STEP, rays=4000, seed=4)
+    localizer = Localizer(SlamConfig(), mapped.map())
+    before = len(mapped.map().points())
+
+    seen = []
+    for number, sweep in enumerate(run.sweeps(drifting(truth, 0.5, 4, STEP))):
+        localizer.add(sweep)
+        seen.append(localizer.state)
+        if localizer.state is SlamState.SEARCHING:
+            assert localizer.T_map_odom is None
+        if localizer.state is SlamState.LOCALIZED:
+            assert localizer.T_map_odom is not None
+            assert off_by(localizer.T_map_odom @ sweep.T_odom_body, run, number, mapped) < 0.12
+
+    assert SlamState.LOCALIZED in seen[: round(12.0 / STEP)]
+    assert seen[-1] is SlamState.LOCALIZED
+    assert len(mapped.map().points()) == before
+
+
+def off_by(pose: np.ndarray, run: MappingRun, number: int, mapped: Slam) -> float:
+    """Return the distance [m] from the truth; the map frame is that of the first sweep."""
+    first = furnished_walk_start()
+    true = se3.inverse(first) @ run.truth[number]
+    return float(np.linalg.norm((pose - true)[:3, 3]))
+
+
+def furnished_walk_start() -> np.ndarray:
+    return se3.leveled(walk(furnished_office(), 0.1, step=STEP)[0])
+
+
+def test_a_start_outside_the_map_announces_nothing(mapped: Slam) -> None:
+    scene = street_block()
+    truth = walk(scene, 0.05, step=STEP, seed=2)
+    run = scan(scene, truth, step=STEP, rays=4000, seed=2)
+    localizer = Localizer(SlamConfig(), mapped.map())
+
+    for sweep in run.sweeps(drifting(truth, 0.5, 2, STEP)):
+        localizer.add(sweep)
+        assert localizer.state is not SlamState.LOCALIZED
+        assert localizer.T_map_odom is None
+
+
+def test_a_given_pose_is_corrected_by_the_map(office: MappingRun, mapped: Slam) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    run = office.part(20, 50)
+    odometry = drifting(run.truth, 0.5, 9, STEP)
+    assert not localizer.set_pose(0.0, 0.0, 0.0)
+    true = se3.inverse(se3.leveled(office.truth[0])) @ run.truth
+    for number, sweep in enumerate(run.sweeps(odometry)):
+        localizer.add(sweep)
+        if number == 0:
+            x, y, _ = true[0, :3, 3]
+            assert localizer.set_pose(x + 0.4, y - 0.3, se3.yaw_of(true[0]) + 0.1)
+
+    assert localizer.state is SlamState.LOCALIZED
+    assert localizer.T_map_odom is not None
+    assert np.linalg.norm((localizer.T_map_odom @ odometry[-1] - true[-1])[:3, 3]) < 0.12
+
+
+def test_far_from_the_map_the_place_is_carried_on_then_lost(
+    office: MappingRun, mapped: Slam
+) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    true = se3.inverse(se3.leveled(office.truth[0])) @ office.truth
+    sweeps = list(office.sweeps(true))
+    localizer.add(sweeps[0])
+    localizer.set_pose(*true[0, :2, 3].tolist(), se3.yaw_of(true[0]))
+    for sweep in sweeps[1:30]:
+        localizer.add(sweep)
+    assert localizer.state is SlamState.LOCALIZED
+    states = []
+    street = street_block()
+    truth = walk(street, 0.12, step=STEP, seed=1)
+    run = scan(street, truth, step=STEP, rays=1500)
+    onward = sweeps[29].T_odom_body @ se3.inverse(truth[0]) @ truth
+    for sweep in run.sweeps(onward):
+        localizer.add(sweep)
+        states.append(localizer.state)
+
+    assert SlamState.DEAD_RECKONING in states
+    assert localizer.T_map_odom is not None
+    assert localizer.sigma > 0.05
