@@ -157,6 +157,58 @@ class SweepConfig:
         hi=0.0,
         live=True,
     )
+    override_angle_calibration: bool = setting(
+        False,
+        "use calAlphaAngleBias, calBetaAngle, calXiAngle, calThetaAngleBias and calBAxisDist "
+        "instead of the values the unit reports; they win over calibration_file",
+        name="EnableCalAngleOVR",
+        live=True,
+    )
+    alpha_angle_bias: float = setting(
+        0.032398,
+        "mirror angle of the first slot, with EnableCalAngleOVR",
+        name="calAlphaAngleBias",
+        unit="rad",
+        lo=-0.2,
+        hi=0.2,
+        live=True,
+    )
+    beta_angle: float = setting(
+        0.003818,
+        "tilt of the mirror's axis, with EnableCalAngleOVR",
+        name="calBetaAngle",
+        unit="rad",
+        lo=-0.2,
+        hi=0.2,
+        live=True,
+    )
+    xi_angle: float = setting(
+        0.002945,
+        "angle of the beam off the mirror's plane, with EnableCalAngleOVR",
+        name="calXiAngle",
+        unit="rad",
+        lo=-0.2,
+        hi=0.2,
+        live=True,
+    )
+    theta_angle_bias: float = setting(
+        2.0769,
+        "head angle of the zero mark, with EnableCalAngleOVR",
+        name="calThetaAngleBias",
+        unit="rad",
+        lo=-6.3,
+        hi=6.3,
+        live=True,
+    )
+    b_axis_dist: float = setting(
+        0.006586,
+        "distance between the axes of head and mirror, with EnableCalAngleOVR",
+        name="calBAxisDist",
+        unit="m",
+        lo=-0.05,
+        hi=0.05,
+        live=True,
+    )
     range_min: float = setting(
         0.0, "shortest range that is published", unit="m", lo=0.0, hi=100.0, live=True
     )
@@ -271,10 +323,15 @@ class WatchdogConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileConfig:
-    """Captures of what is received and sent (pcap), to write and to read."""
+    """Captures to write and to read, and the calibration of the unit."""
 
     record_file: str = setting("", "capture file to write; a number is added if the file exists")
     replay_file: str = setting("", "capture file to replay instead of listening to an L2")
+    calibration_file: str = setting(
+        "",
+        "calibration of the unit, written by l2lidar calibrate; used for packets whose reported "
+        "calibration block is the file's, and ignored for others",
+    )
     replay_rate: float = setting(1.0, "replay speed; 0 is as fast as possible", lo=0.0, hi=1000.0)
     replay_loop: bool = setting(False, "start over at the end, with stamps that continue")
     replay_clock: bool = setting(

@@ -8,10 +8,11 @@ import numpy as np
 
 from l2lidar_node.calibration import planes as flat
 from l2lidar_node.calibration import solver
-from l2lidar_node.calibration.model import BIAS, F8, STRETCH, beams
+from l2lidar_node.calibration.model import BIAS, STRETCH, beams
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.result import Estimate, Verdict
 from l2lidar_node.calibration.solver import FewPlanesError, Scene, Solution, Unknown
+from l2lidar_node.types import F64
 
 FEWEST_DIRECTIONS: Final = 3
 _LARGE_PLANES: Final = 4
@@ -84,7 +85,7 @@ def _bowed(scene: Scene, solution: Solution) -> tuple[int, bool, int]:
 
 def directions(planes: Planes) -> int:
     """Return how many directions, 30 degrees and more apart, the normals have (at most 9)."""
-    chosen: list[F8] = []
+    chosen: list[F64] = []
     weights = planes.counts
     for index in np.argsort(-weights):
         normal = planes.normal[index]

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
-
-F8 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 RETURN: Final = np.dtype(
     [
@@ -77,17 +76,17 @@ class Beams(NamedTuple):
         Corrected range [m].
     """
 
-    origin: F8
-    direction: F8
-    distance: F8
+    origin: F64
+    direction: F64
+    distance: F64
 
     @property
-    def points(self) -> F8:
+    def points(self) -> F64:
         """The returns in the cloud frame [m], shape (N, 3)."""
         return self.origin + self.direction * self.distance[:, None]
 
 
-def beams(returns: NDArray[np.void], block: Block, correction: F8) -> Beams:
+def beams(returns: NDArray[np.void], block: Block, correction: F64) -> Beams:
     """Return the rays of returns under a corrected block.
 
     Parameters
@@ -116,8 +115,8 @@ def beams(returns: NDArray[np.void], block: Block, correction: F8) -> Beams:
 
 
 def derivatives(
-    returns: NDArray[np.void], block: Block, correction: F8, normals: F8, distance: F8
-) -> F8:
+    returns: NDArray[np.void], block: Block, correction: F64, normals: F64, distance: F64
+) -> F64:
     """Return how far each parameter moves a point along a normal.
 
     Parameters
@@ -160,7 +159,7 @@ def derivatives(
     return found
 
 
-def _angles(returns: NDArray[np.void], own: dict[str, float], correction: F8) -> tuple[F8, F8]:
+def _angles(returns: NDArray[np.void], own: dict[str, float], correction: F64) -> tuple[F64, F64]:
     """Return alpha and beta of every return [rad]."""
     alpha = returns["alpha"]
     alpha = alpha + correction[..., ALPHA] + correction[..., STRETCH] * (alpha - np.pi / 2)

@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.calibration.model import F8, RETURN, Block
+from l2lidar_node.calibration.model import RETURN, Block
 from l2lidar_node.protocol import wire
+from l2lidar_node.types import F64
 
 GYRO: Final = np.dtype(
     [
@@ -206,7 +207,7 @@ def _records(items: list[_Timed], layout: np.dtype[np.void]) -> NDArray[np.void]
     return np.frombuffer(b"".join(item.payload for item in items), layout)
 
 
-def _head_angles(raw: NDArray[np.void], block: Block) -> F8:
+def _head_angles(raw: NDArray[np.void], block: Block) -> F64:
     """Return the head angle at the first slot of every packet [rad], unwrapped."""
     angle = raw["com_horizontal_angle_start"].astype(np.float64)
     return np.asarray(np.unwrap(angle) + block.values["theta_angle_bias"])

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.calibration.model import F8
+from l2lidar_node.types import F64
 
 CELLS_M: Final = (0.4, 0.6)  # edges of the cells of both grids
 _FEWEST: Final = 40  # points of a cell
@@ -45,10 +45,10 @@ class Planes(NamedTuple):
 
     member: I8
     first: I8
-    center: F8
-    normal: F8
-    u: F8
-    v: F8
+    center: F64
+    normal: F64
+    u: F64
+    v: F64
 
     @property
     def plane(self) -> I8:
@@ -64,14 +64,14 @@ class Planes(NamedTuple):
         """Return the same planes of points that are stored plane by plane."""
         return self._replace(member=np.arange(first, first + len(self.member)))
 
-    def heights(self, points: F8) -> F8:
+    def heights(self, points: F64) -> F64:
         """Return the distance of each member from its plane [m], shape (M,)."""
         plane = self.plane
         away = points[self.member] - self.center[plane]
         return np.asarray(np.einsum("ni,ni->n", away, self.normal[plane]))
 
 
-def cells(points: F8, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
+def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
     """Return the flat cells of two grids that hold points of both halves of the fan.
 
     Parameters
@@ -86,7 +86,7 @@ def cells(points: F8, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
     return joined([_cells(points, is_far_half, groups, size) for size in CELLS_M])
 
 
-def _cells(points: F8, is_far_half: NDArray[np.bool_], groups: I8, size: float) -> Planes:
+def _cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8, size: float) -> Planes:
     found = _grid(points, groups, size, is_far_half)
     found = _kept(found, _flat(found, points))
     found = _trimmed(found, points)
@@ -94,7 +94,7 @@ def _cells(points: F8, is_far_half: NDArray[np.bool_], groups: I8, size: float) 
     return _thinned(found, points)
 
 
-def large(points: F8, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
+def large(points: F64, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
     """Return large flat surfaces, merged from neighboring cells; one half may see them alone.
 
     Takes ``is_far_half`` to be called as :func:`cells` is. The tolerance is wide enough for a
@@ -143,18 +143,18 @@ def joined(parts: Sequence[Planes]) -> Planes:
     )
 
 
-def part(planes: Planes, keep: NDArray[np.bool_], points: F8) -> Planes:
+def part(planes: Planes, keep: NDArray[np.bool_], points: F64) -> Planes:
     """Return the planes through some of their members, shape (M,); few remain no plane."""
     found = _sorted(planes.member[keep], planes.plane[keep], points)
     return _kept(found, found.counts >= _FEWEST_OF_HALF)
 
 
-def refitted(planes: Planes, points: F8) -> Planes:
+def refitted(planes: Planes, points: F64) -> Planes:
     """Return the same planes through the same members where these are now."""
     return _fitted(planes.member, planes.first, points)
 
 
-def products(columns: F8, first: I8, weight: F8 | None = None) -> F8:
+def products(columns: F64, first: I8, weight: F64 | None = None) -> F64:
     """Return the weighted scalar products of columns (N, C) in each plane, shape (K, C, C)."""
     count = columns.shape[1]
     rows = np.ascontiguousarray(columns.T)
@@ -167,7 +167,7 @@ def products(columns: F8, first: I8, weight: F8 | None = None) -> F8:
 
 
 def _grid(
-    points: F8, groups: I8, size: float, is_far_half: NDArray[np.bool_] | None = None
+    points: F64, groups: I8, size: float, is_far_half: NDArray[np.bool_] | None = None
 ) -> Planes:
     """Return the cells of a grid with enough points, and of both halves where these are given."""
     cell = np.floor(points / size + _SHIFT).astype(np.int64)
@@ -183,7 +183,7 @@ def _grid(
     return _sorted(np.arange(len(points)), np.where(enough[label], label, -1), points)
 
 
-def _sorted(member: I8, key: I8, points: F8) -> Planes:
+def _sorted(member: I8, key: I8, points: F64) -> Planes:
     """Return planes of members by key; negative keys are left out."""
     member, key = member[key >= 0], key[key >= 0]
     order = np.argsort(key, kind="stable")
@@ -193,7 +193,7 @@ def _sorted(member: I8, key: I8, points: F8) -> Planes:
     return _fitted(member, np.flatnonzero(is_first), points)
 
 
-def _fitted(member: I8, first: I8, points: F8) -> Planes:
+def _fitted(member: I8, first: I8, points: F64) -> Planes:
     if not len(first):
         none = np.empty((0, 3))
         return Planes(member, first, none, none, none, none)
@@ -204,7 +204,7 @@ def _fitted(member: I8, first: I8, points: F8) -> Planes:
     return Planes(member, first, center, axes[..., 0], axes[..., 1], axes[..., 2])
 
 
-def _eigen(planes: Planes, points: F8) -> tuple[F8, F8]:
+def _eigen(planes: Planes, points: F64) -> tuple[F64, F64]:
     """Return eigenvalues (K, 3) [m^2], ascending, and eigenvectors (K, 3, 3) of the scatter."""
     if not len(planes.first):
         return np.empty((0, 3)), np.empty((0, 3, 3))
@@ -214,7 +214,7 @@ def _eigen(planes: Planes, points: F8) -> tuple[F8, F8]:
     return np.maximum(values, 0.0), vectors
 
 
-def _flat(planes: Planes, points: F8) -> NDArray[np.bool_]:
+def _flat(planes: Planes, points: F64) -> NDArray[np.bool_]:
     values, _ = _eigen(planes, points)
     flat = (values[:, 0] < _FLATNESS * values[:, 1]) & (values[:, 0] < _THICKEST_M**2)
     return np.asarray(flat)
@@ -237,7 +237,7 @@ def _kept(planes: Planes, keep: NDArray[np.bool_]) -> Planes:
     )
 
 
-def _trimmed(planes: Planes, points: F8) -> Planes:
+def _trimmed(planes: Planes, points: F64) -> Planes:
     """Return the planes without points that stick out, refitted."""
     if not len(planes.first):
         return planes
@@ -248,7 +248,7 @@ def _trimmed(planes: Planes, points: F8) -> Planes:
     return _sorted(planes.member[inside], plane[inside], points)
 
 
-def _thinned(planes: Planes, points: F8, most: int = _MOST) -> Planes:
+def _thinned(planes: Planes, points: F64, most: int = _MOST) -> Planes:
     """Return the planes with at most so many points each, evenly taken."""
     if not len(planes.first):
         return planes

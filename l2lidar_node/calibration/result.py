@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from l2lidar_node.calibration.model import F8, Block
+from l2lidar_node.calibration.model import Block
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.solver import Scene
 from l2lidar_node.calibration.whirl import Whirl
+from l2lidar_node.types import F64
 
 
 class Verdict(Enum):
@@ -132,7 +133,7 @@ class StillResult:
     directions: int
     refusals: tuple[Refusal, ...]
     notes: tuple[str, ...]
-    correction: F8
+    correction: F64
     scene: Scene
     surfaces: Planes
 

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration.model import F8, NAMES, Block, beams, derivatives
+from l2lidar_node.calibration.model import NAMES, Block, beams, derivatives
 from l2lidar_node.calibration.planes import I8, Planes
+from l2lidar_node.types import F64
 
 # 1-sigma range noise of a real unit along smooth surfaces, over the distance
 NOISE_AT_M: Final = np.array([0.0, 8.0, 12.5, 20.0, 30.0])
@@ -32,7 +33,7 @@ _STEP: Final = np.array(
 _BALANCE: Final = 2.0  # a direction of normals counts at most so many times the mean of all
 
 
-Finder = Callable[[F8, NDArray[np.bool_], I8], Planes]
+Finder = Callable[[F64, NDArray[np.bool_], I8], Planes]
 
 
 class FewPlanesError(ValueError):
@@ -62,7 +63,7 @@ class Scene(NamedTuple):
 
     returns: NDArray[np.void]
     group: I8
-    known: F8
+    known: F64
     block: Block
 
     @property
@@ -96,24 +97,24 @@ class Solution:
     """
 
     unknowns: tuple[Unknown, ...]
-    values: F8
-    hessian: F8
-    covariance: F8
+    values: F64
+    hessian: F64
+    covariance: F64
     cost: float
     planes: Planes
     scale: float
 
-    def per_group(self, groups: int) -> F8:
+    def per_group(self, groups: int) -> F64:
         """Return the corrections of every group, shape (G, 8)."""
         return spread(self.unknowns, self.values, groups)
 
     @property
-    def sd(self) -> F8:
+    def sd(self) -> F64:
         """Standard deviation of each unknown, shape (P,)."""
         return np.sqrt(np.diag(self.covariance))
 
 
-def spread(unknowns: Sequence[Unknown], values: F8, groups: int) -> F8:
+def spread(unknowns: Sequence[Unknown], values: F64, groups: int) -> F64:
     """Return the corrections of every group, shape (G, 8), of the values of the unknowns."""
     found = np.zeros((groups, len(NAMES)))
     for unknown, value in zip(unknowns, values, strict=True):
@@ -122,7 +123,7 @@ def spread(unknowns: Sequence[Unknown], values: F8, groups: int) -> F8:
     return found
 
 
-def points(scene: Scene, corrections: F8) -> F8:
+def points(scene: Scene, corrections: F64) -> F64:
     """Return the returns in their places' cloud frames under corrections (G, 8) [m]."""
     full = (scene.known + corrections)[scene.group]
     return beams(scene.returns, scene.block, full).points
@@ -131,9 +132,9 @@ def points(scene: Scene, corrections: F8) -> F8:
 def solve(
     scene: Scene,
     unknowns: Sequence[Unknown],
-    start: F8 | None = None,
+    start: F64 | None = None,
     find: Finder = flat.cells,
-    prior: F8 | None = None,
+    prior: F64 | None = None,
 ) -> Solution:
     """Estimate the unknowns.
 
@@ -187,7 +188,7 @@ def solve(
     )
 
 
-def cost_on(scene: Scene, unknowns: Sequence[Unknown], values: F8, planes: Planes) -> float:
+def cost_on(scene: Scene, unknowns: Sequence[Unknown], values: F64, planes: Planes) -> float:
     """Return the mean robust cost of values on planes found with others."""
     members, own = scene.part(planes.member), planes.at()
     unknowns = tuple(unknowns)
@@ -218,7 +219,7 @@ def widened(scene: Scene, solution: Solution, more: Sequence[Unknown]) -> Soluti
     )
 
 
-def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F8:
+def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F64:
     """Return the unknowns as some of the solution's members alone would have them.
 
     One Gauss-Newton step from the solution, on its planes.
@@ -239,9 +240,9 @@ def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F8:
 
 
 class _System(NamedTuple):
-    hessian: F8
-    gradient: F8
-    covariance: F8
+    hessian: F64
+    gradient: F64
+    covariance: F64
     cost: float
     scale: float
 
@@ -249,9 +250,9 @@ class _System(NamedTuple):
 def _linearized(
     scene: Scene,
     unknowns: tuple[Unknown, ...],
-    values: F8,
+    values: F64,
     planes: Planes,
-    information: F8 | float = 0.0,
+    information: F64 | float = 0.0,
 ) -> _System:
     """Return the normal equations of the unknowns, planes eliminated; all returns are members."""
     returns, group = scene.returns, scene.group
@@ -314,14 +315,14 @@ def _linearized(
     )
 
 
-def _per_cluster(scores: F8, center: F8, group: I8) -> F8:
+def _per_cluster(scores: F64, center: F64, group: I8) -> F64:
     """Return the sums of the scores of neighboring planes, whose errors are correlated."""
     place = np.column_stack((group, np.floor(center / _CLUSTER_M).astype(np.int64)))
     cluster = np.unique(place, axis=0, return_inverse=True)[1].ravel()
     return np.stack([np.bincount(cluster, column) for column in scores.T], axis=-1)
 
 
-def _balance(planes: Planes) -> F8:
+def _balance(planes: Planes) -> F64:
     """Return a weight of each plane by which no direction of normals outvotes the others."""
     axes = np.array(
         [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.float64
@@ -334,10 +335,10 @@ def _balance(planes: Planes) -> F8:
     return np.asarray(np.minimum(1.0, most / np.maximum(share, 1e-12))[direction])
 
 
-def _newton(hessian: F8, gradient: F8, rcond: float | None = None) -> F8:
+def _newton(hessian: F64, gradient: F64, rcond: float | None = None) -> F64:
     return np.asarray(np.linalg.lstsq(hessian, -gradient, rcond=rcond)[0], np.float64)
 
 
-def _bounded(step: F8, unknowns: Sequence[Unknown]) -> F8:
+def _bounded(step: F64, unknowns: Sequence[Unknown]) -> F64:
     limit = _STEP[[item.parameter for item in unknowns]]
     return np.asarray(step / max(1.0, float(np.max(np.abs(step) / limit))))

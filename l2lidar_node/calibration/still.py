@@ -12,16 +12,7 @@ from l2lidar_node.calibration import planes as flat
 from l2lidar_node.calibration import solver
 from l2lidar_node.calibration.bias import FEWEST_DIRECTIONS, range_bias, significant
 from l2lidar_node.calibration.bias import directions as facing
-from l2lidar_node.calibration.model import (
-    ALPHA,
-    BETA,
-    F8,
-    NAMES,
-    ROCK_COS,
-    ROCK_SIN,
-    XI,
-    B,
-)
+from l2lidar_node.calibration.model import ALPHA, BETA, NAMES, ROCK_COS, ROCK_SIN, XI, B
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.result import (
@@ -34,6 +25,7 @@ from l2lidar_node.calibration.result import (
 )
 from l2lidar_node.calibration.solver import FewPlanesError, Scene, Solution, Unknown
 from l2lidar_node.calibration.whirl import Whirl, demodulated
+from l2lidar_node.types import F64
 
 DEG: Final = np.pi / 180.0
 
@@ -344,7 +336,7 @@ def _alone(
     return reports
 
 
-def _uncertainty(scene: Scene, solution: Solution) -> tuple[F8, F8, float]:
+def _uncertainty(scene: Scene, solution: Solution) -> tuple[F64, F64, float]:
     """Return deviations of the unknowns, scatter of the quarters, and xi and beta together.
 
     A deviation is the largest of what the planes, the quarters of the recording and near against
@@ -379,8 +371,8 @@ def _side_sd(scene: Scene, solution: Solution) -> float:
 
 def _judged(
     solution: Solution,
-    sd: F8,
-    scatter: F8,
+    sd: F64,
+    scatter: F64,
     together: float,
     directions: int,
     reports: Sequence[PlaceReport],
@@ -448,7 +440,9 @@ def _judged(
     return found
 
 
-def _alpha(places: Sequence[Place], alphas: F8, sd: F8, verdict: Verdict, keep: bool) -> Estimate:
+def _alpha(
+    places: Sequence[Place], alphas: F64, sd: F64, verdict: Verdict, keep: bool
+) -> Estimate:
     """Return alpha, stored only if it repeats after switching the unit off and on."""
     value, uncertain = float(alphas.mean()), float(np.sqrt(np.mean(sd**2)))
     spread = float(alphas.max() - alphas.min())
@@ -483,14 +477,14 @@ def _axis_distance(angles: Solution) -> Estimate:
     return significant(value, sd)
 
 
-def _qualities(scene: Scene, solution: Solution, corrections: F8) -> tuple[Quality, Quality]:
+def _qualities(scene: Scene, solution: Solution, corrections: F64) -> tuple[Quality, Quality]:
     return (
         quality(scene, solution.planes, np.zeros_like(corrections)),
         quality(scene, solution.planes, corrections),
     )
 
 
-def quality(scene: Scene, planes: Planes, corrections: F8) -> Quality:
+def quality(scene: Scene, planes: Planes, corrections: F64) -> Quality:
     """Return how thin planes are, and how far apart the halves, under corrections (G, 8).
 
     The rocking of the mount is taken out in any case.
@@ -510,7 +504,7 @@ def quality(scene: Scene, planes: Planes, corrections: F8) -> Quality:
     )
 
 
-def _half_gaps(height: F8, far: NDArray[np.bool_], planes: Planes) -> F8:
+def _half_gaps(height: F64, far: NDArray[np.bool_], planes: Planes) -> F64:
     """Return the distance of the two halves' means on every plane [m], shape (K,)."""
     counts = np.add.reduceat(far.astype(np.float64), planes.first)
     others = planes.counts - counts

@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.calibration.model import ALPHA, BETA, F8, NAMES, ROCK_COS, ROCK_SIN
+from l2lidar_node.calibration.model import ALPHA, BETA, NAMES, ROCK_COS, ROCK_SIN
 from l2lidar_node.calibration.observation import Place
+from l2lidar_node.types import F64
 
 _HARMONICS: Final = (-2, -1, 0, 1, 2)
 _PARTS: Final = 8  # of the recording, whose scatter tells the uncertainty
@@ -58,7 +59,7 @@ class Whirl:
         return float(np.hypot(self.rock_cos, self.rock_sin))
 
     @property
-    def correction(self) -> F8:
+    def correction(self) -> F64:
         """What the whirl adds to the parameters of the beams, shape (8,)."""
         found = np.zeros(len(NAMES))
         found[[ALPHA, BETA, ROCK_COS, ROCK_SIN]] = (
@@ -79,7 +80,7 @@ def demodulated(place: Place) -> Whirl | None:
     return Whirl(tilt_a, tilt_b, rock_cos, rock_sin, sd, _is_at_rest(gyro))
 
 
-def _lines(gyro: NDArray[np.void], head_rate: float) -> F8:
+def _lines(gyro: NDArray[np.void], head_rate: float) -> F64:
     """Return tilt_a, tilt_b, rock_cos, rock_sin of the lines at the head's frequency [rad]."""
     rate = gyro["rate"][:, 0] + 1j * gyro["rate"][:, 1]
     basis = np.exp(1j * np.outer(gyro["theta"], _HARMONICS))

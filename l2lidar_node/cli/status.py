@@ -65,6 +65,9 @@ def info(
         print_json({**about, "health": as_data(checks)})
         return
     calibration = about.pop("calibration")
+    for name in list(about):
+        if name.startswith("calibration_"):
+            del about[name]  # of use where a driver runs
     del about["work_mode_names"]
     mode = about["work_mode"]
     about["work_mode"] = None if mode is None else work_mode_text(mode)

@@ -12,8 +12,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver.calibration import BlockChoice, calibration_file
 from l2lidar_node.driver.counters import Counters
 from l2lidar_node.driver.device import Answer, CommandClient, DeviceState, QuerySchedule, Watchdog
 from l2lidar_node.driver.orientation import GravityAlignment, GravityMonitor
@@ -62,9 +64,16 @@ class Driver:
     Parameters
     ----------
     config : DriverConfig
+    calibration : CalibrationFile, optional
+        Of the unit; read from the file that the settings name if left out.
+
+    Raises
+    ------
+    SettingError
+        If the calibration file cannot be used.
     """
 
-    def __init__(self, config: DriverConfig) -> None:
+    def __init__(self, config: DriverConfig, calibration: CalibrationFile | None = None) -> None:
         self.counters = Counters()
         self.version: Version | None = None
         self.parameters: Parameters | None = None
@@ -78,7 +87,8 @@ class Driver:
         self.counters.sequence = self._reorder_buffer.counts
         self._clock = DeviceClock(config.clock)
         self._gravity_alignment = GravityAlignment(config.imu.roll_pitch_only)
-        self._assembler = SweepAssembler(config.sweep, self._level())
+        self.blocks = BlockChoice(config.sweep, calibration or calibration_file(config.files))
+        self._assembler = SweepAssembler(config.sweep, self._level(), self.blocks)
         self._requests = CommandClient()
         self._watchdog = Watchdog(config.watchdog)
         self._outbox: list[Outgoing] = []

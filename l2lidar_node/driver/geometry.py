@@ -17,7 +17,7 @@ not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -132,6 +132,7 @@ class Projector:
         limits: RangeLimits | None = None,
         override: RangeCalibration | None = None,
         rotations: F64 | None = None,
+        used: Callable[[bytes], bytes] | None = None,
     ) -> PointBatch:
         """Return the points of a batch of packets.
 
@@ -148,6 +149,8 @@ class Projector:
         rotations : ndarray, shape (P, 3, 3), float64, optional
             From the cloud frame to that of the points, for each packet; where it is not known,
             NaN, and the packet's points are left out. The cloud frame if not given.
+        used : callable, optional
+            Returns the calibration block to use for a reported one, both 32 bytes.
 
         Returns
         -------
@@ -161,6 +164,9 @@ class Projector:
         first_s: float | None = None
         for block, constants in self._blocks(raw):
             packets, starts = raw[block], start_s[block]
+            if used is not None:
+                size = wire.CALIBRATION.itemsize
+                constants = used(constants[:size]) + constants[size:]
             table = _table(constants, self._slots)
             work = _Work._make(array[: len(packets)] for array in self._work)
             _fill_ranges(packets, table, limits or RangeLimits(), override, work)

@@ -45,6 +45,18 @@ _WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
 _MAX_TILT_DEG: Final = 10.0
 
 
+_CALIBRATION_UNITS: Final = {
+    "a_axis_dist": "m",
+    "b_axis_dist": "m",
+    "theta_angle_bias": "rad",
+    "alpha_angle_bias": "rad",
+    "beta_angle": "rad",
+    "xi_angle": "rad",
+    "range_bias": "counts",
+    "range_scale": "m/count",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Check:
     """The judgement of one aspect.
@@ -100,6 +112,7 @@ def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
     ]
     if driver.last_points is not None:
         checks.append(_hardware(driver.last_points))
+        checks += _calibration(driver, driver.last_points)
     report = driver.gravity.take()
     if report is not None:
         checks.append(_imu(report))
@@ -269,6 +282,31 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
     if slots and share < _MIN_VALID_SHARE:
         return Check("points", Level.WARN, "hardly any returns: is the sensor covered?", values)
     return Check("points", Level.OK, f"{100 * share:.0f} % of the slots return", values)
+
+
+def _calibration(driver: Driver, payload: bytes) -> list[Check]:
+    """Return what is used instead of the reported calibration; nothing where that is used."""
+    start = wire.DATA_INFO.itemsize + wire.INSIDE_STATE.itemsize
+    reported = payload[start : start + wire.CALIBRATION.itemsize]
+    blocks = driver.blocks
+    sources = blocks.sources(reported)
+    own = np.frombuffer(reported, wire.CALIBRATION, 1)[0]
+    values = {
+        f"{name} [{_CALIBRATION_UNITS[name]}]": f"{used:.7g} ({source}; reported {own[name]:.7g})"
+        for (name, used), source in zip(
+            blocks.values(reported).items(), sources.values(), strict=True
+        )
+    }
+    if blocks.file is not None and not blocks.file.matches(reported):
+        message = (
+            f"{blocks.file.path} was made for another unit or mode: the unit's own calibration "
+            "is used; run l2lidar calibrate"
+        )
+        return [Check("calibration", Level.ERROR, message, values)]
+    others = sorted(set(sources.values()) - {"unit"})
+    if not others:
+        return []
+    return [Check("calibration", Level.OK, f"corrected by {' and '.join(others)}", values)]
 
 
 def _hardware(payload: bytes) -> Check:

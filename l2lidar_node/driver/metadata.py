@@ -23,7 +23,15 @@ class Metadata:
         Bits of :class:`wire.WorkMode`.
     work_mode_names : list of str
     calibration : dict
-        Names and units as in :data:`wire.CALIBRATION`.
+        What the unit reports; names and units as in :data:`wire.CALIBRATION`.
+    calibration_used : dict
+        What its points are made with.
+    calibration_source : dict
+        Where each entry of that is from: ``unit``, ``parameter``, or the path of a file.
+    calibration_file : str
+        The file that the settings name; it is used only if ``calibration_matches``.
+    calibration_matches : bool or None
+        Whether the file was made for what the unit reports; None without a file or a packet.
     slots : int or None
         Slots in a packet.
     angle_min_rad, angle_increment_rad : float or None
@@ -44,6 +52,10 @@ class Metadata:
     work_mode: int | None
     work_mode_names: list[str]
     calibration: dict[str, float]
+    calibration_used: dict[str, float]
+    calibration_source: dict[str, str]
+    calibration_file: str
+    calibration_matches: bool | None
     slots: int | None
     angle_min_rad: float | None
     angle_increment_rad: float | None
@@ -64,6 +76,9 @@ def metadata(driver: Driver) -> Metadata:
         layout = wire.POINTS_3D_PAYLOAD if driver.config.sweep.frame3d else wire.POINTS_2D_PAYLOAD
         packet = np.frombuffer(driver.last_points, layout)[0]
 
+    block = None if packet is None else packet["calibration"].tobytes()
+    file = driver.blocks.file
+
     def told(name: str) -> float | None:
         return None if packet is None else float(packet[name])
 
@@ -80,6 +95,10 @@ def metadata(driver: Driver) -> Metadata:
         calibration={}
         if packet is None
         else {name: float(packet["calibration"][name]) for name in wire.CALIBRATION.names or ()},
+        calibration_used={} if block is None else driver.blocks.values(block),
+        calibration_source={} if block is None else driver.blocks.sources(block),
+        calibration_file=driver.config.files.calibration_file,
+        calibration_matches=None if file is None or block is None else file.matches(block),
         slots=None if packet is None else int(packet["point_num"]),
         angle_min_rad=told("angle_min"),
         angle_increment_rad=told("angle_increment"),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.config import SweepConfig
+from l2lidar_node.driver.calibration import BlockChoice
 from l2lidar_node.driver.geometry import Projector, RangeCalibration, RangeLimits
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.packets import NS, PointPacket
@@ -49,6 +50,8 @@ class SweepAssembler:
     level : callable, optional
         Returns a rotation for the start of every packet of a sweep, by which its points are turned
         into a levelled frame: shape (P, 3, 3), NaN for packets that cannot be.
+    blocks : BlockChoice, optional
+        Which calibration blocks to use; those that the unit reports if left out.
 
     Attributes
     ----------
@@ -59,7 +62,13 @@ class SweepAssembler:
         start, a gap or a change of the cut, and the last one before a stop or a gap.
     """
 
-    def __init__(self, config: SweepConfig, level: Level | None = None) -> None:
+    def __init__(
+        self,
+        config: SweepConfig,
+        level: Level | None = None,
+        blocks: BlockChoice | None = None,
+    ) -> None:
+        self.blocks = BlockChoice(config) if blocks is None else blocks
         self.unlevelled = 0
         self.fragments = 0
         self.fragment_packets = 0
@@ -79,6 +88,7 @@ class SweepAssembler:
             self._begins_at_boundary = False
         self._config = config
         self._level = level
+        self.blocks.configure(config)
 
     @property
     def is_collecting(self) -> bool:
@@ -172,6 +182,7 @@ class SweepAssembler:
             if config.override_range_calibration
             else None,
             None if self._level is None else self._level(starts),
+            self.blocks.used if self.blocks.is_needed else None,
         )
         self.unlevelled += batch.left_out
         batch.points.flags.writeable = False

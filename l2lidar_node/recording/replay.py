@@ -172,7 +172,7 @@ class Playback(Loop):
             self._shift_ns += self._time - self._recording.start + LAP_GAP_NS
             self._on_lap(self._shift_ns)
             self._time = self._recording.start
-            self.driver = Driver(self.driver.config)
+            self.driver = Driver(self.driver.config, self.driver.blocks.file)
 
     def _play(self) -> None:
         first = self._recording.start

@@ -48,6 +48,15 @@ UPSTREAM = {
     "standby_on_powerup_enabled": (bool, False, False),
 }
 SETTINGS = {item.name: item for item in settings_of(DriverConfig)}
+UPSTREAMS_MANNER = {
+    "EnableCalAngleOVR",
+    "calAlphaAngleBias",
+    "calBetaAngle",
+    "calXiAngle",
+    "calThetaAngleBias",
+    "calBAxisDist",
+}
+"""Settings of ours that stand beside upstream's EnableCalRangeOVR, named as it is."""
 
 
 @pytest.mark.parametrize("name", UPSTREAM)
@@ -61,7 +70,7 @@ def test_upstreams_whole_file_is_taken() -> None:
     assert build(DriverConfig, values) == DriverConfig()
 
 
-@pytest.mark.parametrize("name", sorted(set(SETTINGS) - set(UPSTREAM)))
+@pytest.mark.parametrize("name", sorted(set(SETTINGS) - set(UPSTREAM) - UPSTREAMS_MANNER))
 def test_a_setting_of_ours_is_in_snake_case(name: Any) -> None:
     assert name == name.lower()
     assert name.isidentifier()
