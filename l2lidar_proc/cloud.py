@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import POINT, HostNs, Sweep
 
-TIME_FIELDS: Final = ("time", "t", "timestamp")
+TIME_FIELDS: Final = ("time", "t", "timestamp", "offset_time")
 
 _UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
 _NEAR_NS: Final = 2_000_000_000  # how far times may be from the stamp
@@ -25,19 +25,25 @@ class CloudError(ValueError):
     """A cloud whose points' times cannot be told; the message says why."""
 
 
-def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Sweep:
+def to_sweep(
+    cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto", *, snapshots: bool = False
+) -> Sweep:
     """Return a cloud's points with times in seconds after the sweep's start, ascending.
 
     Parameters
     ----------
     cloud : ndarray, shape (N,) or (H, W)
-        Structured, with ``x``, ``y``, ``z`` and exactly one of ``time``, ``t`` and ``timestamp``.
+        Structured, with ``x``, ``y``, ``z`` and exactly one of ``time``, ``t``, ``timestamp`` and
+        ``offset_time``.
     stamp : HostNs
         The cloud's stamp. Times may count from it or be absolute.
     unit : str
         Of the times: s, ms, us, ns; or auto, which takes floating-point numbers that span up to 1
         for seconds, 1e3 to 1e6 for microseconds, more for nanoseconds, and integers that span
         1e6 or more for nanoseconds. Anything else could be two things and is refused.
+    snapshots : bool
+        Take a cloud without a time field, or whose times are all equal, as measured at the
+        instant of its stamp, as a depth camera does: ``start`` and ``end`` are the same then.
 
     Returns
     -------
@@ -56,14 +62,18 @@ def to_sweep(cloud: NDArray[np.void], stamp: HostNs, unit: str = "auto") -> Swee
     cloud = cloud.reshape(-1)
     if len(cloud) > MAX_POINTS:
         raise CloudError(f"{len(cloud)} points are too many; a sweep has up to {MAX_POINTS}")
-    name = _time_field(cloud.dtype)
-    finite = np.isfinite(cloud[name])
+    name = _time_field(cloud.dtype, snapshots)
+    finite = np.isfinite(cloud[name]) if name else np.ones(len(cloud), np.bool_)
     for axis in "xyz":
         finite &= np.isfinite(cloud[axis])
     if not finite.all():
         cloud = cloud[finite]
     if not len(cloud):
         raise CloudError("no point is finite")
+    if snapshots and (not name or cloud[name].min() == cloud[name].max()):
+        points = _with_time(cloud, name, np.zeros(len(cloud)))
+        points.flags.writeable = False
+        return Sweep(stamp, stamp, points, 0, 0)
     if unit == "auto" and (cloud.dtype.names or ())[:6] == POINT.names:
         unit = "s"  # the driver's own layouts, whose sweeps may last for many seconds
     times = _relative_ns(cloud[name], stamp, unit)
@@ -101,11 +111,14 @@ def position_problem(layout: np.dtype[Any]) -> str:
     return ""
 
 
-def _time_field(layout: np.dtype[Any]) -> str:
+def _time_field(layout: np.dtype[Any], snapshots: bool) -> str:
+    """Return the name of the time field, empty where there is none and need not be."""
     names = layout.names or ()
     if problem := position_problem(layout):
         raise CloudError(problem)
     found = [name for name in TIME_FIELDS if name in names]
+    if not found and snapshots:
+        return ""
     if not found:
         raise CloudError(f"no time field; one of {', '.join(TIME_FIELDS)} is needed")
     if len(found) > 1:
@@ -155,13 +168,16 @@ def _unit(layout: np.dtype[Any], spread: float) -> str:
 def _with_time(
     cloud: NDArray[np.void], name: str, seconds: NDArray[np.float64]
 ) -> NDArray[np.void]:
-    """Return the points with their time field replaced by ``time``, float32 seconds."""
+    """Return the points with their time field, if any, replaced by ``time``, float32 seconds."""
     layout = cloud.dtype
     renamed = {old: "time" if old == name else old for old in layout.names or ()}
     kinds = [
         (new, np.dtype("<f4") if old == name else layout[old]) for old, new in renamed.items()
     ]
+    if not name:
+        kinds.append(("time", np.dtype("<f4")))
     points = np.empty(len(cloud), dtype=kinds)
     for old, new in renamed.items():
-        points[new] = seconds if old == name else cloud[old]
+        points[new] = cloud[old] if old != name else 0.0
+    points["time"] = seconds
     return points

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_convention import ImuConvention
 from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
@@ -31,6 +32,8 @@ class OdometryPipeline:
         IMU coordinates to cloud coordinates.
     imu_wait_ms : int
         Longest wait for IMU samples up to the end of a sweep; plain KISS-ICP does not wait.
+    accelerometer : bool
+        False: the accelerometer is watched, for its sign, but not used.
 
     Attributes
     ----------
@@ -42,14 +45,23 @@ class OdometryPipeline:
     counts : Counter of Status
         How often what was reported.
     last : OdometryEstimate or None
+    convention : ImuConvention
+        In which unit and with which sign the accelerometer measures.
     """
 
     def __init__(
-        self, config: OdometryConfig, T_cloud_imu: NDArray[np.float64], imu_wait_ms: int = 50
+        self,
+        config: OdometryConfig,
+        T_cloud_imu: NDArray[np.float64],
+        imu_wait_ms: int = 50,
+        *,
+        accelerometer: bool = True,
     ) -> None:
         self._config = config
+        self._uses_accelerometer = accelerometer
         self._wait_ns = imu_wait_ms * _MS if config.mode == "inertial" else 0
         self._newest_imu: HostNs | None = None
+        self.convention = ImuConvention()
         self.mount(T_cloud_imu)
 
     def mount(self, T_cloud_imu: NDArray[np.float64]) -> None:
@@ -73,6 +85,7 @@ class OdometryPipeline:
 
     def _begin(self) -> None:
         self._sequencer = Sequencer(self._wait_ns)
+        self.convention.forget_motion()
         self.trajectory = Trajectory()
         self.sweeps = 0
         self.counts: Counter[Status] = Counter()
@@ -88,11 +101,16 @@ class OdometryPipeline:
         """Stamp of the newest IMU sample."""
         return self._newest_imu
 
-    def imu(self, samples: Samples) -> None:
-        """Take IMU samples (N,) in any order and state."""
+    def imu(self, samples: Samples) -> Samples:
+        """Take IMU samples (N,) in any order and state; return them as they are used."""
+        samples = self.convention.corrected(samples)
+        if not self._uses_accelerometer:
+            samples = samples.copy()
+            samples["linear_acceleration"] = 0.0
         self.odometry.imu(samples)
         if len(samples):
             self._newest_imu = HostNs(int(samples["stamp"][-1]))
+        return samples
 
     def sweep(self, sweep: Sweep, now: int) -> None:
         """Take a sweep that arrives at ``now`` [ns]."""
@@ -110,4 +128,14 @@ class OdometryPipeline:
                 self.last = estimate
                 self.trajectory.append(estimate.stamp, estimate.T_map_lidar)
                 estimates.append(estimate)
+                self._watch(estimate)
         return estimates
+
+    def _watch(self, estimate: OdometryEstimate) -> None:
+        """Begin again where the accelerometer turns out to point the other way."""
+        odometry = self.odometry
+        if isinstance(odometry, PlainOdometry) or not estimate.is_aligned:
+            return
+        T_map_imu = estimate.T_map_lidar @ odometry.T_cloud_imu
+        if self.convention.watch(estimate.stamp, T_map_imu[:3, :3], T_map_imu[:3, 3]):
+            self.mount(odometry.T_cloud_imu)

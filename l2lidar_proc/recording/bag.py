@@ -33,11 +33,14 @@ IMU: Final = "sensor_msgs/msg/Imu"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 TWIST: Final = "geometry_msgs/msg/TwistStamped"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
+LIVOX: Final = ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")
+CLOUDS: Final = (CLOUD, *LIVOX)
+"""Types of messages that clouds come in."""
 
 _NUMBERS: Final = {code: number for number, code in fields.DATATYPES.items()}
 
 
-def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str:
+def chosen(kinds: dict[str, str], wanted: str, kind: str | tuple[str, ...], parameter: str) -> str:
     """Return the topic that was asked for, or the only one of its kind.
 
     Parameters
@@ -45,8 +48,8 @@ def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str
     kinds : dict
         Types of the recording's topics, by name.
     wanted : str
-    kind : str
-        Type to look for.
+    kind : str or tuple of str
+        Type or types to look for.
     parameter : str
         What ``wanted`` is the value of, for the message.
 
@@ -55,13 +58,14 @@ def chosen(kinds: dict[str, str], wanted: str, kind: str, parameter: str) -> str
     RecordingError
         If there is none, or more than one and none of that name.
     """
-    found = [topic for topic, its in kinds.items() if its == kind]
+    allowed = (kind,) if isinstance(kind, str) else kind
+    found = [topic for topic, its in kinds.items() if its in allowed]
     if wanted in found:
         return wanted
     if len(found) == 1:
         return found[0]
     listed = ", ".join(found) or "none"
-    raise RecordingError(f"no {kind} on '{wanted}' ({parameter}); there are: {listed}")
+    raise RecordingError(f"no {allowed[0]} on '{wanted}' ({parameter}); there are: {listed}")
 
 
 def stamp_of(message: Any) -> HostNs:
@@ -78,6 +82,72 @@ def points_of(message: Any) -> NDArray[np.void]:
         If fields and sizes do not agree.
     """
     return fields.points_of(message)
+
+
+_LIVOX_POINT: Final = np.dtype(
+    [
+        ("offset_time", "<u4"),  # [ns] after the message's stamp
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("reflectivity", "u1"),
+        ("tag", "u1"),
+        ("line", "u1"),
+    ]
+)
+
+
+def livox_points(data: bytes, *, cdr: bool = True) -> tuple[str, HostNs, NDArray[np.void]]:
+    """Return frame, stamp and points (N,) of Livox's CustomMsg, read from its bytes.
+
+    A message holds 20,000 points and more as structures of their own, which a general reader
+    makes Python objects of: that takes longer than the odometry.
+
+    Parameters
+    ----------
+    data : bytes
+        A serialized message.
+    cdr : bool
+        As in ROS 2 (CDR, numbers aligned); False: as in ROS 1 (packed).
+
+    Raises
+    ------
+    ValueError
+        If sizes do not agree.
+    """
+    if cdr:
+        if len(data) < 4 or data[0] != 0 or data[1] not in (1, 0):
+            raise ValueError("a Livox message does not begin like CDR")
+        if data[1] == 0:
+            raise ValueError("a Livox message is big-endian, which is not supported")
+        data = data[4:]
+    at = 0 if cdr else 4  # ROS 1 begins with a sequence number
+
+    def number(kind: str) -> int:
+        nonlocal at
+        size = np.dtype(kind).itemsize
+        at += -at % size if cdr else 0
+        if at + size > len(data):
+            raise ValueError("a Livox message is cut off")
+        at += size
+        return int(np.frombuffer(data, kind, 1, at - size)[0])
+
+    seconds, nanoseconds = number("<u4"), number("<u4")
+    length = number("<u4")
+    frame = data[at : at + length].rstrip(b"\0").decode("utf-8", "replace")
+    at += length
+    number("<u8")  # the sensor's own time of the first point
+    number("<u4")  # points, which the sequence's length says again
+    at += 4  # the unit's number, three bytes of nothing
+    count = number("<u4")
+    size = _LIVOX_POINT.itemsize
+    stride = size + (-size % 4 if cdr else 0)
+    if count and at + (count - 1) * stride + size > len(data):
+        raise ValueError("a Livox message is cut off")
+    whole = np.frombuffer(data[at:].ljust(count * stride, b"\0"), np.uint8, count * stride)
+    packed = np.ascontiguousarray(whole.reshape(count, stride)[:, :size])
+    stamp = HostNs(seconds * 1_000_000_000 + nanoseconds)
+    return frame, stamp, packed.view(_LIVOX_POINT).reshape(-1)
 
 
 def sample_of(message: Any) -> NDArray[np.void]:

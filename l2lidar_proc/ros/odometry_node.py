@@ -26,7 +26,7 @@ from l2lidar_node.ros.program import run
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError, to_sweep
-from l2lidar_proc.config import OdometryNodeConfig
+from l2lidar_proc.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
@@ -73,6 +73,7 @@ class OdometryNode(Node):
         self._cloud_frame = ""
         self._mounted: tuple[int, str, str] | None = None
         self._inputs = InputMonitor(self, (topics.cloud_topic, topics.imu_topic))
+        self._said: set[str] = set()
         self._looked_at = 0
         self._path: deque[PoseStamped] = deque(maxlen=topics.path_length)
         self._path_end = np.full((4, 4), np.inf)
@@ -129,8 +130,9 @@ class OdometryNode(Node):
             self._inputs.refuse("IMU sample with a stamp that is out of range")
             return
         if self._inputs.imu.takes(message.header.frame_id):
-            sample = to_sample(message)
-            self._pipeline.imu(sample)
+            sample = self._pipeline.imu(to_sample(message))
+            for note in self._pipeline.convention.notes:
+                self._say(f"{message.header.frame_id}: {note}")
             if self._settings.value.topics.imu_rate > 0.0:
                 self._samples.append(sample)
 
@@ -142,9 +144,14 @@ class OdometryNode(Node):
             self._begin_again()
         self._cloud_frame = frame
         try:
-            sweep = to_sweep(from_cloud(message), from_time(message.header.stamp))
+            sweep = to_sweep(from_cloud(message), from_time(message.header.stamp), snapshots=True)
             if not sweep_in_range(sweep):
                 raise CloudError("the stamp is out of range")
+            if sweep.start == sweep.end:
+                self._say(
+                    f"{frame}: clouds without a time per point: each is taken as measured at the "
+                    "instant of its stamp"
+                )
         except (CloudError, ValueError) as error:
             self._inputs.refuse(str(error))
             self.get_logger().warning(f"cloud dropped: {error}", throttle_duration_sec=5.0)
@@ -160,6 +167,7 @@ class OdometryNode(Node):
     def _mount(self) -> None:
         """Take the mounts from TF, as long as nothing depends on them yet or they changed."""
         imu_frame = self._inputs.imu.name or ""
+        self._share_frame(imu_frame)
         if self._frames is None:
             return
         asked = (self._frames.version, self._cloud_frame, imu_frame)
@@ -181,6 +189,28 @@ class OdometryNode(Node):
             T_cloud_base = self._frames.find(self._cloud_frame, base)
             if T_cloud_base is not None and not np.allclose(T_cloud_base, self._base.T_lidar_base):
                 self._base = BaseFrame(T_cloud_base)
+
+    def _say(self, note: str) -> None:
+        """Warn of something once."""
+        if note not in self._said:
+            self._said.add(note)
+            self.get_logger().warning(note)
+
+    def _share_frame(self, imu_frame: str) -> None:
+        """Put the IMU where the clouds' frame is, if it says that it is measured in that one."""
+        odometry, topics = self._pipeline.odometry, self._settings.value.topics
+        if (
+            imu_frame
+            and imu_frame == self._cloud_frame
+            and topics.imu_xyz == OdometryTopics().imu_xyz  # a place set by hand counts more
+            and isinstance(odometry, Odometry)
+            and not np.allclose(odometry.T_cloud_imu, np.eye(4), atol=1e-6)
+        ):
+            self._pipeline.mount(np.eye(4))
+            self._say(
+                f"IMU and clouds have the same frame '{imu_frame}': the IMU is taken to be "
+                "at its origin"
+            )
 
     def _hand_out(self) -> None:
         """Publish what is finished, and come back in time for what still waits."""
@@ -348,6 +378,8 @@ class OdometryNode(Node):
         level, text = self._inputs.judge(level, text)
         if self._frames is not None and self._frames.refused:
             level, text = max(level, health.WARN), f"{text}; {self._frames.refused}"
+        if self._said:
+            values["recognized"] = "; ".join(sorted(self._said))
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -12,7 +13,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.progress import Progress as Bar
-from rosbags.highlevel import AnyReaderError
+from rosbags.highlevel import AnyReader, AnyReaderError
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
@@ -22,9 +23,9 @@ from l2lidar_node.recording.recording import Recording
 from l2lidar_node.recording.replay import measurements
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.settings import build
-from l2lidar_node.types import IMU_SAMPLE, Sweep
+from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
-from l2lidar_proc.config import OdometryNodeConfig
+from l2lidar_proc.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.motion.frames import FrameTree
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
@@ -35,6 +36,9 @@ from l2lidar_proc.recording.bag import RecordingError
 from l2lidar_proc.recording.trajectory import StampedPoses, kitti, tum
 
 _END_NS: Final = 2**62
+_LOOK_AHEAD_NS: Final = 2_000_000_000
+_UPRIGHT: Final = 0.5  # cosine of the angle between the clouds' z and up
+_SIGN_S: Final = 20.0  # of a recording in which the accelerometer's sign is looked for
 _FILES: Final = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
 _CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
 
@@ -57,6 +61,8 @@ class OdometryRun:
         Sweeps by what was remarkable about them.
     refused : Counter of str
         Clouds that could not be used, by reason.
+    notes : tuple of str
+        What was recognized about the recording.
     """
 
     poses: StampedPoses
@@ -64,12 +70,14 @@ class OdometryRun:
     sweeps: int
     counts: Counter[Status]
     refused: Counter[str]
+    notes: tuple[str, ...] = ()
 
     @property
     def report(self) -> list[str]:
         """Lines that tell a person what was found."""
         return [
             f"{len(self.poses)} poses from {self.sweeps} sweeps",
+            *self.notes,
             *(f"{count} sweeps: {status.value}" for status, count in self.counts.items()),
             *(f"{count} clouds not used: {reason}" for reason, count in self.refused.items()),
         ]
@@ -90,12 +98,39 @@ class OdometryRunner:
     config : OdometryNodeConfig
     observer : callable, optional
         Given the estimates one by one.
+    opposite : bool
+        Whether the accelerometer is known to point the other way.
+    accelerometer : bool
+        False: the accelerometer is watched, for its sign, but not used.
+
+    Attributes
+    ----------
+    pipeline : OdometryPipeline
+    base : BaseFrame
+    refused : Counter of str
+        Clouds that could not be used, by reason.
+    notes : list of str
+        What was recognized about the recording.
     """
 
-    def __init__(self, config: OdometryNodeConfig, observer: Observer | None = None) -> None:
+    def __init__(
+        self,
+        config: OdometryNodeConfig,
+        observer: Observer | None = None,
+        *,
+        opposite: bool = False,
+        accelerometer: bool = True,
+    ) -> None:
         self._observer = observer
         topics = config.topics
-        self.pipeline = OdometryPipeline(config.odometry, topics.T_cloud_imu, topics.imu_wait_ms)
+        self.pipeline = OdometryPipeline(
+            config.odometry,
+            topics.T_cloud_imu,
+            topics.imu_wait_ms,
+            accelerometer=accelerometer,
+        )
+        self.pipeline.convention.reversed = opposite
+        self.notes: list[str] = []
         self.base = BaseFrame(np.eye(4))
         self.refused: Counter[str] = Counter()
 
@@ -122,7 +157,14 @@ class OdometryRunner:
         if len(found):
             turn = self.base.odom_from_map(found["pose"][0])
             points = points @ turn[:3, :3].T + turn[:3, 3]
-        return OdometryRun(poses, points, self.pipeline.sweeps, self.pipeline.counts, self.refused)
+        return OdometryRun(
+            poses,
+            points,
+            self.pipeline.sweeps,
+            self.pipeline.counts,
+            self.refused,
+            (*self.notes, *self.pipeline.convention.notes),
+        )
 
 
 def run_events(
@@ -189,7 +231,9 @@ def run_bag(
     source : Path
         Rosbag2 folder or MCAP file.
     config : OdometryNodeConfig
-        As for the node. A topic that is not in the bag is replaced by the only one of its kind.
+        As for the node. A topic that is not in the bag is replaced by the only one of its kind;
+        of several IMUs the only one in the namespace of the clouds is taken. Without any IMU the
+        odometry runs on clouds alone. Livox's own messages are clouds as well.
     progress : callable
         Told how far it is.
     observer : callable, optional
@@ -203,47 +247,187 @@ def run_bag(
     try:
         with bag.open_bag(source) as reader:
             kinds = {item.topic: item.msgtype for item in reader.connections}
-            cloud = bag.chosen(kinds, config.topics.cloud_topic, bag.CLOUD, "cloud_topic")
+            cloud = bag.chosen(kinds, config.topics.cloud_topic, bag.CLOUDS, "cloud_topic")
             imu = ""
             if config.odometry.mode == "inertial":
-                imu = bag.chosen(kinds, config.topics.imu_topic, bag.IMU, "imu_topic")
-            listener = _Listener(OdometryRunner(config, observer), config, cloud, imu)
-            span = max(reader.end_time - reader.start_time, 1)
-            for connection, now, data in bag.messages(reader):
-                if connection.topic in (cloud, imu) or connection.msgtype == bag.TRANSFORMS:
-                    listener.take(
-                        connection.topic, reader.deserialize(data, connection.msgtype), now
-                    )
-                    progress(min(max((now - reader.start_time) / span, 0.0), 1.0))
-            return listener.runner.finish()
+                imu = _imu_topic(kinds, config.topics.imu_topic, cloud)
+
+            def listener(runner: OdometryRunner) -> _Listener:
+                made = _Listener(runner, config, cloud, imu)
+                made.look_ahead(reader)
+                return made
+
+            final = listener(OdometryRunner(config, observer))
+            opposite = final.may_be_opposite and not _heard(
+                reader, listener(OdometryRunner(config, accelerometer=False)), until_s=_SIGN_S
+            )
+            if opposite:
+                final = listener(OdometryRunner(config, observer, opposite=True))
+            # an observer cannot be told the same twice: for it a new map begins in between
+            if not _heard(reader, final, progress, stops=observer is None):
+                # what it took for up is down: from the beginning
+                final = listener(OdometryRunner(config, opposite=True))
+                _heard(reader, final, progress)
+            return final.finish()
     except (AnyReaderError, FileNotFoundError) as error:
         raise bag.unreadable(source, error) from None
 
 
+def _heard(
+    reader: AnyReader,
+    listener: _Listener,
+    progress: Progress = lambda share: None,
+    until_s: float = np.inf,
+    *,
+    stops: bool = True,
+) -> bool:
+    """Pass a bag's messages on; return False if the accelerometer's sign was found wrong.
+
+    Then it stops at once, if it ``stops`` at all; else it goes on with a new map.
+    """
+    span = max(reader.end_time - reader.start_time, 1)
+    convention = listener.runner.pipeline.convention
+    known = convention.reversed
+    for connection, now, data in bag.messages(reader):
+        if now > reader.start_time + until_s * 1e9:
+            break
+        if connection.msgtype in bag.LIVOX and connection.topic == listener.cloud:
+            listener.livox(data, now, cdr=reader.is2)
+        elif (
+            connection.topic in (listener.cloud, listener.imu)
+            or connection.msgtype == bag.TRANSFORMS
+        ):
+            listener.take(connection.topic, reader.deserialize(data, connection.msgtype), now)
+        else:
+            continue
+        if stops and convention.reversed and not known:
+            return False
+        progress(min(max((now - reader.start_time) / span, 0.0), 1.0))
+    return True
+
+
+def _imu_topic(kinds: dict[str, str], wanted: str, cloud: str) -> str:
+    """Return the topic of the IMU that belongs to the clouds, empty where there is no IMU."""
+    found = [topic for topic, its in kinds.items() if its == bag.IMU]
+    if not found:
+        return ""
+    beside = [topic for topic in found if topic.rpartition("/")[0] == cloud.rpartition("/")[0]]
+    if wanted not in found and len(beside) == 1:
+        return beside[0]
+    return bag.chosen(kinds, wanted, bag.IMU, "imu_topic")
+
+
 class _Listener:
-    """Turns messages into events, and takes the mounts from /tf_static."""
+    """Turns messages into events, and takes the mounts from /tf_static.
+
+    Parameters
+    ----------
+    runner : OdometryRunner
+    config : OdometryNodeConfig
+    cloud, imu : str
+        Topics; ``imu`` is empty where there is none.
+    """
 
     def __init__(
         self, runner: OdometryRunner, config: OdometryNodeConfig, cloud: str, imu: str
     ) -> None:
         self.runner = runner
+        self.cloud = cloud
+        self.imu = imu
         self._config = config
-        self._topics = cloud, imu
         self._frames = FrameTree()
         self._cloud_frame = ""
+        self._imu_frame = ""
+        self._is_mounted = False
+        self._force = np.zeros(3)
+        self._snapshots = 0
+
+    def look_ahead(self, reader: AnyReader) -> None:
+        """Learn frames and mounts from the first seconds: a later mount begins a new map."""
+        for connection, now, data in bag.messages(reader):
+            if now > reader.start_time + _LOOK_AHEAD_NS:
+                break
+            if connection.topic == self.cloud and connection.msgtype in bag.LIVOX:
+                with suppress(ValueError):
+                    self._cloud_frame = bag.livox_points(data, cdr=reader.is2)[0]
+            elif connection.topic in (self.cloud, self.imu):
+                message: Any = reader.deserialize(data, connection.msgtype)
+                if connection.topic == self.cloud:
+                    self._cloud_frame = message.header.frame_id
+                else:
+                    self._imu_frame = message.header.frame_id
+                    force = bag.sample_of(message)["linear_acceleration"][0]
+                    if np.isfinite(force).all():
+                        self._force = self._force + force
+            elif self._tells_mounts(connection.topic, connection.msgtype):
+                self._frames.take(reader.deserialize(data, connection.msgtype))
+            if self._cloud_frame and self._imu_frame and not self._is_mounted:
+                self._mount(self._imu_frame)
+
+    @property
+    def may_be_opposite(self) -> bool:
+        """Whether the clouds' z does not point up, if the accelerometer is to be believed.
+
+        Sensors are seldom mounted like that: then their motion has to tell whether it is so.
+        """
+        odometry = self.runner.pipeline.odometry
+        if not isinstance(odometry, Odometry) or not self._force.any():
+            return False
+        up = odometry.T_cloud_imu[:3, :3] @ self._force / np.linalg.norm(self._force)
+        return bool(up[2] < _UPRIGHT)
 
     def take(self, topic: str, message: Any, now: int) -> None:
-        cloud, imu = self._topics
-        if topic == cloud:
-            self._cloud(message, now)
-        elif topic == imu:
+        if topic == self.cloud:
+            self._sweep(
+                message.header.frame_id, bag.stamp_of(message), now, lambda: bag.points_of(message)
+            )
+        elif topic == self.imu:
             self._mount(message.header.frame_id)
             self.runner.take((now, bag.sample_of(message)))
-        elif topic.endswith("tf_static") and self._config.topics.use_tf:
+        elif self._tells_mounts(topic, bag.TRANSFORMS):
             self.runner.refused.update(self._frames.take(message))
 
-    def _cloud(self, message: Any, now: int) -> None:
-        self._cloud_frame = message.header.frame_id
+    def livox(self, data: bytes, now: int, *, cdr: bool) -> None:
+        """Take one of Livox's own messages."""
+        try:
+            frame, stamp, points = bag.livox_points(data, cdr=cdr)
+        except ValueError as error:
+            self.runner.refused[str(error)] += 1
+            return
+        self._sweep(frame, stamp, now, lambda: points)
+
+    def finish(self) -> OdometryRun:
+        """Return what was found, and what is to be said of the recording."""
+        notes = self.runner.notes
+        if self._config.odometry.mode == "inertial":
+            if not self.imu:
+                notes.append("no IMU in the recording: the motion comes from the clouds alone")
+            elif self._imu_frame and self._imu_frame == self._cloud_frame:
+                place = "its origin" if self._is_mounted else "imu_xyz"
+                notes.append(
+                    f"IMU and clouds have the same frame '{self._imu_frame}': the IMU is taken to "
+                    f"be at {place}"
+                )
+            elif self._imu_frame and self._cloud_frame and not self._is_mounted:
+                notes.append(
+                    f"no transform from '{self._imu_frame}' to '{self._cloud_frame}' in "
+                    "/tf_static: the place of the IMU is that of imu_xyz"
+                )
+        if self._snapshots:
+            notes.append(
+                f"{self._snapshots} clouds without a time per point: each is taken as measured at "
+                "the instant of its stamp"
+            )
+        return self.runner.finish()
+
+    def _tells_mounts(self, topic: str, msgtype: str) -> bool:
+        is_static = msgtype == bag.TRANSFORMS and topic.endswith("tf_static")
+        return is_static and self._config.topics.use_tf
+
+    def _sweep(
+        self, frame: str, stamp: HostNs, now: int, points: Callable[[], NDArray[np.void]]
+    ) -> None:
+        self._cloud_frame = frame
         base = self._config.topics.base_frame
         if base:
             T_cloud_base = self._frames.find(self._cloud_frame, base)
@@ -251,22 +435,27 @@ class _Listener:
             if T_cloud_base is not None and not np.allclose(T_cloud_base, known):
                 self.runner.base = BaseFrame(T_cloud_base)
         try:
-            sweep = to_sweep(bag.points_of(message), bag.stamp_of(message))
+            sweep = to_sweep(points(), stamp, snapshots=True)
         except (CloudError, ValueError) as error:
             self.runner.refused[str(error)] += 1
             return
+        self._snapshots += sweep.start == sweep.end
         self.runner.take((now, sweep))
 
     def _mount(self, imu_frame: str) -> None:
+        self._imu_frame = imu_frame
         odometry = self.runner.pipeline.odometry
-        if not self._cloud_frame or imu_frame == self._cloud_frame:
+        if not self._cloud_frame or not isinstance(odometry, Odometry):
             return
         T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
-        if (
-            T_cloud_imu is not None
-            and isinstance(odometry, Odometry)
-            and not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6)
-        ):
+        if imu_frame == self._cloud_frame:
+            # a place that was set by hand counts more than a frame's name
+            is_set = self._config.topics.imu_xyz != OdometryTopics().imu_xyz
+            T_cloud_imu = None if is_set else np.eye(4)
+        if T_cloud_imu is None:
+            return
+        self._is_mounted = True
+        if not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6):
             self.runner.pipeline.mount(T_cloud_imu)
 
 

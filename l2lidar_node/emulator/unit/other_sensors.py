@@ -110,7 +110,7 @@ def _depth_camera(k: int) -> tuple[F64, F64]:
     return times, np.tile(image, (6, 1))
 
 
-def _spinning(rings: F64, columns: int, sweep_s: float) -> Callable[[int], tuple[F64, F64]]:
+def spinning(rings: F64, columns: int, sweep_s: float) -> Callable[[int], tuple[F64, F64]]:
     """Return the beams of a lidar that turns once per sweep; elevations of the rings [rad]."""
     azimuth = -np.arange(columns) * 2.0 * np.pi / columns
     directions = np.stack(
@@ -141,11 +141,11 @@ SENSORS: Final[dict[str, RangeSensor]] = {
     for sensor in (
         RangeSensor("depth_camera", 0.1, _depth_camera, 0.15, 5.0, 0.004, 0.0025, 0.02),
         RangeSensor(
-            "spinning_16", 0.1, _spinning(np.deg2rad(np.arange(-15.0, 16.0, 2.0)), 1200, 0.1),
+            "spinning_16", 0.1, spinning(np.deg2rad(np.arange(-15.0, 16.0, 2.0)), 1200, 0.1),
             0.5, 100.0, 0.02, 0.0,
         ),
         RangeSensor(
-            "spinning_64", 0.1, _spinning(np.linspace(-0.39, 0.39, 64), 512, 0.1),
+            "spinning_64", 0.1, spinning(np.linspace(-0.39, 0.39, 64), 512, 0.1),
             0.5, 90.0, 0.015, 0.0,
         ),
         RangeSensor("rosette", 0.1, _rosette, 0.3, 90.0, 0.015, 0.0),

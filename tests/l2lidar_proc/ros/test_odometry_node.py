@@ -221,9 +221,32 @@ def test_plain_kiss_icp(bench):
 def test_a_cloud_that_cannot_be_used_is_told_of(bench):
     run = recording("room", "still", 3.0)
     points = next(sweeps(run, "turn")).points.copy()
-    points["time"] = 0.0
+    points["time"] += 1e6
     bench.send_cloud(points, 10**18)
-    bench.until(
-        lambda: any("times are equal" in v.key for s in bench.diagnostics for v in s.values)
-    )
+    bench.until(lambda: any("neither" in v.key for s in bench.diagnostics for v in s.values))
     assert not bench.call("save_map").success
+
+
+def test_what_other_sensors_do_differently_is_recognized_and_said(bench):
+    run = recording("room", "still", 3.0)
+    some = list(sweeps(run, "turn"))[:5]
+    in_g = run.imu.copy()
+    in_g["linear_acceleration"] /= 9.80665
+    for sample in in_g[:40]:
+        bench.send_sample(sample, frame=FRAME)
+    bench.until(lambda: bench.node._pipeline.convention.in_g)
+    for sweep in some:
+        points = sweep.points.copy()
+        points["time"] = 0.0
+        bench.send_cloud(points, sweep.start)
+    bench.until(
+        lambda: any(
+            "measures in g" in v.value
+            and "without a time per point" in v.value
+            and f"the same frame '{FRAME}'" in v.value
+            for s in bench.diagnostics
+            for v in s.values
+        )
+    )
+    bench.until(lambda: len(bench.poses) == 5)
+    assert np.allclose(bench.node._pipeline.odometry.T_cloud_imu, np.eye(4))

@@ -1,0 +1,152 @@
+"""Recognizes accelerometers that measure in g, or with the opposite sign."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import HostNs
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.imu_buffer import Samples
+
+F64 = NDArray[np.float64]
+
+_G_NORMS: Final = (0.7, 1.4)  # median |a| of an accelerometer that measures in g
+_DECIDED: Final = 100  # samples after which the unit stays as it is
+_KEPT_NS: Final = 2_000_000_000
+_MOST_KEPT: Final = 10_000  # samples
+# The sign is decided by comparing accelerations with how poses bend: 20 bends are 4 to 5 s, and
+# walking gives bends of 0.1 to 0.3 m/s; noise of 2 mm in poses 0.2 s apart makes 0.025 m/s.
+_LEAST_BENDS: Final = 20
+_MOST_BENDS: Final = 200
+_LEAST_BEND: Final = 0.05  # [m/s] root mean square
+_OPPOSITE: Final = -0.7  # correlation of what was measured with what the poses say
+_LONGEST_S: Final = 0.5  # between poses that are compared
+_SHORTEST_NS: Final = 190_000_000
+
+
+class ImuConvention:
+    """Brings samples to m/s^2 and to specific force: +9.8 upwards at rest, as REP 145 has it.
+
+    The unit is told from the norm of the first samples. The sign can only be told from motion:
+    how the poses of the odometry bend says which way the sensor was accelerated.
+
+    Attributes
+    ----------
+    in_g : bool
+        Whether samples are multiplied by 9.80665.
+    reversed : bool
+        Whether the sign of samples is changed.
+    """
+
+    def __init__(self) -> None:
+        self.in_g = False
+        self.reversed = False
+        self._norms = np.empty(0)
+        self.forget_motion()
+
+    @property
+    def notes(self) -> list[str]:
+        """What was recognized, for people."""
+        found = []
+        if self.in_g:
+            found.append("the accelerometer measures in g: multiplied by 9.80665")
+        if self.reversed:
+            found.append(
+                "the accelerometer points the other way (gravity instead of specific force): "
+                "its sign is changed"
+            )
+        return found
+
+    def forget_motion(self) -> None:
+        """Forget poses and samples, as after a restart; what was recognized stays."""
+        self._stamps: list[int] = []
+        self._forces: list[F64] = []
+        self._poses: list[tuple[HostNs, F64]] = []
+        self._bends: list[tuple[F64, F64]] = []
+
+    def corrected(self, samples: Samples) -> Samples:
+        """Return samples (N,) in m/s^2, as specific force."""
+        if len(self._norms) < _DECIDED and len(samples):
+            norms = np.linalg.norm(samples["linear_acceleration"], axis=1)
+            norms = norms[np.isfinite(norms)]
+            self._norms = np.concatenate((self._norms, norms))[:_DECIDED]
+            if len(self._norms):
+                self.in_g = bool(_G_NORMS[0] < np.median(self._norms) < _G_NORMS[1])
+        if self.in_g or self.reversed:
+            samples = samples.copy()
+            factor = tuning.STANDARD_GRAVITY if self.in_g else 1.0
+            samples["linear_acceleration"] *= -factor if self.reversed else factor
+        if len(self._stamps) > _MOST_KEPT:  # no poses come that would let them go
+            self._drop(self._stamps[_MOST_KEPT // 2])
+        self._stamps += samples["stamp"].tolist()
+        self._forces += list(samples["linear_acceleration"].astype(np.float64))
+        return samples
+
+    def watch(self, stamp: HostNs, R_odom_imu: F64, position: F64) -> bool:
+        """Compare a pose with the samples; return whether the sign has just been found wrong.
+
+        Parameters
+        ----------
+        stamp : HostNs
+            Later than that of the pose before.
+        R_odom_imu : ndarray, shape (3, 3)
+        position : ndarray, shape (3,)
+            Of the IMU in the odometry frame [m].
+        """
+        if self._poses and stamp - self._poses[-1][0] < _SHORTEST_NS:
+            return False
+        pose = np.column_stack([R_odom_imu, position])
+        self._poses = [*self._poses[-2:], (stamp, pose)]
+        if not self.reversed and len(self._poses) == 3:
+            bend = self._bend()
+            if bend is not None:
+                self._bends = [*self._bends[1 - _MOST_BENDS :], bend]
+        self._drop(self._poses[0][0] - _KEPT_NS)
+        if self.reversed or len(self._bends) < _LEAST_BENDS:
+            return False
+        self.reversed = self._opposite()
+        return self.reversed
+
+    def _drop(self, before: int) -> None:
+        """Forget samples that no pose will ask for again."""
+        count = int(np.searchsorted(self._stamps, before))
+        del self._stamps[:count], self._forces[:count]
+
+    def _bend(self) -> tuple[F64, F64] | None:
+        """Return the change of velocity between three poses, by the poses and by the samples.
+
+        The difference of the mean velocities before and after the middle pose is the integral of
+        the acceleration, weighted by a triangle over the three instants.
+        """
+        instants = np.array([stamp for stamp, _ in self._poses], dtype=np.int64)
+        t = (instants - instants[1]) * 1e-9
+        stamps = np.array(self._stamps, dtype=np.int64)
+        if (np.diff(t) <= 0.0).any() or np.diff(t).max() > _LONGEST_S or not len(stamps):
+            return None
+        within = (stamps > instants[0]) & (stamps < instants[2])
+        if np.count_nonzero(within) < 8:
+            return None
+        p = np.array([pose[:, 3] for _, pose in self._poses])
+        seen = (p[2] - p[1]) / (t[2] - t[1]) - (p[1] - p[0]) / (t[1] - t[0])
+        when = (stamps[within] - instants[1]) * 1e-9
+        weight = np.interp(when, t, [0.0, 1.0, 0.0])
+        force = np.array(self._forces)[within]
+        turns = np.array([pose[:, :3] for _, pose in self._poses])
+        near = np.clip(np.searchsorted((t[:-1] + t[1:]) / 2.0, when), 0, 2)
+        turned = np.einsum("nij,nj->ni", turns[near], force)
+        # a mean by weights times half the span: samples may be missing
+        felt = weight @ turned / weight.sum() * (t[2] - t[0]) / 2.0
+        return seen, felt
+
+    def _opposite(self) -> bool:
+        """Return whether samples and poses clearly bend in opposite directions."""
+        seen = np.array([bend[0] for bend in self._bends])
+        felt = np.array([bend[1] for bend in self._bends])
+        seen = seen - seen.mean(axis=0)
+        felt = felt - felt.mean(axis=0)  # gravity is the same in all of them
+        energy = np.sqrt((seen**2).sum() * (felt**2).sum())
+        strong = np.sqrt((seen**2).sum(axis=1).mean()) > _LEAST_BEND
+        return bool(strong and (seen * felt).sum() < _OPPOSITE * energy)

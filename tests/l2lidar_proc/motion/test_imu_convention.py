@@ -1,0 +1,92 @@
+"""Unit and sign of accelerometers, against motions whose accelerations are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_node.emulator.motion import trajectories
+from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
+from l2lidar_node.emulator.world import scenes
+from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_proc.motion.imu_convention import ImuConvention
+
+
+def samples_of(motion, seconds: float, factor: float = 1.0) -> np.ndarray:
+    raw, times = Inertial(motion, ImuNoise(), 3).samples(0, int(250 * seconds))
+    samples = np.zeros(len(raw), IMU_SAMPLE)
+    samples["stamp"] = np.round(times * 1e9).astype(np.int64)
+    samples["linear_acceleration"] = factor * raw["linear_acceleration"]
+    return samples
+
+
+def watched(name: str, factor: float, noise_m: float = 0.001) -> tuple[ImuConvention, int]:
+    """Return a convention after 20 s, and the number of poses until the sign was changed."""
+    motion = trajectories.make(name, scenes.make("room"), seed=1)
+    samples = samples_of(motion, 20.0, factor)
+    convention, rng, first = ImuConvention(), np.random.default_rng(5), 0
+    for number, t in enumerate(np.arange(0.2, 20.0, 0.23)):
+        last = int(np.searchsorted(samples["stamp"], (t + 0.115) * 1e9))
+        convention.corrected(samples[first:last])
+        first = last
+        place, quaternion = motion.poses(np.array([t]))
+        place = place[0] + rng.normal(0.0, noise_m, 3)
+        turn = rotation_matrices(quaternion)[0]
+        if convention.watch(HostNs(round(t * 1e9)), turn, place):
+            return convention, number
+    return convention, -1
+
+
+@pytest.mark.parametrize("name", ["walk", "trot", "drone", "still", "spin"])
+def test_a_sound_accelerometer_stays_as_it_is(name: str) -> None:
+    convention, changed = watched(name, 1.0)
+    assert changed == -1
+    assert convention.notes == []
+
+
+@pytest.mark.parametrize("factor", [-1.0, -1.0 / 9.80665])
+def test_the_opposite_sign_is_found_within_seconds_of_motion(factor: float) -> None:
+    convention, changed = watched("walk", factor)
+    assert 20 <= changed < 50
+    assert convention.reversed
+    assert "points the other way" in convention.notes[-1]
+    assert convention.in_g == (abs(factor) < 0.5)
+
+
+def test_at_rest_nothing_can_be_said_of_the_sign() -> None:
+    convention, changed = watched("still", -1.0, noise_m=0.003)
+    assert changed == -1
+    assert not convention.reversed
+
+
+def test_samples_in_g_are_multiplied() -> None:
+    motion = trajectories.make("walk", scenes.make("room"))
+    true, given = samples_of(motion, 2.0), samples_of(motion, 2.0, 1.0 / 9.80665)
+    convention = ImuConvention()
+    found = np.concatenate([convention.corrected(given[k : k + 1]) for k in range(len(given))])
+    np.testing.assert_allclose(
+        found["linear_acceleration"], true["linear_acceleration"], rtol=1e-6, atol=1e-6
+    )
+    assert given["linear_acceleration"][0, 2] < 2.0  # what came in was not changed
+
+
+def test_the_known_fault_of_the_l2_is_not_taken_for_a_unit() -> None:
+    samples = samples_of(trajectories.make("still", scenes.make("room")), 1.0, 2.0)
+    convention = ImuConvention()
+    assert convention.corrected(samples) is samples
+    assert convention.notes == []
+
+
+def test_samples_without_poses_do_not_pile_up() -> None:
+    samples = np.zeros(500, IMU_SAMPLE)
+    convention = ImuConvention()
+    for k in range(100):
+        samples["stamp"] = np.arange(500) * 4_000_000 + k * 2_000_000_000
+        convention.corrected(samples)
+    assert len(convention._stamps) < 11_000
+    nothing = ImuConvention()
+    hostile = np.zeros(3, IMU_SAMPLE)
+    hostile["linear_acceleration"] = np.nan
+    assert np.isnan(nothing.corrected(hostile)["linear_acceleration"]).all()
+    assert not nothing.in_g

@@ -1,0 +1,150 @@
+"""The odometry over bags that other sensors' drivers recorded: formats, units, missing parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2lidar_proc.config import OdometryNodeConfig
+from l2lidar_proc.recording import bag
+from l2lidar_proc.verbs.odometry import OdometryRun, run_bag
+from tests.support.foreign_bags import (
+    FORMATS,
+    LIVOX,
+    BagMaker,
+    Measured,
+    depth,
+    images,
+    measured,
+    ouster,
+    write_bag,
+)
+
+pytest.importorskip("open3d")
+
+FRAME = "sensor"
+
+
+def put_ouster(bag: BagMaker, stamp: int, cloud: np.ndarray) -> None:
+    bag.cloud("/ouster/points", stamp, FRAME, ouster(cloud, stamp), stamp + 100_000_000)
+
+
+def off(found: OdometryRun, given: Measured) -> float:
+    """Return the largest error of the way between any pose and the first [m]."""
+    poses, true = found.poses["pose"], given.truth(found.poses["stamp"])
+    way = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    return float(np.abs(way - np.linalg.norm(true - true[0], axis=1)).max())
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_each_maker_s_time_field(name: str, tmp_path: Path) -> None:
+    given = measured()
+    late = 100_000_000 if name == "velodyne" else 0
+
+    def put(bag: BagMaker, stamp: int, cloud: np.ndarray) -> None:
+        points = FORMATS[name](cloud, stamp)
+        bag.cloud("/points_raw", stamp + late, FRAME, points, stamp + 100_000_000)
+
+    write_bag(tmp_path / "bag", given, put)
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert found.refused == {}
+    assert len(found.poses) == len(given.clouds)
+    assert off(found, given) < 0.025
+
+
+def test_livox_s_own_messages(tmp_path: Path) -> None:
+    given = measured()
+    write_bag(
+        tmp_path / "bag",
+        given,
+        lambda bag, stamp, cloud: bag.livox(
+            "/livox/lidar", stamp, FRAME, cloud, stamp + 100_000_000
+        ),
+        imu=lambda force: force / 9.80665,
+        imu_topic="/livox/imu",
+        imu_frame=FRAME,
+    )
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert found.refused == {}
+    assert len(found.poses) == len(given.clouds)
+    assert off(found, given) < 0.025
+    said = " ".join(found.report)
+    assert "the accelerometer measures in g: multiplied by 9.80665" in said
+    assert "IMU and clouds have the same frame 'sensor'" in said
+
+
+def test_livox_bytes_are_read_as_a_general_reader_reads_them(tmp_path: Path) -> None:
+    given = measured()
+    write_bag(
+        tmp_path / "bag",
+        given,
+        lambda bag, stamp, cloud: bag.livox("/livox/lidar", stamp, "frame", cloud, stamp),
+        imu=None,
+    )
+    with bag.open_bag(tmp_path / "bag") as reader:
+        _, _, data = next(bag.messages(reader))
+        message = reader.deserialize(data, LIVOX)
+    frame, stamp, points = bag.livox_points(data)
+    assert (frame, stamp) == ("frame", bag.stamp_of(message))
+    assert points["offset_time"].tolist() == [point.offset_time for point in message.points]
+    assert points["z"].tolist() == [point.z for point in message.points]
+    assert points["line"].tolist() == [point.line for point in message.points]
+    for cut in (0, 3, 20, 40, 60, len(data) - 1):
+        with pytest.raises(ValueError, match="Livox message"):
+            bag.livox_points(data[:cut])
+
+
+def test_without_an_imu_it_runs_and_says_so(run, tmp_path: Path) -> None:
+    given = measured()
+    write_bag(tmp_path / "bag", given, put_ouster, imu=None)
+    done = run("odometry", str(tmp_path / "bag"), str(tmp_path / "out"))
+    assert (done.code, done.err) == (0, "")
+    assert "no IMU in the recording: the motion comes from the clouds alone" in done.out
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert len(found.poses) > 0.9 * len(given.clouds)
+    assert off(found, given) < 0.06
+
+
+def test_of_several_imus_that_beside_the_clouds_is_taken(tmp_path: Path) -> None:
+    given = measured()
+
+    def put(maker: BagMaker, stamp: int, cloud: np.ndarray) -> None:
+        put_ouster(maker, stamp, cloud)
+        maker.imu("/camera/imu", stamp, "camera", np.full(3, 2.0), np.zeros(3))
+
+    write_bag(tmp_path / "bag", given, put, imu_topic="/ouster/imu")
+    assert off(run_bag(tmp_path / "bag", OdometryNodeConfig()), given) < 0.025
+
+
+def test_a_depth_camera_whose_clouds_have_no_times(tmp_path: Path) -> None:
+    given = measured("depth_camera")
+    some = images(given)
+    write_bag(
+        tmp_path / "bag",
+        given,
+        lambda bag, stamp, cloud: bag.cloud(
+            "/camera/depth/points", stamp, FRAME, depth(cloud, stamp), stamp
+        ),
+        clouds=some,
+        imu_topic="/camera/imu",
+    )
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert found.refused == {}
+    assert len(found.poses) == len(some)
+    assert f"{len(some)} clouds without a time per point" in " ".join(found.report)
+    assert off(found, given) < 0.05
+
+
+def test_an_accelerometer_that_points_the_other_way(tmp_path: Path) -> None:
+    given = measured("small", 5.2)
+    write_bag(tmp_path / "bag", given, put_ouster, imu=lambda force: -force)
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert "points the other way" in " ".join(found.report)
+    assert len(found.poses) == len(given.clouds)
+    assert off(found, given) < 0.025
+    # and up is up
+    way = found.poses["pose"][:, 2, 3] - found.poses["pose"][0, 2, 3]
+    true = given.truth(found.poses["stamp"])[:, 2]
+    assert np.abs(way - (true - true[0])).max() < 0.06
