@@ -8,7 +8,7 @@ BENCH_ARGS ?=
 BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-noble check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
+.PHONY: help setup demo test test-noble docs docs-serve pages animation check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -44,6 +44,18 @@ format: setup ## put every Python file into the project's format
 	$(RUN) -m ruff check --fix-only .
 	$(RUN) -m ruff format .
 
+docs: setup pages ## the documents as a site with search and API pages, in site/
+	$(RUN) -m mkdocs build --quiet
+
+docs-serve: docs ## the same at http://127.0.0.1:8000, renewed at every change
+	$(RUN) -m mkdocs serve
+
+pages: setup ## write the pages that follow from the code (docs/parameters.md)
+	$(RUN) -m benchmarks.pages
+
+animation: setup ## draw README's animation (docs/demo.gif)
+	$(RUN) -m benchmarks.animation
+
 $(BENCHES:%=bench-%): bench-%: setup
 	$(RUN) -m benchmarks.bench_$(subst -,_,$*) $(BENCH_ARGS)
 
@@ -57,5 +69,5 @@ fuzz: setup ## hostile input for everything that reads input from outside
 	$(RUN) -m benchmarks.fuzz $(BENCH_ARGS)
 
 clean: ## remove .venv and everything built, measured or cached
-	rm -rf .venv .venv-noble-* build install log out *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf .venv .venv-noble-* build install log out site *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 		.import_linter_cache

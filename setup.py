@@ -60,6 +60,7 @@ setup(
         "bench": ["evo>=1.31"],
         "slam": ["gtsam>=4.3,<5"],
         "view": ["rerun-sdk>=0.20"],
+        "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.26"],
         "dev": [
             "hypothesis>=6.100",
             "import-linter>=2.1",

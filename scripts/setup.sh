@@ -212,7 +212,7 @@ main() {
         mark ros "$ros_made"
     fi
     say "installing the Python packages this project needs (the first time: some minutes)"
-    pip_install --no-build-isolation --editable '.[bench,dev,slam,view]'
+    pip_install --no-build-isolation --editable '.[bench,dev,docs,slam,view]'
     is_healthy || die "something is still missing from ${venv##*/}; run 'make clean', then the command again."
     mark installed "$installed"
     say "done"

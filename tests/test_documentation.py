@@ -8,6 +8,10 @@ from typing import Any
 
 import pytest
 
+from benchmarks import pages
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.settings import settings_of
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -17,7 +21,7 @@ ADMIN = "changes the machine"
 
 RUN_BY = {
     r"git clone .*": "CI, which starts in a fresh clone",
-    r"make (test|setup|check|format|pytest|test-noble)\b.*": "CI itself",
+    r"make (test|setup|check|format|pytest|test-noble|docs)\b.*": "CI itself",
     r"PYTHON=.* make setup": "tests/test_setup.py",
     r"(python3 -m venv|\.venv/bin/(pip|python -m colcon)) .*": "tests/test_packaging.py",
     r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
@@ -25,6 +29,7 @@ RUN_BY = {
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/recording/test_bag_readers.py",
     r"l2lidar deskew .*": "tests/l2lidar_proc/verbs/test_deskew.py",
+    r"l2lidar check .*\.pcap .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"l2lidar check .*\.mcap .*": "tests/l2lidar_node/check/test_recordings.py",
     r"l2lidar check /.*": "tests/l2lidar_node/ros/test_topic_source.py",
     r"l2lidar view.*": "tests/l2lidar_node/ros/test_viewer.py",
@@ -72,8 +77,45 @@ def test_the_tests_named_exist(where: Any) -> None:
     assert (ROOT / where).exists()
 
 
+def anchors(page: Path) -> set[str]:
+    """Return the names by which links reach the headings of a page."""
+    found = set()
+    for heading in re.findall(r"^#+ (.*)$", page.read_text(), re.M):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower()
+        found.add(re.sub(r"[^\w\- ]", "", plain).strip().replace(" ", "-"))
+    return found
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Any) -> None:
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
+def test_links_lead_somewhere(page):
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text()):
         if "://" not in target:
-            assert (page.parent / target).exists(), target
+            path = page.parent / target if target else page
+            assert path.exists(), target
+            if anchor and path.suffix == ".md":
+                assert anchor in anchors(path), f"{target}#{anchor}"
+
+
+def test_the_site_shows_every_page():
+    """mkdocs builds what is in its list, the start page and the generated ones besides."""
+    listed = set(re.findall(r"^ +- .*?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
+    assert {page.name for page in (ROOT / "docs").glob("*.md")} <= listed
+
+
+def test_the_page_of_parameters_is_that_of_the_code():
+    assert pages.PAGE.read_text() == pages.parameters(), "run `make pages`"
+
+
+def test_the_first_screen_names_parameters_that_exist():
+    readme = (ROOT / "README.md").read_text()
+    table = readme.partition("## The dozen parameters")[2].partition("\n## ")[0]
+    names = re.findall(
+        r"`(\w+)`", "".join(row.split("|")[1] for row in table.splitlines() if "|" in row)
+    )
+    known = {item.name for item in settings_of(DriverConfig)}
+    assert len(names) >= 12
+    assert set(names) <= known
+
+
+def test_the_animation_is_small():
+    assert (ROOT / "docs/demo.gif").stat().st_size < 1_000_000
