@@ -16,6 +16,7 @@ from l2lidar_node.driver import health
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.metadata import metadata
 from l2lidar_node.ros.conversions import to_time
+from l2lidar_node.ros.mount import MountMonitor
 from l2lidar_node.ros.program import StartError
 from l2lidar_node.transport.session import Loop
 from l2lidar_node.types import HostNs
@@ -56,6 +57,7 @@ class HealthPublisher:
     def __init__(self, node: Node, session: Loop) -> None:
         self._node = node
         self._session = session
+        self._mount = MountMonitor(node, session.driver.config.frames.cloud)
         self._before: health.Period | None = None
         self._driver: Driver | None = None
         self._metadata = ""
@@ -72,6 +74,8 @@ class HealthPublisher:
             return
         config = self._session.driver.config
         if checks:
+            mount = self._mount.judge(config.imu.adjust)
+            checks += [mount] if mount is not None else []
             name = self._node.get_fully_qualified_name().lstrip("/")
             self._diagnostics.publish(diagnostic_array(checks, name, config.network.l2_ip, now))
         text = json.dumps(about, indent=2)

@@ -54,9 +54,9 @@ class Run:
     motion: Motion
 
 
-def record(scene: str, motion: str, seed: int, seconds: float) -> Run:
+def record(scene: str, motion: str, seed: int, seconds: float, mount: str = "upright") -> Run:
     """Return a recording of a built-in motion in a built-in scene."""
-    physics = assemble(PhysicsConfig(world=scene, motion=motion, seed=seed))
+    physics = assemble(PhysicsConfig(world=scene, motion=motion, seed=seed, mount=mount))
     projector = Projector(wire.PacketType.POINTS_3D)
     total = int(seconds / physics.scanner.period_s)
     points, instants, counts, starts, heads = [], [], [], [], []

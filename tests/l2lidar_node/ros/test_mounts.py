@@ -1,0 +1,175 @@
+"""The example robots with a virtual L2 on them: points are where the world is, in base_link."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from geometry_msgs.msg import TransformStamped  # noqa: E402  after importorskip
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
+
+from l2lidar_node.config import FrameConfig  # noqa: E402
+from l2lidar_node.ros.mount import MAX_TILT_DEG, MountMonitor  # noqa: E402
+from l2lidar_node.types import Level  # noqa: E402
+from tests.l2lidar_node.ros.rig import open_rig  # noqa: E402
+from tests.support.odometry_runs import record, sweeps  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "urdf" / "examples"
+MOUNTS = {"top": "upright", "forward": "forward"}
+SENSOR_HEIGHT = 1.0  # of the built-in motions
+CEILING = 2.8  # of the built-in room
+BAND = 0.06  # [m] range noise and the onboard orientation's error included
+
+
+def mount(example):
+    """Return the pose of the sensor in base_link as the URDF has it, (4, 4)."""
+    robot = ElementTree.parse(EXAMPLES / f"l2_{example}_mount_example.urdf").getroot()
+    joints = {joint.find("child").get("link"): joint for joint in robot.iter("joint")}
+    pose, link = np.eye(4), FrameConfig().cloud
+    while link != "base_link":
+        origin = joints[link].find("origin").attrib
+        step = np.eye(4)
+        rpy = [float(value) for value in origin["rpy"].split()]
+        step[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+        step[:3, 3] = [float(value) for value in origin["xyz"].split()]
+        pose, link = step @ pose, joints[link].find("parent").get("link")
+    return pose
+
+
+def heights(points, pose):
+    """Return the heights of points (N,) above base_link's origin [m]."""
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1)
+    return xyz @ pose[2, :3] + pose[2, 3]
+
+
+def is_upright(points, pose):
+    """Return whether floor and ceiling are at their heights in base_link, and nothing beyond."""
+    floor = pose[2, 3] - SENSOR_HEIGHT
+    z = heights(points, pose)
+    shares = [np.mean(np.abs(z - at) < BAND) for at in (floor, floor + CEILING)]
+    beyond = np.mean((z < floor - 2 * BAND) | (z > floor + CEILING + 2 * BAND))
+    sees_floor = pose[2, 2] < 0.5  # an upright L2 sees nothing below its own horizon
+    return bool(shares[1] > 0.1 and (shares[0] > 0.1 or not sees_floor) and beyond < 0.001)
+
+
+@pytest.mark.parametrize(("example", "emulated"), MOUNTS.items())
+def test_points_as_measured_are_upright_on_every_example_robot(example, emulated):
+    run = record("room", "still", 0, 1.0, mount=emulated)
+    points = list(sweeps(run, "turn"))[1].points
+    pose = mount(example)
+    assert is_upright(points, pose)
+    # Turned upright already, and then by TF once more: right where the mount is level.
+    leveled = points.copy()
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1) @ pose[:3, :3].T
+    for axis, values in zip("xyz", xyz.T, strict=True):
+        leveled[axis] = values
+    assert is_upright(leveled, pose) == (example == "top")
+
+
+def transforms(pose):
+    q = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    item = TransformStamped(child_frame_id=FrameConfig().cloud)
+    item.header.frame_id = "base_link"
+    place, turn = item.transform.translation, item.transform.rotation
+    place.x, place.y, place.z = pose[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = q.tolist()
+    return TFMessage(transforms=[item])
+
+
+@pytest.fixture
+def node():
+    rclpy.init()
+    made = rclpy.create_node("driver")
+    yield made
+    made.destroy_node()
+    rclpy.shutdown()
+
+
+def publish(node, monitor, message, frame):
+    """Publish static transforms and wait until the monitor has them."""
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(TFMessage, "/tf_static", latched)
+    publisher.publish(message)
+    for _ in range(200):
+        if monitor.tilt_deg()[0] == frame:
+            return
+        rclpy.spin_once(node, timeout_sec=0.05)
+    raise AssertionError(f"nothing above is known but {monitor.tilt_deg()}")
+
+
+@pytest.mark.parametrize(
+    ("example", "tilt", "level"), [("top", 0.0, Level.OK), ("forward", 90.0, Level.WARN)]
+)
+def test_a_mount_that_is_not_level_is_warned_of_where_points_are_leveled(
+    node, example, tilt, level
+):
+    monitor = MountMonitor(node, FrameConfig().cloud)
+    assert monitor.judge(True) is None, "no mount, nothing to say"
+    publish(node, monitor, transforms(mount(example)), "base_link")
+    assert monitor.tilt_deg()[1] == pytest.approx(tilt, abs=1e-3)
+    assert monitor.judge(True).level == level
+    assert monitor.judge(False).level == Level.OK
+    if level == Level.WARN:
+        assert "set imu_adjust: false" in monitor.judge(True).message
+
+
+def test_a_chain_of_frames_is_followed_and_loops_and_damage_are_not(node):
+    monitor = MountMonitor(node, "lidar")
+    chain = TFMessage()
+    for parent, child, roll in (("base", "mast", 40.0), ("mast", "lidar", -40.0 + MAX_TILT_DEG)):
+        item = TransformStamped(child_frame_id=child)
+        item.header.frame_id = parent
+        turn = item.transform.rotation
+        turn.x, turn.y, turn.z, turn.w = Rotation.from_euler("x", roll, degrees=True).as_quat()
+        chain.transforms.append(item)
+    damaged = TransformStamped(child_frame_id="base")
+    damaged.header.frame_id = "nowhere"
+    damaged.transform.rotation.w = float("nan")
+    chain.transforms.append(damaged)
+    publish(node, monitor, chain, "base")
+    assert monitor.tilt_deg()[1] == pytest.approx(MAX_TILT_DEG, abs=1e-6)
+    loop = TransformStamped(child_frame_id="base")
+    loop.header.frame_id = "lidar"
+    loop.transform.rotation.w = 1.0
+    monitor._take(TFMessage(transforms=[loop]))
+    assert np.isfinite(monitor.tilt_deg()[1])
+
+
+def test_the_driver_warns_and_its_points_come_upright_once_told():
+    """The example that looks ahead, with the driver's own defaults first."""
+    pose = mount("forward")
+    with open_rig() as rig:
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        publisher = rig.observer.create_publisher(TFMessage, "/tf_static", latched)
+        publisher.publish(transforms(pose))
+        rig.emulator("--ready", "--world", "room", "--motion", "still", "--mount", "forward")
+        rig.driver(imu_adjust=True, sweep_cut="turn")
+        checks = rig.observer
+
+        def mount_check():
+            return checks.checks.get("mount", {})
+
+        rig.wait_for(lambda: "is applied twice" in mount_check().get("message", ""), "a warning")
+        rig.wait_for(lambda: rig.observer.cloud is not None, "a cloud")
+        assert not is_upright(rig.observer.cloud, pose)
+        from rcl_interfaces.srv import SetParameters
+
+        request = SetParameters.Request(
+            parameters=[Parameter("imu_adjust", value=False).to_parameter_msg()]
+        )
+        rig.call(SetParameters, "/l2lidar_node/set_parameters", request)
+        seen = len(rig.observer.points)
+        # The sweep that is being collected may be half of each.
+        rig.wait_for(lambda: len(rig.observer.points) >= seen + 3, "clouds as measured")
+        assert is_upright(rig.observer.cloud, pose)
+        rig.wait_for(lambda: "tilted by 90" in mount_check().get("message", ""), "all clear")
