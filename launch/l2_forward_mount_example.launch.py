@@ -41,6 +41,11 @@ def generate_launch_description():
                 default_value=str(share / "rviz" / "rvizl2lidar_example.rviz"),
                 description="RViz layout",
             ),
+            DeclareLaunchArgument(
+                "emulator_options",
+                default_value="--ready --mount forward",
+                description="command line options of the virtual L2, in one string",
+            ),
             Node(
                 package="robot_state_publisher",
                 executable="robot_state_publisher",

@@ -341,7 +341,8 @@ def test_emulator_is_on_loopback_and_ready_at_once(launched: Any, name: Any) -> 
     made = launched(name, emulator="true", l2_ip="10.0.0.1", host_port="7001")
     ((program, *words),) = made.processes
     assert Path(program).name == "l2lidar_emulator"
-    assert words == ["--lidar-port", "6101", "--host-port", "7001", "--ready"]
+    mounted = ["--mount", "forward"] if name == "l2_forward_mount_example" else []
+    assert words == ["--lidar-port", "6101", "--host-port", "7001", "--ready", *mounted]
     values = made.node("l2lidar_node").parameters
     assert {key: values[key] for key in NETWORK} == {
         "l2_ip": "127.0.0.1", "l2_port": 6101, "host_ip": "127.0.0.1", "host_port": 7001

@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
 from l2lidar_node.command_line import for_typer
+from l2lidar_node.demo import robot
 from l2lidar_node.demo.observer import Observer, TopicRecord, TopicRecorder
 from l2lidar_node.demo.processes import (
     ProgramError,
@@ -40,6 +41,13 @@ def demo(
     motion: Annotated[
         str, typer.Option(help="still, spin, walk, trot, drone, or a TUM file.")
     ] = "walk",
+    forward: Annotated[
+        bool,
+        typer.Option(
+            "--forward",
+            help="Put the sensor on the front of the example robot; show the cloud in base_link.",
+        ),
+    ] = False,
     driver_only: Annotated[
         bool, typer.Option("--driver-only", help="Leave deskew and odometry out.")
     ] = False,
@@ -52,7 +60,7 @@ def demo(
 
     The exit code is 1 if a figure is not as it should be.
     """
-    options = _Options(duration, world, motion, driver_only, folder, record)
+    options = _Options(duration, world, motion, forward, driver_only, folder, record)
     code = _run(options)
     if code:
         raise typer.Exit(code)
@@ -64,6 +72,7 @@ class _Options(NamedTuple):
     duration: float
     world: str
     motion: str
+    forward: bool
     driver_only: bool
     folder: Path
     record: Path | None
@@ -87,6 +96,9 @@ def _run(options: _Options) -> int:
     )
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C interrupts this one
     observer = Observer()
+    mount = robot.mount("forward") if options.forward else None
+    if mount is not None:
+        observer.publish_static(robot.as_message(mount))
     try:
         with ExitStack() as stack:
             if options.record is not None:
@@ -110,7 +122,9 @@ def _run(options: _Options) -> int:
         rclpy.try_shutdown()
     if options.record is not None:
         console.print(f"{recorder.messages} messages recorded in {options.record}")
-    troubles = report(console, observer, options.folder, with_odometry=not options.driver_only)
+    troubles = report(
+        console, observer, options.folder, with_odometry=not options.driver_only, mount=mount
+    )
     for trouble in troubles:
         console.print(f"[red]{trouble}")
     return 1 if troubles else 0
@@ -138,6 +152,7 @@ def _start(programs: Programs, options: _Options) -> None:
         [
             "--world", options.world,
             "--motion", options.motion,
+            "--mount", "forward" if options.forward else "upright",
             "--host-port", str(host_port),
             "--lidar-port", str(lidar_port),
             "--boot-scale", str(_BOOT_SCALE),

@@ -97,6 +97,12 @@ class Observer(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
         self.create_subscription(TFMessage, "/tf_static", self._transform, latched)
 
+    def publish_static(self, message: TFMessage) -> None:
+        """Publish a mount, as a robot's description would."""
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._mount = self.create_publisher(TFMessage, "/tf_static", latched)
+        self._mount.publish(message)
+
     @property
     def checks(self) -> dict[str, dict[str, str]]:
         """The latest value of every check by name, of all nodes."""

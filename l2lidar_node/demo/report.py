@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.demo import picture
+from l2lidar_node.demo import picture, robot
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.emulator.truth.results import Results
 from l2lidar_node.protocol.wire import PacketType
@@ -81,10 +82,18 @@ def stamp_errors_ms(truth: Results, packet_type: PacketType, stamps: list[int]) 
 _SPACING_MS: Final = {"/points": 229.8, "/imu/data": 4.0}  # a cloud per turn of the head
 _TOLERANCE: Final = 0.02
 _MAX_ATE_M: Final = 0.05
+_SENSOR_HEIGHT_M: Final = 1.0  # of the built-in motions above the floor
+_HEIGHT_TOLERANCE_M: Final = 0.25  # a walk heaves and pitches
 _MIN_POSES: Final = 10
 
 
-def report(console: Console, observer: Observer, folder: Path, with_odometry: bool) -> list[str]:
+def report(
+    console: Console,
+    observer: Observer,
+    folder: Path,
+    with_odometry: bool,
+    mount: F64 | None = None,
+) -> list[str]:
     """Print what was seen, write pictures, and return what is wrong.
 
     Parameters
@@ -95,6 +104,8 @@ def report(console: Console, observer: Observer, folder: Path, with_odometry: bo
         Of the pictures; its subfolder ``truth`` is what the virtual L2 wrote.
     with_odometry : bool
         Whether deskew and odometry took part.
+    mount : ndarray, shape (4, 4), optional
+        Pose of the cloud frame in the base frame of a robot; the cloud is then shown there.
     """
     console.print(_topics(observer, with_odometry))
     troubles = _troubles(observer)
@@ -114,11 +125,29 @@ def report(console: Console, observer: Observer, folder: Path, with_odometry: bo
         )
     console.print(f"lost packets: {_lost(observer.checks.get('link', {}))}")
     if observer.cloud is not None:
-        picture.save_cloud(observer.cloud, folder / "cloud.png", "one cloud, as measured")
+        if mount is None:
+            picture.save_cloud(observer.cloud, folder / "cloud.png", "one cloud, as measured")
+        else:
+            troubles += _in_base(console, observer.cloud, mount, folder)
     if with_odometry:
         troubles += _odometry(console, observer, truth, folder)
     console.print(f"pictures: {', '.join(str(path) for path in sorted(folder.glob('*.png')))}")
     return troubles
+
+
+def _in_base(console: Console, cloud: NDArray[np.void], mount: F64, folder: Path) -> list[str]:
+    """Show a cloud as RViz does with the fixed frame base_link; return what is wrong."""
+    shown = robot.moved(cloud, mount)
+    floor, ceiling = robot.floor_and_ceiling(shown)
+    text = (
+        f"in {robot.BASE_FRAME} the floor is at z = {floor:.2f} m, the ceiling at {ceiling:.2f} m"
+    )
+    console.print(text)
+    picture.save_cloud(shown, folder / "cloud.png", text)
+    expected = float(mount[2, 3]) - _SENSOR_HEIGHT_M
+    if abs(floor - expected) > _HEIGHT_TOLERANCE_M:
+        return [f"the floor is at z = {floor:.2f} m in {robot.BASE_FRAME}, not {expected:.2f} m"]
+    return []
 
 
 def _topics(observer: Observer, with_odometry: bool) -> Table:

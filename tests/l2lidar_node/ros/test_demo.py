@@ -39,6 +39,16 @@ def test_the_driver_alone_streams_without_loss_and_draws_a_cloud(tmp_path: Path)
         assert reader.deserialize(data, clouds[0].msgtype).header.frame_id == "l2lidar_link"
 
 
+def test_a_sensor_that_looks_ahead_sees_an_upright_world_in_base_link(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [*COMMAND, "--forward", "--driver-only", "--duration", "4", "--folder", str(tmp_path)],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "in base_link the floor is at z = -0." in result.stdout
+    assert (tmp_path / "cloud.png").stat().st_size > 20_000
+
+
 def test_the_whole_chain_is_judged_against_the_truth(tmp_path: Path) -> None:
     result = subprocess.run(
         [*COMMAND, "--duration", "8", "--folder", str(tmp_path)],

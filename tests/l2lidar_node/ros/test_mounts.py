@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from xml.etree import ElementTree
-
 import numpy as np
 import pytest
 
@@ -17,6 +14,7 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.config import FrameConfig  # noqa: E402
+from l2lidar_node.demo.robot import as_message, floor_and_ceiling, mount, moved  # noqa: E402
 from l2lidar_node.ros.mount import MAX_TILT_DEG, MountMonitor  # noqa: E402
 from l2lidar_node.types import Level  # noqa: E402
 from tests.l2lidar_node.ros.rig import open_rig  # noqa: E402
@@ -24,26 +22,10 @@ from tests.support.odometry_runs import record, sweeps  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
-EXAMPLES = Path(__file__).resolve().parents[3] / "urdf" / "examples"
 MOUNTS = {"top": "upright", "forward": "forward"}
 SENSOR_HEIGHT = 1.0  # of the built-in motions
 CEILING = 2.8  # of the built-in room
 BAND = 0.06  # [m] range noise and the onboard orientation's error included
-
-
-def mount(example):
-    """Return the pose of the sensor in base_link as the URDF has it, (4, 4)."""
-    robot = ElementTree.parse(EXAMPLES / f"l2_{example}_mount_example.urdf").getroot()
-    joints = {joint.find("child").get("link"): joint for joint in robot.iter("joint")}
-    pose, link = np.eye(4), FrameConfig().cloud
-    while link != "base_link":
-        origin = joints[link].find("origin").attrib
-        step = np.eye(4)
-        rpy = [float(value) for value in origin["rpy"].split()]
-        step[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
-        step[:3, 3] = [float(value) for value in origin["xyz"].split()]
-        pose, link = step @ pose, joints[link].find("parent").get("link")
-    return pose
 
 
 def heights(points, pose):
@@ -68,22 +50,14 @@ def test_points_as_measured_are_upright_on_every_example_robot(example, emulated
     points = list(sweeps(run, "turn"))[1].points
     pose = mount(example)
     assert is_upright(points, pose)
+    _, ceiling = floor_and_ceiling(moved(points, pose))
+    assert ceiling == pytest.approx(pose[2, 3] - SENSOR_HEIGHT + CEILING, abs=BAND)
     # Turned upright already, and then by TF once more: right where the mount is level.
     leveled = points.copy()
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1) @ pose[:3, :3].T
     for axis, values in zip("xyz", xyz.T, strict=True):
         leveled[axis] = values
     assert is_upright(leveled, pose) == (example == "top")
-
-
-def transforms(pose):
-    q = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    item = TransformStamped(child_frame_id=FrameConfig().cloud)
-    item.header.frame_id = "base_link"
-    place, turn = item.transform.translation, item.transform.rotation
-    place.x, place.y, place.z = pose[:3, 3].tolist()
-    turn.x, turn.y, turn.z, turn.w = q.tolist()
-    return TFMessage(transforms=[item])
 
 
 @pytest.fixture
@@ -115,7 +89,7 @@ def test_a_mount_that_is_not_level_is_warned_of_where_points_are_leveled(
 ):
     monitor = MountMonitor(node, FrameConfig().cloud)
     assert monitor.judge(True) is None, "no mount, nothing to say"
-    publish(node, monitor, transforms(mount(example)), "base_link")
+    publish(node, monitor, as_message(mount(example)), "base_link")
     assert monitor.tilt_deg()[1] == pytest.approx(tilt, abs=1e-3)
     assert monitor.judge(True).level == level
     assert monitor.judge(False).level == Level.OK
@@ -151,7 +125,7 @@ def test_the_driver_warns_and_its_points_come_upright_once_told():
     with open_rig() as rig:
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         publisher = rig.observer.create_publisher(TFMessage, "/tf_static", latched)
-        publisher.publish(transforms(pose))
+        publisher.publish(as_message(pose))
         rig.emulator("--ready", "--world", "room", "--motion", "still", "--mount", "forward")
         rig.driver(imu_adjust=True, sweep_cut="turn")
         checks = rig.observer
