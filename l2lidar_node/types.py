@@ -22,6 +22,36 @@ HostNs = NewType("HostNs", int)
 DeviceNs = NewType("DeviceNs", int)
 """Nanoseconds on the sensor's own clock, which runs at about half speed and steps."""
 
+FIRST_STAMP: Final = HostNs(-(1 << 31) * 1_000_000_000)
+LAST_STAMP: Final = HostNs((1 << 31) * 1_000_000_000 - 1)
+"""2038-01-19 03:14:07.999999999 UTC: seconds of ROS 2 stamps have 32 bits."""
+
+
+class StampError(ValueError):
+    """An instant that no ROS stamp can hold; the message says which."""
+
+
+def is_ros_time(stamp: int) -> bool:
+    """Return whether a ROS stamp can hold an instant [ns]: those from 1901 to 2038."""
+    return FIRST_STAMP <= stamp <= LAST_STAMP
+
+
+def split_stamp(stamp: int) -> tuple[int, int]:
+    """Return seconds and nanoseconds of a ROS stamp.
+
+    Raises
+    ------
+    StampError
+        If a ROS stamp cannot hold the instant.
+    """
+    if not is_ros_time(stamp):
+        raise StampError(
+            f"the time {stamp / 1e9:.3f} s after 1970 is out of range: stamps of ROS 2 hold "
+            "1901-12-13 to 2038-01-19"
+        )
+    return divmod(int(stamp), 1_000_000_000)
+
+
 POINT: Final = np.dtype(
     [
         ("x", "<f4"),  # [m] cloud frame

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_node.types import POINT, HostNs, Sweep, is_ros_time
 
 TIME_FIELDS: Final = ("time", "t", "timestamp", "offset_time")
 
@@ -56,8 +56,8 @@ def to_sweep(
     ------
     CloudError
         If there is no time field, or several; if all times are equal; if unit or origin are not
-        plain; or if there are more points or seconds than :data:`MAX_POINTS` and
-        :data:`MAX_DURATION_NS`.
+        plain; if a time is none that a ROS stamp can hold; or if there are more points or seconds
+        than :data:`MAX_POINTS` and :data:`MAX_DURATION_NS`.
     """
     cloud = cloud.reshape(-1)
     if len(cloud) > MAX_POINTS:
@@ -70,6 +70,8 @@ def to_sweep(
         cloud = cloud[finite]
     if not len(cloud):
         raise CloudError("no point is finite")
+    if not is_ros_time(stamp):
+        raise CloudError("its time is out of range: stamps of ROS 2 hold 1901 to 2038")
     if snapshots and (not name or cloud[name].min() == cloud[name].max()):
         points = _with_time(cloud, name, np.zeros(len(cloud)))
         points.flags.writeable = False
@@ -87,6 +89,8 @@ def to_sweep(
             "can be used"
         )
     before = min(int(times[0]), 0)
+    if not is_ros_time(stamp + before) or not is_ros_time(stamp + int(times[-1])):
+        raise CloudError("its time is out of range: stamps of ROS 2 hold 1901 to 2038")
     points = _with_time(cloud, name, np.asarray((times - before) * 1e-9))
     points.flags.writeable = False
     return Sweep(HostNs(stamp + before), HostNs(stamp + int(times[-1])), points, 0, 0)

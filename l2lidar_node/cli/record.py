@@ -23,7 +23,7 @@ from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
-from l2lidar_node.types import Stream
+from l2lidar_node.types import StampError, Stream
 
 _CAPTURES: Final = (".pcap", ".cap")
 _LOOK_S: Final = 0.25
@@ -109,6 +109,8 @@ def _record_bag(
                 bag.add(event)
             except OSError as error:
                 failures.append(f"recording to {file} ended: {error.strerror}")
+            except StampError as error:
+                failures.append(f"recording to {file} ended: {error}; set this host's clock")
 
     try:
         with bag:
@@ -156,7 +158,7 @@ def convert(
                     writer.add(event)
     except OSError as error:
         raise CommandError(f"{error.filename or bag}: {error.strerror}") from None
-    except CaptureError as error:
+    except (CaptureError, StampError) as error:
         raise CommandError(f"{capture}: {error}") from None
     cut = "; the capture is cut off at its end" if recording.is_cut_off else ""
     say(f"{bag}: {writer.clouds} clouds, {writer.samples} IMU samples{cut}")

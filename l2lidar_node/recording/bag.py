@@ -28,7 +28,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Event
 from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import HostNs, ImuSample, Sweep
+from l2lidar_node.types import HostNs, ImuSample, Sweep, split_stamp
 
 _NS: Final = 1_000_000_000
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
@@ -220,7 +220,7 @@ class Messages:
         )
 
     def _header(self, stamp: HostNs, frame: str) -> Any:
-        time = self._types["builtin_interfaces/msg/Time"](*divmod(int(stamp), _NS))
+        time = self._types["builtin_interfaces/msg/Time"](*split_stamp(stamp))
         return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 

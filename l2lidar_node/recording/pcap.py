@@ -6,6 +6,7 @@ Formats: draft-ietf-opsawg-pcap and draft-ietf-opsawg-pcapng. What stands in a p
 
 from __future__ import annotations
 
+import errno
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -226,6 +227,14 @@ class PacketWriter:
         stream.write(struct.pack("<I2H4I", _NANO, 2, 4, 0, 0, _MAX_PACKET, link))
 
     def write(self, time: HostNs, data: bytes) -> None:
-        """Append a packet; its time must be from 1970 to 2106."""
+        """Append a packet.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written, or its time is not from 1970 to 2106.
+        """
         seconds, fraction = divmod(time, _NS)
+        if not 0 <= seconds < 1 << 32:
+            raise OSError(errno.EOVERFLOW, "a capture holds times from 1970 to 2106")
         self._stream.write(self._RECORD.pack(seconds, fraction, len(data), len(data)) + data)

@@ -12,9 +12,7 @@ from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Entry, Received, Recording, Sent, Stepped
 from l2lidar_node.transport.session import Loop
-from l2lidar_node.types import Datagram, HostNs, ImuSample, Sweep
-
-_END_NS: Final = 2**31 * 1_000_000_000  # seconds of ROS 2 stamps are signed 32-bit numbers
+from l2lidar_node.types import LAST_STAMP, Datagram, HostNs, ImuSample, Sweep, is_ros_time
 
 
 def feed(driver: Driver, entry: Entry) -> list[Event]:
@@ -25,10 +23,11 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
     CaptureError
         If its time is beyond what a ROS 2 stamp can hold.
     """
-    if entry.time >= _END_NS:
+    if not is_ros_time(entry.time):
         raise CaptureError(
-            f"its times reach {entry.time // 1_000_000_000} s after 1970; ROS 2 stamps end at "
-            f"{_END_NS // 1_000_000_000} s, in January 2038. Was the clock of that machine set?"
+            f"its times reach {entry.time // 1_000_000_000} s after 1970; stamps of ROS 2 end at "
+            f"{(LAST_STAMP + 1) // 1_000_000_000} s, in January 2038. Was the clock of that "
+            "machine set?"
         )
     if isinstance(entry, Received):
         return driver.receive(entry.data, entry.time)

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, PointCloud2, PointField
 from l2lidar_node.clouds.fields import DATATYPES, points_of
 from l2lidar_node.config import FrameConfig, ImuConfig
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import HostNs, ImuSample
+from l2lidar_node.types import HostNs, ImuSample, split_stamp
 
 _NUMBERS: Final = {code: number for number, code in DATATYPES.items()}
 
@@ -32,20 +32,6 @@ _QUATERNION: Final = struct.Struct("<4d")
 _VECTOR: Final = struct.Struct("<3d")
 
 
-FIRST_STAMP: Final = HostNs(-(1 << 31) * NS)
-LAST_STAMP: Final = HostNs((1 << 31) * NS - 1)
-"""2038-01-19 03:14:07.999999999 UTC: seconds of ROS 2 stamps have 32 bits."""
-
-
-class StampError(ValueError):
-    """An instant that no ROS stamp can hold; the message says which."""
-
-
-def is_ros_time(stamp: int) -> bool:
-    """Return whether a ROS stamp can hold an instant [ns]: those from 1901 to 2038."""
-    return FIRST_STAMP <= stamp <= LAST_STAMP
-
-
 def to_time(stamp: HostNs) -> Time:
     """Return a stamp as a message.
 
@@ -54,17 +40,8 @@ def to_time(stamp: HostNs) -> Time:
     StampError
         If it is not from 1901 to 2038.
     """
-    seconds, nanoseconds = _split_stamp(stamp)
+    seconds, nanoseconds = split_stamp(stamp)
     return Time(sec=seconds, nanosec=nanoseconds)
-
-
-def _split_stamp(stamp: int) -> tuple[int, int]:
-    if not is_ros_time(stamp):
-        raise StampError(
-            f"the time {stamp / 1e9:.3f} s since 1970 is out of range: ROS 2 stamps hold "
-            "1901-12-13 to 2038-01-19"
-        )
-    return divmod(stamp, NS)
 
 
 def from_time(stamp: Time) -> HostNs:
@@ -145,7 +122,7 @@ class CloudTemplate:
         return b"".join(
             (
                 self._encapsulation,
-                _STAMP.pack(*_split_stamp(stamp)),
+                _STAMP.pack(*split_stamp(stamp)),
                 self._before,
                 struct.pack("<I", len(points)),
                 self._between,
@@ -190,7 +167,7 @@ class ImuTemplate:
         """Return the CDR message of a sample."""
         stamp, (w, x, y, z), rate, acceleration = sample
         data = self._data
-        _STAMP.pack_into(data, _STAMP_AT, *_split_stamp(stamp))
+        _STAMP.pack_into(data, _STAMP_AT, *split_stamp(stamp))
         _QUATERNION.pack_into(data, self._at[0], x, y, z, w)
         _VECTOR.pack_into(data, self._at[1], *rate)
         _VECTOR.pack_into(data, self._at[2], *acceleration)

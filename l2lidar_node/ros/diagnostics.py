@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import CancelledError
+import time
+from concurrent.futures import CancelledError, Future
 from dataclasses import asdict
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
@@ -19,10 +21,13 @@ from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.ros.mount import MountMonitor
 from l2lidar_node.ros.program import StartError
 from l2lidar_node.transport.session import Loop
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, HostNs, Level
 
 PERIOD_S = 1.0
 _SHORTEST_NS = 500_000_000
+_SILENT_S = 3.0
+
+_Figures = tuple[list[health.Check], dict[str, Any], HostNs]
 
 
 def diagnostic_array(
@@ -64,33 +69,57 @@ class HealthPublisher:
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._about = node.create_publisher(String, "~/metadata", latched)
-        node.create_timer(PERIOD_S, self._publish)
+        self._asked: Future[_Figures] | None = None
+        self._asked_at = 0.0
+        self._ready = node.create_guard_condition(self._publish)
+        node.create_timer(PERIOD_S, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _ask(self) -> None:
+        """Ask the session's thread for the figures; it wakes the executor when it has them."""
+        if self._asked is not None:
+            self._tell_silence()
+            return
+        self._asked, self._asked_at = self._session.call(self._look), time.monotonic()
+        self._asked.add_done_callback(lambda _: self._ready.trigger())
+
+    def _tell_silence(self) -> None:
+        silent_s = time.monotonic() - self._asked_at
+        if silent_s < _SILENT_S:
+            return
+        text = f"the receiving thread has not answered for {silent_s:.0f} s"
+        check = health.Check("device", Level.ERROR, text, {})
+        self._send([check], HostNs(self._node.get_clock().now().nanoseconds))
 
     def _publish(self) -> None:
+        asked, self._asked = self._asked, None
+        if asked is None:
+            return
         try:
-            checks, about, now = self._session.call(self._look).result()
+            checks, about, now = asked.result()
         except CancelledError:
             self._ended()
             return
-        config = self._session.driver.config
         if checks:
-            mount = self._mount.judge(config.imu.adjust)
+            mount = self._mount.judge(self._session.driver.config.imu.adjust)
             checks += [mount] if mount is not None else []
-            name = self._node.get_fully_qualified_name().lstrip("/")
-            self._diagnostics.publish(diagnostic_array(checks, name, config.network.l2_ip, now))
+            self._send(checks, now)
         text = json.dumps(about, indent=2)
         if text != self._metadata:
             self._metadata = text
             self._about.publish(String(data=text))
+
+    def _send(self, checks: list[health.Check], now: HostNs) -> None:
+        name = self._node.get_fully_qualified_name().lstrip("/")
+        address = self._session.driver.config.network.l2_ip
+        stamp = HostNs(min(max(now, FIRST_STAMP), LAST_STAMP))
+        self._diagnostics.publish(diagnostic_array(checks, name, address, stamp))
 
     def _ended(self) -> None:
         """End the program if the session failed: nothing would ever come again."""
         if self._session.failure is not None and self._node.context.ok():
             raise StartError(f"the receiving thread failed: {self._session.failure!r}")
 
-    def _look(
-        self, driver: Driver, now: HostNs
-    ) -> tuple[list[health.Check], dict[str, Any], HostNs]:
+    def _look(self, driver: Driver, now: HostNs) -> _Figures:
         after = health.observe(driver, self._session.transport, now)
         before = self._before
         if driver is not self._driver:  # that of a replay's next lap counts from 0

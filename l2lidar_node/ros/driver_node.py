@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
-from concurrent.futures import TimeoutError as NoAnswerError
+import time
+from collections.abc import Callable, Generator
+from concurrent.futures import Future
 from pathlib import Path
+from typing import TypeVar
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
@@ -34,7 +35,9 @@ from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.transport import session
 from l2lidar_node.transport.session import Loop, Session
 from l2lidar_node.transport.udp import TransportError
-from l2lidar_node.types import HostNs, ImuSample, Sweep
+from l2lidar_node.types import HostNs, ImuSample, StampError, Sweep, is_ros_time, split_stamp
+
+T = TypeVar("T")
 
 _CLOCK_DEPTH = 10
 
@@ -69,9 +72,10 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
     path = Path(config.files.replay_file).expanduser()
     try:
         recording = Recording(path.open("rb"), config.network.l2_ip)
+        split_stamp(recording.start)
     except OSError as error:
         raise StartError(f"cannot replay {path}: {error.strerror}") from None
-    except CaptureError as error:
+    except (CaptureError, StampError) as error:
         raise StartError(f"cannot replay {path}: {error}") from None
     logger = node.get_logger()
     rate = config.files.replay_rate
@@ -82,7 +86,7 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
     clock = node.create_publisher(Clock, "/clock", _CLOCK_DEPTH)
 
     def on_time(now: HostNs) -> None:
-        if config.files.replay_clock and node.context.ok():
+        if config.files.replay_clock and node.context.ok() and is_ros_time(now):
             clock.publish(Clock(clock=to_time(now)))
 
     def on_lap(shift_ns: int | None) -> None:
@@ -102,7 +106,8 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
     return playback
 
 
-_ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 5.0  # however busy the machine is
+_ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 1.0
+_NOT_IN_TIME = "the driver did not get to it in time"
 _NO_DEVICE = "a recording is replayed, there is no device to command"
 # 4 s, of half turns, for reliable subscribers that are held up.
 _CLOUD_DEPTH = 40
@@ -178,6 +183,8 @@ class DriverNode(Node):
                 self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
             else:
                 self._report(event)
+        except StampError as error:
+            self.get_logger().error(f"not published: {error}", throttle_duration_sec=10.0)
         except RCLError:
             # A signal ends rclpy while the session still hands out what it holds.
             if self.context.ok():
@@ -214,7 +221,9 @@ class DriverNode(Node):
         if future is not None:
             future.set_result(answer)
 
-    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    async def _enable(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
         if self._settings.value.files.replay_file:
             response.success, response.message = False, _NO_DEVICE
             return response
@@ -229,33 +238,55 @@ class DriverNode(Node):
             for event in events:
                 self._handle(event)
 
-        try:
-            self._session.call(command).result(_ANSWER_TIMEOUT_S)
-            answer = future.result(_ANSWER_TIMEOUT_S)
+        await self._completed(self._session.call(command))
+        answer = await self._completed(future)
+        if answer is None:
+            response.success, response.message = False, _NOT_IN_TIME
+        else:
             response.success, response.message = answer.ok, answer.text
-        except (NoAnswerError, CancelledError):
-            response.success, response.message = False, "the driver did not get to it in time"
         return response
 
-    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _reset(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         del request
         if self._settings.value.files.replay_file:
             response.success, response.message = False, _NO_DEVICE
             return response
 
-        def command(driver: Driver, now: HostNs) -> None:
+        def command(driver: Driver, now: HostNs) -> bool:
             for event in driver.reset_device(now):
                 self._handle(event)
+            return True
 
-        try:
-            self._session.call(command).result(_ANSWER_TIMEOUT_S)
+        if await self._completed(self._session.call(command)):
             response.success = True
             response.message = (
                 "reset sent; the device does not acknowledge it and is back in about 25 s"
             )
-        except (NoAnswerError, CancelledError):
-            response.success, response.message = False, "the driver did not get to it in time"
+        else:
+            response.success, response.message = False, _NOT_IN_TIME
         return response
+
+    async def _completed(self, future: Future[T]) -> T | None:
+        """Return a future's result, None where it does not come in time.
+
+        Meanwhile the executor does everything else: timers, parameters, other calls.
+        """
+        executor = self.executor
+        future.add_done_callback(lambda _: executor.wake())
+        deadline = time.monotonic() + _ANSWER_TIMEOUT_S
+        while not future.done() and time.monotonic() < deadline:
+            await _NextTurn()
+        return future.result() if future.done() and not future.cancelled() else None
+
+
+class _NextTurn:
+    """Awaitable that lets the executor do what else there is to do, once."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        """Yield to the executor."""
+        yield
 
 
 def main(args: list[str] | None = None) -> int:

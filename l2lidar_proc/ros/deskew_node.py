@@ -22,19 +22,18 @@ from l2lidar_node.ros.conversions import (
     CloudTemplate,
     from_cloud,
     from_time,
-    is_ros_time,
     to_cloud,
 )
 from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import HostNs, Level
+from l2lidar_node.types import HostNs, Level, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.tracker import carried_over
-from l2lidar_proc.ros.inputs import InputMonitor, steady_timer, sweep_in_range
+from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
 from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
@@ -134,8 +133,6 @@ class DeskewNode(Node):
         try:
             points = from_cloud(message)
             sweep = to_sweep(points, stamp, self._settings.value.proc.deskew.time_unit)
-            if not sweep_in_range(sweep):
-                raise ValueError("the stamp is out of range")
         except CloudError as error:
             if position_problem(points.dtype) or not is_ros_time(stamp):
                 self._refuse(error, "dropped")

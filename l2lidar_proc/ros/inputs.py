@@ -14,7 +14,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from l2lidar_node.ros.conversions import is_ros_time
 from l2lidar_node.types import Sweep
 
 _MAX_REASONS: Final = 20  # senders choose field names and numbers, so reasons have no end
@@ -181,11 +180,6 @@ class InputMonitor:
         if covered < 180:
             return [f"the points of a cloud cover {covered} of 360 degrees of azimuth"]
         return []
-
-
-def sweep_in_range(sweep: Sweep) -> bool:
-    """Return whether both ends of a sweep can be written as ROS stamps."""
-    return is_ros_time(sweep.start) and is_ros_time(sweep.end)
 
 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:

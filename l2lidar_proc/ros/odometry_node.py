@@ -20,10 +20,10 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.files import DataFolder, FileNameError, write_whole
-from l2lidar_node.ros.conversions import from_cloud, from_time, is_ros_time, to_cloud
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, HostNs, is_ros_time
 from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig, OdometryTopics
@@ -40,7 +40,6 @@ from l2lidar_proc.ros.inputs import (
     InputMonitor,
     answer_or_error,
     steady_timer,
-    sweep_in_range,
 )
 from l2lidar_proc.ros.samples import to_sample
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
@@ -145,8 +144,6 @@ class OdometryNode(Node):
         self._cloud_frame = frame
         try:
             sweep = to_sweep(from_cloud(message), from_time(message.header.stamp), snapshots=True)
-            if not sweep_in_range(sweep):
-                raise CloudError("the stamp is out of range")
             if sweep.start == sweep.end:
                 self._say(
                     f"{frame}: clouds without a time per point: each is taken as measured at the "

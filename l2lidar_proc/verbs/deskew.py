@@ -11,6 +11,7 @@ from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.ros.parameter_files import settings_for
+from l2lidar_node.types import is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
@@ -100,7 +101,7 @@ class _Deskewer:
             sweep = to_sweep(points, stamp, self._unit)
         except CloudError as error:
             self._refuse(str(error))
-            if not position_problem(points.dtype):
+            if not position_problem(points.dtype) and is_ros_time(stamp):
                 cloud = without_time(points)
                 self._writer.cloud(self._output, now, cloud, stamp, self._cloud_frame)
         except ValueError as error:

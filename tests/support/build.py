@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node import settings
-from l2lidar_node.config import SweepConfig
+from l2lidar_node.config import NetworkConfig, SweepConfig
 from l2lidar_node.driver.sweep import SweepAssembler
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import PointPacket, decode
 from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.recording.recording import RecordingWriter, endpoints
 from l2lidar_node.types import HostNs, Sweep
 
 NS = 1_000_000_000
@@ -258,6 +259,14 @@ class RealCapture(NamedTuple):
             Datagram(EPOCH_NS + index * PERIOD_NS, data)
             for index, data in enumerate(frames_3d(self.payloads))
         ]
+
+
+def write_capture(path: Path, datagrams: Sequence[Datagram], later_ns: int = 0) -> None:
+    """Write datagrams as a capture, all of them so much later than they say."""
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, *endpoints(NetworkConfig()))
+        for item in datagrams:
+            writer.received(item.data, HostNs(item.arrival_ns + later_ns))
 
 
 def real_capture(number: int, packets: int | None = None) -> RealCapture:

@@ -248,9 +248,9 @@ def test_the_capture_names_an_address_of_this_machine() -> None:
 def test_convert_writes_what_the_driver_hands_out(
     run: Run, unit: Unit, tmp_path: Path, name: str
 ) -> None:
-    capture = tmp_path / "run.pcap"
-    config, found = live(unit, capture, 4, imu_adjust=False, sweep_cut="turn")
-    outcome = run("convert", str(capture), str(tmp_path / name))
+    file = tmp_path / "run.pcap"
+    config, found = live(unit, file, 4, imu_adjust=False, sweep_cut="turn")
+    outcome = run("convert", str(file), str(tmp_path / name))
     assert (outcome.code, outcome.err) == (0, "")
     sweeps = [event for event in found if isinstance(event, Sweep)]
     samples = [event for event in found if isinstance(event, ImuSample)]
@@ -275,7 +275,7 @@ def test_convert_writes_what_the_driver_hands_out(
     assert transform.transform.translation.x == wire.IMU_POSITION_M[0]
     assert transform.transform.rotation.w == 1.0
     assert sorted(path.name for path in tmp_path.iterdir()) == [name, "run.pcap"]
-    assert run("convert", str(capture), str(tmp_path / name)).code == 2
+    assert run("convert", str(file), str(tmp_path / name)).code == 2
 
 
 def stamp(message: object) -> int:

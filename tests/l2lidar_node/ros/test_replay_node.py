@@ -19,6 +19,9 @@ from l2lidar_node.demo.processes import Program, assigned
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.ros.conversions import from_time
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
+from tests.support import build
+
+YEARS_NS = 20 * 365 * 86_400 * 10**9  # from 2023 into the 2040s
 
 SETTINGS = {"qos_reliability": "reliable", "sweep_cut": "half_turn", "imu_adjust": True}
 
@@ -156,7 +159,7 @@ def test_a_loop_goes_on_in_time_and_obeys_nobody(rig: Rig, tmp_path: Path) -> No
     ("parameters", "words"),
     [
         ({"replay_file": "no/such.pcap"}, "cannot replay no/such.pcap: No such file"),
-        ({"replay_file": "README.md"}, "no capture file"),
+        ({"replay_file": "README.md"}, "a capture file"),
         ({"record_file": "/proc/no/a.pcap"}, "cannot record to /proc/no/a.pcap"),
         ({"serial_port": "/dev/null"}, "no serial device"),
     ],
@@ -186,3 +189,17 @@ def test_a_serial_line_feeds_the_node(rig: Rig) -> None:
         assert name, "the emulator ended"
     rig.driver(serial_port=name.split()[1].rstrip(","))
     rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= 3, "clouds")
+
+
+def test_a_capture_after_2038_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "late.pcap"
+    build.write_capture(path, build.capture(1.0), YEARS_NS)
+    command = [sys.executable, "-m", "l2lidar_node.ros.driver_node"]
+    result = subprocess.run(
+        [*command, *assigned({"replay_file": str(path)})],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert result.returncode == 1
+    assert f"cannot replay {path}: the time " in result.stderr
+    assert "stamps of ROS 2 hold 1901-12-13 to 2038-01-19" in result.stderr
+    assert "Traceback" not in result.stderr

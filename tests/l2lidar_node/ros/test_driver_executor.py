@@ -1,0 +1,129 @@
+"""Nothing that the driver's node waits for keeps it from answering others."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402  after importorskip
+from rcl_interfaces.srv import GetParameters  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+
+from l2lidar_node.demo.processes import free_udp_ports  # noqa: E402
+from l2lidar_node.ros import driver_node  # noqa: E402
+from l2lidar_node.ros.driver_node import DriverNode  # noqa: E402
+from l2lidar_node.types import LAST_STAMP, HostNs, Sweep  # noqa: E402
+from tests.l2lidar_proc.motion.analytic import Motion, seen  # noqa: E402
+
+pytestmark = pytest.mark.ros
+TIMEOUT_S = 30.0
+
+
+class Rig:
+    """A driver's node without a device, and a peer, in one thread."""
+
+    def __init__(self) -> None:
+        host, lidar = free_udp_ports(2)
+        values = {
+            "l2_ip": "127.0.0.1",
+            "host_ip": "127.0.0.1",
+            "l2_port": lidar,
+            "host_port": host,
+        }
+        given = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+        rclpy.init(args=["test", "--ros-args", *given])
+        self.node = DriverNode()
+        self.peer = rclpy.create_node("peer")
+        self.said: list[str] = []
+        self.clouds: list[PointCloud2] = []
+        self.peer.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
+        self.peer.create_subscription(
+            PointCloud2, "/points", self.clouds.append, qos_profile_sensor_data
+        )
+        self.parameters = self.peer.create_client(GetParameters, "/l2lidar_node/get_parameters")
+        self.enable = self.peer.create_client(SetBool, "/l2lidar_node/enable")
+        self.reset = self.peer.create_client(Trigger, "/l2lidar_node/reset")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.peer)
+        for client in (self.parameters, self.enable, self.reset):
+            self.until(client.service_is_ready)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        self.said.extend(status.message for status in message.status)
+
+    def until(self, condition: Callable[[], object]) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
+        while not condition():
+            assert time.monotonic() < deadline
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def answers(self) -> bool:
+        """Ask for a parameter and wait for the answer."""
+        future = self.parameters.call_async(GetParameters.Request(names=["l2_ip"]))
+        self.until(future.done)
+        return bool(future.result().values[0].string_value == "127.0.0.1")
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    made.executor.shutdown()
+    made.peer.destroy_node()
+    made.node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_while_a_device_does_not_acknowledge_everything_else_goes_on(rig):
+    """The command is repeated for 1.2 s; other calls are answered before that."""
+    pending = [rig.enable.call_async(SetBool.Request(data=value)) for value in (True, False)]
+    assert rig.answers()
+    assert not all(future.done() for future in pending)
+    for future in pending:
+        rig.until(future.done)
+        assert not future.result().success
+        assert "did not acknowledge" in future.result().message
+
+
+def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(rig, monkeypatch):
+    monkeypatch.setattr(driver_node, "_ANSWER_TIMEOUT_S", 0.5)
+    free, held = threading.Event(), threading.Event()
+
+    def hang(driver, now):
+        held.set()
+        free.wait()
+
+    rig.node._session.call(hang)
+    rig.until(held.is_set)
+    try:
+        pending = [rig.enable.call_async(SetBool.Request(data=True)),
+                   rig.reset.call_async(Trigger.Request())]  # fmt: skip
+        assert rig.answers()
+        for future in pending:
+            rig.until(future.done)
+            assert not future.result().success
+            assert future.result().message == "the driver did not get to it in time"
+        rig.until(lambda: any("receiving thread has not answered for" in t for t in rig.said))
+    finally:
+        free.set()
+    rig.said.clear()
+    rig.until(lambda: any("nothing heard from 127.0.0.1" in text for text in rig.said))
+    assert not any("has not answered" in text for text in rig.said[-5:])
+
+
+def test_a_host_clock_after_2038_ends_nothing(rig):
+    rig.until(rig.node._cloud_publisher.get_subscription_count)
+    points = seen(Motion(), 0.0, 0.2, 0.0)[0]
+    for start in (LAST_STAMP + 1, 2_000_000_000_000_000_000):
+        rig.node._handle(Sweep(HostNs(start), HostNs(start + 200_000_000), points, 38, 0))
+    rig.until(lambda: rig.clouds)
+    assert [cloud.header.stamp.sec for cloud in rig.clouds] == [2_000_000_000]
