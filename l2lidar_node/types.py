@@ -137,8 +137,8 @@ class Datagram(NamedTuple):
     arrival: HostNs
 
 
-class Transport(Protocol):
-    """Where bytes come from and go to."""
+class TransportCounts(Protocol):
+    """What a transport counts."""
 
     @property
     def foreign(self) -> int:
@@ -151,6 +151,10 @@ class Transport(Protocol):
     @property
     def kernel_drops(self) -> int:
         """What was lost because nobody took it in time."""
+
+
+class Transport(TransportCounts, Protocol):
+    """Where bytes come from and go to."""
 
     def receive(self, timeout_s: float) -> list[Datagram]:
         """Return what has arrived, waiting at most ``timeout_s`` for the first of it."""

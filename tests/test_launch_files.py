@@ -117,7 +117,7 @@ def test_driver_arguments_are_parameters_of_the_driver() -> None:
     known = {item.name for item in settings_of(DriverConfig)}
     (tree,) = (ast.parse(path.read_text()) for path in LAUNCH_FILES if name_of(path) == "l2lidar")
     passed = {
-        target.id: set(ast.literal_eval(node.value))
+        ast.unparse(target): set(ast.literal_eval(node.value))
         for node in tree.body
         if isinstance(node, ast.Assign)
         for target in node.targets
@@ -175,7 +175,7 @@ def test_consumers_named_are_those_configured() -> None:
     (named,) = (
         ast.literal_eval(node.value)
         for node in ast.parse((ROOT / "launch" / "lio_input.launch.py").read_text()).body
-        if isinstance(node, ast.Assign) and node.targets[0].id == "CONSUMERS"
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CONSUMERS"
     )
     assert set(named) == {path.name for path in CONSUMERS.iterdir() if path.is_dir()}
 
@@ -241,14 +241,17 @@ class Launched:
     """A launch file with its actions made, but nothing started."""
 
     def __init__(self, path: Any, given: Any) -> None:
-        from launch import LaunchContext, LaunchDescription
+        from launch import LaunchContext, LaunchDescription  # type: ignore[attr-defined]  # our folder launch/ hides it
         from launch.actions import IncludeLaunchDescription
         from launch.launch_description_sources import AnyLaunchDescriptionSource
 
         self.context = LaunchContext()
         self.context._set_asyncio_loop(None)
         self.context.launch_configurations.update(given)
-        self.declared, self.nodes, self.processes, self.said = {}, [], [], []
+        self.declared: dict[str, Any] = {}
+        self.nodes: list[Any] = []
+        self.processes: list[Any] = []
+        self.said: list[Any] = []
         source = AnyLaunchDescriptionSource(str(path))
         description = source.get_launch_description(self.context)
         assert isinstance(description, LaunchDescription)
@@ -424,7 +427,7 @@ def test_missing_files_and_wrong_words_are_refused(launched: Any) -> None:
 
 @needs_launch
 def test_a_required_node_that_fails_ends_the_launch() -> None:
-    from launch import LaunchContext
+    from launch import LaunchContext  # type: ignore[attr-defined]  # our folder launch/ hides it
     from launch.actions import Shutdown
     from launch.events.process import ProcessExited
 

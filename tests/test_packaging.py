@@ -77,18 +77,20 @@ def test_every_ros_package_imported_is_declared() -> None:
 
 def test_the_page_on_installing_names_what_is_declared() -> None:
     """What pip brings to a machine with ROS is a part of what setup.py asks for."""
-    declared = {re.match(r"[\w.-]+", line)[0] for line in importlib.metadata.requires(NAME) or []}
+    declared = {
+        re.findall(r"[\w.-]+", line)[0] for line in importlib.metadata.requires(NAME) or []
+    }
     lines = (ROOT / "requirements/ubuntu-pip.txt").read_text().splitlines()
-    names = {re.match(r"[\w.-]+", line)[0] for line in lines if not line.startswith("#")}
+    names = {re.findall(r"[\w.-]+", line)[0] for line in lines if not line.startswith("#")}
     assert "kiss-icp" in names
     assert names - declared == set()
 
 
 def test_every_python_package_imported_is_declared() -> None:
     requirements = importlib.metadata.requires(NAME) or []
-    declared = {re.match(r"[\w.-]+", line)[0] for line in requirements if "extra ==" not in line}
+    declared = {re.findall(r"[\w.-]+", line)[0] for line in requirements if "extra ==" not in line}
     optional = {
-        re.match(r"[\w.-]+", line)[0]
+        re.findall(r"[\w.-]+", line)[0]
         for line in requirements
         if re.search(r"""extra == ["'](view|slam)["']""", line)
     }

@@ -4,10 +4,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
+BASE_PYTHON = str(vars(sys)["_base_executable"])  # of a venv: the interpreter it was made with
 
 
 NOWHERE = {
@@ -40,7 +42,7 @@ def replace_program(project: Path, name: str, script: str) -> None:
 
 def run(project: Path, *command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     # The interpreter this one was made from: it has the right version and no ROS 2 of its own.
-    environment = {"PYTHON": sys._base_executable, "HOME": str(project.parent)} | environment
+    environment = {"PYTHON": BASE_PYTHON, "HOME": str(project.parent)} | environment
     environment["PATH"] = f"{project.parent / 'bin'}:/usr/local/bin:/usr/bin:/bin"
     return subprocess.run(
         command or [str(project / "scripts/setup.sh")],
@@ -95,7 +97,7 @@ def test_an_unreachable_package_index_is_explained(project: Path) -> None:
 
 
 @pytest.mark.parametrize("command", [(), ("make", "setup")], ids=["script", "make"])
-def test_an_interpreter_that_will_not_do_is_refused(project: Path, command) -> None:
+def test_an_interpreter_that_will_not_do_is_refused(project: Path, command: Any) -> None:
     """Named by PYTHON it is not passed over for another one, neither by make nor by the script."""
     done = run(project, *command, PYTHON="/bin/false")
     assert done.returncode != 0
@@ -109,7 +111,7 @@ def test_the_interpreter_chosen_once_is_kept(project: Path) -> None:
         project, "ldconfig", "printf '%s \\n' libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libgomp.so.1"
     )
     first = run(project, "make", "setup", **NOWHERE)
-    assert f"making .venv with {sys._base_executable}" in first.stdout
+    assert f"making .venv with {BASE_PYTHON}" in first.stdout
     again = run(project, "make", "setup", PYTHON="", **NOWHERE)
     assert "PIP_INDEX_URL" in again.stderr
     assert "making" not in again.stdout

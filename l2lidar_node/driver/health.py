@@ -17,7 +17,7 @@ from l2lidar_node.driver.device import DeviceState
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.orientation import GravityReport
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import STANDARD_GRAVITY, HostNs, Level, Stream, Transport
+from l2lidar_node.types import STANDARD_GRAVITY, HostNs, Level, Stream, TransportCounts
 
 POINTS_3D_HZ: Final = 1 / wire.MIRROR_PERIOD_S
 POINTS_2D_HZ: Final = 50.0
@@ -89,7 +89,7 @@ class Period:
     clock_events: dict[ClockEventKind, int]
 
 
-def observe(driver: Driver, transport: Transport, now: HostNs) -> Period:
+def observe(driver: Driver, transport: TransportCounts, now: HostNs) -> Period:
     """Return the counts of this instant."""
     return Period(
         now,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +17,7 @@ OFFSETS_NS = np.array([0, 8_000, 50_000_000, 99_992_000], dtype=np.int64)
 XY = [("x", "f4"), ("y", "f4")]
 
 
-def cloud(name: str, kind: str, times, **more) -> np.ndarray:
+def cloud(name: str, kind: str, times: Any, **more: Any) -> np.ndarray:
     made = np.zeros(
         len(times), dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind), ("ring", "<u2")]
     )
@@ -25,7 +27,7 @@ def cloud(name: str, kind: str, times, **more) -> np.ndarray:
     return made
 
 
-def check(points, start=STAMP, offsets=OFFSETS_NS, atol=2e-8):
+def check(points: Any, start: Any = STAMP, offsets: Any = OFFSETS_NS, atol: float = 2e-8) -> Any:
     sweep = to_sweep(points, STAMP)
     assert abs(sweep.start - start) < 300
     assert sweep.points.dtype["time"] == np.dtype("<f4")
@@ -49,7 +51,7 @@ def check(points, start=STAMP, offsets=OFFSETS_NS, atol=2e-8):
         ("t", "<f4", OFFSETS_NS.astype(float), 1e-8),
     ],
 )
-def test_usual_types_and_units(name, kind, times, atol):
+def test_usual_types_and_units(name: str, kind: str, times: Any, atol: float) -> None:
     sweep = check(cloud(name, kind, times), atol=atol)
     assert sweep.points["x"].tolist() == [0, 1, 2, 3]
     assert sweep.points["ring"].tolist() == [3, 2, 1, 0]
@@ -57,35 +59,35 @@ def test_usual_types_and_units(name, kind, times, atol):
     assert not sweep.points.flags.writeable
 
 
-def test_a_stamp_at_the_end_of_the_sweep():
+def test_a_stamp_at_the_end_of_the_sweep() -> None:
     times = (OFFSETS_NS - OFFSETS_NS[-1]) * 1e-9
     check(cloud("time", "<f4", times), start=STAMP - OFFSETS_NS[-1])
 
 
-def test_a_first_point_after_the_stamp_keeps_the_stamp():
+def test_a_first_point_after_the_stamp_keeps_the_stamp() -> None:
     sweep = to_sweep(cloud("time", "<f4", OFFSETS_NS[1:] * 1e-9), STAMP)
     assert sweep.start == STAMP
     assert sweep.points["time"][0] == np.float32(8e-6)
 
 
-def test_unordered_points_are_put_in_order():
+def test_unordered_points_are_put_in_order() -> None:
     sweep = check(cloud("time", "<f4", OFFSETS_NS[::-1] * 1e-9))
     assert sweep.points["x"].tolist() == [3, 2, 1, 0]
 
 
-def test_what_is_not_finite_is_left_out():
+def test_what_is_not_finite_is_left_out() -> None:
     points = cloud("time", "<f4", [0, 0.01, np.nan, 0.03, 0.04])
     points["y"][1] = np.nan
     points["z"][3] = np.inf
     assert to_sweep(points, STAMP).points["x"].tolist() == [0, 4]
 
 
-def test_organised_clouds_are_taken_row_by_row():
+def test_organised_clouds_are_taken_row_by_row() -> None:
     points = cloud("t", "<u4", [0, 2_000_000, 1_000_000, 3_000_000]).reshape(2, 2)
     assert to_sweep(points, STAMP).points["x"].tolist() == [0, 2, 1, 3]
 
 
-def test_our_own_long_sweep_is_in_seconds():
+def test_our_own_long_sweep_is_in_seconds() -> None:
     points = np.zeros(3, dtype=POINT)
     points["time"] = [0, 2, 18]
     assert to_sweep(points, STAMP).end - STAMP == 18_000_000_000
@@ -95,7 +97,7 @@ def test_our_own_long_sweep_is_in_seconds():
     assert to_sweep(with_ring, STAMP).end - STAMP == 18_000_000_000
 
 
-def test_a_given_unit_decides():
+def test_a_given_unit_decides() -> None:
     assert to_sweep(cloud("time", "<f4", [0, 100]), STAMP, "ms").end == STAMP + 100_000_000
     assert to_sweep(cloud("t", "<u4", [0, 230_000]), STAMP, "us").end == STAMP + 230_000_000
 
@@ -118,12 +120,12 @@ def test_a_given_unit_decides():
         (np.zeros(2, [*XY, ("z", "f4"), ("t", "u4", (2,))]), "'t'"),
     ],
 )  # fmt: skip
-def test_doubtful_times_are_refused_with_a_reason(points, reason):
+def test_doubtful_times_are_refused_with_a_reason(points: Any, reason: str) -> None:
     with pytest.raises(CloudError, match=reason):
         to_sweep(points, STAMP)
 
 
-def test_a_clock_near_zero_makes_wide_times_ambiguous_but_not_narrow_ones():
+def test_a_clock_near_zero_makes_wide_times_ambiguous_but_not_narrow_ones() -> None:
     with pytest.raises(CloudError, match="may be absolute"):
         to_sweep(cloud("timestamp", "<f8", [0.5, 0.6]), HostNs(500_000_000))
     assert to_sweep(cloud("time", "<f4", [0.0, 0.1]), HostNs(500_000_000)).start == 500_000_000
@@ -133,7 +135,7 @@ def test_a_clock_near_zero_makes_wide_times_ambiguous_but_not_narrow_ones():
     st.lists(st.floats(width=32) | st.just(float("nan")), max_size=20),
     st.sampled_from(["<f4", "<f8", "<u8"]),
 )
-def test_nothing_else_than_a_cloud_error(times, kind):
+def test_nothing_else_than_a_cloud_error(times: Any, kind: Any) -> None:
     with np.errstate(all="ignore"):
         points = cloud("time", kind, np.array(times, dtype=np.float64).astype(kind))
         try:
@@ -144,7 +146,7 @@ def test_nothing_else_than_a_cloud_error(times, kind):
     assert (sweep.points["time"] >= 0).all()
 
 
-def test_without_time():
+def test_without_time() -> None:
     points = np.ones(3, dtype=POINT)
     slim = without_time(points)
     assert slim.dtype.names == ("x", "y", "z", "intensity", "range")

@@ -10,7 +10,7 @@ from l2lidar_proc.config import DeskewNodeConfig
 ROOT = Path(__file__).parents[2]
 
 
-def test_every_filter_and_picture_is_there():
+def test_every_filter_and_picture_is_there() -> None:
     page = (ROOT / "docs" / "deskew.md").read_text()
     for name in next(
         s for s in settings_of(DeskewNodeConfig) if s.name == "filters_after"

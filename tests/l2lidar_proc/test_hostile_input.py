@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,18 +23,18 @@ steps = st.integers(-20, 60) | st.sampled_from([0, 300, 700, -900, 2_000, -5_000
 
 
 @st.composite
-def imu_run(draw):
+def imu_run(draw: Any) -> Any:
     """Return how a run of samples goes on: how many, how far apart, what they say."""
     return ("imu", draw(st.integers(1, 60)), draw(steps), draw(vectors), draw(vectors))
 
 
 @st.composite
-def sweep_event(draw):
+def sweep_event(draw: Any) -> Any:
     return ("sweep", draw(steps))
 
 
 @st.composite
-def velocity_event(draw):
+def velocity_event(draw: Any) -> Any:
     return ("velocity", draw(steps), draw(vectors))
 
 
@@ -42,7 +44,7 @@ def velocity_event(draw):
     st.sampled_from(["start", "middle", "end"]),
     st.booleans(),
 )
-def test_anything_goes(events, reference, use_accelerometer):
+def test_anything_goes(events: Any, reference: Any, use_accelerometer: Any) -> None:
     pipeline = Pipeline(
         build(ProcConfig, {"reference": reference, "use_accelerometer": use_accelerometer})
     )
@@ -54,7 +56,7 @@ def test_anything_goes(events, reference, use_accelerometer):
             _, count, step, rate, force = event
             samples = np.zeros(count, dtype=IMU_SAMPLE)
             samples["stamp"] = imu + np.cumsum(np.full(count, max(step, -20) * MS // 8))
-            imu = int(samples["stamp"][-1]) + (step if step < -20 else 0) * MS
+            imu = HostNs(int(samples["stamp"][-1]) + (step if step < -20 else 0) * MS)
             samples["angular_velocity"] = rate + random.normal(0, 0.01, (count, 3))
             samples["linear_acceleration"] = force + random.normal(0, 0.01, (count, 3))
             pipeline.imu(samples)
@@ -64,7 +66,7 @@ def test_anything_goes(events, reference, use_accelerometer):
             start = imu + event[1] * MS
             pipeline.sweep(Sweep(HostNs(start), HostNs(start + 100 * MS), POINTS, 1, 0), now)
             sent += 1
-        now += 10 * MS
+        now = HostNs(now + 10 * MS)
         done += pipeline.poll(now)
     done += pipeline.poll(now + 10**12)
     assert len(done) == sent == pipeline.counts.sweeps
@@ -74,7 +76,7 @@ def test_anything_goes(events, reference, use_accelerometer):
         assert np.isfinite(item.quality.bias).all()
 
 
-def test_an_imu_without_accelerometer():
+def test_an_imu_without_accelerometer() -> None:
     samples = Motion(turn=1.0).imu(0, 5)
     samples["linear_acceleration"] = 0.0
     pipeline = Pipeline(ProcConfig())

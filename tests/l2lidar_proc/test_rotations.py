@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,16 +14,16 @@ RNG = np.random.default_rng(4)
 VECTORS = RNG.normal(size=(50, 3)) * RNG.uniform(0, 1.7, (50, 1))
 
 
-def as_scipy(q):
+def as_scipy(q: Any) -> Any:
     return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
-def test_exp_of_nothing_is_exactly_the_identity():
+def test_exp_of_nothing_is_exactly_the_identity() -> None:
     assert rotations.exp(np.zeros(3)).tolist() == [1.0, 0.0, 0.0, 0.0]
     assert (rotations.matrices(rotations.exp(np.zeros((2, 3)))) == np.eye(3)).all()
 
 
-def test_exp_and_log_agree_with_scipy_and_with_each_other():
+def test_exp_and_log_agree_with_scipy_and_with_each_other() -> None:
     q = rotations.exp(VECTORS)
     np.testing.assert_allclose(
         as_scipy(q).as_rotvec(), Rotation.from_rotvec(VECTORS).as_rotvec(), atol=1e-12
@@ -32,7 +34,7 @@ def test_exp_and_log_agree_with_scipy_and_with_each_other():
     np.testing.assert_allclose(rotations.log(-q), rotations.log(q), atol=1e-12)
 
 
-def test_products_rotations_and_matrices_agree_with_scipy():
+def test_products_rotations_and_matrices_agree_with_scipy() -> None:
     a, b = rotations.exp(VECTORS), rotations.exp(VECTORS[::-1])
     v = RNG.normal(size=(50, 3))
     product = as_scipy(a) * as_scipy(b)
@@ -48,7 +50,7 @@ def test_products_rotations_and_matrices_agree_with_scipy():
 
 
 @pytest.mark.parametrize("length", [1, 2, 3, 7, 50])
-def test_running_product_equals_the_loop(length):
+def test_running_product_equals_the_loop(length: int) -> None:
     q = rotations.exp(VECTORS[:length])
     expected = [q[0]]
     for factor in q[1:]:
@@ -56,14 +58,14 @@ def test_running_product_equals_the_loop(length):
     np.testing.assert_allclose(rotations.cumulative(q), expected, atol=1e-12)
 
 
-def test_quaternion_of_a_matrix():
+def test_quaternion_of_a_matrix() -> None:
     for q in rotations.exp(VECTORS):
         back = rotations.from_matrix(rotations.matrices(q))
         np.testing.assert_allclose(back * np.sign(back[0]), q * np.sign(q[0]), atol=1e-9)
 
 
 @pytest.mark.parametrize("target", [(0, 0, 2), (1, 0, 0), (0, 0, -1), (0.3, -0.2, 0.9)])
-def test_shortest_turn_between_directions(target):
+def test_shortest_turn_between_directions(target: Any) -> None:
     q = rotations.between((0, 0, 5.0), target)
     np.testing.assert_allclose(
         rotations.rotate(q, (0.0, 0.0, 1.0)), np.array(target) / np.linalg.norm(target), atol=1e-12

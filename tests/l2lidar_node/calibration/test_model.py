@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -24,7 +26,7 @@ def returns(seed: int = 0, count: int = 200) -> np.ndarray:
     return made
 
 
-def test_points_are_those_of_the_driver():
+def test_points_are_those_of_the_driver() -> None:
     payload = points_3d(theta=1.0, ranges=5000, calibration=UNIT_B)
     raw = np.frombuffer(payload, wire.POINTS_3D_PAYLOAD)[0]
     slots = np.arange(300)
@@ -41,7 +43,7 @@ def test_points_are_those_of_the_driver():
 
 
 @pytest.mark.parametrize("index", range(len(NAMES)), ids=NAMES)
-def test_derivatives_are_those_of_the_points(index):
+def test_derivatives_are_those_of_the_points(index: Any) -> None:
     made = returns()
     random = np.random.default_rng(1)
     correction = random.normal(0, 3e-3, len(NAMES))
@@ -56,7 +58,7 @@ def test_derivatives_are_those_of_the_points(index):
     np.testing.assert_allclose(exact, numeric, atol=1e-6, rtol=1e-6)
 
 
-def test_a_mount_that_rocks_is_alpha_and_beta():
+def test_a_mount_that_rocks_is_alpha_and_beta() -> None:
     """To first order, tilt x p in the head frame: nothing in a cloud tells them apart."""
     made = returns(2)
     tilt = np.array([2e-4, -1e-4])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,17 +27,17 @@ ERRORS = UnitErrors(
 POSES = ("upright", "tilted", "on its side")
 
 
-def places(errors: UnitErrors = ERRORS, **more):
+def places(errors: UnitErrors = ERRORS, **more: Any) -> Any:
     unit = replace(UNITS["a"], name="made", errors=errors)
     return still_places(unit, **{"seconds": 2.5, "poses": POSES, **more})
 
 
 @pytest.fixture(scope="module")
-def recovered():
+def recovered() -> Any:
     return calibrate(places(), keep_alpha=True)
 
 
-def test_injected_errors_are_recovered(recovered):
+def test_injected_errors_are_recovered(recovered: Any) -> None:
     found = recovered.estimates
     assert not recovered.refusals
     for name in ("xi", "beta"):
@@ -50,14 +51,14 @@ def test_injected_errors_are_recovered(recovered):
     assert found["bias"].verdict is Verdict.CORRECTED
 
 
-def test_the_halves_come_together(recovered):
+def test_the_halves_come_together(recovered: Any) -> None:
     assert recovered.before.gap > 5e-3
     assert recovered.after.gap < 2e-3
     assert recovered.after.thickness < 0.9 * recovered.before.thickness
     assert "together" in recovered.weakest
 
 
-def test_rocking_of_the_mount_is_taken_out(recovered):
+def test_rocking_of_the_mount_is_taken_out(recovered: Any) -> None:
     for report in recovered.places:
         assert report.whirl.tilt_a == pytest.approx(ERRORS.whirl[0], abs=0.02 * DEG)
         assert report.whirl.tilt_b == pytest.approx(ERRORS.whirl[1], abs=0.02 * DEG)
@@ -66,7 +67,7 @@ def test_rocking_of_the_mount_is_taken_out(recovered):
     assert sum("taken out" in note for note in recovered.notes) == len(POSES)
 
 
-def test_a_perfect_unit_is_left_alone():
+def test_a_perfect_unit_is_left_alone() -> None:
     result = calibrate(places(UnitErrors(), poses=POSES[:2]))
     assert not result.refusals
     assert result.stored == {}
@@ -76,12 +77,12 @@ def test_a_perfect_unit_is_left_alone():
     assert abs(result.side) < 0.02 * DEG
 
 
-def test_one_turn_is_refused():
+def test_one_turn_is_refused() -> None:
     result = calibrate(places(seconds=0.25, poses=POSES))
     assert any("turns of the head" in item.reason for item in result.refusals)
 
 
-def test_a_scene_without_surfaces_is_refused():
+def test_a_scene_without_surfaces_is_refused() -> None:
     (place,) = places(poses=("upright",), seconds=2.0)
     random = np.random.default_rng(0)
     cloudy = place.returns.copy()
@@ -90,12 +91,12 @@ def test_a_scene_without_surfaces_is_refused():
         calibrate([replace(place, returns=cloudy)])
 
 
-def test_a_corridor_does_not_tell_everything():
+def test_a_corridor_does_not_tell_everything() -> None:
     result = calibrate(places(world="corridor", poses=("upright",)))
     assert result.refusals or result.estimates["bias"].verdict is Verdict.UNKNOWN
 
 
-def test_a_sensor_that_turned_is_refused():
+def test_a_sensor_that_turned_is_refused() -> None:
     first, second = places(poses=("upright", "tilted"), seconds=2.2)
     half = len(first.gyro) // 2
     rate = first.gyro.copy()
@@ -106,20 +107,20 @@ def test_a_sensor_that_turned_is_refused():
     assert any("moved" in item.reason for item in calibrate([moved]).refusals)
 
 
-def test_a_strong_rocking_is_refused():
+def test_a_strong_rocking_is_refused() -> None:
     strong = replace(ERRORS, whirl=(0.6 * DEG, 0.0))
     result = calibrate(places(strong, poses=("tilted",)))
     assert any("rocks" in item.reason for item in result.refusals)
 
 
-def test_without_an_imu_the_result_is_for_this_mount():
+def test_without_an_imu_the_result_is_for_this_mount() -> None:
     made = [replace(place, gyro=np.empty(0, GYRO)) for place in places(poses=("tilted",))]
     result = calibrate(made)
     assert any("this mount only" in note for note in result.notes)
     assert result.places[0].whirl is None
 
 
-def test_alpha_that_differs_between_power_ups_is_shown_not_stored():
+def test_alpha_that_differs_between_power_ups_is_shown_not_stored() -> None:
     low, high = (
         places(replace(ERRORS, alpha=value * DEG), poses=("tilted",))[0] for value in (0.1, 0.35)
     )
@@ -130,13 +131,13 @@ def test_alpha_that_differs_between_power_ups_is_shown_not_stored():
     assert "alpha" not in result.stored
 
 
-def test_a_gyro_line_that_is_not_a_motion_is_refused():
+def test_a_gyro_line_that_is_not_a_motion_is_refused() -> None:
     noisy = ImuNoise(gyro_line=0.2)
     result = calibrate(places(UnitErrors(), poses=("tilted",), imu=noisy))
     assert any("cannot be trusted" in item.reason for item in result.refusals)
 
 
-def test_packets_of_a_wide_view_and_of_two_blocks_are_named():
+def test_packets_of_a_wide_view_and_of_two_blocks_are_named() -> None:
     (place,) = places(poses=("upright",), seconds=2.0)
     other = replace(place, is_wide=True, blocks=2, dirt=9.0)
     reasons = " ".join(item.reason for item in still._problems(other))
@@ -144,7 +145,7 @@ def test_packets_of_a_wide_view_and_of_two_blocks_are_named():
         assert word in reasons
 
 
-def test_a_place_without_points_is_an_error():
+def test_a_place_without_points_is_an_error() -> None:
     gathering = Gathering()
     gathering.flat()
     with pytest.raises(ValueError, match="set the unit to 3D"):
@@ -152,7 +153,7 @@ def test_a_place_without_points_is_an_error():
 
 
 @pytest.mark.skipif(not real_l2.FOLDER.exists(), reason="the recordings are not here")
-def test_real_captures():
+def test_real_captures() -> None:
     both = [
         real_l2.place(real_l2.FOLDER / f"{name}.npy", number)
         for number, name in enumerate(real_l2.CAPTURES)

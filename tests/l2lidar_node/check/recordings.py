@@ -173,7 +173,7 @@ def stamp_of(message: Any) -> int:
 
 
 def cloud(points: np.ndarray, stamp: int, frame: str = "l2lidar_link") -> Any:
-    places = dict(points.dtype.fields)
+    places = dict(points.dtype.fields or {})
     return T[CLOUD](
         header=header(stamp, frame),
         height=1,

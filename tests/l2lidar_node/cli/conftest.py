@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -76,7 +77,7 @@ class Unit:
 def make_unit() -> Iterator[Callable[..., Unit]]:
     units: list[Unit] = []
 
-    def make(mode: int = 0, faults: FaultConfig | None = None, **power: float) -> Unit:
+    def make(mode: int = 0, faults: FaultConfig | None = None, **power: Any) -> Unit:
         settings = dataclasses.replace(PowerConfig(boot_scale=0.0), **power)
         units.append(Unit(faults or FaultConfig(), settings, mode))
         return units[-1]

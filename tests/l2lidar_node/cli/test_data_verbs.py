@@ -46,9 +46,7 @@ from tests.support.build import SHARED_DATA
 ROOT = Path(__file__).parents[3]
 
 
-def live(
-    unit: Unit, path: Path, sweeps: int, **settings: object
-) -> tuple[DriverConfig, list[Event]]:
+def live(unit: Unit, path: Path, sweeps: int, **settings: Any) -> tuple[DriverConfig, list[Event]]:
     """Run a driver on a unit, recorded, until there are so many sweeps.
 
     Returns its settings and what it handed out.
@@ -150,7 +148,7 @@ def test_a_tcpdump_of_a_run_replays(make_unit: Any, tmp_path: Path, settings: An
     sweeps = [item for item in found if isinstance(item, Sweep)][:-1]  # the end cut the last one
     assert len(samples) > 60
     assert sweeps
-    again = [item for item in replayed if isinstance(item, ImuSample)][: len(samples)]
+    again: list[Any] = [item for item in replayed if isinstance(item, ImuSample)][: len(samples)]
     again += [item for item in replayed if isinstance(item, Sweep)][: len(sweeps)]
     with (tmp_path / "own.pcap").open("rb") as stream:
         times = [entry.time for entry in Recording(stream)]
@@ -255,7 +253,9 @@ def test_convert_writes_what_the_driver_hands_out(
     sweeps = [event for event in found if isinstance(event, Sweep)]
     samples = [event for event in found if isinstance(event, ImuSample)]
     assert f"{len(sweeps)} clouds, {len(samples)} IMU samples" in outcome.out
-    clouds, imus, transforms = [], [], []
+    clouds: list[Any] = []
+    imus: list[Any] = []
+    transforms: list[Any] = []
     with AnyReader([tmp_path / name]) as reader:
         for connection, _, data in reader.messages():
             message = reader.deserialize(data, connection.msgtype)
@@ -264,7 +264,7 @@ def test_convert_writes_what_the_driver_hands_out(
             ].append(message)
     assert [stamp(cloud) for cloud in clouds] == [sweep.start for sweep in sweeps]
     assert bytes(clouds[1].data) == sweeps[1].points.tobytes()
-    assert [field.name for field in clouds[1].fields] == list(sweeps[1].points.dtype.names)
+    assert [field.name for field in clouds[1].fields] == list(sweeps[1].points.dtype.names or ())
     assert clouds[1].header.frame_id == config.frames.cloud
     assert [stamp(imu) for imu in imus] == [sample.stamp for sample in samples]
     assert imus[5].orientation.w == samples[5].orientation_wxyz[0]
@@ -530,7 +530,9 @@ def test_times_that_no_stamp_can_hold_are_explained(
     assert data == [entry.data for entry in capture[1]]  # it carries no stamps
 
 
-def test_info_describes_recordings(run: Run, capture, tmp_path: Path) -> None:
+def test_info_describes_recordings(
+    run: Run, capture: tuple[Path, list[Received]], tmp_path: Path
+) -> None:
     path, entries = capture
     about = json.loads(run("info", str(path), "--json").out)
     assert about["kind"] == "capture"
@@ -570,7 +572,9 @@ def test_info_of_a_calibration_says_what_is_in_it(run: Run, tmp_path: Path) -> N
         ("nothing", None, "there is no such file"),
     ],
 )
-def test_info_of_what_is_neither_says_so(run: Run, tmp_path, name, content, words) -> None:
+def test_info_of_what_is_neither_says_so(
+    run: Run, tmp_path: Path, name: str, content: Any, words: str
+) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
     outcome = run("info", str(tmp_path / name))
@@ -579,7 +583,9 @@ def test_info_of_what_is_neither_says_so(run: Run, tmp_path, name, content, word
     assert outcome.err.count("\n") == 1
 
 
-def test_check_judges_a_capture_as_the_consumer_would_get_it(run: Run, capture) -> None:
+def test_check_judges_a_capture_as_the_consumer_would_get_it(
+    run: Run, capture: tuple[Path, list[Received]]
+) -> None:
     outcome = run("check", str(capture[0]), "--for", "lio_sam", "--json")
     found = json.loads(outcome.out)
     texts = [item["text"] for item in found["findings"]]

@@ -207,7 +207,7 @@ def test_interrupted_it_leaves_the_unit_as_it_was(
     command = Device.command
     sent = []
 
-    def interrupted(self, start: Any) -> Any:
+    def interrupted(self: Any, start: Any) -> Any:
         answer = command(self, start)
         sent.append(answer.command)
         if len(sent) == 1:
@@ -325,7 +325,7 @@ def test_an_interrupted_change_is_undone(
     read = Device.read_parameters
     calls = []
 
-    def interrupted(self) -> Any:
+    def interrupted(self: Any) -> Any:
         calls.append(unit.flash)
         if len(calls) == 2:
             raise KeyboardInterrupt

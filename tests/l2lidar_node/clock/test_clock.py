@@ -1,5 +1,7 @@
 """The device clock against simulated truth; the benchmark repeats this against the virtual L2."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ EVERYTHING = Scenario(
 )  # fmt: skip
 
 
-def scenario(base: Scenario = EVERYTHING, **changes: object) -> Scenario:
+def scenario(base: Scenario = EVERYTHING, **changes: Any) -> Scenario:
     return Scenario(**{**{key: getattr(base, key) for key in base.__slots__}, **changes})
 
 

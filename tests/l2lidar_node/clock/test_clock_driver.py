@@ -1,5 +1,7 @@
 """The clock where it works: in the driver, against the virtual L2 and its own truth."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from tests.support.clock_rig import Case, run
 
 @pytest.mark.parametrize("sync", ["off", "once", "periodic"])
 def test_the_driver_stamps_packets_of_the_virtual_unit_truly(sync: str) -> None:
-    faults = {"jitter": "heavy", "jitter_ms": 20.0, "loss": 0.05, "reorder": 0.02}
+    faults: dict[str, Any] = {"jitter": "heavy", "jitter_ms": 20.0, "loss": 0.05, "reorder": 0.02}
     notes, clock = run(Case(ratio=1.99866, sync=sync, faults=faults, seconds=10.0), seed=5)
     stamped = notes[notes["published"] != 0]
     errors = (stamped["published"] - stamped["truth"]) * 1e-6

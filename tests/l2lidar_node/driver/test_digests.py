@@ -55,7 +55,7 @@ def test_a_change_of_one_bit_of_a_packet_is_seen_and_named(at: str, bit: int, fi
     before = [build.digest(sweep.points) for sweep in build.sweeps(datagrams)]
     number = next(i for i, item in enumerate(datagrams) if len(item.data) > 1000)
     payload = bytearray(datagrams[number].data[wire.HEADER.size : -wire.TAIL.size])
-    offset = int(wire.POINTS_3D_PAYLOAD.fields[at][1])
+    offset = int(dict(wire.POINTS_3D_PAYLOAD.fields or {})[at][1])
     payload[offset + bit // 8] ^= 1 << bit % 8
     data = build.frame(wire.PacketType.POINTS_3D, bytes(payload))
     datagrams[number] = datagrams[number]._replace(data=data)

@@ -48,7 +48,7 @@ CASES = DAMAGE | CONTENT | HARMLESS | TRAFFIC | EVERYTHING
 class Outcome:
     """What a driver made of a faulty device, and what it could have made of it."""
 
-    def __init__(self, faults: dict[str, object], mode: WorkMode, seconds: float = 3.0) -> None:
+    def __init__(self, faults: dict[str, Any], mode: WorkMode, seconds: float = 3.0) -> None:
         unit = DeviceConfig(
             power=rig.READY,
             identity=IdentityConfig(work_mode=int(mode)),
@@ -79,7 +79,7 @@ class Outcome:
         if isinstance(packet, ImuPacket | PointPacket) and isinstance(item, Frame):
             self.decoded[(item.packet_type, packet.seq, packet.stamp)] += 1
 
-    def of(self, kind: type) -> list:
+    def of(self, kind: type) -> list[Any]:
         return [event for event in self.events if isinstance(event, kind)]
 
     def used(self, stream: Stream) -> int:
@@ -173,7 +173,7 @@ def test_damage_is_counted(outcome: Any) -> None:
     [("nan", "not_finite"), ("hostile_count", "point_num")],
     indirect=["outcome"],
 )
-def test_impossible_content_is_counted_by_reason(outcome: str, reason: str) -> None:
+def test_impossible_content_is_counted_by_reason(outcome: Any, reason: str) -> None:
     rejected = outcome.driver.counters.rejected
     assert rejected.total() > 5
     assert {name.split(".")[1] for name in rejected} == {reason}

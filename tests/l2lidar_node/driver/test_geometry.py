@@ -196,7 +196,7 @@ def test_packets_whose_rotation_is_not_known_are_left_out(kind: Any) -> None:
 
 def test_limits_and_angles_that_change_within_a_batch() -> None:
     rng = np.random.default_rng(6)
-    common = {"calibration": build.UNIT_A}
+    common: dict[str, Any] = {"calibration": build.UNIT_A}
     payloads = [
         random_packet(rng, **common),
         random_packet(rng, **common, range_max=7.0),

@@ -19,7 +19,7 @@ OK, WARN, ERROR = Level.OK, Level.WARN, Level.ERROR
 PLAIN = {"imu_adjust": False}
 
 
-def judged(begin: float = 2.5, end: float = 3.5, **run: object) -> dict[str, Check]:
+def judged(begin: float = 2.5, end: float = 3.5, **run: Any) -> dict[str, Check]:
     """Return how a driver judges a stretch of a run."""
     periods: list[Period] = []
     found: list[Check] = []

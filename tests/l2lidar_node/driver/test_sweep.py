@@ -259,7 +259,11 @@ def test_settings_changed_in_mid_sweep_take_effect_with_the_next_packet() -> Non
 
 
 def test_the_override_uses_the_users_scale_and_bias() -> None:
-    config = {"override_range_calibration": True, "range_scale": 0.001, "range_bias": -500.0}
+    config: dict[str, Any] = {
+        "override_range_calibration": True,
+        "range_scale": 0.001,
+        "range_bias": -500.0,
+    }
     stream = Stream(packets=1, **config)
     stream.push()
     assert stream.sweeps[0].points["range"][0] == pytest.approx(2.5)

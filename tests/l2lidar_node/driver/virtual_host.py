@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -118,8 +119,8 @@ class VirtualHost:
 def live_run(
     seconds: float = 5.0,
     *,
-    settings: dict[str, object] | None = None,
-    faults: dict[str, object] | None = None,
+    settings: dict[str, Any] | None = None,
+    faults: dict[str, Any] | None = None,
     busy: float = 0.0,
     calls: Sequence[tuple[float, Callable[[Driver, HostNs], object]]] = (),
     host_steps: Sequence[tuple[float, float]] = (),

@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -113,7 +113,7 @@ class Bench:
         link: Link = Link.ETHERNET,
         power_on_ns: int = 0,
         packet_log: PacketLog | None = None,
-        **groups: object,
+        **groups: Any,
     ) -> None:
         config = dataclasses.replace(config or DeviceConfig(power=READY), **groups)
         self.device = VirtualL2(

@@ -32,7 +32,7 @@ RANDOM = (
     "bad_crc", "truncate", "hostile_size", "hostile_count", "nan", "garbage",
     "coalesce", "split", "loss", "duplicate", "reorder",
 )  # fmt: skip
-TIMED = {
+TIMED: dict[str, dict[str, Any]] = {
     "jitter": {"jitter": "heavy", "jitter_ms": 20.0},
     "burst": {"burst_ms": 100.0, "burst_every_s": 0.7},
     "silence": {"silence_at": (1.0, 3.0), "silence_s": 0.5},
@@ -40,14 +40,15 @@ TIMED = {
     "clock_step": {"clock_step_at": (1.0,)},
     "foreign_sync": {"foreign_sync_at": (1.0,)},
 }
-EVERY = {**{name: {name: 0.1} for name in RANDOM}, **TIMED}
+EVERY: dict[str, dict[str, Any]] = {**{name: {name: 0.1} for name in RANDOM}, **TIMED}
+OFF: dict[str, Any] = dict.fromkeys(RANDOM, 0.0)
 DESTRUCTIVE = {"bad_crc", "truncate", "hostile_size", "hostile_count", "nan", "loss", "silence"}
 
 
 PLAIN = WorkMode(0)
 
 
-def bench_with(seed: int = 3, mode: WorkMode = PLAIN, **faults: object) -> Bench:
+def bench_with(seed: int = 3, mode: WorkMode = PLAIN, **faults: Any) -> Bench:
     config = DeviceConfig(power=READY, faults=FaultConfig(**faults), seed=seed)
     flash = Flash.factory(config.addresses, config.identity)
     return Bench(config, flash=dataclasses.replace(flash, work_mode=int(mode)))
@@ -70,7 +71,7 @@ def test_without_faults_every_packet_is_its_own_datagram_in_time() -> None:
 
 
 def test_a_rate_of_zero_is_byte_identical_to_no_fault() -> None:
-    plain, zero = bench_with(), bench_with(**dict.fromkeys(RANDOM, 0.0), jitter_ms=7.0)
+    plain, zero = bench_with(), bench_with(**OFF, jitter_ms=7.0)
     assert plain.run(3.0) == zero.run(3.0)
 
 
@@ -148,7 +149,8 @@ def test_one_fault_strikes_alike_with_and_without_another() -> None:
 
 @pytest.mark.parametrize("name", RANDOM)
 def test_the_rate_is_met(name: Any) -> None:
-    bench = bench_with(**{name: 0.1})
+    rate: dict[str, Any] = {name: 0.1}
+    bench = bench_with(**rate)
     bench.run(20.0)
     count = bench.device.packet_log.counts[Fault[name.upper()]]
     of = len(bench.device.packet_log.of_type(102)) if name == "hostile_count" else None
@@ -379,7 +381,8 @@ def test_pieces_that_do_not_follow_each_other_make_no_packet() -> None:
 @given(st.binary(min_size=1, max_size=5000), st.lists(st.integers(1, 4999), max_size=5))
 def test_cutting_and_joining_change_nothing(data: Any, cuts: Any) -> None:
     whole = Datagram(5, data, (Piece(0, 0, len(data), len(data)),))
-    rest, parts = whole, []
+    rest = whole
+    parts: list[Any] = []
     for at in sorted(cuts):
         done = sum(len(part.data) for part in parts)
         if done < at < len(data):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,9 +21,9 @@ RATE = 250.0
 
 
 def inertial(
-    motion: str, noise: ImuNoise = CLEAN, *, seed: int = 0, unit: str = "a", **more: object
+    motion: str, noise: ImuNoise = CLEAN, *, seed: int = 0, unit: str = "a", **more: Any
 ) -> Inertial:
-    return Inertial(trajectories.make(motion, ROOM, **more), noise, seed, UNITS[unit])  # type: ignore[arg-type]
+    return Inertial(trajectories.make(motion, ROOM, **more), noise, seed, UNITS[unit])
 
 
 def orientation(samples: np.ndarray) -> Rotation:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,8 +31,8 @@ def still() -> Motion:
     return trajectories.make("still", scenes.make("box"), rest_s=0.0)
 
 
-def scanner(motion: str = "walk", noise: RangeNoise = CLEAN, **more: object) -> Scanner:
-    return Scanner(ROOM_WORLD, trajectories.make(motion, ROOM), noise=noise, **more)  # type: ignore[arg-type]
+def scanner(motion: str = "walk", noise: RangeNoise = CLEAN, **more: Any) -> Scanner:
+    return Scanner(ROOM_WORLD, trajectories.make(motion, ROOM), noise=noise, **more)
 
 
 def decode_3d(packet: np.void, j: int) -> tuple[float, float, float]:

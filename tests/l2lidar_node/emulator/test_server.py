@@ -10,13 +10,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.config import AddressConfig, DeviceConfig, FaultConfig, IdentityConfig
 from l2lidar_node.emulator.link import port
-from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort
+from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort, unread
 from l2lidar_node.emulator.server import MAX_SPEED, Latency, Server
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.flash import Flash, Network, network_payload
@@ -64,7 +65,7 @@ def host() -> Iterator[Host]:
     item.socket.close()
 
 
-def config_for(host_port: int, **groups: object) -> DeviceConfig:
+def config_for(host_port: int, **groups: Any) -> DeviceConfig:
     addresses = AddressConfig(lidar_port=0, host_port=host_port)
     return DeviceConfig(**{"addresses": addresses, "power": READY, **groups})
 
@@ -83,9 +84,9 @@ def unit(
 
 
 @contextlib.contextmanager
-def running(device: VirtualL2, port: Port, **options: object) -> Iterator[Server]:
+def running(device: VirtualL2, port: Port, **options: Any) -> Iterator[Server]:
     """Serve in a thread for the length of a block."""
-    server = Server(device, port, **options)  # type: ignore[arg-type]  # tests know the names
+    server = Server(device, port, **options)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
@@ -199,7 +200,7 @@ def test_nobody_listening_is_no_reason_to_fail() -> None:
     Server(device, port, 50.0).run(2.0)
     port.close()
     assert device.sent[wire.PacketType.IMU] == 500
-    assert port.unread("127.0.0.1", unused) is None
+    assert unread("127.0.0.1", unused) is None
 
 
 def test_an_address_in_use_or_elsewhere_is_named(host: Host) -> None:

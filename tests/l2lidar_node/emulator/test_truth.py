@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,7 +130,7 @@ def test_a_mount_may_be_given_in_degrees() -> None:
         ({"mount_rpy_deg": (1.0, 2.0)}, "mount_rpy_deg"),
     ],
 )
-def test_bad_settings_are_named(values: dict[str, object], message: str) -> None:
+def test_bad_settings_are_named(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         assemble(build(PhysicsConfig, {"world": "box", **values}))
 
@@ -139,7 +140,7 @@ def test_settings_are_checked_by_their_ranges() -> None:
         build(PhysicsConfig, {"range_noise": -1.0})
 
 
-def test_meshes_and_trajectories_come_from_files(tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_meshes_and_trajectories_come_from_files(tmp_path: Path) -> None:
     mesh, trajectory = tmp_path / "wall.obj", tmp_path / "path.tum"
     mesh.write_text("v 3 -9 -9\nv 3 9 -9\nv 3 0 20\nf 1 2 3\n")
     trajectory.write_text("".join(f"{t} {0.1 * t} 0 0 0 0 0 1\n" for t in range(6)))

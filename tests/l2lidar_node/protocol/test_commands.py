@@ -53,7 +53,7 @@ def test_a_time_the_device_cannot_hold(now: Any) -> None:
         commands.sync_time(HostNs(now))
 
 
-NETWORK = {
+NETWORK: dict[str, Any] = {
     "lidar_ip": "192.168.1.62", "user_ip": "192.168.1.2", "gateway": "192.168.1.1",
     "subnet_mask": "255.255.255.0", "lidar_port": 6101, "user_port": 6201,
 }  # fmt: skip

@@ -107,7 +107,7 @@ def test_nothing_raises_warns_or_comes_out_infinite(seed: Any) -> None:
     }
     driver = Driver(configure(DriverConfig, values))
     now = HostNs(build.EPOCH_NS)
-    period = observe(driver, Link, now)
+    period = observe(driver, Link(), now)
     makers = frames(rng)
     for number in range(600):
         now = HostNs(now + rng.choice(JUMPS_NS if rng.random() < 0.01 else STEPS_NS))
@@ -117,7 +117,7 @@ def test_nothing_raises_warns_or_comes_out_infinite(seed: Any) -> None:
             events += driver.tick(now)
             driver.outbox()
         if number % 50 == 0:
-            before, period = period, observe(driver, Link, now)
+            before, period = period, observe(driver, Link(), now)
             judge(driver, before, period)
             metadata(driver)
         if number % 97 == 0:

@@ -86,7 +86,7 @@ def test_an_imu_packet_from_its_bytes() -> None:
 @pytest.mark.parametrize("norm", [0.5001, 0.9983, 1.0, 1.5])
 def test_the_quaternion_is_normalised(norm: float) -> None:
     quaternion = np.array([0.5, -0.5, 0.5, 0.5]) * norm
-    packet = decode(Frame(104, build.imu(quaternion_wxyz=quaternion)))
+    packet = decode(Frame(104, build.imu(quaternion_wxyz=quaternion.tolist())))
     assert isinstance(packet, ImuPacket)
     assert math.hypot(*packet.orientation_wxyz) == pytest.approx(1.0, abs=1e-12)
     assert packet.orientation_wxyz == pytest.approx((0.5, -0.5, 0.5, 0.5), abs=1e-6)
@@ -94,7 +94,7 @@ def test_the_quaternion_is_normalised(norm: float) -> None:
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0.49, 0, 0, 0)])
 def test_an_imu_that_is_switched_off_is_dropped(quaternion: Any) -> None:
-    assert reason(104, build.imu(quaternion_wxyz=quaternion)) == "quaternion_norm"
+    assert reason(104, build.imu(quaternion_wxyz=quaternion.tolist())) == "quaternion_norm"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -151,7 +151,8 @@ def test_fewer_points_are_fine(kind: Any, count: int) -> None:
 @pytest.mark.parametrize("packet_type", [102, 103, 104])
 @pytest.mark.parametrize("nsec", [1_000_000_000, 0xFFFF_FFFF])
 def test_a_stamp_with_too_many_nanoseconds(packet_type: int, nsec: int) -> None:
-    maker = {102: build.points_3d, 103: build.points_2d, 104: build.imu}[packet_type]
+    makers: dict[int, Any] = {102: build.points_3d, 103: build.points_2d, 104: build.imu}
+    maker = makers[packet_type]
     assert reason(packet_type, patched(maker(), 24, "<I", nsec)) == "stamp"
 
 

@@ -47,7 +47,7 @@ def ethernet(network: object, kind: int = 0x0800) -> bytes:
     return bytes(dpkt.ethernet.Ethernet(src=b"\2" * 6, dst=b"\4" * 6, type=kind, data=network))
 
 
-def tcpdump(packets: list[tuple[float, bytes]], link: int = 1, **options: object) -> io.BytesIO:
+def tcpdump(packets: list[tuple[float, bytes]], link: int = 1, **options: Any) -> io.BytesIO:
     """Return a file as tcpdump writes it, made by dpkt."""
     stream = io.BytesIO()
     writer = dpkt.pcap.Writer(stream, linktype=link, **options)
@@ -123,7 +123,8 @@ def test_times_of_tcpdump_are_exact(nano: bool) -> None:
     from decimal import Decimal
 
     exact = TIME if nano else TIME // 1000 * 1000
-    stream = tcpdump([(Decimal(exact) / NS, ethernet(udp_packet(IMU)))], nano=nano)
+    packets: list[Any] = [(Decimal(exact) / NS, ethernet(udp_packet(IMU)))]
+    stream = tcpdump(packets, nano=nano)
     assert [datagram.time for datagram in read(stream)] == [exact]
 
 

@@ -22,7 +22,7 @@ LIMIT_S = 120.0  # generous: only a failure waits that long
 class Played:
     """A playback and everything it says."""
 
-    def __init__(self, stream: io.BytesIO, config: Any, laps: int = 1, **files: object) -> None:
+    def __init__(self, stream: io.BytesIO, config: Any, laps: int = 1, **files: Any) -> None:
         self.events: list[Event] = []
         self.laps: list[list[Event]] = []
         self.shifts: list[int | None] = []
@@ -93,10 +93,12 @@ def test_laps_are_alike_and_never_go_back_in_time(recorded: Any) -> None:
     played = Played(stream, config, laps=3, replay_loop=True)
     assert played.ended.wait(LIMIT_S)
     played.playback.stop()
-    assert played.shifts[:2] == [played.shifts[0], 2 * played.shifts[0]]
+    first = played.shifts[0]
+    assert first is not None
+    assert played.shifts[:2] == [first, 2 * first]
     stamps: list[int] = []
     for number, lap in enumerate(played.laps[:3]):
-        later = number * played.shifts[0]
+        later = number * first
         samples = [item for item in lap if isinstance(item, ImuSample)]
         assert [item.stamp - later for item in samples] == [
             item.stamp for item in live if isinstance(item, ImuSample)

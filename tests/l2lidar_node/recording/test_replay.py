@@ -23,7 +23,7 @@ ROUGH = {
     "jitter": "heavy",
     "jitter_ms": 5.0,
 }
-SETTINGS = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "periodic": {"l2_sync_mode": "periodic", "enable_latency_measure": True},
     "half turns": {"sweep_cut": "half_turn", "imu_adjust": False},
@@ -31,7 +31,7 @@ SETTINGS = {
     "arrival stamps": {"UseSystemTimeTS": True, "imu_adjust": False},
     "unlocked": {"publish_unlocked": True, "aggregateNframes": 0},
 }
-FAULTS = {
+FAULTS: dict[str, dict[str, Any]] = {
     "none": {},
     "rough": ROUGH,
     "silences": {**ROUGH, "silence_at": (1.5, 2.5), "silence_s": 0.25},
@@ -112,6 +112,8 @@ def test_shifted_events_move_in_time_and_in_nothing_else() -> None:
             assert after.points is before.points
         elif isinstance(before, ImuSample):
             assert after.stamp == before.stamp + 1_000
+            assert isinstance(after, tuple)
+            assert isinstance(before, tuple)
             assert after[1:] == before[1:]
         else:
             assert after is before

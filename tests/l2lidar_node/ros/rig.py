@@ -34,13 +34,13 @@ class Rig:
         world = [] if "--world" in arguments else ["--world", "pattern"]
         return self.programs.start("l2lidar_node.emulator", [*ports, *world, *arguments])
 
-    def driver(self, **parameters: object) -> Program:
+    def driver(self, **parameters: Any) -> Program:
         """Start the driver node for this rig's virtual L2."""
         return self.programs.start("l2lidar_node.ros.driver_node", self.arguments(**parameters))
 
-    def arguments(self, **parameters: object) -> list[str]:
+    def arguments(self, **parameters: Any) -> list[str]:
         """Return the driver's command line."""
-        values: dict[str, object] = {
+        values: dict[str, Any] = {
             "l2_ip": "127.0.0.1",
             "host_ip": "127.0.0.1",
             "l2_port": self.lidar_port,

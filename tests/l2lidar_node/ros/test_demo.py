@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rosbags.highlevel import AnyReader
@@ -36,7 +37,8 @@ def test_the_driver_alone_streams_without_loss_and_draws_a_cloud(tmp_path: Path)
         assert reader.topics["/diagnostics"].msgcount > 2
         clouds = [connection for connection in reader.connections if connection.topic == "/points"]
         _, _, data = next(reader.messages(connections=clouds))
-        assert reader.deserialize(data, clouds[0].msgtype).header.frame_id == "l2lidar_link"
+        cloud: Any = reader.deserialize(data, clouds[0].msgtype)
+        assert cloud.header.frame_id == "l2lidar_link"
 
 
 def test_a_sensor_that_looks_ahead_sees_an_upright_world_in_base_link(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def started(tmp_path: Path) -> Iterator[Any]:
         rclpy.init(args=["--ros-args", "--params-file", str(file)], context=context)
         node = Node("lists", context=context)
         made.append((context, node))
-        changes = []
+        changes: list[Any] = []
         return node, ParameterSet(node, Lists, changes.append), changes
 
     yield start

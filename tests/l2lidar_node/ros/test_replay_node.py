@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rclpy
@@ -73,7 +74,7 @@ class Ear:
         self.times.append(from_time(message.clock))
 
 
-def heard_again(rig: Rig, path: Path, **settings: object) -> Ear:
+def heard_again(rig: Rig, path: Path, **settings: Any) -> Ear:
     """Replay a recording, slowly where this machine has not found the publishers by its end."""
     for rate in (1.0, 0.3, 0.1):
         ear = Ear(rig)

@@ -30,7 +30,7 @@ from l2lidar_node.settings import build
 from l2lidar_node.transport.serial import SerialTransport
 from l2lidar_node.transport.session import Session, describe_transport, open_transport
 from l2lidar_node.transport.udp import TransportError
-from l2lidar_node.types import Datagram, Stream, Sweep
+from l2lidar_node.types import Datagram, HostNs, Stream, Sweep
 from tests.l2lidar_node.driver.virtual_host import MemoryTap, essence
 
 LIMIT_S = 120.0  # generous: only a failure waits that long
@@ -87,7 +87,7 @@ def test_bytes_come_as_they_were_sent_with_the_time_of_arrival(
 
 
 def test_frames_go_out_as_they_are(line: Line, transport: SerialTransport) -> None:
-    frame = commands.sync_time(0x0A0D_1311_0403_7F00).encode()
+    frame = commands.sync_time(HostNs(0x0A0D_1311_0403_7F00)).encode()
     transport.send(frame)
     assert os.read(line.end, 4096) == frame
     assert transport.send_errors == 0

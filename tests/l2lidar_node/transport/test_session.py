@@ -48,9 +48,9 @@ class Running:
         for frame in frames:
             self.device.sendto(frame, self.address)
 
-    def wait_for(self, kind: type, count: int = 1) -> list:
+    def wait_for(self, kind: type, count: int = 1) -> list[Any]:
         """Return the next events of a kind; others are dropped."""
-        found: list = []
+        found: list[Any] = []
         while len(found) < count:
             event = self.events.get(timeout=PATIENCE_S)
             found += [event] if isinstance(event, kind) else []
@@ -134,7 +134,12 @@ def test_calls_run_in_the_loops_thread_and_return_or_raise(running: Running) -> 
 
 def test_a_call_that_nobody_wants_any_more_harms_nothing(running: Running) -> None:
     reached, go_on = threading.Event(), threading.Event()
-    running.session.call(lambda *_: (reached.set(), go_on.wait(PATIENCE_S)))
+
+    def held(*_: object) -> None:
+        reached.set()
+        go_on.wait(PATIENCE_S)
+
+    running.session.call(held)
     assert reached.wait(PATIENCE_S)
     unwanted: Future[int] = running.session.call(lambda *_: 1)
     assert unwanted.cancel()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from tests.l2lidar_proc.motion.test_sweep_trajectory import trajectory
 START, END = 0.3, 0.53
 
 
-def path_of(motion: Motion):
+def path_of(motion: Motion) -> Any:
     return trajectory(motion, START, END, START)
 
 
@@ -28,7 +30,9 @@ def path_of(motion: Motion):
         (Motion(speed=2.0), 0.0005),
     ],
 )
-def test_points_go_where_a_still_sensor_would_have_seen_them(motion, bound, reference):
+def test_points_go_where_a_still_sensor_would_have_seen_them(
+    motion: Any, bound: float, reference: Any
+) -> None:
     points, truth = seen(motion, START, END, reference)
     deskewed = deskew(points, at(START), path_of(motion), at(reference))
     assert rms(xyz(points) - truth) > 100 * bound
@@ -37,7 +41,7 @@ def test_points_go_where_a_still_sensor_would_have_seen_them(motion, bound, refe
         assert (deskewed[name] == points[name]).all()
 
 
-def test_the_batch_equals_the_loop():
+def test_the_batch_equals_the_loop() -> None:
     motion = Motion(turn=3.0, nod=0.3, speed=1.5)
     points, _ = seen(motion, START, END, START, count=500)
     path = path_of(motion)
@@ -51,21 +55,21 @@ def test_the_batch_equals_the_loop():
     )
 
 
-def test_the_points_at_the_reference_stay():
+def test_the_points_at_the_reference_stay() -> None:
     motion = Motion(turn=3.0, speed=1.0)
     points, _ = seen(motion, START, END, START)
     deskewed = deskew(points, at(START), path_of(motion), at(START))
     assert deskewed[0] == points[0]
 
 
-def test_a_still_sensor_changes_no_bit():
+def test_a_still_sensor_changes_no_bit() -> None:
     points, _ = seen(Motion(), START, END, START)
     points["x"][:3] = (-0.0, 0.0, np.float32(1e-40))
     still = still_trajectory(at(START), at(END))
     assert deskew(points, at(START), still, at(END)).tobytes() == points.tobytes()
 
 
-def test_the_input_is_left_alone_and_nothing_is_enough():
+def test_the_input_is_left_alone_and_nothing_is_enough() -> None:
     motion = Motion(turn=3.0)
     points, _ = seen(motion, START, END, START)
     before = points.tobytes()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,7 @@ def rms_mm(scenario: Scenario) -> dict[str, float]:
     ],
     ids=lambda scenario: scenario.name,
 )
-def test_with_odometry_a_moving_sensor_sees_what_a_still_one_would(scenario):
+def test_with_odometry_a_moving_sensor_sees_what_a_still_one_would(scenario: Any) -> None:
     found = rms_mm(scenario)
     assert found["odometry"] < 10.0
     assert found["odometry"] < found["none"] / 10.0
@@ -36,7 +38,7 @@ def test_with_odometry_a_moving_sensor_sees_what_a_still_one_would(scenario):
     assert found["gyro only"] < found["none"]
 
 
-def test_turning_in_place_needs_no_velocity():
+def test_turning_in_place_needs_no_velocity() -> None:
     found = rms_mm(Scenario("pivot", "pivot", 3.0, seconds=6.0))
     assert found["none"] > 500.0
     assert found["gyro only"] < 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ RNG = np.random.default_rng(8)
 SLOT = 7.73e-6
 
 
-def points(*xyz) -> np.ndarray:
+def points(*xyz: Any) -> np.ndarray:
     made = np.zeros(len(xyz), dtype=POINT)
     made["x"], made["y"], made["z"] = np.array(xyz, dtype=float).reshape(-1, 3).T
     made["time"] = np.arange(len(xyz)) * SLOT
@@ -28,27 +29,27 @@ CLOUD = points(*RNG.uniform(-5, 5, (500, 3)))
 CLOUD["intensity"] = RNG.integers(0, 256, 500)
 
 
-def kept(name: str, cloud=CLOUD, **settings) -> list[int]:
+def kept(name: str, cloud: Any = CLOUD, **settings: Any) -> list[int]:
     return filters.apply(cloud, [name], replace(FilterConfig(), **settings)).tolist()
 
 
-def expected(condition) -> list[int]:
+def expected(condition: Any) -> list[int]:
     return [
         i for i, p in enumerate(CLOUD) if condition(float(p["x"]), float(p["y"]), float(p["z"]))
     ]
 
 
-def test_every_name_is_a_filter_and_every_filter_has_a_name():
+def test_every_name_is_a_filter_and_every_filter_has_a_name() -> None:
     assert set(FILTERS) == set(filters.FILTERS)
 
 
-def test_range():
+def test_range() -> None:
     found = kept("range", range_min=2.0, range_max=4.0)
     assert found == expected(lambda x, y, z: 4.0 <= x * x + y * y + z * z <= 16.0)
     assert 0 < len(found) < 500
 
 
-def test_elevation():
+def test_elevation() -> None:
     found = kept("vertical", vertical_min=-10.0, vertical_max=30.0)
     assert found == expected(
         lambda x, y, z: -10.0 <= np.degrees(np.arctan2(z, np.sqrt(x * x + y * y))) <= 30.0
@@ -64,13 +65,15 @@ def test_elevation():
         (-180, 180, [(-1, 0, 0), (1, 0, 0), (0, -1, 0)], []),
     ],
 )
-def test_azimuth_window_may_go_across_the_back(low, high, inside, outside):
+def test_azimuth_window_may_go_across_the_back(
+    low: int, high: int, inside: Any, outside: Any
+) -> None:
     cloud = points(*inside, *outside)
     found = kept("azimuth", cloud, azimuth_min=float(low), azimuth_max=float(high))
     assert found == list(range(len(inside)))
 
 
-def test_boxes():
+def test_boxes() -> None:
     boxes = (-1.0, -1.0, -1.0, 1.0, 2.0, 3.0, 4.0, 4.0, 4.0, 3.0, 3.0, 3.0)
     inside = expected(
         lambda x, y, z: (
@@ -84,14 +87,14 @@ def test_boxes():
     assert len(kept("keep_boxes")) == len(kept("remove_boxes")) == 500
 
 
-def test_intensity():
+def test_intensity() -> None:
     found = kept("intensity", intensity_min=10.0, intensity_max=200.0)
     assert found == [i for i in range(500) if 10 <= CLOUD["intensity"][i] <= 200]
     with pytest.raises(FilterError, match="intensity"):
         kept("intensity", CLOUD[["x", "y", "z"]])
 
 
-def test_voxel_keeps_the_first_point_of_every_cube():
+def test_voxel_keeps_the_first_point_of_every_cube() -> None:
     cells, first = {}, []
     for i, p in enumerate(CLOUD):
         cell = tuple(int(np.floor(float(p[axis]) / 1.5)) for axis in "xyz")
@@ -124,7 +127,7 @@ def wall_with_dust() -> np.ndarray:
     return cloud
 
 
-def test_isolated_finds_dust_on_the_scan_line():
+def test_isolated_finds_dust_on_the_scan_line() -> None:
     cloud = wall_with_dust()
     assert slot_time(cloud["time"]) == pytest.approx(SLOT, rel=1e-3)
     removed = sorted(set(range(len(cloud))) - set(kept("isolated", cloud)))
@@ -134,7 +137,7 @@ def test_isolated_finds_dust_on_the_scan_line():
     assert 521 not in kept("isolated", cloud, isolated_intensity=150.0)
 
 
-def test_isolated_does_not_take_the_next_packet_for_a_neighbour():
+def test_isolated_does_not_take_the_next_packet_for_a_neighbour() -> None:
     lonely = points((1, 0, 0), (1, 0.001, 0))
     lonely["time"] = (0, 4.639e-3)
     assert kept("isolated", lonely) == []
@@ -143,7 +146,7 @@ def test_isolated_does_not_take_the_next_packet_for_a_neighbour():
         kept("isolated", lonely[["x", "y", "z"]])
 
 
-def test_outliers_by_open3d():
+def test_outliers_by_open3d() -> None:
     pytest.importorskip("open3d")
     blob = RNG.normal(0, 0.1, (200, 3))
     cloud = points(*blob, (9, 9, 9), (-8, 7, 2))
@@ -154,7 +157,7 @@ def test_outliers_by_open3d():
     assert kept("radius", pair, radius=0.5, radius_neighbours=2) == []
 
 
-def test_a_chain_is_applied_in_its_order():
+def test_a_chain_is_applied_in_its_order() -> None:
     config = replace(FilterConfig(), range_min=3.0, voxel_size=20.0)
     origin_first = np.concatenate((points((0.1, 0.1, 0.1)), CLOUD[CLOUD["range"] >= 0]))
     far_first = filters.apply(origin_first, ["range", "voxel"], config)
@@ -174,6 +177,6 @@ def test_a_chain_is_applied_in_its_order():
         ({"voxel_size": 0.0}, "voxel_size"),
     ],
 )
-def test_wrong_settings_are_refused(values, reason):
+def test_wrong_settings_are_refused(values: Any, reason: str) -> None:
     with pytest.raises(SettingError, match=reason):
         build(FilterConfig, values)

@@ -24,7 +24,7 @@ def sweep(returned: np.ndarray, jitter: float = 0.0) -> tuple[np.ndarray, np.nda
 
 
 @pytest.mark.parametrize("share", [1.0, 0.66, 0.2])
-def test_every_point_gets_its_place(share):
+def test_every_point_gets_its_place(share: float) -> None:
     returned = np.random.default_rng(1).random((50, SLOTS)) < share
     returned[7] = False  # a lost packet
     returned[3, 0] = True
@@ -37,7 +37,7 @@ def test_every_point_gets_its_place(share):
     assert np.isfinite(image["x"]).sum() == returned.sum()
 
 
-def test_small_jitter_of_the_stamps_moves_a_row_by_a_slot_at_most():
+def test_small_jitter_of_the_stamps_moves_a_row_by_a_slot_at_most() -> None:
     returned = np.ones((50, SLOTS), dtype=bool)
     points, *_ = sweep(returned, jitter=1e-6)
     image = organise(points, points["time"])
@@ -46,7 +46,7 @@ def test_small_jitter_of_the_stamps_moves_a_row_by_a_slot_at_most():
     assert np.nanmax(np.abs(shift)) <= 2
 
 
-def test_first_slots_missing_in_one_packet_stay_empty():
+def test_first_slots_missing_in_one_packet_stay_empty() -> None:
     returned = np.ones((5, SLOTS), dtype=bool)
     returned[2, :40] = False
     points, *_ = sweep(returned)
@@ -55,7 +55,7 @@ def test_first_slots_missing_in_one_packet_stay_empty():
     assert image["y"][2, 40] == 40
 
 
-def test_few_points_and_other_fields():
+def test_few_points_and_other_fields() -> None:
     for count in (0, 1, 2):
         points = np.zeros(count, dtype=[("x", "f4"), ("ring", "u2")])
         image = organise(points, np.arange(count, dtype=np.float32) * np.float32(SLOT))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from l2lidar_node.types import Level
@@ -27,7 +29,7 @@ def quality(*flags: Flag, still: bool = False) -> Quality:
         ((Flag.NO_VELOCITY, Flag.ACCELEROMETER_FAULT), Level.ERROR),
     ],
 )
-def test_a_sweep(flags, level):
+def test_a_sweep(flags: Any, level: Any) -> None:
     told = report.of_sweep(quality(*flags), 7_000_000)
     assert told.level == level
     assert all(flag.value in told.message for flag in flags)
@@ -38,7 +40,7 @@ def test_a_sweep(flags, level):
 
 
 def period(
-    before: int, after: int, last, *, is_levelled: bool = False, untied: str = ""
+    before: int, after: int, last: Any, *, is_levelled: bool = False, untied: str = ""
 ) -> report.Report:
     return report.of_period(
         PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, ImuCounts(), None,
@@ -46,7 +48,7 @@ def period(
     )  # fmt: skip
 
 
-def test_a_period():
+def test_a_period() -> None:
     last = report.of_sweep(quality(still=True), 0)
     told = period(3, 8, last)
     assert told.level == Level.OK
@@ -58,14 +60,14 @@ def test_a_period():
     assert period(3, 8, None).level == Level.OK
 
 
-def test_a_velocity_that_cannot_be_used_is_told_unless_worse_is():
+def test_a_velocity_that_cannot_be_used_is_told_unless_worse_is() -> None:
     told = period(3, 8, report.of_sweep(quality(), 0), untied="'base' is not tied")
     assert told.level == Level.WARN
     assert told.message.endswith("velocity not used: 'base' is not tied")
     assert period(3, 8, report.of_sweep(quality(Flag.NO_IMU), 0), untied="x").level == Level.ERROR
 
 
-def test_levelled_clouds_are_an_error_whatever_else():
+def test_levelled_clouds_are_an_error_whatever_else() -> None:
     told = period(3, 8, report.of_sweep(quality(), 0), is_levelled=True)
     assert told.level == Level.ERROR
     assert "imu_adjust" in told.message

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,7 @@ def noisy(
 
 def seen(
     motion: Motion, start: float, end: float, reference: float, count: int = 6000, seed: int = 1
-):
+) -> Any:
     """Return a sweep of random points, dtype POINT, and their true places from the reference."""
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(start, end, count).astype(np.float32).astype(np.float64))

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from l2lidar_node.types import F64
 from l2lidar_proc import rotations
 from l2lidar_proc.motion.frames import FrameTree
 
 
-def pose(turn, place):
+def found(tree: FrameTree, to: str, source: str) -> F64:
+    """Return a transform that has to be there."""
+    transform = tree.find(to, source)
+    assert transform is not None
+    return transform
+
+
+def pose(turn: Any, place: Any) -> Any:
     return rotations.transform(rotations.exp(turn), place)
 
 
-def test_chains_go_up_and_down():
+def test_chains_go_up_and_down() -> None:
     tree = FrameTree()
     T_base_mast, T_mast_lidar = pose((0, 0, 1.0), (1, 0, 0)), pose((0.5, 0, 0), (0, 0, 2))
     T_base_wheel = pose((0, 0.1, 0), (0, 3, 0))
@@ -20,37 +30,37 @@ def test_chains_go_up_and_down():
     tree.add("base", "mast", T_base_mast)
     tree.add("base", "wheel", T_base_wheel)
     tree.add("elsewhere", "other", np.eye(4))
-    np.testing.assert_allclose(tree.find("base", "lidar"), T_base_mast @ T_mast_lidar)
+    np.testing.assert_allclose(found(tree, "base", "lidar"), T_base_mast @ T_mast_lidar)
     expected = np.linalg.inv(T_base_wheel) @ T_base_mast @ T_mast_lidar
-    np.testing.assert_allclose(tree.find("wheel", "lidar"), expected, atol=1e-12)
-    np.testing.assert_allclose(tree.find("lidar", "wheel"), np.linalg.inv(expected), atol=1e-12)
+    np.testing.assert_allclose(found(tree, "wheel", "lidar"), expected, atol=1e-12)
+    np.testing.assert_allclose(found(tree, "lidar", "wheel"), np.linalg.inv(expected), atol=1e-12)
     assert tree.find("base", "other") is None
     assert tree.find("nowhere", "base") is None
-    np.testing.assert_array_equal(tree.find("x", "x"), np.eye(4))
+    np.testing.assert_array_equal(found(tree, "x", "x"), np.eye(4))
 
 
-def test_a_newer_transform_replaces_the_older():
+def test_a_newer_transform_replaces_the_older() -> None:
     tree = FrameTree()
     tree.add("a", "b", pose((0, 0, 0), (1, 0, 0)))
     tree.add("a", "b", pose((0, 0, 0), (2, 0, 0)))
-    assert tree.find("a", "b")[0, 3] == 2
-    assert tree.find("b", "a")[0, 3] == -2
+    assert found(tree, "a", "b")[0, 3] == 2
+    assert found(tree, "b", "a")[0, 3] == -2
 
 
-def test_a_frame_has_one_parent_the_newest():
+def test_a_frame_has_one_parent_the_newest() -> None:
     tree = FrameTree()
     tree.add("a", "b", pose((0, 0, 0), (1, 0, 0)))
     tree.add("c", "b", pose((0, 0, 0), (2, 0, 0)))
     assert tree.find("a", "b") is None
-    assert tree.find("c", "b")[0, 3] == 2
+    assert found(tree, "c", "b")[0, 3] == 2
 
 
-def test_mounts_in_a_circle_and_long_chains_have_an_end():
+def test_mounts_in_a_circle_and_long_chains_have_an_end() -> None:
     tree = FrameTree()
     for child, parent in ("ab", "bc", "ca"):
         tree.add(parent, child, np.eye(4))
     assert tree.find("a", "x") is None
-    np.testing.assert_array_equal(tree.find("a", "c"), np.eye(4))
+    np.testing.assert_array_equal(found(tree, "a", "c"), np.eye(4))
     for number in range(5000):
         tree.add(f"{number + 1}", f"{number}", np.eye(4))
     assert tree.find("5000", "0") is None

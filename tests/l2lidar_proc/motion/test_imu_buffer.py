@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
@@ -11,7 +13,7 @@ MS = 1_000_000
 BASE = 10**18
 
 
-def samples(*milliseconds: float):
+def samples(*milliseconds: float) -> Any:
     made = np.zeros(len(milliseconds), dtype=IMU_SAMPLE)
     made["stamp"] = BASE + np.round(np.array(milliseconds) * MS).astype(np.int64)
     made["orientation_wxyz"][:, 0] = milliseconds
@@ -26,7 +28,7 @@ def kept(window: ImuBuffer) -> list[float]:
     return rates
 
 
-def test_any_order_ends_up_in_order():
+def test_any_order_ends_up_in_order() -> None:
     order = np.random.default_rng(3).permutation(60) * 4.0
     one_by_one, at_once = ImuBuffer(), ImuBuffer()
     one_by_one.push(samples(-1.0))
@@ -39,7 +41,7 @@ def test_any_order_ends_up_in_order():
     assert one_by_one.counts.reordered == at_once.counts.reordered > 0
 
 
-def test_push_returns_only_what_continues_the_window():
+def test_push_returns_only_what_continues_the_window() -> None:
     window = ImuBuffer()
     window.push(samples(0, 4))
     fresh = window.push(samples(12, 8, 16))
@@ -47,7 +49,7 @@ def test_push_returns_only_what_continues_the_window():
     assert kept(window) == [0, 4, 8, 12, 16]
 
 
-def test_duplicates_invalid_and_stale_samples_are_refused_and_counted():
+def test_duplicates_invalid_and_stale_samples_are_refused_and_counted() -> None:
     window = ImuBuffer()
     window.push(samples(0, 4, 8))
     window.push(samples(4))
@@ -62,7 +64,7 @@ def test_duplicates_invalid_and_stale_samples_are_refused_and_counted():
     assert (counts.duplicate, counts.invalid, counts.stale, counts.jumps) == (2, 2, 1, 0)
 
 
-def test_a_jump_of_the_clock_starts_afresh():
+def test_a_jump_of_the_clock_starts_afresh() -> None:
     window = ImuBuffer(jump_s=1.0)
     window.push(samples(10_000, 10_004))
     window.push(samples(100, 104))
@@ -72,7 +74,7 @@ def test_a_jump_of_the_clock_starts_afresh():
     assert window.counts.jumps == 2
 
 
-def test_between_includes_a_neighbour_on_either_side():
+def test_between_includes_a_neighbour_on_either_side() -> None:
     window = ImuBuffer()
     window.push(samples(0, 4, 8, 12, 16))
 
@@ -87,7 +89,7 @@ def test_between_includes_a_neighbour_on_either_side():
     assert span(90, 99) == [16]
 
 
-def test_memory_is_bounded_and_old_samples_go():
+def test_memory_is_bounded_and_old_samples_go() -> None:
     window = ImuBuffer(length_s=1.0)
     for first in range(0, 60_000, 400):
         window.push(samples(*range(first, first + 400, 4)))

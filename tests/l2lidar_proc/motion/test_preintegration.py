@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,13 +20,13 @@ GAP_NS = 50_000_000
 WALK = Motion(turn=1.0, nod=0.15, speed=1.0)
 
 
-def integrated(samples, start, end, **options):
+def integrated(samples: Any, start: Any, end: Any, **options: Any) -> Any:
     imu = segment(samples, [at(start), at(end)], GAP_NS, ZERO)
     given = {"gyro_bias": ZERO, "accel_bias": ZERO, "rest_force": ZERO, **options}
     return imu, integrate(imu, 0, **given)
 
 
-def test_the_sums_lead_along_a_walk():
+def test_the_sums_lead_along_a_walk() -> None:
     imu, sums = integrated(WALK.imu(0.0, 0.5), 0.05, 0.35)
     ends = np.array([0.05, 0.35])
     turn = WALK.rotation(ends)
@@ -50,7 +51,7 @@ def test_the_sums_lead_along_a_walk():
     assert not imu.missing.any()
 
 
-def test_coning_is_integrated_to_second_order():
+def test_coning_is_integrated_to_second_order() -> None:
     """Between two samples the rate turns by a right angle: the mean alone is 3 mrad off."""
     samples = np.zeros(2, IMU_SAMPLE)
     samples["stamp"] = at(0.0), at(0.04)
@@ -69,14 +70,14 @@ def test_coning_is_integrated_to_second_order():
     assert np.linalg.norm(plain) > 3e-3
 
 
-def test_another_anchor_gives_the_same_sums():
+def test_another_anchor_gives_the_same_sums() -> None:
     _, sums = integrated(WALK.imu(0.0, 0.5), 0.05, 0.35)
     back = sums.anchored_at(len(sums.stamps) - 1).anchored_at(0)
     np.testing.assert_allclose(back.positions, sums.positions, atol=1e-12)
     np.testing.assert_allclose(back.velocities, sums.velocities, atol=1e-12)
 
 
-def test_gaps_hold_rate_and_speed():
+def test_gaps_hold_rate_and_speed() -> None:
     samples = np.zeros(101, IMU_SAMPLE)
     samples["stamp"] = EPOCH + np.arange(101) * 4_000_000
     samples["angular_velocity"] = [0.0, 0.0, 0.5]
@@ -90,7 +91,7 @@ def test_gaps_hold_rate_and_speed():
     np.testing.assert_allclose(sums.velocities[-1], [0.0, 0.0, 0.6 * G], atol=1e-6)
 
 
-def test_in_a_gap_the_rate_goes_straight_from_before_to_after():
+def test_in_a_gap_the_rate_goes_straight_from_before_to_after() -> None:
     samples = np.zeros(201, IMU_SAMPLE)
     samples["stamp"] = EPOCH + np.arange(201) * 4_000_000
     samples["angular_velocity"][:, 2] = np.linspace(0.0, 1.0, 201)
@@ -100,20 +101,22 @@ def test_in_a_gap_the_rate_goes_straight_from_before_to_after():
 
 
 @pytest.mark.parametrize(("last", "turned"), [(0.452, 0.152 + 0.02), (0.2, 0.0)])
-def test_beyond_the_samples_the_rate_is_held_a_little_and_then_stops(last, turned):
+def test_beyond_the_samples_the_rate_is_held_a_little_and_then_stops(
+    last: float, turned: Any
+) -> None:
     samples = Motion(turn=1.0).imu(0, last)
     imu = segment(samples, [at(0.3), at(0.6)], GAP_NS, ZERO, 20_000_000)
     sums = integrate(imu, 0, gyro_bias=ZERO, accel_bias=ZERO, rest_force=ZERO)
     assert rotations.log(sums.rotations_wxyz[-1])[2] == pytest.approx(turned, abs=1e-4)
 
 
-def test_before_the_samples_likewise():
+def test_before_the_samples_likewise() -> None:
     imu = segment(Motion(turn=1.0).imu(0.4, 1.0), [at(0.3), at(0.6)], GAP_NS, ZERO, 20_000_000)
     sums = integrate(imu, 0, gyro_bias=ZERO, accel_bias=ZERO, rest_force=ZERO)
     assert rotations.log(sums.rotations_wxyz[-1])[2] == pytest.approx(0.22, abs=1e-4)
 
 
-def test_without_forces_the_velocity_turns_with_the_body():
+def test_without_forces_the_velocity_turns_with_the_body() -> None:
     circle = Motion(turn=2.0)
     imu = segment(circle.imu(0, 1), [at(0.1), at(0.6)], GAP_NS, ZERO)
     ahead = np.array([1.0, 0.0, 0.0])
@@ -130,7 +133,7 @@ def test_without_forces_the_velocity_turns_with_the_body():
     jump=st.integers(-60 * 365 * 86_400 * 10**9, 60 * 365 * 86_400 * 10**9),
     count=st.integers(0, 60),
 )
-def test_work_is_bounded_whatever_the_clock_does(jump, count):
+def test_work_is_bounded_whatever_the_clock_does(jump: int, count: int) -> None:
     samples = WALK.imu(0.0, 0.3)[:count]
     later = HostNs(at(0.3) + jump)
     marks = [at(0.0), later]
@@ -163,6 +166,6 @@ def test_work_is_bounded_whatever_the_clock_does(jump, count):
         ([], 0.0, 10),
     ],
 )
-def test_coverage_of_a_span(stamps, share, gap):
+def test_coverage_of_a_span(stamps: Any, share: float, gap: int) -> None:
     found = coverage(np.array(stamps, dtype=np.int64), HostNs(1), HostNs(11))
     assert found == (pytest.approx(share), gap)

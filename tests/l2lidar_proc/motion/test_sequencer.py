@@ -15,7 +15,7 @@ def sweep(start: int, length: int = 200 * MS) -> Sweep:
     return Sweep(HostNs(start), HostNs(start + length), np.zeros(0, POINT), 0, 0)
 
 
-def test_goes_when_the_imu_covers_its_end():
+def test_goes_when_the_imu_covers_its_end() -> None:
     sequencer = Sequencer(50 * MS)
     first = sweep(10 * S)
     sequencer.push(first, now=0)
@@ -27,7 +27,7 @@ def test_goes_when_the_imu_covers_its_end():
     assert sequencer.due_ns is None
 
 
-def test_goes_when_its_time_is_up():
+def test_goes_when_its_time_is_up() -> None:
     sequencer = Sequencer(50 * MS)
     sequencer.push(sweep(10 * S), now=7)
     assert sequencer.due_ns == 7 + 50 * MS
@@ -35,7 +35,7 @@ def test_goes_when_its_time_is_up():
     assert [r.reason for r in sequencer.release(None, 7 + 50 * MS)] == [Reason.WAITED]
 
 
-def test_order_is_kept():
+def test_order_is_kept() -> None:
     sequencer = Sequencer(50 * MS)
     sweeps = [sweep(10 * S + i * 200 * MS) for i in range(3)]
     for i, item in enumerate(sweeps):
@@ -44,7 +44,7 @@ def test_order_is_kept():
     assert [r.sweep for r in sequencer.release(sweeps[2].end, 3)] == sweeps[2:]
 
 
-def test_a_clock_that_jumps_back_releases_those_that_wait():
+def test_a_clock_that_jumps_back_releases_those_that_wait() -> None:
     sequencer = Sequencer(50 * MS)
     old, new = sweep(100 * S), sweep(10 * S)
     assert not sequencer.push(old, now=0)
@@ -56,13 +56,13 @@ def test_a_clock_that_jumps_back_releases_those_that_wait():
     assert [r.sweep for r in sequencer.release(None, 3)] == [new]
 
 
-def test_a_sweep_slightly_out_of_order_is_no_jump():
+def test_a_sweep_slightly_out_of_order_is_no_jump() -> None:
     sequencer = Sequencer(50 * MS)
     sequencer.push(sweep(10 * S), now=0)
     assert not sequencer.push(sweep(10 * S - 200 * MS), now=1)
 
 
-def test_the_number_that_waits_is_bounded():
+def test_the_number_that_waits_is_bounded() -> None:
     sequencer = Sequencer(10 * S)
     sweeps = [sweep(10 * S + i * MS) for i in range(25)]
     for item in sweeps:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,15 +16,15 @@ UNKNOWN = np.zeros(3)
 
 
 @pytest.fixture(params=LEVELS, scope="module")
-def level(request):
+def level(request: pytest.FixtureRequest) -> Any:
     return LEVELS[request.param]
 
 
-def still(level, seconds: float = 20.0):
+def still(level: Any, seconds: float = 20.0) -> Any:
     return noisy(Motion().imu(0, seconds, BIAS), *level)
 
 
-def test_a_still_sensor_is_found_at_rest_with_its_bias(level):
+def test_a_still_sensor_is_found_at_rest_with_its_bias(level: Any) -> None:
     samples = still(level)
     found = [static_reference(samples[i : i + 250], UNKNOWN, 0.1) for i in range(0, 4750, 250)]
     assert all(found)
@@ -31,7 +33,7 @@ def test_a_still_sensor_is_found_at_rest_with_its_bias(level):
     assert np.abs(biases - BIAS).max() < 0.25 * (level[0] + level[1]) + 1e-6
 
 
-def test_it_is_still_still_in_every_head_turn(level):
+def test_it_is_still_still_in_every_head_turn(level: Any) -> None:
     samples = still(level)
     rest = static_reference(samples[:250], UNKNOWN, 0.1)
     assert all(rest.matches(samples[i : i + 60]) for i in range(250, 4900, 60))
@@ -41,7 +43,7 @@ def test_it_is_still_still_in_every_head_turn(level):
     "motion",
     [Motion(turn=0.5), Motion(turn=3.0), Motion(speed=0.7, nod=0.05), Motion(speed=1.2, turn=0.5)],
 )
-def test_motion_is_neither_rest_nor_still(level, motion):
+def test_motion_is_neither_rest_nor_still(level: Any, motion: Any) -> None:
     rest = static_reference(still(level)[:250], UNKNOWN, 0.1)
     samples = noisy(motion.imu(0, 10, BIAS), *level)
     for i in range(0, 2250, 250):
@@ -51,13 +53,13 @@ def test_motion_is_neither_rest_nor_still(level, motion):
     assert fraction == 0.0
 
 
-def test_a_known_bias_forbids_a_slow_turn_to_pass_for_rest():
+def test_a_known_bias_forbids_a_slow_turn_to_pass_for_rest() -> None:
     slow = noisy(Motion(turn=0.08).imu(0, 2, BIAS))
     assert static_reference(slow[:250], UNKNOWN, 0.2) is not None
     assert static_reference(slow[:250], np.array(BIAS), 0.01) is None
 
 
-def test_too_few_samples_prove_nothing():
+def test_too_few_samples_prove_nothing() -> None:
     samples = still((0, 0, 0), 1.0)
     assert static_reference(samples[:99], UNKNOWN, 0.1) is None
     assert not static_reference(samples, UNKNOWN, 0.1).matches(samples[:20])

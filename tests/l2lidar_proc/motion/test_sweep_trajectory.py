@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -45,7 +47,7 @@ def trajectory(motion: Motion, start: float, end: float, anchor: float) -> Sweep
 
 @pytest.mark.parametrize("anchor", [0.3, 0.45, 0.6])
 @pytest.mark.parametrize("motion", [WALK, Motion(turn=3.0, nod=0.2)])
-def test_it_follows_the_motion_from_any_anchor(motion, anchor):
+def test_it_follows_the_motion_from_any_anchor(motion: Any, anchor: float) -> None:
     found = trajectory(motion, 0.3, 0.6, anchor)
     moments = np.linspace(0.3, 0.6, 400)
     q, p = found.poses(np.array([at(t) for t in moments]))
@@ -58,7 +60,7 @@ def test_it_follows_the_motion_from_any_anchor(motion, anchor):
     assert np.linalg.norm(place - p, axis=1).max() < 2e-4
 
 
-def test_the_lever_arm_counts_from_the_anchor():
+def test_the_lever_arm_counts_from_the_anchor() -> None:
     """A sensor that turns about its own origin stays there, its IMU does not."""
     pivot = Motion(turn=3.0)
     found = trajectory(pivot, 0.3, 0.6, 0.45)
@@ -66,7 +68,7 @@ def test_the_lever_arm_counts_from_the_anchor():
     assert 3.0 * np.linalg.norm(LEVER[:2]) * 0.15 > 5e-3
 
 
-def test_between_two_instants():
+def test_between_two_instants() -> None:
     found, later = trajectory(WALK, 0.2, 0.7, 0.2), trajectory(WALK, 0.4, 0.7, 0.4)
     q, p = found.between(at(0.4), at(0.6))
     q_expected, p_expected = later.pose(at(0.6))
@@ -74,14 +76,14 @@ def test_between_two_instants():
     np.testing.assert_allclose(p, p_expected, atol=5e-4)
 
 
-def test_rotations_alone():
+def test_rotations_alone() -> None:
     found = trajectory(WALK, 0.2, 0.7, 0.2).without_translation()
     assert not found.positions.any()
     assert found.rates.any()
     assert not found.is_still
 
 
-def test_a_still_one_is_whole():
+def test_a_still_one_is_whole() -> None:
     still = still_trajectory(at(0), HostNs(at(0) + 10))
     q, p = still.pose(at(5))
     assert still.is_still

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
 START, END = 6.0, 6.23
 
 
-def tracked(samples, motion=None, config=None) -> MotionTracker:
+def tracked(samples: Any, motion: Any = None, config: Any = None) -> MotionTracker:
     """Return a tracker that followed samples, with velocities up to 0.1 s before the sweep."""
     tracker = MotionTracker(config or MotionConfig())
     for i in range(0, len(samples), 10):
@@ -40,7 +41,7 @@ def tracked(samples, motion=None, config=None) -> MotionTracker:
     return tracker
 
 
-def test_a_walk_with_a_velocity_from_before_the_sweep():
+def test_a_walk_with_a_velocity_from_before_the_sweep() -> None:
     tracker = tracked(WALK.imu(0, END + 0.01), WALK)
     trajectory, quality = tracker.trajectory(at(START), at(END))
     points, truth = seen(WALK, START, END, START)
@@ -57,7 +58,7 @@ def test_a_walk_with_a_velocity_from_before_the_sweep():
     assert not quality.is_still
 
 
-def test_the_accelerometer_makes_the_difference():
+def test_the_accelerometer_makes_the_difference() -> None:
     points, truth = seen(WALK, START, END, START)
     errors = []
     for use in (True, False):
@@ -69,7 +70,7 @@ def test_the_accelerometer_makes_the_difference():
     assert errors[0] < errors[1] / 3
 
 
-def test_without_velocity_rotation_only_and_it_says_so():
+def test_without_velocity_rotation_only_and_it_says_so() -> None:
     trajectory, quality = tracked(WALK.imu(0, END + 0.01)).trajectory(at(START), at(END))
     assert quality.flags == (Flag.NO_VELOCITY,)
     assert quality.translation_m == 0.0
@@ -77,7 +78,7 @@ def test_without_velocity_rotation_only_and_it_says_so():
     assert not trajectory.positions.any()
 
 
-def test_a_sensor_at_rest_has_a_path_that_does_not_move():
+def test_a_sensor_at_rest_has_a_path_that_does_not_move() -> None:
     samples = noisy(Motion().imu(0, END + 0.01, (0.02, -0.03, 0.01)))
     for tracker, (start, end) in (
         (tracked(samples), (START, END)),
@@ -90,7 +91,7 @@ def test_a_sensor_at_rest_has_a_path_that_does_not_move():
         assert deskew(points, at(start), trajectory, at(end)).tobytes() == points.tobytes()
 
 
-def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise():
+def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise() -> None:
     samples = noisy(Motion().imu(0, END + 0.01))
     _, quality = tracked(samples, Motion(speed=0.5)).trajectory(at(START), at(END))
     assert not quality.is_still
@@ -108,7 +109,7 @@ def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise():
         (lambda t: t < 0, (Flag.NO_IMU,), 0.0),
     ],
 )
-def test_missing_samples_are_reported(keep, flags, covered):
+def test_missing_samples_are_reported(keep: Any, flags: Any, covered: Any) -> None:
     samples = WALK.imu(0, END + 0.01)
     samples = samples[keep((samples["stamp"] - EPOCH) * 1e-9)]
     trajectory, quality = tracked(samples).trajectory(at(START), at(END))
@@ -118,7 +119,7 @@ def test_missing_samples_are_reported(keep, flags, covered):
     assert (trajectory.rates.any() or trajectory.positions.any()) == (Flag.NO_IMU not in flags)
 
 
-def test_a_faulty_accelerometer_is_reported_and_left_alone():
+def test_a_faulty_accelerometer_is_reported_and_left_alone() -> None:
     samples = Motion(turn=1.0, speed=1.0).imu(0, END + 0.01)
     samples["linear_acceleration"] *= 2.0
     tracker = tracked(samples, Motion(turn=1.0, speed=1.0))
@@ -128,7 +129,7 @@ def test_a_faulty_accelerometer_is_reported_and_left_alone():
     assert quality.translation_m == pytest.approx(0.23, abs=0.02)
 
 
-def test_a_jump_of_the_imu_clock_forgets_what_was():
+def test_a_jump_of_the_imu_clock_forgets_what_was() -> None:
     tracker = tracked(WALK.imu(0, 3), WALK)
     assert tracker.imu(WALK.imu(10, 10.5))
     assert tracker.buffer.samples["stamp"][0] == at(10)
@@ -137,7 +138,7 @@ def test_a_jump_of_the_imu_clock_forgets_what_was():
     assert quality.flags == (Flag.NO_VELOCITY,)
 
 
-def test_the_mount_of_the_imu():
+def test_the_mount_of_the_imu() -> None:
     assert MotionConfig().imu_xyz == wire.IMU_POSITION_M
     np.testing.assert_allclose(MotionConfig().T_cloud_imu, T_CLOUD_IMU)
     turned = build(
@@ -151,7 +152,7 @@ def test_the_mount_of_the_imu():
         build(MotionConfig, {"imu_xyz": [1.0]})
 
 
-def test_velocity_of_a_mounted_sensor():
+def test_velocity_of_a_mounted_sensor() -> None:
     """A sensor one meter ahead of a body that turns left moves to the left as well."""
     mount = rotations.transform([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)], (1.0, 0.0, 0.2))
     velocity = carried_over((0.5, 0, 0), (0, 0, 2.0), rotations.inverse(mount))

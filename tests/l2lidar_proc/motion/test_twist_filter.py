@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -24,7 +26,9 @@ def at_rest_then(motion: Motion, rest: float, end: float) -> np.ndarray:
     return noisy(np.concatenate((resting, moving)))
 
 
-def follow(samples, motion=None, rest=0.0, every=50, late_s=0.0) -> TwistFilter:
+def follow(
+    samples: Any, motion: Any = None, rest: float = 0.0, every: int = 50, late_s: float = 0.0
+) -> TwistFilter:
     """Return a filter that followed samples, with true velocities of a motion if given."""
     buffer = ImuBuffer(25.0)
     found = TwistFilter(buffer, T_CLOUD_IMU[:3, 3], 0.1)
@@ -46,7 +50,7 @@ def tilt_error(found: TwistFilter, motion: Motion, t: float) -> float:
     return float(np.arccos(np.clip(up @ found.up, -1, 1)))
 
 
-def test_rest_gives_bias_gravity_and_stillness():
+def test_rest_gives_bias_gravity_and_stillness() -> None:
     found = follow(noisy(Motion(nod=0.0).imu(0, 4, BIAS)))
     assert np.abs(found.gyro_bias - BIAS).max() < 0.006
     assert found.is_static
@@ -58,14 +62,14 @@ def test_rest_gives_bias_gravity_and_stillness():
     assert not found.is_still(noisy(Motion(turn=0.5).imu(3, 3.3, BIAS), seed=9))
 
 
-def test_stillness_shows_within_the_first_sweep_but_not_in_motion():
+def test_stillness_shows_within_the_first_sweep_but_not_in_motion() -> None:
     assert follow(Motion().imu(0, 0.2)).is_still(noisy(Motion().imu(0, 0.23, BIAS)))
     walk = Motion(turn=0.5, nod=0.1, speed=0.7)
     assert not follow(walk.imu(0, 0.2)).is_still(noisy(walk.imu(0, 0.23, BIAS)))
 
 
 @pytest.mark.parametrize("with_velocity", [True, False])
-def test_the_vertical_is_held_through_motion(with_velocity):
+def test_the_vertical_is_held_through_motion(with_velocity: bool) -> None:
     walk = Motion(turn=0.8, nod=0.2, speed=1.0)
     samples = at_rest_then(walk, 2.5, 40)
     found = follow(samples, walk if with_velocity else None, rest=2.5)
@@ -75,7 +79,7 @@ def test_the_vertical_is_held_through_motion(with_velocity):
     assert found.is_trusted
 
 
-def test_bias_across_the_vertical_is_found_while_moving():
+def test_bias_across_the_vertical_is_found_while_moving() -> None:
     walk = Motion(turn=0.3, nod=0.3, speed=0.7)
     found = follow(noisy(walk.imu(0, 60, (0.05, -0.04, 0.0))), walk)
     assert np.abs(found.gyro_bias - (0.05, -0.04, 0.0))[:2].max() < 0.012
@@ -83,7 +87,7 @@ def test_bias_across_the_vertical_is_found_while_moving():
 
 
 @pytest.mark.parametrize("late_s", [0.2, 1.2])
-def test_a_late_source_still_serves(late_s):
+def test_a_late_source_still_serves(late_s: float) -> None:
     walk = Motion(turn=0.5, nod=0.1, speed=1.0)
     found = follow(walk.imu(0, 12), walk, late_s=late_s)
     moment = np.array([(found._state.stamp - EPOCH) * 1e-9])
@@ -92,7 +96,7 @@ def test_a_late_source_still_serves(late_s):
     assert np.linalg.norm(body - walk.velocity(moment)[0]) < 0.03
 
 
-def test_a_source_that_jumps_is_followed():
+def test_a_source_that_jumps_is_followed() -> None:
     walk = Motion(speed=1.0)
     found = follow(walk.imu(0, 4), walk)
     for k in range(5):
@@ -102,7 +106,7 @@ def test_a_source_that_jumps_is_followed():
     assert np.linalg.norm(found._state.rotation.T @ found._state.velocity) > 2.0
 
 
-def test_a_unit_started_on_its_side_is_caught_and_gravity_not_trusted():
+def test_a_unit_started_on_its_side_is_caught_and_gravity_not_trusted() -> None:
     samples = noisy(Motion().imu(0, 3, BIAS))
     samples["linear_acceleration"] *= 2.0
     found = follow(samples)
@@ -115,7 +119,7 @@ def test_a_unit_started_on_its_side_is_caught_and_gravity_not_trusted():
     assert follow(samples).is_faulty
 
 
-def test_a_long_gap_forgets_the_vertical_but_not_the_bias():
+def test_a_long_gap_forgets_the_vertical_but_not_the_bias() -> None:
     samples = noisy(Motion().imu(0, 3, BIAS))
     buffer = ImuBuffer(25.0, jump_s=5.0)
     found = TwistFilter(buffer, T_CLOUD_IMU[:3, 3], 0.1)
@@ -129,7 +133,7 @@ def test_a_long_gap_forgets_the_vertical_but_not_the_bias():
     np.testing.assert_allclose(found.gyro_bias, bias, atol=1e-9)
 
 
-def test_refuses_what_goes_back_or_is_not_a_number():
+def test_refuses_what_goes_back_or_is_not_a_number() -> None:
     found = TwistFilter(ImuBuffer(), np.zeros(3), 0.1)
     assert found.take(at(1.0), (1.0, 0, 0), "odometry")
     assert not found.take(at(1.0), (0, 0, 0), "odometry")
@@ -141,7 +145,7 @@ def test_refuses_what_goes_back_or_is_not_a_number():
     assert found.newest_twist == at(0.9)
 
 
-def test_nothing_is_known_before_the_first_samples():
+def test_nothing_is_known_before_the_first_samples() -> None:
     found = TwistFilter(ImuBuffer(), np.zeros(3), 0.1)
     found.follow()
     assert not found.gyro_bias.any()
@@ -150,7 +154,7 @@ def test_nothing_is_known_before_the_first_samples():
     assert not found.knows_velocity(at(0), 10**9)
 
 
-def test_turned_axes_turn_the_vertical():
+def test_turned_axes_turn_the_vertical() -> None:
     turn = rotations.matrices(rotations.exp([np.pi / 2, 0, 0]))
     samples = noisy(Motion().imu(0, 3))
     for name in ("angular_velocity", "linear_acceleration"):

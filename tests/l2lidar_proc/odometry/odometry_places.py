@@ -86,6 +86,6 @@ def visited(place: str, seconds: float = 8.0) -> Run:
     )
     with tempfile.TemporaryDirectory() as folder:
         world, motion = Path(folder) / "world.ply", Path(folder) / "motion.tum"
-        o3d.io.write_triangle_mesh(str(world), mesh)
+        o3d.io.write_triangle_mesh(world, mesh)
         motion.write_text(tum.render(ring(seconds)), encoding="utf-8")
         return record(str(world), str(motion), 1, seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,9 @@ def feed(
     return out
 
 
-def drive(run: Run, cut: str = "turn", config: OdometryConfig | None = None, imu=None):
+def drive(
+    run: Run, cut: str = "turn", config: OdometryConfig | None = None, imu: Any = None
+) -> Any:
     odometry = Odometry(config or OdometryConfig(), T_CLOUD_IMU)
     return feed(odometry, run, list(sweeps(run, cut)), imu)
 

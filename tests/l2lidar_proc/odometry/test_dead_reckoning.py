@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
-from l2lidar_node.types import IMU_SAMPLE
+from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.odometry.dead_reckoning import LONGEST_NS, DeadReckoning
 from l2lidar_proc.odometry.odometry import Odometry
@@ -17,7 +19,7 @@ from tests.support.odometry_runs import sweeps
 STEP = 5  # samples, 20 ms
 
 
-def track(run, most=40):
+def track(run: Any, most: int = 40) -> Iterator[Any]:
     """Yield dead reckoning, extrapolation and the extrapolation after the sweep, of each sweep."""
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
     reckoning = DeadReckoning(T_CLOUD_IMU)
@@ -28,7 +30,7 @@ def track(run, most=40):
             samples = run.imu[begin : min(begin + STEP, last)]
             odometry.imu(samples)
             carried = reckoning.carry(samples)
-        first, newest = last, int(run.imu["stamp"][last - 1])
+        first, newest = last, HostNs(int(run.imu["stamp"][last - 1]))
         full = odometry.extrapolated(newest)
         odometry.register(sweep)
         corrected = odometry.extrapolated(newest)
@@ -38,13 +40,13 @@ def track(run, most=40):
         reckoning.reset(corrected)
 
 
-def turned_by(one, other):
+def turned_by(one: Any, other: Any) -> Any:
     between = one.T_map_lidar[:3, :3].T @ other.T_map_lidar[:3, :3]
     return np.arccos(np.clip((np.trace(between) - 1.0) / 2.0, -1.0, 1.0))
 
 
 @pytest.mark.parametrize(("world", "motion"), [("room", "trot"), ("yard", "drone")])
-def test_it_is_as_good_as_every_sample_by_itself(world, motion):
+def test_it_is_as_good_as_every_sample_by_itself(world: str, motion: str) -> None:
     found = list(track(recording(world, motion)))
     assert len(found) >= 15
     for carried, full, _ in found:
@@ -58,7 +60,9 @@ def test_it_is_as_good_as_every_sample_by_itself(world, motion):
 
 
 @pytest.mark.parametrize(("world", "motion"), [("room", "walk"), ("room", "trot")])
-def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(world, motion):
+def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(
+    world: str, motion: str
+) -> None:
     corrections = np.array(
         [
             np.abs(corrected.T_map_lidar[:3, 3] - carried.T_map_lidar[:3, 3])
@@ -71,12 +75,12 @@ def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(world, motion
 
 
 @pytest.fixture(scope="module")
-def estimate():
+def estimate() -> Any:
     *_, (carried, _, _) = track(recording("room", "walk"), most=8)
     return carried
 
 
-def samples(start, count, **fields):
+def samples(start: Any, count: Any, **fields: Any) -> Any:
     made = np.zeros(count, IMU_SAMPLE)
     made["stamp"] = start + 4_000_000 * np.arange(1, count + 1)
     made["linear_acceleration"] = [0.0, 0.0, 9.80665]
@@ -85,14 +89,14 @@ def samples(start, count, **fields):
     return made
 
 
-def test_nothing_comes_of_nothing(estimate):
+def test_nothing_comes_of_nothing(estimate: Any) -> None:
     reckoning = DeadReckoning(T_CLOUD_IMU)
     assert reckoning.carry(samples(estimate.stamp, 5)) is None
     reckoning.reset(estimate)
     assert reckoning.carry(samples(estimate.stamp, 0)) is None
 
 
-def test_samples_that_are_damaged_or_late_move_nothing(estimate):
+def test_samples_that_are_damaged_or_late_move_nothing(estimate: Any) -> None:
     reckoning = DeadReckoning(T_CLOUD_IMU)
     reckoning.reset(estimate)
     good = reckoning.carry(samples(estimate.stamp, 5))
@@ -107,7 +111,7 @@ def test_samples_that_are_damaged_or_late_move_nothing(estimate):
 
 
 @pytest.mark.parametrize("silence", [60_000_000, LONGEST_NS, 10**15])
-def test_it_ends_with_a_gap_and_begins_with_the_next_sweep(estimate, silence):
+def test_it_ends_with_a_gap_and_begins_with_the_next_sweep(estimate: Any, silence: Any) -> None:
     reckoning = DeadReckoning(T_CLOUD_IMU)
     reckoning.reset(estimate)
     assert reckoning.carry(samples(estimate.stamp + silence, 5)) is None
@@ -117,7 +121,7 @@ def test_it_ends_with_a_gap_and_begins_with_the_next_sweep(estimate, silence):
     assert reckoning.carry(samples(later.stamp, 5)) is not None
 
 
-def test_it_ends_a_second_after_the_latest_sweep(estimate):
+def test_it_ends_a_second_after_the_latest_sweep(estimate: Any) -> None:
     reckoning = DeadReckoning(T_CLOUD_IMU)
     reckoning.reset(estimate)
     lasted = [
@@ -126,7 +130,7 @@ def test_it_ends_a_second_after_the_latest_sweep(estimate):
     assert lasted == [True] * 50 + [False] * 10
 
 
-def test_untrusted_gravity_holds_the_speed(estimate):
+def test_untrusted_gravity_holds_the_speed(estimate: Any) -> None:
     reckoning = DeadReckoning(np.eye(4))
     reckoning.reset(dataclasses.replace(estimate, gravity=np.zeros(3)))
     carried = reckoning.carry(samples(estimate.stamp, 10, linear_acceleration=[40.0, 0.0, 0.0]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from tests.support.odometry_runs import sweeps, truth
     ("scene", "motion", "cut"),
     [("room", "walk", "turn"), ("yard", "drone", "38 packets"), ("room", "trot", "half turn")],
 )
-def test_error_is_a_few_millimetres(scene, motion, cut):
+def test_error_is_a_few_millimetres(scene: str, motion: str, cut: str) -> None:
     run = recording(scene, motion)
     estimates = drive(run, cut)
     found = errors(run, estimates)
@@ -31,7 +32,7 @@ def test_error_is_a_few_millimetres(scene, motion, cut):
     assert not estimates[-1].status
 
 
-def test_every_sweep_has_its_estimate_at_its_middle():
+def test_every_sweep_has_its_estimate_at_its_middle() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
     estimates = drive(run)
@@ -39,7 +40,7 @@ def test_every_sweep_has_its_estimate_at_its_middle():
 
 
 @pytest.mark.parametrize("reference", ["start", "end"])
-def test_other_references_are_stamped_and_met(reference):
+def test_other_references_are_stamped_and_met(reference: str) -> None:
     run = recording("room", "walk")
     estimates = drive(run, config=OdometryConfig(reference=reference))
     some = list(sweeps(run, "turn"))
@@ -47,7 +48,7 @@ def test_other_references_are_stamped_and_met(reference):
     assert errors(run, estimates).max() < 0.02
 
 
-def test_covariance_and_twist_are_those_of_the_errors():
+def test_covariance_and_twist_are_those_of_the_errors() -> None:
     run = recording("room", "walk")
     estimates = drive(run)[8:]
     found = errors(run, estimates)
@@ -62,11 +63,11 @@ def test_covariance_and_twist_are_those_of_the_errors():
     assert np.abs(rate - moving.angular_velocity).max() < 0.1
 
 
-def sweep_epoch(run):
+def sweep_epoch(run: Any) -> Any:
     return int(run.imu["stamp"][0])
 
 
-def test_biases_and_up_are_found():
+def test_biases_and_up_are_found() -> None:
     run = recording("room", "walk")
     last = drive(run)[-1]
     assert np.abs(last.gyro_bias - [0.01, -0.02, 0.015]).max() < 0.01
@@ -74,7 +75,7 @@ def test_biases_and_up_are_found():
     assert last.gravity[2] < -9.7
 
 
-def test_the_cloud_is_the_one_of_the_stamp():
+def test_the_cloud_is_the_one_of_the_stamp() -> None:
     run = recording("room", "walk")
     estimates = drive(run)
     position, quaternion = truth(run, np.array([estimates[-1].stamp]))
@@ -90,7 +91,7 @@ def test_the_cloud_is_the_one_of_the_stamp():
         assert abs(np.median(ceiling[:, 2]) - 2.8) < 0.01
 
 
-def test_standing_still_stays_there():
+def test_standing_still_stays_there() -> None:
     run = recording("room", "still", 3.0)
     estimates = drive(run)
     way = np.array([item.T_map_lidar[:3, 3] for item in estimates])
@@ -98,7 +99,7 @@ def test_standing_still_stays_there():
     assert np.abs(estimates[-1].velocity).max() < 0.02
 
 
-def test_without_imu_it_holds_and_says_so():
+def test_without_imu_it_holds_and_says_so() -> None:
     run = recording("room", "walk")
     estimates = drive(run, imu=run.imu[:0])
     assert errors(run, estimates).max() < 0.04
@@ -106,7 +107,7 @@ def test_without_imu_it_holds_and_says_so():
     assert Status.GRAVITY_UNTRUSTED in estimates[-1].status
 
 
-def test_imu_gap_is_bridged_and_reported():
+def test_imu_gap_is_bridged_and_reported() -> None:
     run = recording("room", "walk")
     seconds = (run.imu["stamp"] - sweep_epoch(run)) * 1e-9
     estimates = drive(run, imu=run.imu[(seconds < 3.6) | (seconds > 4.1)])
@@ -115,7 +116,7 @@ def test_imu_gap_is_bridged_and_reported():
     assert Status.IMU_GAP not in estimates[-1].status
 
 
-def test_doubled_gravity_is_not_trusted_and_survived():
+def test_doubled_gravity_is_not_trusted_and_survived() -> None:
     run = recording("room", "walk")
     imu = run.imu.copy()
     imu["linear_acceleration"] *= 2.05
@@ -124,7 +125,7 @@ def test_doubled_gravity_is_not_trusted_and_survived():
     assert errors(run, estimates).max() < 0.04
 
 
-def test_blocked_sensor_is_predicted_with_growing_covariance():
+def test_blocked_sensor_is_predicted_with_growing_covariance() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
     blind = slice(15, 20)
@@ -141,14 +142,14 @@ def test_blocked_sensor_is_predicted_with_growing_covariance():
     assert errors(run, estimates).max() < 0.05
 
 
-def test_dropped_sweeps_are_survived():
+def test_dropped_sweeps_are_survived() -> None:
     run = recording("room", "walk")
     some = [one for k, one in enumerate(sweeps(run, "turn")) if not 12 <= k < 17]
     estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some)
     assert errors(run, estimates).max() < 0.03
 
 
-def test_corridor_tells_its_weak_direction():
+def test_corridor_tells_its_weak_direction() -> None:
     run = recording("corridor", "walk")
     estimates = drive(run)
     assert errors(run, estimates).max() < 0.05
@@ -160,7 +161,7 @@ def test_corridor_tells_its_weak_direction():
     assert any(Status.DEGENERATE in one.status for one in estimates)
 
 
-def test_a_sweep_that_is_not_later_is_refused():
+def test_a_sweep_that_is_not_later_is_refused() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
@@ -170,7 +171,7 @@ def test_a_sweep_that_is_not_later_is_refused():
     assert again.stamp == before.stamp
 
 
-def test_clock_that_goes_back_keeps_pose_and_map():
+def test_clock_that_goes_back_keeps_pose_and_map() -> None:
     run = recording("room", "still", 6.0)
     some = list(sweeps(run, "turn"))
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
@@ -190,7 +191,7 @@ def test_clock_that_goes_back_keeps_pose_and_map():
     assert np.sqrt(np.diag(estimates[-1].covariance)).min() > 0.3
 
 
-def test_a_map_begun_elsewhere_is_as_uncertain_as_the_way_there():
+def test_a_map_begun_elsewhere_is_as_uncertain_as_the_way_there() -> None:
     """Carried blindly into another place: five seconds without a match, then a new map."""
     room, yard = recording("room", "walk", 9.0), recording("yard", "walk", 9.0)
     at = room.imu["stamp"][0] + 2_500_000_000
@@ -208,7 +209,7 @@ def test_a_map_begun_elsewhere_is_as_uncertain_as_the_way_there():
 
 @pytest.mark.parametrize("count", [0, 1, 2, 9, 50])
 @pytest.mark.parametrize("mode", ["alone", "in the middle"])
-def test_thin_clouds_do_no_harm(count, mode):
+def test_thin_clouds_do_no_harm(count: int, mode: str) -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
@@ -220,7 +221,7 @@ def test_thin_clouds_do_no_harm(count, mode):
     assert rest[-1].is_aligned
 
 
-def test_equal_times_and_numbers_that_are_not_finite_do_no_harm():
+def test_equal_times_and_numbers_that_are_not_finite_do_no_harm() -> None:
     run = recording("room", "walk")
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
     some = list(sweeps(run, "turn"))
@@ -235,7 +236,7 @@ def test_equal_times_and_numbers_that_are_not_finite_do_no_harm():
     assert estimates[-1].is_aligned
 
 
-def test_reset_begins_again():
+def test_reset_begins_again() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
@@ -245,7 +246,7 @@ def test_reset_begins_again():
     np.testing.assert_array_equal(again[-1].T_map_lidar, first[-1].T_map_lidar)
 
 
-def test_extrapolation_leads_to_the_next_sweep():
+def test_extrapolation_leads_to_the_next_sweep() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
@@ -259,7 +260,7 @@ def test_extrapolation_leads_to_the_next_sweep():
     assert np.trace(ahead.covariance) > np.trace(last.covariance)
 
 
-def test_any_layout_with_times_will_do():
+def test_any_layout_with_times_will_do() -> None:
     run = recording("room", "walk")
     layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")]
     some = []
@@ -275,7 +276,7 @@ def test_any_layout_with_times_will_do():
     np.testing.assert_array_equal(plain[-1].T_map_lidar, full[-1].T_map_lidar)
 
 
-def test_imu_axes_follow_the_extrinsic():
+def test_imu_axes_follow_the_extrinsic() -> None:
     run = recording("room", "walk")
     turned = T_CLOUD_IMU.copy()
     turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]

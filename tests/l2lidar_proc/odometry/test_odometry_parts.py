@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ from tests.support.odometry_runs import sweeps
 RNG_SEED = 4
 
 
-def wall(x: float = 2.0):
+def wall(x: float = 2.0) -> Any:
     """Return points on a wall across x, with 1 cm of noise."""
     rng = np.random.default_rng(RNG_SEED)
     points = rng.uniform((x, -1.0, 0.0), (x, 1.0, 2.0), (4000, 3))
@@ -30,7 +32,7 @@ def wall(x: float = 2.0):
     return points
 
 
-def test_a_wall_becomes_surfaces_and_gives_distances():
+def test_a_wall_becomes_surfaces_and_gives_distances() -> None:
     surfaces = SurfelMap((0.25, 0.6))
     surfaces.add(wall(2.12))
     probe = np.array([[2.15, 0.1, 1.1], [2.09, -0.6, 0.4], [5.0, 5.0, 5.0]])
@@ -43,14 +45,14 @@ def test_a_wall_becomes_surfaces_and_gives_distances():
     assert (found.variances < 0.01**2).all()
 
 
-def test_points_of_one_line_are_no_surface():
+def test_points_of_one_line_are_no_surface() -> None:
     surfaces = SurfelMap((0.25,))
     line = np.linspace(0.0, 0.24, 200)[:, None] * [0.6, 0.8, 0.0]
     surfaces.add(line + 0.002 * np.random.default_rng(RNG_SEED).standard_normal((200, 3)))
     assert not len(surfaces.match(line).index)
 
 
-def test_a_full_cell_changes_no_more():
+def test_a_full_cell_changes_no_more() -> None:
     surfaces = SurfelMap((4.0,), capacity=1000)
     surfaces.add(wall())
     before = surfaces.match(np.array([[2.0, 0.5, 0.5]])).distances
@@ -58,7 +60,7 @@ def test_a_full_cell_changes_no_more():
     np.testing.assert_array_equal(surfaces.match(np.array([[2.0, 0.5, 0.5]])).distances, before)
 
 
-def test_far_cells_are_forgotten_and_the_rest_stays():
+def test_far_cells_are_forgotten_and_the_rest_stays() -> None:
     surfaces = SurfelMap((0.25,))
     surfaces.add(wall(2.12))
     surfaces.add(wall(52.12))
@@ -70,7 +72,7 @@ def test_far_cells_are_forgotten_and_the_rest_stays():
     assert len(surfaces) == count
 
 
-def test_trajectory_files_keep_nanoseconds():
+def test_trajectory_files_keep_nanoseconds() -> None:
     pose = np.eye(4)
     pose[:3, 3] = [1.0, -2.0, 0.5]
     trajectory = Trajectory()
@@ -86,7 +88,7 @@ def test_trajectory_files_keep_nanoseconds():
     assert tum(trajectory.poses[-1:]).startswith("1700000000.123457088 ")
 
 
-def test_the_start_keeps_roll_and_pitch_only():
+def test_the_start_keeps_roll_and_pitch_only() -> None:
     pose = np.eye(4)
     pose[:3, :3] = rotations.matrices(
         rotations.multiply(rotations.exp((0.0, 0.0, 1.0)), rotations.exp((0.1, 0.0, 0.0)))
@@ -99,7 +101,7 @@ def test_the_start_keeps_roll_and_pitch_only():
     )
 
 
-def test_base_frame_moves_with_the_arm():
+def test_base_frame_moves_with_the_arm() -> None:
     T_lidar_base = np.eye(4)
     T_lidar_base[:3, 3] = [-1.0, 0.0, 0.0]
     base = BaseFrame(T_lidar_base)
@@ -109,7 +111,7 @@ def test_base_frame_moves_with_the_arm():
     np.testing.assert_allclose(base.pose(turned)[:3, 3], [1.0, -1.0, 0.0], atol=1e-12)
 
 
-def test_thinning_keeps_one_point_per_voxel_and_says_which():
+def test_thinning_keeps_one_point_per_voxel_and_says_which() -> None:
     points = wall()
     kept = thinned_indices(points, 0.5)
     assert len(set(kept.tolist())) == len(kept)
@@ -117,7 +119,7 @@ def test_thinning_keeps_one_point_per_voxel_and_says_which():
     assert len(kept) == len(cells)
 
 
-def test_thinning_of_a_wall_at_one_x_names_every_point_it_keeps():
+def test_thinning_of_a_wall_at_one_x_names_every_point_it_keeps() -> None:
     rng = np.random.default_rng(RNG_SEED)
     points = rng.uniform((2.0, -3.0, 0.0), (2.0, 3.0, 3.0), (4000, 3))
     kept = thinned_indices(points, 0.2)
@@ -127,7 +129,7 @@ def test_thinning_of_a_wall_at_one_x_names_every_point_it_keeps():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 11])
-def test_plain_mode_survives_what_aborts_kiss_icp(count):
+def test_plain_mode_survives_what_aborts_kiss_icp(count: int) -> None:
     """Without the guards the process ends here, and all tests with it."""
     run = recording("room", "still", 3.0)
     whole = next(iter(sweeps(run, "turn")))
@@ -141,7 +143,7 @@ def test_plain_mode_survives_what_aborts_kiss_icp(count):
     assert np.isfinite(estimate.T_map_lidar).all()
 
 
-def test_plain_mode_leaves_out_points_with_their_times():
+def test_plain_mode_leaves_out_points_with_their_times() -> None:
     points = np.zeros(100, POINT)
     points["x"], points["time"] = np.linspace(1, 5, 100), np.linspace(0, 0.2, 100)
     points["y"][::7] = np.nan
@@ -162,12 +164,12 @@ def test_plain_mode_leaves_out_points_with_their_times():
         ({"odometry_topic": "my odometry"}, "odometry_topic"),
     ],
 )
-def test_settings_that_cannot_work_are_refused_by_name(values, name):
+def test_settings_that_cannot_work_are_refused_by_name(values: Any, name: str) -> None:
     with pytest.raises(SettingError, match=f"parameter '{name}': .*expected"):
         build(OdometryNodeConfig, values)
 
 
-def test_settings_refuse_what_cannot_be():
+def test_settings_refuse_what_cannot_be() -> None:
     with pytest.raises(SettingError, match="map_file"):
         build(OdometryNodeConfig, {"map_file": "map.txt"})
     with pytest.raises(SettingError, match="did you mean 'base_frame'"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from tests.support.odometry_runs import sweeps
 @pytest.mark.parametrize(
     ("place", "cut"), [("bushes", "turn"), ("poles", "turn"), ("poles", "38 packets")]
 )
-def test_foliage_and_poles_are_enough(place, cut):
+def test_foliage_and_poles_are_enough(place: str, cut: str) -> None:
     run = visited(place)
     estimates = drive(run, cut)
     assert len(estimates) == len(list(sweeps(run, cut)))
@@ -36,7 +37,7 @@ def test_foliage_and_poles_are_enough(place, cut):
 
 
 @pytest.mark.parametrize("cut", ["10 packets", "18 packets"])
-def test_short_sweeps_below_an_open_sky_are_enough(cut):
+def test_short_sweeps_below_an_open_sky_are_enough(cut: str) -> None:
     """A hundred points each; half the packets of a turn do not meet what the other half saw."""
     run = visited("poles")
     estimates = drive(run, cut)
@@ -46,14 +47,16 @@ def test_short_sweeps_below_an_open_sky_are_enough(cut):
 
 
 @pytest.mark.parametrize(("place", "cut"), [("bushes", "turn"), ("poles", "half turn")])
-def test_without_an_imu_foliage_and_poles_are_no_worse_than_for_kiss_icp(place, cut):
+def test_without_an_imu_foliage_and_poles_are_no_worse_than_for_kiss_icp(
+    place: str, cut: str
+) -> None:
     run = visited(place)
     estimates = drive(run, cut, imu=run.imu[:0])
     assert all(item.is_aligned for item in estimates)
     assert errors(run, estimates).max() < 0.25
 
 
-def test_the_cloud_of_a_first_part_of_a_turn_lies_where_it_says():
+def test_the_cloud_of_a_first_part_of_a_turn_lies_where_it_says() -> None:
     run = recording("room", "drone")
     some = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.1e9][:8]
     some[0] = dataclasses.replace(some[0], points=some[0].points[: len(some[0].points) // 2])
@@ -67,7 +70,7 @@ def test_the_cloud_of_a_first_part_of_a_turn_lies_where_it_says():
         assert np.percentile(distances, 80) < 0.03
 
 
-def test_in_foliage_it_can_start_in_motion():
+def test_in_foliage_it_can_start_in_motion() -> None:
     run = visited("bushes")
     moving = [one for one in sweeps(run, "turn") if one.start > run.imu["stamp"][0] + 3.5e9]
     estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, moving)
@@ -76,7 +79,7 @@ def test_in_foliage_it_can_start_in_motion():
     assert errors(run, estimates[5:]).max() < 0.06
 
 
-def test_a_turn_that_nobody_measured_is_found_again():
+def test_a_turn_that_nobody_measured_is_found_again() -> None:
     """Shaken, the rate at the beginning of a gap says nothing about its end."""
     run = shaken()
     seconds = (run.imu["stamp"] - run.imu["stamp"][0]) * 1e-9
@@ -87,7 +90,7 @@ def test_a_turn_that_nobody_measured_is_found_again():
     assert errors(run, before + after).max() < 0.02
 
 
-def test_a_long_blindness_ends_where_the_sensor_is():
+def test_a_long_blindness_ends_where_the_sensor_is() -> None:
     """Seconds without points, in which the sensor walks on: none of it may be taken for rest."""
     run = recording("room", "walk", 9.0)
     some = list(sweeps(run, "turn"))
@@ -102,13 +105,13 @@ def test_a_long_blindness_ends_where_the_sensor_is():
     assert all(item.velocity @ item.velocity > 0.2 for item in blind)
 
 
-def _placed(estimate: OdometryEstimate):
+def _placed(estimate: OdometryEstimate) -> Any:
     """Return the points of an estimate in the odometry frame, shape (N, 3)."""
     pose = estimate.T_map_lidar
     return xyz(estimate.points) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _corridor(rng: np.random.Generator, count: int):
+def _corridor(rng: np.random.Generator, count: int) -> Any:
     """Return points on the two walls, the floor and the ceiling of a corridor along x."""
     points = rng.uniform((-6.0, -1.0, -1.2), (6.0, 1.0, 1.2), (count, 3))
     side = rng.integers(0, 4, count)
@@ -117,7 +120,7 @@ def _corridor(rng: np.random.Generator, count: int):
     return points + 0.011 * rng.standard_normal((count, 3))
 
 
-def test_noise_does_not_tell_the_place_along_a_corridor():
+def test_noise_does_not_tell_the_place_along_a_corridor() -> None:
     rng = np.random.default_rng(SEED)
     surfaces = SurfelMap((0.15, 0.3, 0.6, 1.5))
     for _ in range(12):
@@ -136,7 +139,7 @@ def test_noise_does_not_tell_the_place_along_a_corridor():
     assert across[1:].max() < 0.01
 
 
-def test_a_pole_tells_two_directions_and_one_scan_line_none():
+def test_a_pole_tells_two_directions_and_one_scan_line_none() -> None:
     rng = np.random.default_rng(SEED)
     surfaces = SurfelMap((0.3,))
     angle, height = rng.uniform(0.0, 2.0 * np.pi, 120), rng.uniform(0.01, 0.29, 120)
@@ -156,7 +159,7 @@ def test_a_pole_tells_two_directions_and_one_scan_line_none():
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("noise", [0.03, 0.25])
-def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise, seed):
+def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise: float, seed: Any) -> None:
     """Units at rest were measured from 0.03 to 0.35 rad/s."""
     rng = np.random.default_rng(seed)
     run = recording("room", "walk")
@@ -170,7 +173,7 @@ def test_rest_is_told_from_a_walk_however_noisy_the_unit(noise, seed):
     assert not initial_state(moving, HostNs(int(moving["stamp"][100]))).at_rest
 
 
-def test_a_map_begun_again_is_a_new_one_in_the_same_memory():
+def test_a_map_begun_again_is_a_new_one_in_the_same_memory() -> None:
     points = [_corridor(np.random.default_rng(seed), 20_000) for seed in range(4)]
     again, fresh = SurfelMap((0.15, 0.6)), SurfelMap((0.15, 0.6))
     tracemalloc.start()

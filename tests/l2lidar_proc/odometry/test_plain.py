@@ -10,7 +10,7 @@ from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 
 
-def test_points_that_its_deskew_moves_across_the_limit_are_left_out():
+def test_points_that_its_deskew_moves_across_the_limit_are_left_out() -> None:
     # in motion, and with walls on both sides of the limit
     odometry = PlainOdometry(OdometryConfig(mode="plain", max_range=4.0))
     fewer = 0
@@ -20,7 +20,7 @@ def test_points_that_its_deskew_moves_across_the_limit_are_left_out():
         ranges = np.linalg.norm(xyz, axis=1)
         inside = np.count_nonzero((ranges >= odometry.config.min_range) & (ranges <= 4.0))
         assert len(found.points) <= inside
-        fewer += len(found.points) < inside
+        fewer += int(len(found.points) < inside)
         out = np.stack([found.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
         assert np.linalg.norm(out, axis=1).max() < 4.001
     assert fewer > 5

@@ -37,7 +37,7 @@ def turn() -> tuple[np.ndarray, np.ndarray]:
     return points, returned
 
 
-def test_every_real_point_finds_its_slot(turn):
+def test_every_real_point_finds_its_slot(turn: tuple[np.ndarray, np.ndarray]) -> None:
     points, returned = turn
     image = organise(points, points["time"])
     assert image.shape == returned.shape
@@ -45,7 +45,7 @@ def test_every_real_point_finds_its_slot(turn):
     np.testing.assert_array_equal(image["x"][returned], points["x"])
 
 
-def test_dust_is_found_and_the_scene_stays(turn):
+def test_dust_is_found_and_the_scene_stays(turn: tuple[np.ndarray, np.ndarray]) -> None:
     points, _ = turn
     config = FilterConfig()
     kept = filters.apply(points, ["isolated"], config)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def resting(seconds: float, noise: float) -> NDArray[np.void]:
 @pytest.mark.parametrize(
     ("number", "packets", "noise"), [(1, 50, 0.2), (2, 50, 0.04), (2, 38, 0.04), (1, 38, 0.04)]
 )
-def test_a_real_unit_at_rest_stays_where_it_is(number, packets, noise):
+def test_a_real_unit_at_rest_stays_where_it_is(number: int, packets: int, noise: float) -> None:
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
     odometry.imu(resting(6.0, noise))
     estimates = [one for sweep in captured(number, packets) for one in odometry.register(sweep)]
@@ -95,7 +96,9 @@ def creeping(path: Path, velocity: tuple[float, float, float], rate: float) -> s
     ("velocity", "rate"),
     [((0.012, -0.009, 0.0), 0.0), ((0.0, 0.0, 0.01), 0.0), ((0.0, 0.0, 0.0), np.radians(1.0))],
 )
-def test_a_sensor_that_creeps_is_followed_and_its_rests_stay(tmp_path, velocity, rate):
+def test_a_sensor_that_creeps_is_followed_and_its_rests_stay(
+    tmp_path: Path, velocity: Any, rate: Any
+) -> None:
     run = record("room", creeping(tmp_path / "creep.tum", velocity, rate), 1, RESTED + 10.0)
     estimates = drive(run)
     stamps = np.array([one.stamp for one in estimates])
@@ -112,7 +115,7 @@ def test_a_sensor_that_creeps_is_followed_and_its_rests_stay(tmp_path, velocity,
     assert np.ptp(way(estimates)[after]) < 1e-9
 
 
-def test_a_shock_ends_rest_at_once():
+def test_a_shock_ends_rest_at_once() -> None:
     run = record("room", "walk", 1, RESTED + 3.0)
     estimates = drive(run)
     stamps = np.array([one.stamp for one in estimates])

@@ -16,6 +16,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.ros.conversions import to_cloud, to_time
+from l2lidar_node.types import HostNs
 
 TIMEOUT_S = 120.0  # generous: only a failure waits that long
 FRAME = "l2lidar_link"
@@ -57,7 +58,7 @@ class Bench:
         rclpy.shutdown()
 
     def hear(
-        self, kind: type, topic: str, take: Callable[[Any], object], qos: QoSProfile | int = 50
+        self, kind: type, topic: str, take: Callable[..., object], qos: QoSProfile | int = 50
     ) -> None:
         """Have the peer listen to a topic."""
         self.peer.create_subscription(kind, topic, take, qos)
@@ -71,7 +72,7 @@ class Bench:
 
     def send_sample(self, sample: np.void, frame: str = IMU_FRAME) -> None:
         message = Imu()
-        message.header.stamp = to_time(int(sample["stamp"]))
+        message.header.stamp = to_time(HostNs(int(sample["stamp"])))
         message.header.frame_id = frame
         rate, force = message.angular_velocity, message.linear_acceleration
         rate.x, rate.y, rate.z = sample["angular_velocity"].tolist()
@@ -79,4 +80,4 @@ class Bench:
         self.imu_out.publish(message)
 
     def send_cloud(self, points: np.ndarray, stamp: int) -> None:
-        self.clouds_out.publish(to_cloud(points, stamp, FRAME))
+        self.clouds_out.publish(to_cloud(points, HostNs(stamp), FRAME))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,14 +46,14 @@ class DeskewBench(Bench):
         self.until(self.node._output.get_subscription_count)
         self.until(self.node._statistics.get_subscription_count)
 
-    def send_imu(self, samples, frame: str = IMU_FRAME) -> None:
+    def send_imu(self, samples: Any, frame: str = IMU_FRAME) -> None:
         window = self.node._pipeline.tracker.buffer
         for sample in samples:
             self.send_sample(sample, frame)
             last = int(sample["stamp"])
             self.until(lambda last=last: window.newest is not None and window.newest >= last)
 
-    def send_odometry(self, seconds: float, velocity, frame: str = FRAME) -> None:
+    def send_odometry(self, seconds: float, velocity: Any, frame: str = FRAME) -> None:
         message = Odometry(child_frame_id=frame)
         message.header.stamp = to_time(at(seconds))
         linear = message.twist.twist.linear
@@ -64,7 +66,7 @@ class DeskewBench(Bench):
 
 
 @pytest.fixture
-def bench(request):
+def bench(request: pytest.FixtureRequest) -> Iterator[Any]:
     made = DeskewBench(*getattr(request, "param", ()))
     yield made
     made.close()
@@ -85,7 +87,9 @@ def stop_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("bench", [("imu_wait_ms:=1000",)], indirect=True)
-def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(bench, monkeypatch):
+def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     prime(bench, 2.1)
     stop_time(monkeypatch)
     bench.send_odometry(2.0, WALK.velocity(np.array([2.0]))[0])
@@ -98,7 +102,7 @@ def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(bench, monkeyp
     assert from_time(cloud.header.stamp) == at(2.0)
     assert cloud.header.frame_id == FRAME
     deskewed = from_cloud(cloud)
-    assert "time" not in deskewed.dtype.names
+    assert "time" not in (deskewed.dtype.names or ())
     assert rms(xyz(points) - truth) > 0.3
     assert rms(xyz(deskewed) - truth) < 0.03
     bench.until(lambda: bench.statistics)
@@ -106,7 +110,7 @@ def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(bench, monkeyp
     assert values["velocity source"] == "odometry"
 
 
-def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench):
+def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench: Any) -> None:
     points, _ = seen(WALK, 0, 0.23, 0)
     bench.send_cloud(points, at(0.0))
     bench.until(lambda: bench.clouds)
@@ -118,7 +122,9 @@ def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench):
 
 
 @pytest.mark.parametrize("bench", [("imu_wait_ms:=1000", "point_layout:=velodyne")], indirect=True)
-def test_the_output_has_the_layout_asked_for_without_a_time(bench, monkeypatch):
+def test_the_output_has_the_layout_asked_for_without_a_time(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     prime(bench, 2.1)
     stop_time(monkeypatch)
     points, _ = seen(WALK, 2.0, 2.23, 2.0, count=3000)
@@ -130,7 +136,7 @@ def test_the_output_has_the_layout_asked_for_without_a_time(bench, monkeypatch):
     assert deskewed.dtype.itemsize == 22
 
 
-def test_a_cloud_without_plain_times_passes_with_the_reason(bench):
+def test_a_cloud_without_plain_times_passes_with_the_reason(bench: Any) -> None:
     points, _ = seen(WALK, 0, 0.23, 0)
     points["time"] = 0.05
     bench.send_cloud(points, at(0.0))
@@ -141,7 +147,7 @@ def test_a_cloud_without_plain_times_passes_with_the_reason(bench):
     )
 
 
-def test_mounts_come_from_tf(bench):
+def test_mounts_come_from_tf(bench: Any) -> None:
     bench.send_cloud(seen(WALK, 0, 0.23, 0)[0], at(0.0))
     bench.until(lambda: bench.clouds)
     mount = TransformStamped(child_frame_id="some_imu")
@@ -171,7 +177,7 @@ def test_mounts_come_from_tf(bench):
 @pytest.mark.parametrize(
     "bench", [("velocity_type:=twist", "velocity_topic:=twist")], indirect=True
 )
-def test_velocity_from_a_twist(bench):
+def test_velocity_from_a_twist(bench: Any) -> None:
     prime(bench, 0.1)
     message = TwistStamped()
     message.header.frame_id = FRAME
@@ -188,7 +194,7 @@ def test_velocity_from_a_twist(bench):
     [("keep_time:=true", "range_max:=8", "remove_boxes:=[0.,0.,0.,1.,1.,1.]")],
     indirect=True,
 )
-def test_filters_and_parameters_live(bench):
+def test_filters_and_parameters_live(bench: Any) -> None:
     points, _ = seen(WALK, 0, 0.23, 0)
     bench.send_cloud(points, at(0.0))
     bench.until(lambda: bench.clouds)
@@ -207,7 +213,7 @@ def test_filters_and_parameters_live(bench):
     assert result.successful, result.reason
 
 
-def test_a_driver_that_levels_is_denounced(bench):
+def test_a_driver_that_levels_is_denounced(bench: Any) -> None:
     bench.peer.declare_parameter("imu_adjust", True)
     bench.node._imu_adjust._ask()
     bench.until(lambda: "/peer" in bench.node._imu_adjust._clients)
@@ -227,7 +233,7 @@ def test_a_driver_that_levels_is_denounced(bench):
     bench.until(retracted)
 
 
-def test_a_wrong_parameter_is_refused_at_the_start():
+def test_a_wrong_parameter_is_refused_at_the_start() -> None:
     rclpy.init(args=["test", "--ros-args", "-p", "reference:=beginning"])
     try:
         with pytest.raises(SettingError, match="reference"):

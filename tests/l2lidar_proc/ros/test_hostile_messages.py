@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,36 +32,36 @@ WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
 
 
 @pytest.fixture(autouse=True)
-def _no_error_is_unforeseen(monkeypatch):
+def _no_error_is_unforeseen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let errors through that a node would survive but nobody foresaw."""
 
-    def failed(self, error):
+    def failed(self: Any, error: Any) -> None:
         raise error
 
     monkeypatch.setattr(inputs.InputMonitor, "failed", failed)
 
 
 @pytest.fixture(scope="module", params=[DeskewBench, OdometryBench], ids=["deskew", "odometry"])
-def bench(request):
+def bench(request: pytest.FixtureRequest) -> Iterator[Any]:
     """One node lives through all of it, and works at the end."""
     made = request.param()
     yield made
     made.close()
 
 
-def wait_for_text(bench, text: str) -> None:
+def wait_for_text(bench: Any, text: str) -> None:
     """Wait until the diagnostics say so; the next ones come within a second."""
     bench.diagnostics.clear()
     bench.until(lambda: any(text in status.message for status in bench.diagnostics))
 
 
-def wait_for_value(bench, text: str) -> None:
+def wait_for_value(bench: Any, text: str) -> None:
     """Wait until a figure of the diagnostics is called so."""
     bench.diagnostics.clear()
     bench.until(lambda: any(text in v.key for s in bench.diagnostics for v in s.values))
 
 
-def works(bench) -> None:
+def works(bench: Any) -> None:
     """Give the node good data and wait for what it makes of them."""
     run = recording("room", "walk")
     if isinstance(bench, OdometryBench):
@@ -99,12 +101,14 @@ def cloud_with(names: list[str], kind: str = "<f4", stamp: int | None = None) ->
         (["intensity"], "<f4", "field 'x' is missing"),
     ],
 )
-def test_clouds_without_positions_are_named(bench, names, kind, told):
+def test_clouds_without_positions_are_named(bench: Any, names: Any, kind: str, told: str) -> None:
     bench.clouds_out.publish(cloud_with(names, kind))
     wait_for_value(bench, told)
 
 
-def transform(child: str, parent: str, q=(0.0, 0.0, 0.0, 1.0), p=(0.0, 0.0, 0.0)):
+def transform(
+    child: str, parent: str, q: Any = (0.0, 0.0, 0.0, 1.0), p: Any = (0.0, 0.0, 0.0)
+) -> Any:
     item = TransformStamped(child_frame_id=child)
     item.header.frame_id = parent
     rotation, place = item.transform.rotation, item.transform.translation
@@ -123,7 +127,9 @@ def transform(child: str, parent: str, q=(0.0, 0.0, 0.0, 1.0), p=(0.0, 0.0, 0.0)
         ((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1e30), "1e+30 m long"),
     ],
 )
-def test_a_mount_that_cannot_be_is_refused_and_named(bench, q, p, told):
+def test_a_mount_that_cannot_be_is_refused_and_named(
+    bench: Any, q: Any, p: Any, told: str
+) -> None:
     bench.until(bench.tf_out.get_subscription_count)
     good = transform("else", "where", p=(1.0, 0.0, 0.0))
     bad = transform(IMU_FRAME, FRAME, q, p)
@@ -132,7 +138,7 @@ def test_a_mount_that_cannot_be_is_refused_and_named(bench, q, p, told):
     assert bench.node._frames.find("where", "else") is not None
 
 
-def test_mounts_in_a_circle_have_an_end(bench):
+def test_mounts_in_a_circle_have_an_end(bench: Any) -> None:
     bench.until(bench.tf_out.get_subscription_count)
     loop = [transform("a", "b"), transform("b", "c"), transform("c", "a"), transform("a", "a")]
     bench.tf_out.publish(TFMessage(transforms=loop))
@@ -140,14 +146,14 @@ def test_mounts_in_a_circle_have_an_end(bench):
     assert bench.node._frames.find("a", "nowhere") is None
 
 
-def test_clouds_of_90_seconds_are_refused_and_named(bench):
+def test_clouds_of_90_seconds_are_refused_and_named(bench: Any) -> None:
     points = seen(WALK, 0.0, 90.0, 0.0)[0]
     for number in range(7):
         bench.send_cloud(points, at(90.0 * number))
     wait_for_value(bench, "s is too long; up to 25 s")
 
 
-def test_clouds_of_another_frame_are_refused_while_the_first_come(bench):
+def test_clouds_of_another_frame_are_refused_while_the_first_come(bench: Any) -> None:
     points = seen(WALK, 0.0, 0.2, 0.0)[0]
     for number in range(5):
         bench.send_cloud(points, at(number))
@@ -156,13 +162,13 @@ def test_clouds_of_another_frame_are_refused_while_the_first_come(bench):
     assert bench.node._cloud_frame == FRAME
 
 
-def test_a_second_publisher_is_named(bench):
+def test_a_second_publisher_is_named(bench: Any) -> None:
     second = bench.peer.create_publisher(PointCloud2, "/points", 10)
     wait_for_text(bench, "2 publishers on /points: /peer, /peer")
     bench.peer.destroy_publisher(second)
 
 
-def test_stamps_that_go_back_are_named(bench):
+def test_stamps_that_go_back_are_named(bench: Any) -> None:
     points = seen(WALK, 0.0, 0.2, 0.0)[0]
     for start in (0.0, 0.127):
         bench.send_cloud(points, at(start))
@@ -170,7 +176,7 @@ def test_stamps_that_go_back_are_named(bench):
 
 
 @pytest.mark.parametrize(("seconds", "nanoseconds"), [(2**31 - 1, 999_999_999), (-(2**31), 0)])
-def test_a_stamp_at_the_end_of_time_is_refused(bench, seconds, nanoseconds):
+def test_a_stamp_at_the_end_of_time_is_refused(bench: Any, seconds: Any, nanoseconds: int) -> None:
     message = to_cloud(seen(WALK, 0.0, 0.2, 0.0)[0], HostNs(0), FRAME)
     message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
     if seconds < 0:  # and one just before it
@@ -184,7 +190,7 @@ def test_a_stamp_at_the_end_of_time_is_refused(bench, seconds, nanoseconds):
 
 
 @pytest.mark.parametrize("nanoseconds", [2**32 - 1])
-def test_a_sample_at_the_end_of_time_is_refused(bench, nanoseconds):
+def test_a_sample_at_the_end_of_time_is_refused(bench: Any, nanoseconds: Any) -> None:
     message = Imu()
     message.header.frame_id = IMU_FRAME
     message.header.stamp.sec, message.header.stamp.nanosec = 2**31 - 1, nanoseconds
@@ -192,7 +198,7 @@ def test_a_sample_at_the_end_of_time_is_refused(bench, nanoseconds):
     wait_for_value(bench, "IMU sample with a stamp that is out of range")
 
 
-def test_a_flat_and_a_half_cloud_are_named(bench):
+def test_a_flat_and_a_half_cloud_are_named(bench: Any) -> None:
     flat = seen(WALK, 0.0, 0.2, 0.0)[0]
     flat["z"] = 0.0
     bench.send_cloud(flat, at(0.0))
@@ -203,7 +209,9 @@ def test_a_flat_and_a_half_cloud_are_named(bench):
     wait_for_text(bench, "of 360 degrees of azimuth")
 
 
-def test_simulated_time_that_nobody_publishes_is_named_and_nothing_waits_for_it(bench):
+def test_simulated_time_that_nobody_publishes_is_named_and_nothing_waits_for_it(
+    bench: Any,
+) -> None:
     bench.node.set_parameters([Parameter("use_sim_time", value=True)])
     try:
         wait_for_text(bench, "use_sim_time is on, but nobody publishes /clock")
@@ -215,12 +223,12 @@ def test_simulated_time_that_nobody_publishes_is_named_and_nothing_waits_for_it(
         bench.node.set_parameters([Parameter("use_sim_time", value=False)])
 
 
-def test_stamps_far_from_the_nodes_clock_are_named(bench):
+def test_stamps_far_from_the_nodes_clock_are_named(bench: Any) -> None:
     bench.send_cloud(seen(WALK, 0.0, 0.2, 0.0)[0], at(0.0))
     wait_for_text(bench, "s behind the node's clock: with a recording set use_sim_time")
 
 
-def test_reasons_have_an_end(bench):
+def test_reasons_have_an_end(bench: Any) -> None:
     monitor = inputs.InputMonitor(bench.node, ())
     for number in range(1000):
         monitor.refuse(f"field '{number}'")
@@ -228,7 +236,7 @@ def test_reasons_have_an_end(bench):
     assert monitor.refused.total() == 1000
 
 
-def test_what_is_read_at_the_start_stays(bench):
+def test_what_is_read_at_the_start_stays(bench: Any) -> None:
     if isinstance(bench, DeskewBench):
         changes = {"cloud_topic": "/other", "use_tf": False}
     else:
@@ -241,5 +249,5 @@ def test_what_is_read_at_the_start_stays(bench):
         assert bench.node.describe_parameter(name).read_only
 
 
-def test_after_all_that_good_data_come_through(bench):
+def test_after_all_that_good_data_come_through(bench: Any) -> None:
     works(bench)

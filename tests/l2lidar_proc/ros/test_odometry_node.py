@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +13,8 @@ rclpy = pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402  after importorskip
 from geometry_msgs.msg import TransformStamped  # noqa: E402
-from nav_msgs.msg import Odometry, Path  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402  after importorskip
+from nav_msgs.msg import Path as PathMessage  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
@@ -30,7 +35,7 @@ class OdometryBench(Bench):
         super().__init__(OdometryNode, overrides)
         self.poses: list[Odometry] = []
         self.fast: list[Odometry] = []
-        self.paths: list[Path] = []
+        self.paths: list[PathMessage] = []
         self.maps: list[PointCloud2] = []
         self.registered: list[PointCloud2] = []
         self.transforms: list[TransformStamped] = []
@@ -40,7 +45,7 @@ class OdometryBench(Bench):
         self.sent: list[tuple[int, int]] = []
         self.hear(Odometry, "odometry", self._pose)
         self.hear(Odometry, "odometry_imu", self.fast.append)
-        self.hear(Path, "path", self.paths.append, LATCHED)
+        self.hear(PathMessage, "path", self.paths.append, LATCHED)
         self.hear(PointCloud2, "local_map", self.maps.append, LATCHED)
         self.hear(PointCloud2, "registered_points", self.registered.append)
         self.hear(TFMessage, "/tf", self._transform)
@@ -67,7 +72,7 @@ class OdometryBench(Bench):
         """Return the stamp that /tf had reached at an instant [ns]."""
         return max((stamp for sent, stamp in self.transforms_out if sent <= instant), default=0)
 
-    def send(self, run, some) -> None:
+    def send(self, run: Any, some: Any) -> None:
         """Send sweeps, each after the samples that cover it."""
         pipeline = self.node._pipeline
         first = 0
@@ -92,14 +97,14 @@ class OdometryBench(Bench):
 
 
 @pytest.fixture
-def bench(request, tmp_path):
+def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
     made = OdometryBench(f"data_dir:={tmp_path}", *getattr(request, "param", ()))
     yield made
     made.close()
 
 
 @pytest.mark.parametrize("bench", [("map_period_s:=0.2",)], indirect=True)
-def test_everything_that_is_published(bench, tmp_path):
+def test_everything_that_is_published(bench: Any, tmp_path: Path) -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))[:18]
     bench.send(run, some)
@@ -123,7 +128,7 @@ def test_everything_that_is_published(bench, tmp_path):
     assert (tf.header.frame_id, tf.child_frame_id) == ("odom", FRAME)
     assert tf.transform.translation.x == bench.poses[0].pose.pose.position.x
     assert bench.registered[-1].header.frame_id == "odom"
-    assert "time" not in from_cloud(bench.registered[-1]).dtype.names
+    assert "time" not in (from_cloud(bench.registered[-1]).dtype.names or ())
     bench.until(lambda: bench.maps and bench.fast and bench.paths)
     assert bench.maps[-1].width > 1000
     bench.until(lambda: bench.diagnostics)
@@ -146,7 +151,7 @@ def test_everything_that_is_published(bench, tmp_path):
     ],
     indirect=["bench"],
 )
-def test_a_base_that_is_not_on_tf_is_an_error_that_says_so(bench, words):
+def test_a_base_that_is_not_on_tf_is_an_error_that_says_so(bench: Any, words: str) -> None:
     bench.send(recording("room", "walk"), list(sweeps(recording("room", "walk"), "turn"))[:3])
     bench.until(lambda: any(words in status.message for status in bench.diagnostics))
     (first, *_) = [status for status in bench.diagnostics if words in status.message]
@@ -157,7 +162,7 @@ def test_a_base_that_is_not_on_tf_is_an_error_that_says_so(bench, words):
 @pytest.mark.parametrize(
     "bench", [("base_frame:=base_link", "invert_tf:=true", "odom_frame:=map")], indirect=True
 )
-def test_base_frame_from_tf_with_the_transform_inverted(bench):
+def test_base_frame_from_tf_with_the_transform_inverted(bench: Any) -> None:
     run = recording("room", "walk")
     mount = TransformStamped(child_frame_id=FRAME)
     mount.header.frame_id = "base_link"
@@ -175,7 +180,7 @@ def test_base_frame_from_tf_with_the_transform_inverted(bench):
     assert not bench.node._untied()
 
 
-def test_a_cloud_can_be_transformed_when_it_comes(bench):
+def test_a_cloud_can_be_transformed_when_it_comes(bench: Any) -> None:
     """RViz, Nav2 and others drop a cloud whose transform has not come yet."""
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))[:18]
@@ -200,7 +205,7 @@ def test_a_cloud_can_be_transformed_when_it_comes(bench):
 
 
 @pytest.mark.parametrize("bench", [("imu_rate:=0.0",)], indirect=True)
-def test_without_a_rate_there_is_one_transform_for_each_sweep(bench):
+def test_without_a_rate_there_is_one_transform_for_each_sweep(bench: Any) -> None:
     run = recording("room", "walk")
     bench.send(run, list(sweeps(run, "turn"))[:6])
     bench.until(lambda: len(bench.poses) == 6 and len(bench.transforms) == 6)
@@ -210,7 +215,7 @@ def test_without_a_rate_there_is_one_transform_for_each_sweep(bench):
 
 
 @pytest.mark.parametrize("bench", [("mode:=plain",)], indirect=True)
-def test_plain_kiss_icp(bench):
+def test_plain_kiss_icp(bench: Any) -> None:
     run = recording("room", "still", 3.0)
     bench.send(run, list(sweeps(run, "turn"))[:5])
     bench.until(lambda: len(bench.poses) == 5)
@@ -218,7 +223,7 @@ def test_plain_kiss_icp(bench):
     bench.until(lambda: len(bench.transforms) == 5)
 
 
-def test_a_cloud_that_cannot_be_used_is_told_of(bench):
+def test_a_cloud_that_cannot_be_used_is_told_of(bench: Any) -> None:
     run = recording("room", "still", 3.0)
     points = next(sweeps(run, "turn")).points.copy()
     points["time"] += 1e6

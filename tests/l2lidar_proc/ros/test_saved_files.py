@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
@@ -18,13 +22,13 @@ pytestmark = pytest.mark.ros
 
 
 @pytest.fixture
-def odometry(tmp_path):
+def odometry(tmp_path: Path) -> Iterator[Any]:
     made = OdometryBench(f"data_dir:={tmp_path}/data")
     yield made
     made.close()
 
 
-def works(bench) -> None:
+def works(bench: Any) -> None:
     """Give the node good data and wait for what it makes of them."""
     some = list(sweeps(recording("room", "walk"), "turn"))[:18]
     bench.poses.clear()
@@ -35,13 +39,15 @@ def works(bench) -> None:
 @pytest.mark.parametrize(
     "name", ["", ".", "..", "/etc/x.ply", "../x.ply", "a/b.ply", ".x.ply", "x\n.ply", "x" * 200]
 )
-def test_a_file_parameter_takes_names_only(name):
+def test_a_file_parameter_takes_names_only(name: Any) -> None:
     for parameter in ("map_file", "trajectory_file"):
         with pytest.raises(SettingError, match="is not a file name, expected up to 100 letters"):
             build(OdometryNodeConfig, {parameter: name})
 
 
-def test_an_error_that_nobody_foresaw_is_reported_and_survived(odometry, monkeypatch):
+def test_an_error_that_nobody_foresaw_is_reported_and_survived(
+    odometry: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pipeline = odometry.node._pipeline
     real = pipeline.sweep
     monkeypatch.setattr(pipeline, "sweep", lambda sweep, now: 1 / 0)
@@ -53,7 +59,9 @@ def test_an_error_that_nobody_foresaw_is_reported_and_survived(odometry, monkeyp
     works(odometry)
 
 
-def test_services_write_into_the_data_folder_and_overwrite_nothing(odometry, tmp_path):
+def test_services_write_into_the_data_folder_and_overwrite_nothing(
+    odometry: Any, tmp_path: Path
+) -> None:
     works(odometry)
     for name, files in (
         ("save_map", ["map.ply"]),
@@ -75,7 +83,7 @@ def test_services_write_into_the_data_folder_and_overwrite_nothing(odometry, tmp
     assert outside.read_text() == "mine"
 
 
-def test_a_folder_that_cannot_be_made_is_named(odometry, tmp_path):
+def test_a_folder_that_cannot_be_made_is_named(odometry: Any, tmp_path: Path) -> None:
     (tmp_path / "data").write_text("a file")
     works(odometry)
     for name in ("save_map", "save_trajectory"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.settings import build
-from l2lidar_node.types import POINT
+from l2lidar_node.types import POINT, HostNs
 from l2lidar_proc.config import DeskewNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
@@ -25,16 +26,16 @@ LENGTH = 0.23
 STARTS = [1.0, 1.5, 2.0, 2.5, 3.0]
 
 
-def header(seconds: float, frame: str):
+def header(seconds: float, frame: str) -> Any:
     sec, nanosec = divmod(at(seconds), 10**9)
     return T["std_msgs/msg/Header"](T["builtin_interfaces/msg/Time"](sec, nanosec), frame)
 
 
-def vector(values):
+def vector(values: Any) -> Any:
     return T["geometry_msgs/msg/Vector3"](*(float(v) for v in values))
 
 
-def imu(sample, frame="imu"):
+def imu(sample: Any, frame: str = "imu") -> Any:
     seconds = (int(sample["stamp"]) - at(0)) * 1e-9
     q = T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     none = np.zeros(9)
@@ -42,7 +43,7 @@ def imu(sample, frame="imu"):
     return T[bag.IMU](header(seconds, frame), q, none, rate, none, force, none)
 
 
-def odometry(seconds: float):
+def odometry(seconds: float) -> Any:
     velocity = WALK.velocity(np.array([seconds]))[0]
     pose = T["geometry_msgs/msg/PoseWithCovariance"](
         T["geometry_msgs/msg/Pose"](
@@ -57,12 +58,12 @@ def odometry(seconds: float):
     return T[bag.ODOMETRY](header(seconds, "odom"), "lidar", pose, twist)
 
 
-def points_at(start: float):
+def points_at(start: float) -> Any:
     return seen(WALK, start, start + LENGTH, start, count=2000)
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "walk"
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics = {
@@ -71,7 +72,7 @@ def recording(tmp_path_factory) -> Path:
         }  # fmt: skip
         lines = {t: writer.add_connection(t, kind, typestore=TYPES) for t, kind in topics.items()}
 
-        def write(topic: str, when: float, message) -> None:
+        def write(topic: str, when: float, message: Any) -> None:
             data = TYPES.serialize_cdr(message, topics[topic])
             writer.write(lines[topic], at(when), data)
 
@@ -83,19 +84,19 @@ def recording(tmp_path_factory) -> Path:
             write(topic, when, message)
     # clouds by the writer under test, which needs a bag of its own
     source = path.parent / "walk_with_clouds"
-    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as writer:
+    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as copy:
         ends = [start + LENGTH for start in STARTS]
         for connection, recorded, data in bag.messages(reader):
             while ends and recorded > at(ends[0]):
                 end = ends.pop(0)
                 start = STARTS[len(STARTS) - len(ends) - 1]
-                writer.cloud("/scan_points", at(end), points_at(start)[0], at(start), "lidar")
-            writer.copy(connection, recorded, data)
+                copy.cloud("/scan_points", at(end), points_at(start)[0], at(start), "lidar")
+            copy.copy(connection, recorded, bytes(data))
     return source
 
 
-def read(path: Path) -> dict[str, list]:
-    found: dict[str, list] = {}
+def read(path: Path) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
     with bag.open_bag(path) as reader:
         for connection, _, data in bag.messages(reader):
             message = reader.deserialize(data, connection.msgtype)
@@ -104,7 +105,9 @@ def read(path: Path) -> dict[str, list]:
 
 
 @pytest.mark.parametrize("name", ["out", "out.mcap"])
-def test_clouds_are_deskewed_and_the_rest_is_kept(recording, tmp_path, name):
+def test_clouds_are_deskewed_and_the_rest_is_kept(
+    recording: Path, tmp_path: Path, name: str
+) -> None:
     target = tmp_path / name
     counts, refused = deskew_recording(recording, target, DeskewNodeConfig())
     assert (counts.sweeps, counts.deskewed) == (5, 5)
@@ -118,12 +121,12 @@ def test_clouds_are_deskewed_and_the_rest_is_kept(recording, tmp_path, name):
         assert bag.stamp_of(message) == at(start)
         assert message.header.frame_id == "lidar"
         points = bag.points_of(message)
-        assert "time" not in points.dtype.names
+        assert "time" not in (points.dtype.names or ())
         raw, truth = points_at(start)
         assert rms(xyz(points) - truth) < rms(xyz(raw) - truth) / 5
 
 
-def test_the_command_line(run, recording, tmp_path):
+def test_the_command_line(run: Any, recording: Path, tmp_path: Path) -> None:
     parameters = tmp_path / "p.yaml"
     parameters.write_text(
         "deskew_node:\n  ros__parameters:\n    range_max: 6.0\n    organised: true\n"
@@ -137,7 +140,9 @@ def test_the_command_line(run, recording, tmp_path):
     assert not cloud.is_dense
 
 
-def test_the_command_line_refuses_what_is_in_the_way(run, recording, tmp_path):
+def test_the_command_line_refuses_what_is_in_the_way(
+    run: Any, recording: Path, tmp_path: Path
+) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "file").touch()
     for source, target, code, words in (
@@ -160,7 +165,9 @@ def test_the_command_line_refuses_what_is_in_the_way(run, recording, tmp_path):
         ("{", "parameter file"),
     ],
 )
-def test_a_wrong_parameter_file_is_explained(run, recording, tmp_path, text, words):
+def test_a_wrong_parameter_file_is_explained(
+    run: Any, recording: Path, tmp_path: Path, text: str, words: str
+) -> None:
     parameters = tmp_path / "p.yaml"
     parameters.write_text(text)
     done = run("deskew", str(recording), str(tmp_path / "y"), "--params-file", str(parameters))
@@ -171,7 +178,7 @@ def test_a_wrong_parameter_file_is_explained(run, recording, tmp_path, text, wor
     assert f"parameter file '{tmp_path}': Is a directory" in done.err
 
 
-def test_without_the_needed_topics_it_says_what_there_is(recording, tmp_path):
+def test_without_the_needed_topics_it_says_what_there_is(recording: Path, tmp_path: Path) -> None:
     source = tmp_path / "only"
     with bag.open_bag(recording) as reader, bag.BagWriter(source, TYPES) as writer:
         for connection, recorded, data in bag.messages(reader):
@@ -181,7 +188,9 @@ def test_without_the_needed_topics_it_says_what_there_is(recording, tmp_path):
         deskew_recording(source, tmp_path / "x", DeskewNodeConfig())
 
 
-def test_clouds_without_plain_times_are_passed_on_without_them(recording, tmp_path):
+def test_clouds_without_plain_times_are_passed_on_without_them(
+    recording: Path, tmp_path: Path
+) -> None:
     source = tmp_path / "odd"
     points = np.zeros(5, dtype=POINT)
     with bag.open_bag(recording) as reader, bag.BagWriter(source, TYPES) as writer:
@@ -196,7 +205,7 @@ def test_clouds_without_plain_times_are_passed_on_without_them(recording, tmp_pa
     assert "time" not in [item.name for item in cloud.fields]
 
 
-def test_without_a_velocity_our_odometry_finds_it(tmp_path):
+def test_without_a_velocity_our_odometry_finds_it(tmp_path: Path) -> None:
     walk = record(Scenario("walk", "walk", 1.0, world="box", seconds=6.0))
     shift = at(0) - int(walk.samples["stamp"][0])
     path = tmp_path / "imu"
@@ -207,19 +216,19 @@ def test_without_a_velocity_our_odometry_finds_it(tmp_path):
             data = TYPES.serialize_cdr(imu(sample), bag.IMU)
             writer.write(line, int(sample["stamp"]), data)
     source, target = tmp_path / "source", tmp_path / "target"
-    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as writer:
+    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as copy:
         waiting = [item.sweep for item in walk.sweeps]
-        for connection, recorded, data in bag.messages(reader):
+        for connection, recorded, raw in bag.messages(reader):
             while waiting and recorded > waiting[0].end + shift:
                 sweep = waiting.pop(0)
                 start = sweep.start + shift
-                writer.cloud("/points", recorded, sweep.points, start, "lidar")
-            writer.copy(connection, recorded, data)
+                copy.cloud("/points", recorded, sweep.points, HostNs(start), "lidar")
+            copy.copy(connection, recorded, bytes(raw))
     deskew_recording(source, target, DeskewNodeConfig())
     clouds = {bag.stamp_of(message): message for message in read(target)["/points_deskewed"]}
     late = [item for item in walk.sweeps[-6:] if item.sweep.start + shift in clouds]
     assert len(late) >= 5
     for item in late:
-        points = bag.points_of(clouds[item.sweep.start + shift])
+        points = bag.points_of(clouds[HostNs(item.sweep.start + shift)])
         assert rms(xyz(points) - item.at_start) < 0.01
         assert rms(xyz(item.sweep.points) - item.at_start) > 0.1

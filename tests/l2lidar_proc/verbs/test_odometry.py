@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
     return some
 
 
-def test_bag_in_trajectory_map_and_plot_out(run, tmp_path):
+def test_bag_in_trajectory_map_and_plot_out(run: Any, tmp_path: Path) -> None:
     from evo.tools import file_interface
 
     some = write_bag(tmp_path / "run.mcap", 14)
@@ -69,18 +70,18 @@ def test_bag_in_trajectory_map_and_plot_out(run, tmp_path):
     assert (tmp_path / "out" / "trajectory.png").stat().st_size > 1000
 
 
-def test_events_give_what_the_bag_gives(tmp_path):
+def test_events_give_what_the_bag_gives(tmp_path: Path) -> None:
     some = write_bag(tmp_path / "run.mcap", 8)
     from_bag = run_bag(tmp_path / "run.mcap", OdometryNodeConfig())
     run = recording("room", "walk")
-    events = [(sweep.end, sweep) for sweep in some]
+    events: list[Any] = [(sweep.end, sweep) for sweep in some]
     events += [(int(row["stamp"][0]), row) for row in run.imu[:600].reshape(-1, 1)]
     direct = run_events(iter(sorted(events, key=lambda event: event[0])), OdometryNodeConfig())
     assert len(direct.poses) == len(from_bag.poses) == 8
     np.testing.assert_allclose(direct.poses["pose"][-1], from_bag.poses["pose"][-1], atol=2e-3)
 
 
-def test_what_is_not_a_recording_is_refused(tmp_path):
+def test_what_is_not_a_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nothing: there is no such file"):
         run_bag(tmp_path / "nothing", OdometryNodeConfig())
     with pytest.raises(RecordingError, match=r"no rosbag2 folder: it has no metadata\.yaml"):
