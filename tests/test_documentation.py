@@ -87,7 +87,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page):
+def test_links_lead_somewhere(page: Any) -> None:
     for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text()):
         if "://" not in target:
             path = page.parent / target if target else page
@@ -96,17 +96,17 @@ def test_links_lead_somewhere(page):
                 assert anchor in anchors(path), f"{target}#{anchor}"
 
 
-def test_the_site_shows_every_page():
+def test_the_site_shows_every_page() -> None:
     """mkdocs builds what is in its list, the start page and the generated ones besides."""
     listed = set(re.findall(r"^ +- .*?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
     assert {page.name for page in (ROOT / "docs").glob("*.md")} <= listed
 
 
-def test_the_page_of_parameters_is_that_of_the_code():
+def test_the_page_of_parameters_is_that_of_the_code() -> None:
     assert pages.PAGE.read_text() == pages.parameters(), "run `make pages`"
 
 
-def test_the_first_screen_names_parameters_that_exist():
+def test_the_first_screen_names_parameters_that_exist() -> None:
     readme = (ROOT / "README.md").read_text()
     table = readme.partition("## The dozen parameters")[2].partition("\n## ")[0]
     names = re.findall(
@@ -117,5 +117,5 @@ def test_the_first_screen_names_parameters_that_exist():
     assert set(names) <= known
 
 
-def test_the_animation_is_small():
+def test_the_animation_is_small() -> None:
     assert (ROOT / "docs/demo.gif").stat().st_size < 1_000_000

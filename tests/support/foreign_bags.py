@@ -65,7 +65,7 @@ class Measured:
 
     def truth(self, stamps: NDArray[np.int64]) -> F64:
         """Return true places (N, 3) of the sensor [m]."""
-        return self.motion.poses((stamps - EPOCH) * 1e-9)[0]
+        return self.motion.poses(np.asarray((stamps - EPOCH) * 1e-9, np.float64))[0]
 
 
 @lru_cache(maxsize=4)
@@ -293,8 +293,8 @@ def _in_order(
     for stamp, cloud in clouds:
         end = stamp + round(float(cloud["time"][-1] - cloud["time"][0]) * 1e9)
         events.append((end, 1, stamp, cloud))
-    for _, _, stamp, cloud in sorted(events, key=lambda event: event[:2]):
-        yield stamp, cloud
+    for _, _, stamp, given_cloud in sorted(events, key=lambda event: event[:2]):
+        yield stamp, given_cloud
 
 
 def _xyz(cloud: Cloud, more: list[tuple[str, str]]) -> Cloud:

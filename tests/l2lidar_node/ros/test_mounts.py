@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -28,13 +31,13 @@ CEILING = 2.8  # of the built-in room
 BAND = 0.06  # [m] range noise and the onboard orientation's error included
 
 
-def heights(points, pose):
+def heights(points: Any, pose: Any) -> Any:
     """Return the heights of points (N,) above base_link's origin [m]."""
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1)
     return xyz @ pose[2, :3] + pose[2, 3]
 
 
-def is_upright(points, pose):
+def is_upright(points: Any, pose: Any) -> Any:
     """Return whether floor and ceiling are at their heights in base_link, and nothing beyond."""
     floor = pose[2, 3] - SENSOR_HEIGHT
     z = heights(points, pose)
@@ -45,7 +48,9 @@ def is_upright(points, pose):
 
 
 @pytest.mark.parametrize(("example", "emulated"), MOUNTS.items())
-def test_points_as_measured_are_upright_on_every_example_robot(example, emulated):
+def test_points_as_measured_are_upright_on_every_example_robot(
+    example: Any, emulated: Any
+) -> None:
     run = record("room", "still", 0, 1.0, mount=emulated)
     points = list(sweeps(run, "turn"))[1].points
     pose = mount(example)
@@ -61,7 +66,7 @@ def test_points_as_measured_are_upright_on_every_example_robot(example, emulated
 
 
 @pytest.fixture
-def node():
+def node() -> Iterator[Any]:
     rclpy.init()
     made = rclpy.create_node("driver")
     yield made
@@ -69,7 +74,7 @@ def node():
     rclpy.shutdown()
 
 
-def publish(node, monitor, message, frame):
+def publish(node: Any, monitor: Any, message: Any, frame: Any) -> None:
     """Publish static transforms and wait until the monitor has them."""
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(TFMessage, "/tf_static", latched)
@@ -85,8 +90,8 @@ def publish(node, monitor, message, frame):
     ("example", "tilt", "level"), [("top", 0.0, Level.OK), ("forward", 90.0, Level.WARN)]
 )
 def test_a_mount_that_is_not_level_is_warned_of_where_points_are_leveled(
-    node, example, tilt, level
-):
+    node: Any, example: str, tilt: float, level: Any
+) -> None:
     monitor = MountMonitor(node, FrameConfig().cloud)
     assert monitor.judge(True) is None, "no mount, nothing to say"
     publish(node, monitor, as_message(mount(example)), "base_link")
@@ -97,7 +102,7 @@ def test_a_mount_that_is_not_level_is_warned_of_where_points_are_leveled(
         assert "set imu_adjust: false" in monitor.judge(True).message
 
 
-def test_a_chain_of_frames_is_followed_and_loops_and_damage_are_not(node):
+def test_a_chain_of_frames_is_followed_and_loops_and_damage_are_not(node: Any) -> None:
     monitor = MountMonitor(node, "lidar")
     chain = TFMessage()
     for parent, child, roll in (("base", "mast", 40.0), ("mast", "lidar", -40.0 + MAX_TILT_DEG)):
@@ -119,7 +124,7 @@ def test_a_chain_of_frames_is_followed_and_loops_and_damage_are_not(node):
     assert np.isfinite(monitor.tilt_deg()[1])
 
 
-def test_the_driver_warns_and_its_points_come_upright_once_told():
+def test_the_driver_warns_and_its_points_come_upright_once_told() -> None:
     """The example that looks ahead, with the driver's own defaults first."""
     pose = mount("forward")
     with open_rig() as rig:
@@ -130,7 +135,7 @@ def test_the_driver_warns_and_its_points_come_upright_once_told():
         rig.driver(imu_adjust=True, sweep_cut="turn")
         checks = rig.observer
 
-        def mount_check():
+        def mount_check() -> Any:
             return checks.checks.get("mount", {})
 
         rig.wait_for(lambda: "is applied twice" in mount_check().get("message", ""), "a warning")

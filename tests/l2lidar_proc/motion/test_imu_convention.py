@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.motion.imu_convention import ImuConvention
 
 
-def samples_of(motion, seconds: float, factor: float = 1.0) -> np.ndarray:
+def samples_of(motion: Any, seconds: float, factor: float = 1.0) -> np.ndarray:
     raw, times = Inertial(motion, ImuNoise(), 3).samples(0, int(250 * seconds))
     samples = np.zeros(len(raw), IMU_SAMPLE)
     samples["stamp"] = np.round(times * 1e9).astype(np.int64)

@@ -232,7 +232,7 @@ def test_a_cloud_that_cannot_be_used_is_told_of(bench: Any) -> None:
     assert not bench.call("save_map").success
 
 
-def test_what_other_sensors_do_differently_is_recognized_and_said(bench):
+def test_what_other_sensors_do_differently_is_recognized_and_said(bench: Any) -> None:
     run = recording("room", "still", 3.0)
     some = list(sweeps(run, "turn"))[:5]
     in_g = run.imu.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_livox_bytes_are_read_as_a_general_reader_reads_them(tmp_path: Path) -> 
     )
     with bag.open_bag(tmp_path / "bag") as reader:
         _, _, data = next(bag.messages(reader))
-        message = reader.deserialize(data, LIVOX)
+        message: Any = reader.deserialize(data, LIVOX)
     frame, stamp, points = bag.livox_points(data)
     assert (frame, stamp) == ("frame", bag.stamp_of(message))
     assert points["offset_time"].tolist() == [point.offset_time for point in message.points]
@@ -96,7 +97,7 @@ def test_livox_bytes_are_read_as_a_general_reader_reads_them(tmp_path: Path) -> 
             bag.livox_points(data[:cut])
 
 
-def test_without_an_imu_it_runs_and_says_so(run, tmp_path: Path) -> None:
+def test_without_an_imu_it_runs_and_says_so(run: Any, tmp_path: Path) -> None:
     given = measured()
     write_bag(tmp_path / "bag", given, put_ouster, imu=None)
     done = run("odometry", str(tmp_path / "bag"), str(tmp_path / "out"))
