@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from typing import Any
 
 import numpy as np
 from hypothesis import example, given, settings
@@ -42,7 +43,7 @@ def offsets(who: str, by: int, number: int, when: int) -> tuple[int, int]:
     }[who]
 
 
-def shifted(samples, by: int):
+def shifted(samples: Any, by: int) -> Any:
     moved = samples.copy()
     moved["stamp"] += by
     return moved
@@ -78,7 +79,7 @@ class Deskewing:
 @example(YEAR_NS, "one cloud", 5)
 @example(-int(EPOCH), "both", 5)
 @example(YEAR_NS, "one sample", 5)
-def test_deskew_goes_on_after_any_jump(by, who, when):
+def test_deskew_goes_on_after_any_jump(by: Any, who: Any, when: Any) -> None:
     deskewing = Deskewing()
     tracemalloc.start()
     for number in range(14):
@@ -106,7 +107,7 @@ IMU = recording("room", "walk").imu
 @example(-YEAR_NS, "one cloud")
 @example(YEAR_NS, "one sample")
 @example(-int(ROOM[0].start), "both")
-def test_odometry_goes_on_after_any_jump(by, who):
+def test_odometry_goes_on_after_any_jump(by: Any, who: Any) -> None:
     when, pipeline, first, poses = 9, OdometryPipeline(OdometryConfig(), T_CLOUD_IMU), 0, []
     tracemalloc.start()
     for number, sweep in enumerate(ROOM[:22]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -83,7 +84,7 @@ def rig() -> Iterator[Rig]:
     rclpy.shutdown()
 
 
-def test_while_a_device_does_not_acknowledge_everything_else_goes_on(rig):
+def test_while_a_device_does_not_acknowledge_everything_else_goes_on(rig: Rig) -> None:
     """The command is repeated for 1.2 s; other calls are answered before that."""
     pending = [rig.enable.call_async(SetBool.Request(data=value)) for value in (True, False)]
     assert rig.answers()
@@ -94,11 +95,13 @@ def test_while_a_device_does_not_acknowledge_everything_else_goes_on(rig):
         assert "did not acknowledge" in future.result().message
 
 
-def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(rig, monkeypatch):
+def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(driver_node, "_ANSWER_TIMEOUT_S", 0.5)
     free, held = threading.Event(), threading.Event()
 
-    def hang(driver, now):
+    def hang(driver: Any, now: Any) -> None:
         held.set()
         free.wait()
 
@@ -120,7 +123,7 @@ def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(rig, monkeyp
     assert not any("has not answered" in text for text in rig.said[-5:])
 
 
-def test_a_host_clock_after_2038_ends_nothing(rig):
+def test_a_host_clock_after_2038_ends_nothing(rig: Rig) -> None:
     rig.until(rig.node._cloud_publisher.get_subscription_count)
     points = seen(Motion(), 0.0, 0.2, 0.0)[0]
     for start in (LAST_STAMP + 1, 2_000_000_000_000_000_000):
