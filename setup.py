@@ -77,6 +77,7 @@ setup(
             "l2lidar_node = l2lidar_node.programs:l2lidar_node",
             "l2lidar_emulator = l2lidar_node.programs:l2lidar_emulator",
             "deskew_node = l2lidar_proc.programs:deskew_node",
+            "companion_node = l2lidar_proc.programs:companion_node",
             "odometry_node = l2lidar_proc.programs:odometry_node",
             "l2lidar = l2lidar_node.programs:l2lidar",
         ],

@@ -1,4 +1,4 @@
-"""Starts the whole chain: a virtual L2, the driver, deskew and odometry nodes."""
+"""Starts the whole chain: a virtual L2, the driver, and deskew and odometry in one process."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ EMULATOR: Final = "l2lidar_node.emulator"
 DRIVER: Final = "l2lidar_node.ros.driver_node"
 DESKEW: Final = "l2lidar_proc.ros.deskew_node"
 ODOMETRY: Final = "l2lidar_proc.ros.odometry_node"
+COMPANION: Final = "l2lidar_proc.ros.companion_node"  # both in one process, as launched
 
 
 def start(
     programs: Programs,
     unit: Sequence[str],
     values: Mapping[str, object] | None = None,
-    nodes: Sequence[str] = (DRIVER, DESKEW, ODOMETRY),
+    nodes: Sequence[str] = (DRIVER, COMPANION),
 ) -> dict[str, Program]:
     """Start the nodes that there are and then a unit; return them by name.
 

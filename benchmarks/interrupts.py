@@ -122,6 +122,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
         "driver_node": ["l2lidar_node.ros.driver_node", *assigned(values)],
         "deskew_node": ["l2lidar_proc.ros.deskew_node"],
         "odometry_node": ["l2lidar_proc.ros.odometry_node"],
+        "companion_node": ["l2lidar_proc.ros.companion_node"],
         "emulator": ["l2lidar_node.emulator", "--ready", *ends],
         "demo": ["l2lidar_node.demo", "--duration", "60", "--folder", str(folder / name)],
         "l2lidar monitor": ["l2lidar_node.cli.main", "monitor", *network],

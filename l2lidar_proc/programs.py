@@ -10,6 +10,11 @@ def deskew_node() -> int:
     return run("l2lidar_proc.ros.deskew_node")
 
 
+def companion_node() -> int:
+    """Run deskew and odometry in one process."""
+    return run("l2lidar_proc.ros.companion_node")
+
+
 def odometry_node() -> int:
     """Run the odometry node."""
     return run("l2lidar_proc.ros.odometry_node")

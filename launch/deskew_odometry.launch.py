@@ -17,30 +17,32 @@ from l2lidar_node.ros.launching import (
 
 
 def launch_setup(context):
-    """Return deskew, and odometry where it is asked for."""
+    """Return deskew alone, or one process that hosts it and the odometry."""
     given = context.launch_configurations
-    file = file_given(context, "proc_params_file")
     is_respawned = given["respawn"] == "true"
-    common = {"use_sim_time": True} if given["use_sim_time"] == "true" else {}
-    nodes = {"deskew_node": common}
+    parameters = [file_given(context, "proc_params_file")]
+    if given["use_sim_time"] == "true":
+        parameters.append({"use_sim_time": True})
+    ros_arguments = ["--log-level", LaunchConfiguration("log_level")]
+    name = {"executable": "deskew_node", "name": "deskew_node"}
     if given["odometry"] == "true":
-        frames = parameters_given(context, ["odom_frame", "base_frame"])
-        nodes["odometry_node"] = {**common, **frames}
+        # Without a name: the process hosts deskew_node and odometry_node.
+        name = {"executable": "companion_node"}
+        for frame, value in parameters_given(context, ["odom_frame", "base_frame"]).items():
+            ros_arguments += ["-p", f"odometry_node:{frame}:={value}"]
     return [
         Node(
             package="l2lidar_node",
-            executable=name,
-            name=name,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[file, *([parameters] if parameters else [])],
+            parameters=parameters,
             remappings=DRIVER_REMAPPINGS,
-            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+            ros_arguments=ros_arguments,
             output="screen",
             respawn=is_respawned,
             respawn_delay=RESPAWN_DELAY_S,
             on_exit=required(is_respawned),
+            **name,
         )
-        for name, parameters in nodes.items()
     ]
 
 

@@ -46,7 +46,7 @@ def launch_setup(context):
         replay["replay_rate"] = float(given["rate"])
     except ValueError:
         raise RuntimeError(f"rate:={given['rate']} is not a number") from None
-    companions = ["deskew_node", "odometry_node"] if is_followed else []
+    companions = ["companion_node"] if is_followed else []
     return [
         # At the end of the recording map and path stay to be looked at.
         Node(
@@ -59,7 +59,6 @@ def launch_setup(context):
         *(
             Node(
                 executable=name,
-                name=name,
                 parameters=[file_given(context, "proc_params_file"), RECORDED_TIME],
                 on_exit=required(),
                 **common,

@@ -53,15 +53,15 @@ STARTS = {
     "l2lidar": ["l2lidar_node"],
     "rviz": ["rviz2"],
     "l2lidar_with_rviz": ["rviz2", "l2lidar_node"],
-    "deskew_odometry": ["l2lidar_node", "deskew_node", "odometry_node"],
+    "deskew_odometry": ["l2lidar_node", "companion_node"],
     "lio_input": ["l2lidar_node"],
-    "replay": ["l2lidar_node", "deskew_node", "odometry_node"],
+    "replay": ["l2lidar_node", "companion_node"],
     "l2_top_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
     "l2_forward_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
     "multi": ["l2lidar_node", "l2lidar_node"],
 }
 NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": str(ROOT / "README.md")}}
-OURS = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node"}
+OURS = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "companion_node"}
 
 # The folder launch/ of this repository looks like an empty package: ask for more of the real one.
 try:
@@ -478,9 +478,13 @@ def test_one_file_starts_several_sensors(launched: Any) -> None:
     assert len({port for pair in ports for port in pair}) == 4
     assert len(made.processes) == 2
     odoms = [
-        node.parameters["odom_frame"] for node in made.nodes if node.executable == "odometry_node"
+        text
+        for node in made.nodes
+        if node.executable == "companion_node"
+        for text in node.words
+        if "odom_frame" in text
     ]
-    assert odoms == ["front_odom", "rear_odom"]
+    assert odoms == [f"odometry_node:odom_frame:={side}_odom" for side in ("front", "rear")]
 
 
 @needs_launch
@@ -491,9 +495,10 @@ def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched: Any) 
     assert values["sweep_cut"] == "turn"
     other = launched("deskew_odometry", sweep_cut="half_turn")
     assert other.node("l2lidar_node").parameters["sweep_cut"] == "half_turn"
-    assert "odometry_node" not in launched("deskew_odometry", odometry="false").executables
-    framed = launched("deskew_odometry", base_frame="base_link").node("odometry_node")
-    assert framed.parameters["base_frame"] == "base_link"
+    alone = launched("deskew_odometry", odometry="false").executables
+    assert alone == ["l2lidar_node", "deskew_node"]
+    framed = launched("deskew_odometry", base_frame="base_link").node("companion_node")
+    assert "odometry_node:base_frame:=base_link" in framed.words
 
 
 @needs_launch
@@ -521,7 +526,7 @@ def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched: Any) 
     assert values["replay_loop"] is False
     assert values["imu_adjust"] is False
     assert "use_sim_time" not in values, "the driver makes that time"
-    for name in ("deskew_node", "odometry_node", "rviz2"):
+    for name in ("companion_node", "rviz2"):
         assert made.node(name).parameters["use_sim_time"] is True
     made = launched("replay", deskew_odometry="false", loop="true")
     assert made.executables == ["l2lidar_node"]

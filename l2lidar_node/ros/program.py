@@ -139,12 +139,20 @@ class StartError(RuntimeError):
 def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> int:
     """Make a node, spin it until it is told to end, and return the exit code.
 
+    See :func:`run_nodes`.
+    """
+    return run_nodes(name, lambda: [make()], args)
+
+
+def run_nodes(name: str, make: Callable[[], list[Node]], args: list[str] | None = None) -> int:
+    """Make the nodes of a process, spin them until told to end, and return the exit code.
+
     Parameters
     ----------
     name : str
         Of the program, before its messages.
     make : callable
-        Makes the node. It may raise :class:`SettingError` or :class:`StartError`.
+        Makes the nodes. It may raise :class:`SettingError` or :class:`StartError`.
     args : list of str, optional
         Command line, the program's name first; that of the process if left out.
 
@@ -152,15 +160,15 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
     -------
     int
         0 after ``--help`` and after a signal, which until rclpy is there ends the process; the
-        node's ``exit_code`` where it has one and ended itself; 1 for a :class:`StartError`; 2 for
-        wrong arguments.
+        largest ``exit_code`` of nodes that have one and ended themselves; 1 for a
+        :class:`StartError`; 2 for wrong arguments.
     """
     end_by_signal()
     argv = sys.argv if args is None else args
     if wants_help(argv):
         print(USAGE.format(name=name))
         return 0
-    node = None
+    nodes: list[Node] = []
     # What rclpy says of a node that a signal interrupts while it is being made.
     warnings.filterwarnings("ignore", "Failed to fini", RuntimeWarning)
     try:
@@ -168,8 +176,9 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
         # Before there are handlers: made after a signal, it leaves a trace when it goes.
         executor = SingleThreadedExecutor()
         install_signal_handlers()  # from here on a signal shuts rclpy down and does nothing else
-        node = make()
-        executor.add_node(node)
+        nodes = make()
+        for node in nodes:
+            executor.add_node(node)
         # Or every full collection walks all that was imported, and takes 20 ms on a slow core.
         gc.freeze()
         executor.spin()
@@ -192,8 +201,8 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
         # A signal came while something was being made or used: rclpy has no better word for it.
     finally:
         # Its handlers stay: a signal that comes again does nothing.
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
         ignore_signals()
-    return int(getattr(node, "exit_code", 0))
+    return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)

@@ -5,6 +5,7 @@ Composes sequencer, tracker, filters and deskew; node, offline tool and tests al
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -21,7 +22,7 @@ from l2lidar_proc.deskew.organise import organise
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
-from l2lidar_proc.motion.tracker import Flag, MotionTracker, Quality
+from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, Quality
 
 _MS: Final = 1_000_000
 
@@ -87,6 +88,8 @@ class Pipeline:
     Attributes
     ----------
     tracker : MotionTracker
+    odometry_motion : callable or None
+        Returns the motion that an odometry in the same process has estimated for a sweep.
     counts : PipelineCounts
     problems : str
         What the last filter that could not work said.
@@ -97,6 +100,7 @@ class Pipeline:
         self._sequencer = Sequencer(config.deskew.imu_wait_ms * _MS)
         self.counts = PipelineCounts()
         self.problems = ""
+        self.odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
         self.configure(config)
 
     def configure(self, config: ProcConfig) -> None:
@@ -121,9 +125,11 @@ class Pipeline:
             self._jumped()
             self._sequencer.jump()
 
-    def velocity(self, stamp: HostNs, velocity: ArrayLike, source: str) -> bool:
-        """Take a velocity of the cloud origin, cloud axes [m/s]; return whether it is of use."""
-        return self.tracker.velocity(stamp, velocity, source)
+    def velocity(
+        self, stamp: HostNs, velocity: ArrayLike, source: str, covariance: F64 | None = None
+    ) -> bool:
+        """Take a velocity; see :meth:`l2lidar_proc.motion.tracker.MotionTracker.velocity`."""
+        return self.tracker.velocity(stamp, velocity, source, covariance)
 
     def sweep(self, sweep: Sweep, now: int) -> None:
         """Take a sweep that arrives at ``now`` [ns]."""
@@ -151,7 +157,8 @@ class Pipeline:
 
     def _process(self, release: Release) -> Deskewed:
         sweep = release.sweep
-        trajectory, quality = self.tracker.trajectory(sweep.start, sweep.end)
+        known = self.odometry_motion(sweep) if self.odometry_motion is not None else None
+        trajectory, quality = self.tracker.trajectory(sweep.start, sweep.end, known)
         if release.reason is Reason.CLOCK_JUMP:
             quality = replace(quality, flags=(*quality.flags, Flag.CLOCK_JUMP))
         deskews = Flag.NO_IMU not in quality.flags

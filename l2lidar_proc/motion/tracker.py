@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +28,7 @@ class Flag(Enum):
     NO_VELOCITY = "no velocity is known, so rotation only"
     ACCELEROMETER_FAULT = "the size of gravity is wrong, as after a start on the side"
     CLOCK_JUMP = "the clock jumped while the sweep waited"
+    PREDICTED_VELOCITY = "the odometry did not align the sweep, so its velocity is a prediction"
     FILTER_LEFT_OUT = "a filter could not work on these points, so its chain was left out"
 
 
@@ -65,6 +67,20 @@ class Quality:
     is_still: bool
     is_gravity_trusted: bool
     flags: tuple[Flag, ...]
+
+
+class KnownMotion(NamedTuple):
+    """Motion of a sweep that an odometry in the same process has estimated.
+
+    Attributes
+    ----------
+    trajectory : SweepTrajectory
+    is_aligned : bool
+        The sweep itself was aligned; otherwise its motion is predicted.
+    """
+
+    trajectory: SweepTrajectory
+    is_aligned: bool
 
 
 class MotionTracker:
@@ -147,13 +163,23 @@ class MotionTracker:
         """Gyro bias [rad/s], IMU axes, shape (3,); zero while nothing is known."""
         return np.asarray(self.filter.gyro_bias @ self._T_cloud_imu[:3, :3])
 
-    def trajectory(self, start: HostNs, end: HostNs) -> tuple[SweepTrajectory, Quality]:
+    def trajectory(
+        self, start: HostNs, end: HostNs, known: KnownMotion | None = None
+    ) -> tuple[SweepTrajectory, Quality]:
         """Return the trajectory from ``start`` (or earlier) to ``end``, and how good it is.
 
         A sensor at rest, or one without any IMU sample near, has a trajectory that does not move.
+
+        Parameters
+        ----------
+        start, end : HostNs
+        known : KnownMotion, optional
+            Motion of this very sweep; it takes the place of everything known here.
         """
         covered, gap = coverage(self.buffer.samples["stamp"], start, end)
         flags = self._flags(start, end, gap)
+        if known is not None:
+            return known.trajectory, self._quality_of(known, start, end, covered, gap, flags)
         if Flag.NO_IMU in flags:
             still = still_trajectory(start, end)
             return still, self._quality(covered, gap, still=False, flags=flags)
@@ -161,19 +187,46 @@ class MotionTracker:
             still = still_trajectory(start, end)
             return still, self._quality(covered, gap, still=True, flags=flags)
         newest = self.filter.newest_twist
-        known = self.filter.knows_velocity(start, self._config.velocity_max_age_ms * 1_000_000)
-        if not known:
+        has_velocity = self.filter.knows_velocity(
+            start, self._config.velocity_max_age_ms * 1_000_000
+        )
+        if not has_velocity:
             flags = (*flags, Flag.NO_VELOCITY)
-        found = self.filter.trajectory(start, end, self._config.hold_ms * 1_000_000, known)
+        found = self.filter.trajectory(start, end, self._config.hold_ms * 1_000_000, has_velocity)
         turned_by, moved_by = found.between(start, end)
         return found, self._quality(
             covered,
             gap,
             rotation=float(np.linalg.norm(rotations.log(turned_by))),
             translation=float(np.linalg.norm(moved_by)),
-            age=max(int(end - newest), 0) if known and newest is not None else None,
+            age=max(int(end - newest), 0) if has_velocity and newest is not None else None,
             flags=flags,
         )
+
+    def _quality_of(
+        self,
+        known: KnownMotion,
+        start: HostNs,
+        end: HostNs,
+        covered: float,
+        gap: int,
+        flags: tuple[Flag, ...],
+    ) -> Quality:
+        """Return the quality of a motion from an odometry, which can do without the IMU."""
+        flags = tuple(Flag.IMU_GAP if flag is Flag.NO_IMU else flag for flag in flags)
+        if not known.is_aligned:
+            flags = (*flags, Flag.PREDICTED_VELOCITY)
+        turned_by, moved_by = known.trajectory.between(start, end)
+        quality = self._quality(
+            covered,
+            gap,
+            rotation=float(np.linalg.norm(rotations.log(turned_by))),
+            translation=float(np.linalg.norm(moved_by)),
+            age=0,
+            still=known.trajectory.is_still,
+            flags=flags,
+        )
+        return replace(quality, velocity_source="odometry")
 
     def _is_still(self, start: HostNs, end: HostNs) -> bool:
         speed = self.filter.speed_near(end, self._config.velocity_max_age_ms * 1_000_000)

@@ -13,12 +13,15 @@ from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_convention import ImuConvention
 from l2lidar_proc.motion.sequencer import Sequencer
+from l2lidar_proc.motion.sweep_trajectory import still_trajectory
+from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
-from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.plain import PlainOdometry
 from l2lidar_proc.recording.trajectory import Trajectory
 
 _MS: Final = 1_000_000
+_MOTIONS: Final = 32  # sweeps whose motion is remembered
 
 
 class OdometryPipeline:
@@ -87,9 +90,30 @@ class OdometryPipeline:
         self._sequencer = Sequencer(self._wait_ns)
         self.convention.forget_motion()
         self.trajectory = Trajectory()
+        self._motions: dict[tuple[HostNs, HostNs], KnownMotion] = {}
         self.sweeps = 0
         self.counts: Counter[Status] = Counter()
         self.last: OdometryEstimate | None = None
+
+    def motion_of(self, sweep: Sweep) -> KnownMotion | None:
+        """Return the motion that was estimated for a sweep, None if there is none."""
+        return self._motions.get((sweep.start, sweep.end))
+
+    def _remember(self, sweep: Sweep, registered: list[OdometryEstimate]) -> None:
+        odometry = self.odometry
+        if not registered or not isinstance(odometry, Odometry) or odometry.motion is None:
+            return
+        last = registered[-1]
+        if Status.REFUSED in last.status:
+            return
+        if odometry.phase is Phase.STATIONARY:
+            found = KnownMotion(still_trajectory(sweep.start, sweep.end), True)
+        else:
+            lever = odometry.T_cloud_imu[:3, 3]
+            found = KnownMotion(odometry.motion.trajectory(lever), last.is_aligned)
+        self._motions[(sweep.start, sweep.end)] = found
+        while len(self._motions) > _MOTIONS:
+            del self._motions[next(iter(self._motions))]
 
     @property
     def due_ns(self) -> int | None:
@@ -121,7 +145,9 @@ class OdometryPipeline:
         """Return the estimates that are due by ``now`` [ns], in order."""
         estimates: list[OdometryEstimate] = []
         for release in self._sequencer.release(self._newest_imu, now):
-            for estimate in self.odometry.register(release.sweep):
+            registered = self.odometry.register(release.sweep)
+            self._remember(release.sweep, registered)
+            for estimate in registered:
                 self.counts.update(estimate.status)
                 if Status.REFUSED in estimate.status:
                     continue

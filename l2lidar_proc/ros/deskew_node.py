@@ -15,37 +15,35 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from l2lidar_node.clouds.layouts import LAYOUTS
-from l2lidar_node.ros.conversions import (
-    CloudTemplate,
-    from_cloud,
-    from_time,
-    to_cloud,
-)
+from l2lidar_node.ros.conversions import CloudTemplate, from_time, to_cloud
 from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.types import HostNs, Level, is_ros_time
-from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
+from l2lidar_proc.cloud import CloudError, position_problem, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
+from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
-from l2lidar_proc.ros.samples import to_sample
+from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
+from l2lidar_proc.ros.odometry_node import OdometryNode
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
-from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
-
-_RELIABILITY = {
-    "best_effort": ReliabilityPolicy.BEST_EFFORT,
-    "reliable": ReliabilityPolicy.RELIABLE,
-}
 
 
 class DeskewNode(Node):
     """Publishes every cloud as a sensor at rest would have seen it.
+
+    Parameters
+    ----------
+    companion : OdometryNode, optional
+        An odometry in the same process. Where it follows the same clouds and IMU, its intake is
+        shared; where the velocities would be its own, each sweep is deskewed with the motion that
+        it has estimated for that very sweep.
 
     Raises
     ------
@@ -53,7 +51,7 @@ class DeskewNode(Node):
         If a parameter is wrong.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, companion: OdometryNode | None = None) -> None:
         super().__init__("deskew_node")
         self._settings = ParameterSet(self, DeskewNodeConfig, self._configure)
         config = self._settings.value
@@ -68,26 +66,26 @@ class DeskewNode(Node):
         self._untied = ""
         self._last: report.Report | None = None
         self._before = self._pipeline.counts
-        self._open(config)
+        self._open(config, companion)
         self._imu_adjust = ImuAdjustClient(
             self, config.topics.cloud_topic, on_leveling=self._warn_of_leveling
         )
-        self._overdue = steady_timer(self, 0.01, self._guarded(self._hand_out))
-        self._overdue.cancel()
         steady_timer(self, 1.0, self._guarded(self._diagnose))
 
-    def _open(self, config: DeskewNodeConfig) -> None:
+    def _open(self, config: DeskewNodeConfig, companion: OdometryNode | None) -> None:
         topics = config.topics
-        speaking = QoSProfile(depth=10, reliability=_RELIABILITY[topics.qos_reliability])
+        speaking = QoSProfile(depth=10, reliability=RELIABILITY[topics.qos_reliability])
         self._output = self.create_publisher(PointCloud2, topics.output_topic, speaking)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._statistics = self.create_publisher(DiagnosticStatus, "~/statistics", 10)
-        asked = _RELIABILITY[topics.input_reliability]
-        listening = QoSProfile(depth=CLOUD_DEPTH, reliability=asked)
-        often = QoSProfile(depth=IMU_DEPTH, reliability=asked)
+        shared = companion.intake_of(self, topics) if companion is not None else None
+        self._intake = shared or SensorIntake(
+            self, topics.cloud_topic, topics.imu_topic, topics.input_reliability
+        )
+        self._intake.add(self, self._guarded)
+        if companion is not None and companion.publishes(self, topics) and shared is not None:
+            self._pipeline.odometry_motion = companion.motion_of
         guarded, hear = self._guarded, self.create_subscription
-        hear(PointCloud2, topics.cloud_topic, guarded(self._cloud), listening)
-        self._imu_input = hear(Imu, topics.imu_topic, guarded(self._imu), often)
         velocities = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
             hear(Odometry, topics.velocity_topic, guarded(self._odometry), velocities)
@@ -100,19 +98,17 @@ class DeskewNode(Node):
     def _configure(self, config: DeskewNodeConfig) -> None:
         self._pipeline.configure(config.proc)
 
-    def _imu(self, message: Imu) -> None:
-        self._take(message)
-        if self._pipeline.is_waiting:
-            self._hand_out()
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a sweep waits for IMU samples."""
+        return self._pipeline.is_waiting
 
-    def _take(self, message: Imu) -> None:
-        if not is_ros_time(from_time(message.header.stamp)):
-            self._inputs.refuse("IMU sample with a stamp that is out of range")
-            return
-        if not self._inputs.imu.takes(message.header.frame_id):
-            return
-        self._mount(message.header.frame_id)
-        self._pipeline.imu(to_sample(message))
+    def take_samples(self, samples: Samples, frame: str) -> None:
+        """Take IMU samples (N,) of a frame."""
+        samples = self._inputs.usable(samples, frame)
+        if len(samples):
+            self._mount(frame)
+            self._pipeline.imu(samples)
 
     def _mount(self, imu_frame: str) -> None:
         """Take the place of the IMU from TF as soon as both frames are in it."""
@@ -125,14 +121,14 @@ class DeskewNode(Node):
             if T_cloud_imu is not None and self._cloud_frame != imu_frame:
                 self._pipeline.tracker.mount(T_cloud_imu)
 
-    def _cloud(self, message: PointCloud2) -> None:
-        if not self._inputs.clouds.takes(message.header.frame_id):
+    def take_cloud(self, item: OneCloud) -> None:
+        """Take a cloud; one without usable times is passed on as it came."""
+        points, stamp, frame = item.cloud
+        if not self._inputs.clouds.takes(frame):
             return
-        self._follow(message.header.frame_id)
-        stamp = from_time(message.header.stamp)
+        self._follow(frame)
         try:
-            points = from_cloud(message)
-            sweep = to_sweep(points, stamp, self._settings.value.proc.deskew.time_unit)
+            sweep = item.sweep(self._settings.value.proc.deskew.time_unit)
         except CloudError as error:
             if position_problem(points.dtype) or not is_ros_time(stamp):
                 self._refuse(error, "dropped")
@@ -145,7 +141,10 @@ class DeskewNode(Node):
             return
         self._inputs.sweep(sweep)
         self._pipeline.sweep(sweep, time.monotonic_ns())
-        self._hand_out()
+
+    def refuse_cloud(self, error: ValueError) -> None:
+        """Count a cloud that could not be read."""
+        self._refuse(error, "dropped")
 
     def _follow(self, frame: str) -> None:
         """Begin anew where clouds come in another frame than before."""
@@ -161,14 +160,23 @@ class DeskewNode(Node):
 
     def _odometry(self, message: Odometry) -> None:
         twist = message.twist.twist
-        self._velocity(message, message.child_frame_id, twist.linear, twist.angular, "odometry")
+        covariance = np.reshape(message.twist.covariance, (6, 6))[:3, :3]
+        self._velocity(
+            message, message.child_frame_id, twist.linear, twist.angular, "odometry", covariance
+        )
 
     def _twist(self, message: TwistStamped) -> None:
         twist = message.twist
         self._velocity(message, message.header.frame_id, twist.linear, twist.angular, "twist")
 
     def _velocity(
-        self, message: Any, frame: str, linear: Vector3, angular: Vector3, source: str
+        self,
+        message: Any,
+        frame: str,
+        linear: Vector3,
+        angular: Vector3,
+        source: str,
+        covariance: NDArray[np.float64] | None = None,
     ) -> None:
         if not self._cloud_frame:
             return
@@ -183,19 +191,15 @@ class DeskewNode(Node):
         velocity = carried_over(
             (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), T_cloud_body
         )
-        self._pipeline.velocity(from_time(message.header.stamp), velocity, source)
+        if covariance is not None:
+            turn = T_cloud_body[:3, :3]
+            covariance = turn @ covariance @ turn.T
+        self._pipeline.velocity(from_time(message.header.stamp), velocity, source, covariance)
 
-    def _hand_out(self) -> None:
-        """Publish what is finished, and come back in time for what still waits."""
-        for message in waiting(self._imu_input, IMU_DEPTH):
-            self._take(message)
+    def advance(self) -> None:
+        """Publish what is finished."""
         for item in self._pipeline.poll(time.monotonic_ns()):
             self._publish(item)
-        due = self._pipeline.due_ns
-        self._overdue.cancel()
-        if due is not None:
-            self._overdue.timer_period_ns = max(due - time.monotonic_ns(), 1_000_000)
-            self._overdue.reset()
 
     def _publish(self, item: Deskewed) -> None:
         self._output.publish(self._serialised(item.points, item.stamp))

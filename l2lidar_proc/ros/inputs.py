@@ -14,7 +14,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from l2lidar_node.types import Sweep
+from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Sweep
+from l2lidar_proc.motion.imu_buffer import Samples
 
 _MAX_REASONS: Final = 20  # senders choose field names and numbers, so reasons have no end
 _OTHER: Final = "other reasons"
@@ -80,6 +81,14 @@ class InputMonitor:
         """Count a message that cannot be used."""
         is_known = reason in self.refused or len(self.refused) < _MAX_REASONS
         self.refused[reason if is_known else _OTHER] += 1
+
+    def usable(self, samples: Samples, frame: str) -> Samples:
+        """Return the IMU samples (N,) of a frame that are to be used."""
+        fits = (samples["stamp"] >= FIRST_STAMP) & (samples["stamp"] <= LAST_STAMP)
+        for _ in range(int(np.count_nonzero(~fits))):
+            self.refuse("IMU sample with a stamp that is out of range")
+        samples = samples[fits]
+        return samples if len(samples) and self.imu.takes(frame) else samples[:0]
 
     def sweep(self, sweep: Sweep) -> None:
         """Note a sweep that is used, in the order of arrival."""

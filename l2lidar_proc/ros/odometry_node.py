@@ -15,19 +15,21 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu, PointCloud2
+from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.files import DataFolder, FileNameError, write_whole
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.conversions import to_cloud
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import F64, HostNs, is_ros_time
+from l2lidar_node.settings import SettingError
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import rotations
-from l2lidar_proc.cloud import CloudError, to_sweep
-from l2lidar_proc.config import OdometryNodeConfig, OdometryTopics
+from l2lidar_proc.cloud import CloudError
+from l2lidar_proc.config import DeskewTopics, OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.dead_reckoning import DeadReckoning
@@ -41,9 +43,8 @@ from l2lidar_proc.ros.inputs import (
     answer_or_error,
     steady_timer,
 )
-from l2lidar_proc.ros.samples import to_sample
+from l2lidar_proc.ros.intake import SLOW_LOOK_S, OneCloud, SensorIntake
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
-from l2lidar_proc.ros.waiting import CLOUD_DEPTH, IMU_DEPTH, waiting
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
 _JITTER_NS = 2_000_000  # a step may come by half an IMU period early, or it would miss one
@@ -81,8 +82,6 @@ class OdometryNode(Node):
         self._reckoned_ns = self._transform_ns = 0
         self._open(config)
         guarded = self._guarded
-        self._overdue = steady_timer(self, 0.01, guarded(self._hand_out))
-        self._overdue.cancel()
         steady_timer(self, 1.0, guarded(self._diagnose))
         if topics.map_period_s > 0.0:
             steady_timer(self, topics.map_period_s, guarded(self._show_map))
@@ -103,11 +102,11 @@ class OdometryNode(Node):
         self._registered = self.create_publisher(PointCloud2, topics.registered_topic, out)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        listening = QoSProfile(depth=CLOUD_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        often = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        guarded, hear = self._guarded, self.create_subscription
-        hear(PointCloud2, topics.cloud_topic, guarded(self._cloud), listening)
-        self._imu_input = hear(Imu, topics.imu_topic, guarded(self._imu), often)
+        period_s = 1.0 / topics.imu_rate if topics.imu_rate > 0.0 else SLOW_LOOK_S
+        self.intake = SensorIntake(
+            self, topics.cloud_topic, topics.imu_topic, "best_effort", period_s
+        )
+        self.intake.add(self, self._guarded)
         for name, answer in (
             ("reset", self._reset),
             ("save_map", self._save_map),
@@ -118,48 +117,82 @@ class OdometryNode(Node):
     def _configure(self, config: OdometryNodeConfig) -> None:
         self._pipeline.configure(config.odometry)
 
-    def _imu(self, message: Imu) -> None:
-        self._take(message)
-        self._carry_on()
-        if self._pipeline.due_ns is not None:
-            self._hand_out()
+    def intake_of(self, node: Node, topics: DeskewTopics) -> SensorIntake | None:
+        """Return the intake if it has just what a deskew node listens to."""
+        own = self._settings.value.topics
+        same = (
+            topics.input_reliability == "best_effort"
+            and node.resolve_topic_name(topics.cloud_topic)
+            == self.resolve_topic_name(own.cloud_topic)
+            and node.resolve_topic_name(topics.imu_topic) == self.resolve_topic_name(own.imu_topic)
+        )
+        return self.intake if same else None
 
-    def _take(self, message: Imu) -> None:
-        if not is_ros_time(from_time(message.header.stamp)):
-            self._inputs.refuse("IMU sample with a stamp that is out of range")
+    def publishes(self, node: Node, topics: DeskewTopics) -> bool:
+        """Return whether this is the odometry whose velocities a deskew node takes.
+
+        Raises
+        ------
+        SettingError
+            If it expects twists on the topic of this odometry.
+        """
+        if node.resolve_topic_name(topics.velocity_topic) != self._odometry.topic_name:
+            return False
+        if topics.velocity_type == "twist":
+            raise SettingError(
+                f"parameter 'velocity_topic': {self._odometry.topic_name} carries the odometry of "
+                "this process, not twists; set velocity_type to odometry, or another topic"
+            )
+        return topics.velocity_type == "odometry"
+
+    def motion_of(self, sweep: Sweep) -> KnownMotion | None:
+        """Return the motion that was estimated for a sweep, None if there is none."""
+        return self._pipeline.motion_of(sweep)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a sweep waits for IMU samples."""
+        return self._pipeline.due_ns is not None
+
+    def take_samples(self, samples: Samples, frame: str) -> None:
+        """Take IMU samples (N,) of a frame."""
+        samples = self._inputs.usable(samples, frame)
+        if not len(samples):
             return
-        if self._inputs.imu.takes(message.header.frame_id):
-            sample = self._pipeline.imu(to_sample(message))
-            for note in self._pipeline.convention.notes:
-                self._say(f"{message.header.frame_id}: {note}")
-            if self._settings.value.topics.imu_rate > 0.0:
-                self._samples.append(sample)
+        samples = self._pipeline.imu(samples)
+        for note in self._pipeline.convention.notes:
+            self._say(f"{frame}: {note}")
+        if self._settings.value.topics.imu_rate > 0.0:
+            self._samples.append(samples)
 
-    def _cloud(self, message: PointCloud2) -> None:
-        frame = message.header.frame_id
+    def take_cloud(self, item: OneCloud) -> None:
+        """Take a cloud; one that cannot be read is counted and left out."""
+        frame = item.cloud.frame
         if not self._inputs.clouds.takes(frame):
             return
         if self._cloud_frame not in ("", frame):  # another sensor: neither pose nor map are its
             self._begin_again()
         self._cloud_frame = frame
         try:
-            sweep = to_sweep(from_cloud(message), from_time(message.header.stamp), snapshots=True)
-            if sweep.start == sweep.end:
-                self._say(
-                    f"{frame}: clouds without a time per point: each is taken as measured at the "
-                    "instant of its stamp"
-                )
-        except (CloudError, ValueError) as error:
-            self._inputs.refuse(str(error))
-            self.get_logger().warning(f"cloud dropped: {error}", throttle_duration_sec=5.0)
+            sweep = item.sweep(snapshots=True)
+        except CloudError as error:
+            self.refuse_cloud(error)
             return
+        if sweep.start == sweep.end:
+            self._say(
+                f"{frame}: clouds without a time per point: each is taken as measured at the "
+                "instant of its stamp"
+            )
         self._mount()
         self._inputs.sweep(sweep)
-        self._take_waiting()
         # Whoever shows the deskewed cloud needs the transform up to its end, and needs it first.
         self._carry_on(at_once=True)
         self._pipeline.sweep(sweep, time.monotonic_ns())
-        self._hand_out()
+
+    def refuse_cloud(self, error: ValueError) -> None:
+        """Count a cloud that cannot be used."""
+        self._inputs.refuse(str(error))
+        self.get_logger().warning(f"cloud dropped: {error}", throttle_duration_sec=5.0)
 
     def _mount(self) -> None:
         """Take the mounts from TF, as long as nothing depends on them yet or they changed."""
@@ -209,20 +242,11 @@ class OdometryNode(Node):
                 "at its origin"
             )
 
-    def _hand_out(self) -> None:
-        """Publish what is finished, and come back in time for what still waits."""
-        self._take_waiting()
+    def advance(self) -> None:
+        """Publish what is finished, and the pose at the newest IMU sample."""
+        self._carry_on()
         for estimate in self._pipeline.poll(time.monotonic_ns()):
             self._publish(estimate)
-        due = self._pipeline.due_ns
-        self._overdue.cancel()
-        if due is not None:
-            self._overdue.timer_period_ns = max(due - time.monotonic_ns(), 1_000_000)
-            self._overdue.reset()
-
-    def _take_waiting(self) -> None:
-        for message in waiting(self._imu_input, IMU_DEPTH):
-            self._take(message)
 
     @property
     def _base_name(self) -> str:
@@ -274,16 +298,30 @@ class OdometryNode(Node):
             self._reckoning.reset(odometry.extrapolated(newest))
 
     def _carry_on(self, at_once: bool = False) -> None:
-        """Publish the pose at the newest IMU sample, ``imu_rate`` times a second of its time."""
+        """Publish poses at IMU samples, ``imu_rate`` times a second of their time.
+
+        Parameters
+        ----------
+        at_once : bool
+            Publish one at the newest sample in any case.
+        """
         if not self._samples:
-            return
-        topics = self._settings.value.topics
-        since = int(self._samples[-1]["stamp"][0]) - self._reckoned_ns
-        is_due = not 0 <= since < round(1e9 / topics.imu_rate) - _JITTER_NS
-        if not (is_due or at_once or len(self._samples) >= _MOST_SAMPLES):
             return
         samples = np.concatenate(self._samples)
         self._samples.clear()
+        step = round(1e9 / self._settings.value.topics.imu_rate) - _JITTER_NS
+        first = 0
+        for last, stamp in enumerate(samples["stamp"].tolist()):
+            is_due = not 0 <= stamp - self._reckoned_ns < step
+            if is_due or (at_once and last == len(samples) - 1):
+                self._reckon(samples[first : last + 1])
+                first = last + 1
+        if first < len(samples):
+            self._samples.append(samples[first:][-_MOST_SAMPLES:])
+
+    def _reckon(self, samples: Samples) -> None:
+        """Publish the pose at the last of some samples (N,)."""
+        topics = self._settings.value.topics
         self._reckoned_ns = int(samples["stamp"][-1])
         estimate = self._reckoning.carry(samples)
         if estimate is None:

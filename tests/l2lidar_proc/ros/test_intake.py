@@ -11,7 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import Int32
 
-from l2lidar_proc.ros.waiting import waiting
+from l2lidar_proc.ros.intake import waiting
 
 pytestmark = pytest.mark.ros
 LIMIT_S = 120.0

@@ -1,0 +1,227 @@
+"""Intake of clouds and IMU samples: received, parsed and read once, for one node or two.
+
+The IMU subscription stays out of the executor's wait set: at 250 messages a second, waking up for
+each costs more than all the work on them. Its queue is drained when a cloud comes, on a slow
+timer, and quickly while a sweep waits for its last samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final, NamedTuple, Protocol
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Imu, PointCloud2
+
+from l2lidar_node.types import Sweep
+from l2lidar_proc.cloud import CloudError, to_sweep
+from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.ros import serialized
+from l2lidar_proc.ros.inputs import steady_timer
+from l2lidar_proc.ros.serialized import Cloud
+
+# A node that is held up for some seconds catches up at once: better late than a hole in the map.
+CLOUD_DEPTH: Final = 30
+IMU_DEPTH: Final = 2000
+
+SLOW_LOOK_S: Final = 0.05
+"""Between looks into the IMU's queue where nobody is in a hurry."""
+
+_WAIT_S: Final = 0.003  # between looks while a sweep waits for its last samples
+
+RELIABILITY: Final = {
+    "best_effort": ReliabilityPolicy.BEST_EFFORT,
+    "reliable": ReliabilityPolicy.RELIABLE,
+}
+
+
+class OneCloud:
+    """A cloud, turned into a sweep at most once per unit of its times.
+
+    Attributes
+    ----------
+    cloud : Cloud
+    """
+
+    def __init__(self, cloud: Cloud) -> None:
+        self.cloud = cloud
+        self._sweeps: dict[str, Sweep | CloudError] = {}
+
+    def sweep(self, unit: str = "auto", *, snapshots: bool = False) -> Sweep:
+        """Return the cloud as a sweep; see :func:`l2lidar_proc.cloud.to_sweep`.
+
+        Raises
+        ------
+        CloudError
+        """
+        points, stamp, _ = self.cloud
+        if unit not in self._sweeps:
+            try:
+                self._sweeps[unit] = to_sweep(points, stamp, unit, snapshots=True)
+            except CloudError as error:
+                self._sweeps[unit] = error
+        found = self._sweeps[unit]
+        if isinstance(found, CloudError):
+            raise found
+        # a snapshot has no times: whoever needs them is told so
+        return found if snapshots or found.start < found.end else to_sweep(points, stamp, unit)
+
+
+class Listener(Protocol):
+    """What an intake feeds."""
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a sweep waits for IMU samples."""
+
+    def take_samples(self, samples: Samples, frame: str) -> None:
+        """Take IMU samples (N,) of a frame."""
+
+    def take_cloud(self, item: OneCloud) -> None:
+        """Take a cloud."""
+
+    def refuse_cloud(self, error: ValueError) -> None:
+        """Take note of a cloud that could not be read."""
+
+    def advance(self) -> None:
+        """Publish what is finished."""
+
+
+class NeverExecuted(CallbackGroup):
+    """Keeps what belongs to it out of the executor's wait set; its owner takes the messages."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return False."""
+        del entity
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return False."""
+        del entity
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
+
+
+Guard = Callable[[Callable[..., None]], Callable[..., None]]
+
+
+class _Feed(NamedTuple):
+    """The guarded callbacks of a listener."""
+
+    samples: Callable[..., None]
+    cloud: Callable[..., None]
+    refusal: Callable[..., None]
+    advance: Callable[..., None]
+
+
+class SensorIntake:
+    """Clouds and IMU samples of a pair of topics.
+
+    Parameters
+    ----------
+    node : Node
+        Owns subscriptions and timers.
+    cloud_topic, imu_topic : str
+    reliability : str
+        Asked of both: "best_effort" or "reliable".
+    period_s : float
+        Between looks into the IMU's queue.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        cloud_topic: str,
+        imu_topic: str,
+        reliability: str,
+        period_s: float = SLOW_LOOK_S,
+    ) -> None:
+        asked = RELIABILITY[reliability]
+        self._listeners: list[Listener] = []
+        self._feeds: list[_Feed] = []
+        self._imu = node.create_subscription(
+            Imu,
+            imu_topic,
+            lambda message: None,
+            QoSProfile(depth=IMU_DEPTH, reliability=asked),
+            callback_group=NeverExecuted(),
+            raw=True,
+        )
+        node.create_subscription(
+            PointCloud2,
+            cloud_topic,
+            self._cloud,
+            QoSProfile(depth=CLOUD_DEPTH, reliability=asked),
+            raw=True,
+        )
+        steady_timer(node, min(period_s, SLOW_LOOK_S), self.look)
+        self._soon = steady_timer(node, _WAIT_S, self.look)
+        self._soon.cancel()
+
+    def add(self, listener: Listener, guard: Guard) -> None:
+        """Feed a listener, after those that were added before it.
+
+        Parameters
+        ----------
+        listener : Listener
+        guard : callable
+            Makes a callback survive its own errors: one listener must not stop another.
+        """
+        self._listeners.append(listener)
+        self._feeds.append(
+            _Feed(
+                guard(listener.take_samples),
+                guard(listener.take_cloud),
+                guard(listener.refuse_cloud),
+                guard(listener.advance),
+            )
+        )
+
+    def drain(self) -> None:
+        """Hand out the IMU samples that have come."""
+        messages = [bytes(message) for message in waiting(self._imu, IMU_DEPTH)]
+        for samples, frame in serialized.imu_batches(messages):
+            for feed in self._feeds:
+                feed.samples(samples, frame)
+
+    def look(self) -> None:
+        """Hand out the IMU samples, and let the listeners publish what is finished."""
+        self.drain()
+        for feed in self._feeds:
+            feed.advance()
+        if any(listener.is_waiting for listener in self._listeners):
+            self._soon.reset()
+        else:
+            self._soon.cancel()
+
+    def _cloud(self, message: bytes) -> None:
+        self.drain()
+        try:
+            item = OneCloud(serialized.cloud(message))
+        except ValueError as error:
+            for feed in self._feeds:
+                feed.refusal(error)
+            return
+        for feed in self._feeds:
+            feed.cloud(item)
+        self.look()
+
+
+def waiting(subscription: Subscription, limit: int) -> Iterator[Any]:
+    """Yield the messages that wait at a subscription, at most ``limit``.
+
+    The executor takes one message of every topic in turn: a node that has fallen behind would
+    handle one IMU sample to a cloud, and every cloud before the samples that belong to it.
+    """
+    handle = subscription.handle
+    with handle:
+        for _ in range(limit):
+            taken = handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            yield taken[0]

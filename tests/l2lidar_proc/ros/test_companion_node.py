@@ -1,0 +1,128 @@
+"""Deskew and odometry in one process: one intake, and each sweep deskewed with its own motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import rclpy
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
+from l2lidar_node.ros.conversions import from_cloud, from_time
+from l2lidar_node.settings import SettingError
+from l2lidar_proc import rotations
+from l2lidar_proc.ros.companion_node import make_nodes
+from tests.l2lidar_proc.odometry.odometry_world import recording
+from tests.l2lidar_proc.ros.bench import Bench
+from tests.support.odometry_runs import EPOCH, sweeps, truth
+
+pytestmark = pytest.mark.ros
+
+
+class CompanionBench(Bench):
+    """Both nodes, and what they publish."""
+
+    def __init__(self, overrides: tuple[str, ...]) -> None:
+        self.nodes = []
+
+        def make():
+            self.nodes = make_nodes()
+            return self.nodes[0]
+
+        super().__init__(make, overrides)
+        self.executor.add_node(self.nodes[1])
+        self.poses: list[Odometry] = []
+        self.clouds: list[PointCloud2] = []
+        self.hear(Odometry, "/odometry", self.poses.append)
+        self.hear(PointCloud2, "/points_deskewed", self.clouds.append)
+
+    def close(self) -> None:
+        self.nodes[1].destroy_node()
+        super().close()
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest) -> Iterator[CompanionBench]:
+    made = CompanionBench(getattr(request, "param", ()))
+    yield made
+    made.close()
+
+
+def play(bench: CompanionBench, run, seconds: float) -> list:
+    """Send a recording in its own order; return the sweeps that were sent."""
+    bench.until(
+        lambda: (
+            bench.clouds_out.get_subscription_count()
+            and bench.imu_out.get_subscription_count()
+            and bench.peer.count_publishers("/points_deskewed")
+        )
+    )
+    sent, first = [], 0
+    for sweep in sweeps(run, "turn"):
+        if sweep.end - EPOCH > seconds * 1e9:
+            break
+        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+        for sample in run.imu[first:last]:
+            bench.send_sample(sample)
+        first = last
+        bench.send_cloud(sweep.points, sweep.start)
+        sent.append(sweep)
+        count = len(sent)
+        bench.until(lambda count=count: len(bench.clouds) == count)
+    return sent
+
+
+def test_each_cloud_comes_in_once_and_out_of_both(bench: CompanionBench) -> None:
+    run = recording("room", "walk", 6.0)
+    sent = play(bench, run, 5.5)
+    bench.until(lambda: len(bench.poses) >= len(sent) - 1)
+    odometry, deskew = bench.nodes
+    assert [node.get_name() for node in bench.nodes] == ["odometry_node", "deskew_node"]
+    assert bench.clouds_out.get_subscription_count() == 1
+    assert bench.imu_out.get_subscription_count() == 1
+    assert deskew._intake is odometry.intake
+    assert deskew._pipeline.tracker.buffer.counts.accepted > 1000
+    assert deskew._last.values["velocity source"] == "odometry"
+    assert deskew._last.values["velocity age [ms]"] == "0"
+    # against the truth: where a sensor at rest at the stamp would have seen the same points
+    cloud = bench.clouds[-1]
+    assert from_time(cloud.header.stamp) == sent[-1].start
+    points = from_cloud(cloud)
+    estimate = odometry._pipeline.last
+    at_start = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    at_middle = np.stack([estimate.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    # the odometry leaves out near points
+    kept = np.isin(sent[-1].points["range"], estimate.points["range"])
+    stamps = np.array([sent[-1].start, estimate.stamp])
+    positions, q = truth(run, stamps)
+    turn = rotations.multiply(rotations.conjugate(q[0]), q[1])
+    way = rotations.rotate(rotations.conjugate(q[0]), positions[1] - positions[0])
+    assert np.linalg.norm(way) > 0.05
+    expected = rotations.rotate(turn, at_middle) + way
+    assert np.median(np.linalg.norm(at_start[kept] - expected, axis=1)) < 0.01
+
+
+@pytest.mark.parametrize("bench", [("deskew_node:imu_topic:=/other/imu",)], indirect=True)
+def test_other_topics_have_an_intake_of_their_own(bench: CompanionBench) -> None:
+    odometry, deskew = bench.nodes
+    assert deskew._intake is not odometry.intake
+    assert deskew._pipeline.odometry_motion is None
+    assert odometry.get_parameter("imu_topic").value == "/imu/data"
+
+
+WHEELS = ("deskew_node:velocity_type:=twist", "deskew_node:velocity_topic:=wheels")
+
+
+@pytest.mark.parametrize("bench", [WHEELS], indirect=True)
+def test_another_source_of_velocity_is_respected(bench: CompanionBench) -> None:
+    odometry, deskew = bench.nodes
+    assert deskew._intake is odometry.intake
+    assert deskew._pipeline.odometry_motion is None
+
+
+def test_twists_on_the_topic_of_the_odometry_are_refused() -> None:
+    with pytest.raises(SettingError, match=r"velocity_topic.*not twists"):
+        CompanionBench(WHEELS[:1])
+    rclpy.shutdown()
