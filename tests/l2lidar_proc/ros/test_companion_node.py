@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from sensor_msgs.msg import PointCloud2
 
 from l2lidar_node.ros.conversions import from_cloud, from_time
 from l2lidar_node.settings import SettingError
+from l2lidar_node.types import Sweep
 from l2lidar_proc import rotations
 from l2lidar_proc.ros.companion_node import make_nodes
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.l2lidar_proc.ros.bench import Bench
-from tests.support.odometry_runs import EPOCH, sweeps, truth
+from tests.support.odometry_runs import EPOCH, Run, sweeps, truth
 
 pytestmark = pytest.mark.ros
 
@@ -25,9 +27,9 @@ class CompanionBench(Bench):
     """Both nodes, and what they publish."""
 
     def __init__(self, overrides: tuple[str, ...]) -> None:
-        self.nodes = []
+        self.nodes: list[Any] = []
 
-        def make():
+        def make() -> Any:
             self.nodes = make_nodes()
             return self.nodes[0]
 
@@ -50,7 +52,7 @@ def bench(request: pytest.FixtureRequest) -> Iterator[CompanionBench]:
     made.close()
 
 
-def play(bench: CompanionBench, run, seconds: float) -> list:
+def play(bench: CompanionBench, run: Run, seconds: float) -> list[Sweep]:
     """Send a recording in its own order; return the sweeps that were sent."""
     bench.until(
         lambda: (

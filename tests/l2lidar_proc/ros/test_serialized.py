@@ -11,6 +11,7 @@ from sensor_msgs.msg import Imu
 
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.ros.conversions import to_cloud, to_time
+from l2lidar_node.types import HostNs
 from l2lidar_proc.ros import serialized
 from tests.l2lidar_proc.motion.analytic import Motion, at, seen
 
@@ -20,7 +21,7 @@ SAMPLES = Motion(turn=1.0, nod=0.2, speed=1.0).imu(0.0, 0.2)
 
 def message(sample: np.void, frame: str) -> bytes:
     made = Imu()
-    made.header.stamp = to_time(int(sample["stamp"]))
+    made.header.stamp = to_time(HostNs(int(sample["stamp"])))
     made.header.frame_id = frame
     w, x, y, z = sample["orientation_wxyz"].tolist()
     q = made.orientation
