@@ -58,7 +58,7 @@ class Deskewing:
 
     def __init__(self) -> None:
         self.pipeline = Pipeline(ProcConfig())
-        self.out = []
+        self.out: list[Any] = []
 
     def step(self, number: int, cloud_by: int, imu_by: int) -> None:
         start, end = 0.2 * number, 0.2 * (number + 1)
