@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.config import DeskewConfig, OdometryConfig, ProcConfig
-from l2lidar_proc.deskew.pipeline import Pipeline
+from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.odometry.kiss import PlainKiss
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.plain import PlainOdometry
@@ -127,6 +127,34 @@ def _deskewed(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:
     return out
 
 
+def _deskew_file(run: Run, cut: str, path: Path) -> None:
+    """Replace the sweeps of a file by what our deskew node gives LIO-SAM.
+
+    Deskewed to the middle by the IMU alone, stamped there, without times: with
+    config/consumers/lio_sam/deskew.yaml nothing tells it a velocity.
+    """
+    pipeline = Pipeline(ProcConfig(deskew=DeskewConfig(reference="middle")))
+    found: list[Deskewed] = []
+    first = 0
+    for sweep in odometry_runs.sweeps(run, cut):
+        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+        pipeline.imu(run.imu[first:last])
+        first = last
+        pipeline.sweep(sweep, sweep.end)
+        found += pipeline.poll(sweep.end + 10**9)
+    xyz = [np.stack([item.points[axis] for axis in "xyz"], axis=1) for item in found]
+    with np.load(path) as file:
+        kept = {name: file[name] for name in ("imu", "T_cloud_imu")}
+    np.savez(
+        path,
+        points=np.concatenate(xyz),
+        times=np.zeros(sum(map(len, xyz)), np.float32),
+        edges=np.cumsum([0, *map(len, xyz)]),
+        spans=np.array([(item.stamp, item.stamp) for item in found], dtype=np.int64),
+        **kept,
+    )
+
+
 def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (_LIMIT_S, _LIMIT_S))
 
@@ -135,6 +163,8 @@ def _referee(name: str, run: Run, cut: str) -> Found | None:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "recording.npz"
         odometry_runs.write(run, cut, source)
+        if name == "lio_sam":
+            _deskew_file(run, cut, source)
         return run_referee(name, source)
 
 

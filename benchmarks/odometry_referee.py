@@ -119,7 +119,7 @@ def ct_icp(recording: Recording) -> Poses:
 
 
 def lio_sam(recording: Recording) -> Poses:
-    """LIO-SAM through evalio, with the parameters that we ship for it.
+    """LIO-SAM through evalio, with the parameters that we ship for it, on deskewed clouds.
 
     It holds two sweeps back: what it says after a sweep is the pose at the start of the second
     one before.

@@ -9,6 +9,7 @@ import ipaddress
 from dataclasses import dataclass, field
 from typing import Final
 
+from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
@@ -296,6 +297,12 @@ class TopicConfig:
         choices=("best_effort", "reliable"),
     )
     point_layout: str = setting("native", "fields of a published point", choices=tuple(LAYOUTS))
+    ring_count: int = setting(
+        RINGS,
+        "rings from the horizon to the zenith, in layouts with rings; LIO-SAM's N_SCAN",
+        lo=16,
+        hi=RINGS,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.settings import FILE_NAME, FRAME, TOPIC, SettingError, setting
 from l2lidar_node.types import F64
@@ -299,6 +300,12 @@ class DeskewTopics:
         AS_INPUT,
         "fields of the output; the time field is dropped once points are deskewed",
         choices=(AS_INPUT, *LAYOUTS),
+    )
+    ring_count: int = setting(
+        RINGS,
+        "rings from the horizon to the zenith, in layouts with rings; LIO-SAM's N_SCAN",
+        lo=16,
+        hi=RINGS,
     )
     input_reliability: str = setting(
         "best_effort",

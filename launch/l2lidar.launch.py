@@ -19,7 +19,7 @@ from l2lidar_node.ros.launching import (
 # Arguments that are parameters of the driver.
 TEXT = (
     "l2_name", "l2_ip", "host_ip", "serial_port", "sweep_cut", "point_layout", "qos_reliability",
-    "record_file",
+    "record_file", "calibration_file",
 )  # fmt: skip
 TYPED = ("l2_port", "host_port", "imu_adjust", "enable_IMU_publishing")
 LOOPBACK = {"l2_ip": "127.0.0.1", "l2_port": 6101, "host_ip": "127.0.0.1", "host_port": 6201}
@@ -156,6 +156,11 @@ def generate_launch_description():
                 "record_file",
                 default_value="",
                 description=f"capture of the raw packets to write; {from_file}",
+            ),
+            DeclareLaunchArgument(
+                "calibration_file",
+                default_value="",
+                description=f"calibration of the unit; {from_file}",
             ),
             DeclareLaunchArgument(
                 "emulator",

@@ -12,14 +12,19 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 import yaml
 
-from l2lidar_node.clouds.fields import RINGS
-from l2lidar_node.config import DriverConfig
+from l2lidar_node.clouds.fields import RINGS, rings
+from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.config import DriverConfig, FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.ros.parameter_files import parameters_by_node, parameters_for
 from l2lidar_node.settings import build, settings_of
+from l2lidar_proc.config import DeskewNodeConfig
+from tests.l2lidar_proc.odometry.odometry_world import recording
+from tests.support.odometry_runs import sweeps
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.py"))
@@ -30,7 +35,7 @@ NETWORK = {"l2_ip", "l2_port", "host_ip", "host_port"}
 DRIVER = NETWORK | {
     "namespace", "name", "l2_name", "params_file", "override_params_file", "serial_port",
     "imu_adjust", "enable_IMU_publishing", "sweep_cut", "point_layout", "qos_reliability",
-    "record_file", "emulator", "emulator_options", "respawn", "log_level",
+    "record_file", "calibration_file", "emulator", "emulator_options", "respawn", "log_level",
 }  # fmt: skip
 RVIZ = {"namespace", "rviz_config", "fixed_frame", "use_sim_time"}
 WITH_RVIZ = DRIVER | RVIZ | {"rviz"}
@@ -48,6 +53,9 @@ ARGUMENTS = {
     "l2_top_mount_example": WITH_RVIZ,
     "l2_forward_mount_example": WITH_RVIZ,
     "multi": {"sensors_file", "deskew_odometry", "emulator"},
+    "lio_sam": WITH_RVIZ
+    | {"base_frame", "publish_base_tf", "lio_sam_params_file", "proc_params_file"}
+    | {"deskew_params_file", "fastdds_profile"},
 }
 STARTS = {
     "l2lidar": ["l2lidar_node"],
@@ -59,6 +67,17 @@ STARTS = {
     "l2_top_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
     "l2_forward_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
     "multi": ["l2lidar_node", "l2lidar_node"],
+    "lio_sam": [
+        "rviz2",
+        "static_transform_publisher",
+        "static_transform_publisher",
+        "lio_sam_imuPreintegration",
+        "lio_sam_imageProjection",
+        "lio_sam_featureExtraction",
+        "lio_sam_mapOptimization",
+        "deskew_node",
+        "l2lidar_node",
+    ],
 }
 NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": str(ROOT / "README.md")}}
 OURS = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "companion_node"}
@@ -124,7 +143,7 @@ def test_driver_arguments_are_parameters_of_the_driver() -> None:
     }
     assert passed["TEXT"] | passed["TYPED"] <= known
     assert passed["LOOPBACK"] <= NETWORK
-    assert {"serial_port", "point_layout", "qos_reliability", "record_file"} <= passed["TEXT"]
+    assert {"serial_port", "record_file", "calibration_file"} <= passed["TEXT"]
 
 
 @pytest.mark.parametrize("path", XML_FILES, ids=lambda path: path.name)
@@ -202,7 +221,10 @@ def test_extrinsic_has_each_projects_own_sign() -> None:
 
 def test_rings_of_the_consumers_are_those_of_the_driver() -> None:
     lio_sam = parameters_for(CONSUMERS / "lio_sam/params.yaml", "any", "/any")
-    assert lio_sam["N_SCAN"] == RINGS
+    for name in ("driver", "deskew"):
+        made = parameters_for(CONSUMERS / f"lio_sam/{name}.yaml", "any", "/any")
+        assert made["ring_count"] == lio_sam["N_SCAN"]
+        assert made["point_layout"] == "velodyne"
     for name in ("fast_lio", "point_lio"):  # which have memory for 128
         other = parameters_for(CONSUMERS / name / "l2.yaml", "any", "/any")
         assert other["preprocess.scan_line"] == min(RINGS, 128)
@@ -291,8 +313,13 @@ def launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Read a launch file in a prefix that has this package and those that it starts."""
     index = tmp_path / "prefix" / "share" / "ament_index" / "resource_index" / "packages"
     index.mkdir(parents=True)
-    others = ("rviz2", "robot_state_publisher")
-    for package, programs in {"l2lidar_node": OURS, **{name: {name} for name in others}}.items():
+    others = {
+        "rviz2": {"rviz2"},
+        "robot_state_publisher": {"robot_state_publisher"},
+        "tf2_ros": {"static_transform_publisher"},
+        "lio_sam": {name for name in STARTS["lio_sam"] if name.startswith("lio_sam_")},
+    }
+    for package, programs in {"l2lidar_node": OURS, **others}.items():
         (index / package).touch()
         folder = tmp_path / "prefix" / "lib" / package
         folder.mkdir(parents=True)
@@ -573,6 +600,67 @@ def test_rviz_follows_the_name_of_the_sensor(launched: Any) -> None:
     words = launched("l2lidar_with_rviz", l2_name="rear").node("rviz2").words
     assert words[2:4] == ["-f", "rear_link"]
     assert "-f" not in launched("l2lidar_with_rviz").node("rviz2").words
+
+
+def test_lio_sam_parts_agree_on_topics_frames_and_sizes() -> None:
+    lio_sam = parameters_for(CONSUMERS / "lio_sam/params.yaml", "any", "/any")
+    deskew = build(
+        DeskewNodeConfig,
+        parameters_for(CONSUMERS / "lio_sam/deskew.yaml", "deskew_node", "/deskew_node"),
+    )
+    assert lio_sam["pointCloudTopic"] == f"/{deskew.topics.output_topic}"
+    assert lio_sam["lidarFrame"] == FrameConfig().cloud
+    # Where both are the same LIO-SAM broadcasts transforms with an empty frame.
+    assert lio_sam["baselinkFrame"] != lio_sam["lidarFrame"]
+    assert "time" not in (LAYOUTS["velodyne"].without_time().dtype.names or ())
+    assert deskew.proc.deskew.reference == "middle", "its poses belong to the cloud's stamp"
+    # cloud_info holds two numbers of 4 bytes for each cell and each ring, and a PointXYZI of 32
+    # for each point that has a cell. What stock Fast DDS's 512 kB do not hold is lost.
+    rows, columns = lio_sam["N_SCAN"], lio_sam["Horizon_SCAN"]
+    for scene in ("room", "yard"):
+        for sweep in list(sweeps(recording(scene, "walk"), "turn"))[1:4]:
+            row = rings(sweep.points, rows).astype(np.int64)
+            azimuth = np.arctan2(sweep.points["y"], sweep.points["x"]) / (2 * np.pi) + 0.5
+            kept = len(np.unique(row * columns + (azimuth * columns).astype(np.int64)))
+            assert 8 * (rows * columns + rows) + 32 * kept < 480_000, scene
+    profile = ElementTree.parse(ROOT / "config" / "fastdds_lio_sam.xml").getroot()
+    (size,) = (item.text for item in profile.iter() if item.tag.endswith("segment_size"))
+    assert int(size or "0") == 16 * 2**20
+
+
+@needs_launch
+def test_lio_sam_gets_deskewed_clouds_a_base_frame_and_shared_memory(
+    launched: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.delenv(name, raising=False)
+    made = launched("lio_sam", l2_name="front", base_frame="robot")
+    for node in made.nodes:
+        if node.executable.startswith("lio_sam_"):
+            values = node.parameters
+            assert (values["lidarFrame"], values["baselinkFrame"]) == ("front_link", "robot")
+            assert values["pointCloudTopic"] == "/points_deskewed"
+    profile = made.context.environment["FASTRTPS_DEFAULT_PROFILES_FILE"]
+    assert Path(profile).name == "fastdds_lio_sam.xml"
+    tied = [node for node in made.nodes if node.executable == "static_transform_publisher"]
+    assert tied[1].words[:4] == ["--frame-id", "robot", "--child-frame-id", "front_link"]
+    driver, deskew = made.node("l2lidar_node").parameters, made.node("deskew_node").parameters
+    assert driver["imu_adjust"] is False
+    assert driver["sweep_cut"] == "turn"
+    assert build(DeskewNodeConfig, deskew).topics.ring_count == 75
+    untied = launched("lio_sam", publish_base_tf="false", rviz="false").executables
+    assert untied.count("static_transform_publisher") == 1
+    assert "rviz2" not in untied
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/mine.xml")
+    own = launched("lio_sam").context.environment
+    assert own["FASTRTPS_DEFAULT_PROFILES_FILE"] == "/mine.xml"
+
+
+@needs_launch
+def test_without_lio_sam_nothing_is_started(launched: Any, tmp_path: Path) -> None:
+    (tmp_path / "prefix/share/ament_index/resource_index/packages/lio_sam").unlink()
+    with pytest.raises(RuntimeError, match="package 'lio_sam' is not installed"):
+        launched("lio_sam")
 
 
 @needs_launch

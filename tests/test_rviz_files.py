@@ -19,6 +19,7 @@ FIXED_FRAMES = {
     "rvizl2lidar.rviz": FrameConfig().cloud,
     "rvizl2lidar_example.rviz": "base_link",
     "slam.rviz": "odom",
+    "lio_sam.rviz": "odom",
 }
 # Of rviz_common and rviz_default_plugins as Jazzy has them (14.1).
 DISPLAYS = {
@@ -51,6 +52,10 @@ KINDS = {
     topics.REGISTERED_POINTS: "PointCloud2",
     topics.LOCAL_MAP: "PointCloud2",
     topics.PATH: "Path",
+    topics.LIO_SAM_CLOUD: "PointCloud2",
+    topics.LIO_SAM_MAP: "PointCloud2",
+    topics.LIO_SAM_PATH: "Path",
+    topics.LIO_SAM_ODOMETRY: "Odometry",
     topics.ODOMETRY: "Odometry",
     topics.ROBOT_DESCRIPTION: "RobotModel",
 }
@@ -123,7 +128,7 @@ def test_topics_are_those_of_the_nodes(name: Any) -> None:
     assert named
     for display in named:
         topic = topic_of(display)["Value"]
-        assert topic in topics.SHOWN_TOPICS
+        assert topic in (*topics.SHOWN_TOPICS, *topics.LIO_SAM_TOPICS)
         assert display["Class"] == f"rviz_default_plugins/{KINDS[topic]}"
 
 

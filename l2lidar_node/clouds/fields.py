@@ -105,20 +105,22 @@ point for each ring and column (0.2 degrees of azimuth at 1800 columns), and the
 OPTICAL_CENTRE_M: Final = 0.0445  # height above the mounting face, the same on all units
 
 
-def rings(points: NDArray[np.void]) -> NDArray[np.uint16]:
+def rings(points: NDArray[np.void], count: int = RINGS) -> NDArray[np.uint16]:
     """Return the ring of every point, 0 at the horizon, counted upwards.
 
     Parameters
     ----------
     points : ndarray, shape (N,), dtype with x, y, z
         Cloud frame [m], finite.
+    count : int
+        Rings over the 90 degrees.
 
     Returns
     -------
     ndarray, shape (N,), uint16
-        0 to ``RINGS`` - 1; what lies below the horizon (wide field of view) is in ring 0.
+        0 to ``count`` - 1; what lies below the horizon (wide field of view) is in ring 0.
     """
     horizontal = np.hypot(points["x"], points["y"])
     elevation = np.arctan2(points["z"] - OPTICAL_CENTRE_M, horizontal)
-    ring = np.floor(elevation * (RINGS / (np.pi / 2)))
-    return np.asarray(np.clip(ring, 0, RINGS - 1), np.uint16)
+    ring = np.floor(elevation * (count / (np.pi / 2)))
+    return np.asarray(np.clip(ring, 0, count - 1), np.uint16)

@@ -6,13 +6,14 @@ Offsets, types and units are those that the consumer's own driver publishes.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.clouds.fields import rings
+from l2lidar_node.clouds.fields import RINGS, rings
 from l2lidar_node.types import POINT, HostNs
 
 
@@ -27,11 +28,18 @@ class Layout:
         Of one point as published, little-endian.
     meant_for : str
         Who reads it.
+    ring_count : int
+        Rings over the 90 degrees from horizon to zenith, where the layout has rings.
     """
 
     name: str
     dtype: np.dtype[np.void]
     meant_for: str
+    ring_count: int = RINGS
+
+    def with_rings(self, count: int) -> Layout:
+        """Return the layout with another number of rings."""
+        return dataclasses.replace(self, ring_count=count)
 
     @property
     def time_field(self) -> str:
@@ -51,7 +59,7 @@ class Layout:
                 "itemsize": self.dtype.itemsize,
             }
         )
-        return Layout(self.name, layout, self.meant_for)
+        return dataclasses.replace(self, dtype=layout)
 
     def convert(self, points: NDArray[np.void], start: HostNs) -> NDArray[np.void]:
         """Return points in this layout.
@@ -73,7 +81,10 @@ class Layout:
             return points
         converted = np.zeros(len(points), self.dtype)
         for name in self.dtype.names or ():
-            converted[name] = _field(name, points, start)
+            is_ring = name in ("ring", "channel")
+            converted[name] = (
+                rings(points, self.ring_count) if is_ring else _field(name, points, start)
+            )
         if self.name == "ouster_legacy":
             converted["range"] = np.rint(_range(points) * 1e3)  # whole millimetres
         return converted
@@ -88,8 +99,6 @@ def _field(name: str, points: NDArray[np.void], start: HostNs) -> NDArray[Any]:
         return np.rint(points["time"].astype(np.float64) * 1e9)
     if name == "timestamp":  # s since the epoch
         return np.float64(start / 1e9) + points["time"].astype(np.float64)
-    if name in ("ring", "channel"):
-        return rings(points)
     if name in ("range", "distance"):
         return _range(points)
     if name == "azimuth":

@@ -159,7 +159,8 @@ class Messages:
     def __init__(self, config: DriverConfig) -> None:
         self.store = get_typestore(Stores.ROS2_JAZZY)
         self._config = config
-        self._layout = LAYOUTS[config.topics.point_layout]
+        topics = config.topics
+        self._layout = LAYOUTS[topics.point_layout].with_rings(topics.ring_count)
         self._types: Any = self.store.types
 
     def transforms(self, now: HostNs) -> Any:

@@ -151,7 +151,7 @@ class DriverNode(Node):
             if topics.qos_reliability == "reliable"
             else ReliabilityPolicy.BEST_EFFORT
         )
-        self._layout = layouts.LAYOUTS[topics.point_layout]
+        self._layout = layouts.LAYOUTS[topics.point_layout].with_rings(topics.ring_count)
         self._cloud_template = CloudTemplate(self._layout.dtype, config.frames.cloud)
         self._cloud_publisher = self.create_publisher(
             PointCloud2,

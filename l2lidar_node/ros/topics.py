@@ -17,6 +17,12 @@ ROBOT_DESCRIPTION: Final = "/robot_description"
 
 DRIVER_TOPICS: Final = (POINTS, IMU)
 """Topics that upstream, and so the driver, names from the root."""
+LIO_SAM_CLOUD: Final = "/lio_sam/mapping/cloud_registered"
+LIO_SAM_MAP: Final = "/lio_sam/mapping/map_local"
+LIO_SAM_PATH: Final = "/lio_sam/mapping/path"
+LIO_SAM_ODOMETRY: Final = "/lio_sam/mapping/odometry"
+LIO_SAM_TOPICS: Final = (LIO_SAM_CLOUD, LIO_SAM_MAP, LIO_SAM_PATH, LIO_SAM_ODOMETRY)
+"""What LIO-SAM publishes and its layout shows; the cloud and the path reliable, in ``odom``."""
 SHOWN_TOPICS: Final = (
     *DRIVER_TOPICS,
     POINTS_DESKEWED,

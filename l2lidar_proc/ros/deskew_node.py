@@ -211,9 +211,10 @@ class DeskewNode(Node):
         """Return a cloud to publish; a plain one is put together as bytes, three times as fast."""
         if points.ndim == 2:
             return to_cloud(points, stamp, self._cloud_frame)
-        name = self._settings.value.topics.point_layout
+        topics = self._settings.value.topics
+        name = topics.point_layout
         if name != AS_INPUT:
-            layout = LAYOUTS[name]
+            layout = LAYOUTS[name].with_rings(topics.ring_count)
             has_time = "time" in (points.dtype.names or ())
             points = (layout if has_time else layout.without_time()).convert(points, stamp)
         kind = (points.dtype, self._cloud_frame)
