@@ -1,4 +1,4 @@
-"""Writes what follows from the settings: config/l2lidar_node.yaml and the README's tables.
+"""Writes the parameter files of config/ from the settings; ``make pages`` writes their tables.
 
 Run ``python -m scripts.make_reference`` after a setting changed; ``--check`` tells if it is due.
 """
@@ -11,11 +11,10 @@ import textwrap
 from pathlib import Path
 
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.settings import Setting, markdown_table, settings_of
+from l2lidar_node.settings import Setting, settings_of
 from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
 
 ROOT = Path(__file__).resolve().parents[1]
-README = ROOT / "README.md"
 FILES: dict[str, dict[str, type]] = {
     "l2lidar_node.yaml": {"/**": DriverConfig},
     "l2lidar_proc.yaml": {
@@ -24,12 +23,6 @@ FILES: dict[str, dict[str, type]] = {
     },
 }
 """Parameter files: the settings of each node they are for."""
-TABLES: dict[str, type] = {
-    "driver": DriverConfig,
-    "deskew": DeskewNodeConfig,
-    "odometry": OdometryNodeConfig,
-}
-"""Tables of the README."""
 
 SHIPPED = {"enable_IMU_publishing": True}
 """Where a shipped file differs from the defaults: a newcomer wants to see the IMU."""
@@ -72,28 +65,9 @@ def _scalar(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
-def readme(text: str, tables: dict[str, type]) -> str:
-    """Return the README with the tables between their markers made anew.
-
-    Raises
-    ------
-    ValueError
-        If a marker is missing.
-    """
-    for name, group in tables.items():
-        begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->"
-        before, found, rest = text.partition(begin)
-        _, closed, after = rest.partition(end)
-        if not found or not closed:
-            raise ValueError(f"README.md: the markers of table '{name}' are missing")
-        text = before + begin + markdown_table(group) + "\n" + end + after
-    return text
-
-
 def outputs() -> dict[Path, str]:
     """Return the text of every file that follows from the settings."""
-    files = {ROOT / "config" / name: parameter_file(nodes) for name, nodes in FILES.items()}
-    return {**files, README: readme(README.read_text(), TABLES)}
+    return {ROOT / "config" / name: parameter_file(nodes) for name, nodes in FILES.items()}
 
 
 def main() -> int:

@@ -43,6 +43,7 @@ NOT_RUN = {
     r"rosdep .*": ROS,
     r"mkdir -p ~/ros2_ws/src.*": ADMIN,
     r"cd .*": ADMIN,
+    r"export .*": ROS,
     r"sudo .*": ADMIN,
     r"nmcli .*": ADMIN,
     r"(journalctl|pidstat) .*": ADMIN,
