@@ -79,6 +79,7 @@ setup(
             "deskew_node = l2lidar_proc.programs:deskew_node",
             "companion_node = l2lidar_proc.programs:companion_node",
             "odometry_node = l2lidar_proc.programs:odometry_node",
+            "slam_node = l2lidar_proc.programs:slam_node",
             "l2lidar = l2lidar_node.programs:l2lidar",
         ],
         # Verbs that a package adds to the command l2lidar.

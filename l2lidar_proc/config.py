@@ -510,6 +510,18 @@ class OdometryTopics:
     registered_topic: str = setting(
         "registered_points", "deskewed cloud in odom_frame", form=TOPIC
     )
+    deskewed_topic: str = setting(
+        "deskewed_points", "deskewed cloud in base_frame, stamped as the odometry", form=TOPIC
+    )
+    status_topic: str = setting(
+        "odometry_status", "status of each estimate, stamped as the odometry", form=TOPIC
+    )
+    covariance_when_lost: bool = setting(
+        False,
+        "put 9999 in all variances of an estimate that is LOST or RESTARTED: rtabmap then begins "
+        "a new map",
+        live=True,
+    )
     qos_reliability: str = setting(
         "reliable", "QoS reliability of the published topics", choices=("best_effort", "reliable")
     )

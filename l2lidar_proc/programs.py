@@ -18,3 +18,8 @@ def companion_node() -> int:
 def odometry_node() -> int:
     """Run the odometry node."""
     return run("l2lidar_proc.ros.odometry_node")
+
+
+def slam_node() -> int:
+    """Run the SLAM node."""
+    return run("l2lidar_proc.ros.slam_node")

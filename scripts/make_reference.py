@@ -13,6 +13,7 @@ from pathlib import Path
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import Setting, settings_of
 from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
+from l2lidar_proc.slam.config import SlamNodeConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES: dict[str, dict[str, type]] = {
@@ -21,6 +22,7 @@ FILES: dict[str, dict[str, type]] = {
         "deskew_node": DeskewNodeConfig,
         "odometry_node": OdometryNodeConfig,
     },
+    "l2lidar_slam.yaml": {"slam_node": SlamNodeConfig},
 }
 """Parameter files: the settings of each node they are for."""
 

@@ -46,6 +46,9 @@ ARGUMENTS = {
     "l2lidar_with_rviz": WITH_RVIZ,
     "deskew_odometry": WITH_RVIZ
     | {"proc_params_file", "odometry", "odom_frame", "base_frame", "use_sim_time"},
+    "slam": WITH_RVIZ
+    | {"proc_params_file", "odometry", "odom_frame", "base_frame", "use_sim_time"}
+    | {"slam_params_file", "mode", "load_map", "data_dir", "map_name"},
     "lio_input": WITH_RVIZ | {"consumer"},
     "replay": RVIZ
     | {"file", "rate", "loop", "deskew_odometry", "name", "l2_name", "l2_ip", "rviz"}
@@ -62,6 +65,7 @@ STARTS = {
     "rviz": ["rviz2"],
     "l2lidar_with_rviz": ["rviz2", "l2lidar_node"],
     "deskew_odometry": ["l2lidar_node", "companion_node"],
+    "slam": ["l2lidar_node", "companion_node", "slam_node"],
     "lio_input": ["l2lidar_node"],
     "replay": ["l2lidar_node", "companion_node"],
     "l2_top_mount_example": ["robot_state_publisher", "rviz2", "l2lidar_node"],
@@ -80,7 +84,7 @@ STARTS = {
     ],
 }
 NEEDED = {"lio_input": {"consumer": "lio_sam"}, "replay": {"file": str(ROOT / "README.md")}}
-OURS = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "companion_node"}
+OURS = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "companion_node", "slam_node"}
 
 # The folder launch/ of this repository looks like an empty package: ask for more of the real one.
 try:

@@ -13,6 +13,7 @@ from l2lidar_node.config import FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.types import POINT
 from l2lidar_proc.config import DeskewTopics, OdometryTopics
+from l2lidar_proc.slam.config import SlamTopics
 
 LAYOUTS = Path(__file__).resolve().parent.parent / "rviz"
 FIXED_FRAMES = {
@@ -20,6 +21,7 @@ FIXED_FRAMES = {
     "rvizl2lidar_example.rviz": "base_link",
     "slam.rviz": "odom",
     "lio_sam.rviz": "odom",
+    "map.rviz": "map",
 }
 # Of rviz_common and rviz_default_plugins as Jazzy has them (14.1).
 DISPLAYS = {
@@ -57,6 +59,9 @@ KINDS = {
     topics.LIO_SAM_PATH: "Path",
     topics.LIO_SAM_ODOMETRY: "Odometry",
     topics.ODOMETRY: "Odometry",
+    topics.MAP_POINTS: "PointCloud2",
+    topics.MAP_PATH: "Path",
+    topics.GRAPH: "MarkerArray",
     topics.ROBOT_DESCRIPTION: "RobotModel",
 }
 
@@ -89,6 +94,14 @@ def test_topics_and_frame_are_those_of_the_companions() -> None:
     assert f"/{odometry.path_topic}" == topics.PATH
     assert f"/{odometry.odometry_topic}" == f"/{deskew.velocity_topic}" == topics.ODOMETRY
     assert odometry.odom_frame == FIXED_FRAMES["slam.rviz"]
+    slam = SlamTopics()
+    assert f"/{slam.map_topic}" == topics.MAP_POINTS
+    assert f"/{slam.path_topic}" == topics.MAP_PATH
+    assert f"/{slam.graph_topic}" == topics.GRAPH
+    assert slam.map_frame == FIXED_FRAMES["map.rviz"]
+    assert slam.odometry_topic == odometry.odometry_topic
+    assert slam.cloud_topic == odometry.deskewed_topic
+    assert slam.odometry_status_topic == odometry.status_topic
 
 
 def test_layouts_are_those_known() -> None:

@@ -13,6 +13,9 @@ REGISTERED_POINTS: Final = "/registered_points"
 LOCAL_MAP: Final = "/local_map"
 PATH: Final = "/path"
 ODOMETRY: Final = "/odometry"
+MAP_POINTS: Final = "/map_points"
+MAP_PATH: Final = "/map_path"
+GRAPH: Final = "/graph"
 ROBOT_DESCRIPTION: Final = "/robot_description"
 
 DRIVER_TOPICS: Final = (POINTS, IMU)
@@ -30,6 +33,9 @@ SHOWN_TOPICS: Final = (
     LOCAL_MAP,
     PATH,
     ODOMETRY,
+    MAP_POINTS,
+    MAP_PATH,
+    GRAPH,
     ROBOT_DESCRIPTION,
 )
 """Topics that the RViz layouts may name, all from the root."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Pose, PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseMotion
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+
+UNKNOWN_VARIANCE: Final = 9999.0
+"""What rtabmap takes for a pose or velocity that is not known."""
 
 XYZ: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
@@ -27,6 +32,41 @@ def odometry(motion: BaseMotion, stamp: HostNs, odom_frame: str, base_frame: str
     _set(message.twist.twist.linear, motion.velocity)
     _set(message.twist.twist.angular, motion.angular_velocity)
     message.twist.covariance = motion.twist_covariance.ravel()
+    return message
+
+
+def set_unknown(message: Odometry) -> None:
+    """Give an odometry message the variances that rtabmap takes for "not known"."""
+    unknown = (UNKNOWN_VARIANCE * np.eye(6)).ravel()
+    message.pose.covariance = unknown
+    message.twist.covariance = unknown
+
+
+def odometry_status(estimate: OdometryEstimate, base_frame: str) -> DiagnosticArray:
+    """Return what is remarkable about an estimate, with the estimate's stamp.
+
+    The message is ``ALIGNED``, or the names of :class:`Status` that apply, comma-separated.
+    """
+    lost = {Status.LOST, Status.RESTARTED} & set(estimate.status)
+    level = DiagnosticStatus.WARN if estimate.status else DiagnosticStatus.OK
+    quality = estimate.quality
+    values = {
+        "matched": quality.matched,
+        "inlier_ratio": f"{quality.inlier_ratio:.4f}",
+        "residual_m": f"{quality.residual_m:.4f}",
+        "degeneracy_ratio": f"{quality.degeneracy_ratio:.4f}",
+    }
+    message = DiagnosticArray()
+    message.header.stamp = to_time(estimate.stamp)
+    message.header.frame_id = base_frame
+    message.status = [
+        DiagnosticStatus(
+            level=DiagnosticStatus.ERROR if lost else level,
+            name="odometry",
+            message=",".join(status.name for status in estimate.status) or "ALIGNED",
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+    ]
     return message
 
 
@@ -46,6 +86,17 @@ def pose(matrix: F64) -> Pose:
     _set(message.position, matrix[:3, 3])
     _turn(message.orientation, matrix)
     return message
+
+
+def matrix(pose: Pose) -> F64:
+    """Return the (4, 4) of a pose; not finite where its quaternion is not one."""
+    q = pose.orientation
+    quaternion = np.array((q.w, q.x, q.y, q.z))
+    norm = np.linalg.norm(quaternion)
+    if not 0.5 < norm < 2.0:
+        return np.full((4, 4), np.nan)
+    place = pose.position
+    return rotations.transform(quaternion / norm, (place.x, place.y, place.z))
 
 
 def pose_stamped(matrix: F64, stamp: HostNs, frame: str) -> PoseStamped:

@@ -33,7 +33,7 @@ from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.dead_reckoning import DeadReckoning
-from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import map_file, trajectory
@@ -100,6 +100,8 @@ class OdometryNode(Node):
         self._path_publisher = self.create_publisher(Path, topics.path_topic, latched)
         self._map = self.create_publisher(PointCloud2, topics.map_topic, latched)
         self._registered = self.create_publisher(PointCloud2, topics.registered_topic, out)
+        self._deskewed = self.create_publisher(PointCloud2, topics.deskewed_topic, out)
+        self._status = self.create_publisher(DiagnosticArray, topics.status_topic, out)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         period_s = 1.0 / topics.imu_rate if topics.imu_rate > 0.0 else SLOW_LOOK_S
@@ -256,13 +258,21 @@ class OdometryNode(Node):
         topics = self._settings.value.topics
         motion = self._base.motion(estimate)
         stamp, odom = estimate.stamp, topics.odom_frame
-        self._odometry.publish(messages.odometry(motion, stamp, odom, self._base_name))
+        message = messages.odometry(motion, stamp, odom, self._base_name)
+        if topics.covariance_when_lost and {Status.LOST, Status.RESTARTED} & set(estimate.status):
+            messages.set_unknown(message)
+        self._odometry.publish(message)
+        self._status.publish(messages.odometry_status(estimate, self._base_name))
         self._send_transform(motion.T_odom_base, stamp)
         self._extend_path(motion.T_odom_base, estimate)
         if self._registered.get_subscription_count():
             pose = self._base.odom_from_map(estimate.T_map_lidar) @ estimate.T_map_lidar
             points = messages.moved(estimate.points, pose)
             self._registered.publish(to_cloud(points, stamp, odom))
+        if self._deskewed.get_subscription_count():
+            T_base_lidar = rotations.inverse(self._base.T_lidar_base)
+            points = messages.moved(estimate.points, T_base_lidar)
+            self._deskewed.publish(to_cloud(points, stamp, self._base_name))
         self._go_on_from_here()
 
     def _send_transform(self, T_odom_base: F64, stamp: HostNs) -> None:

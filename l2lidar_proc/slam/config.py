@@ -84,9 +84,9 @@ class LocalizationConfig:
 
     relocalize: str = setting(
         "auto",
-        "auto: the place is searched for whenever it is unknown; service: on ~/relocalize; off: "
+        "auto: the place is searched for whenever it is unknown; service: on ~/relocalize; never: "
         "only from an initial pose",
-        choices=("auto", "service", "off"),
+        choices=("auto", "service", "never"),
     )
     query_step_m: float = setting(
         2.0, "way between two looks at the map", unit="m", lo=0.5, hi=20.0

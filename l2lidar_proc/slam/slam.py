@@ -175,7 +175,7 @@ class Slam:
 
     def _anywhere(self, graph: Graph, number: int) -> list[Loop]:
         """Return a verified pair with a place in a part of the map that nothing leads to."""
-        if self.config.localization.relocalize == "off":
+        if self.config.localization.relocalize == "never":
             return []
         apart = ~np.isfinite(graph.ways)
         eligible = apart & np.array([node.is_comparable for node in self.nodes])

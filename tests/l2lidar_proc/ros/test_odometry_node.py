@@ -11,7 +11,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402  after importorskip
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402  after importorskip
 from nav_msgs.msg import Path as PathMessage  # noqa: E402
@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_cloud, from_time  # noqa: E402
+from l2lidar_proc.ros.odometry_messages import matrix  # noqa: E402
 from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
 from tests.l2lidar_proc.odometry.odometry_world import recording  # noqa: E402
 from tests.l2lidar_proc.ros.bench import FRAME, LATCHED, Bench  # noqa: E402
@@ -255,3 +256,26 @@ def test_what_other_sensors_do_differently_is_recognized_and_said(bench: Any) ->
     )
     bench.until(lambda: len(bench.poses) == 5)
     assert np.allclose(bench.node._pipeline.odometry.T_cloud_imu, np.eye(4))
+
+
+def test_back_ends_get_deskewed_clouds_and_the_status_of_each_pose(bench):
+    clouds: list[PointCloud2] = []
+    statuses: list[DiagnosticArray] = []
+    bench.hear(PointCloud2, "deskewed_points", clouds.append)
+    bench.hear(DiagnosticArray, "odometry_status", statuses.append)
+    bench.until(bench.node._deskewed.get_subscription_count)
+    bench.until(bench.node._status.get_subscription_count)
+    run = recording("room", "walk")
+    bench.send(run, list(sweeps(run, "turn"))[:8])
+    bench.until(lambda: len(clouds) == len(statuses) == len(bench.registered) == 8)
+
+    stamps = [from_time(m.header.stamp) for m in bench.poses]
+    assert [from_time(m.header.stamp) for m in clouds] == stamps
+    assert [from_time(m.header.stamp) for m in statuses] == stamps
+    assert {m.header.frame_id for m in clouds} == {FRAME}
+    assert statuses[-1].status[0].message == "ALIGNED"
+    pose = matrix(bench.poses[-1].pose.pose)
+    body, world = from_cloud(clouds[-1]), from_cloud(bench.registered[-1])
+    moved = np.stack([body[axis] for axis in "xyz"], axis=1) @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(moved, np.stack([world[a] for a in "xyz"], axis=1), atol=1e-4)
+    assert "time" not in (body.dtype.names or ())

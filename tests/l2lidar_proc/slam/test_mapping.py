@@ -17,7 +17,7 @@ from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, deviations, 
 from l2lidar_proc.slam.se3 import F64
 from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.slam.verification import Fit, Match
-from tests.l2lidar_proc.slam.conftest import STEP
+from tests.l2lidar_proc.conftest import STEP
 from tests.support.mapping_runs import MappingRun, ate, drifting, scan, walk
 
 TIGHT = np.diag(np.repeat((1e-3**2, 0.01**2), 3))

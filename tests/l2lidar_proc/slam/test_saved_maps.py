@@ -15,7 +15,7 @@ from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.localization import Localizer
 from l2lidar_proc.slam.nodes import SlamState
 from l2lidar_proc.slam.slam import Slam
-from tests.l2lidar_proc.slam.conftest import STEP
+from tests.l2lidar_proc.conftest import STEP
 from tests.support.mapping_runs import MappingRun, drifting, scan, walk
 
 

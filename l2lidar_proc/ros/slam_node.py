@@ -1,0 +1,377 @@
+"""SLAM as a ROS 2 node: pairs odometry with clouds, hands them to a worker, publishes TF."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
+
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.parameters import ParameterSet
+from l2lidar_node.ros.program import StartError, run
+from l2lidar_node.types import HostNs
+from l2lidar_proc.ros import odometry_messages as messages
+from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
+from l2lidar_proc.slam.atlas import AtlasError
+from l2lidar_proc.slam.config import SlamNodeConfig
+from l2lidar_proc.slam.nodes import Map, OdometrySweep, SlamState, health_of
+from l2lidar_proc.slam.pose_graph import GtsamMissingError
+
+_PENDING: Final = 40  # stamps that wait for their other messages
+_AHEAD_S: Final = 1.0  # the transform is carried on so long after the last odometry
+_SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
+_LEVELS: Final = {
+    SlamState.LOCALIZED: DiagnosticStatus.OK,
+    SlamState.TENTATIVE: DiagnosticStatus.WARN,
+    SlamState.SEARCHING: DiagnosticStatus.WARN,
+    SlamState.DEAD_RECKONING: DiagnosticStatus.ERROR,
+    SlamState.LOST: DiagnosticStatus.ERROR,
+}
+
+
+@dataclass(slots=True)
+class _Parts:
+    """Messages of one stamp."""
+
+    odometry: Odometry | None = None
+    cloud: PointCloud2 | None = None
+    status: DiagnosticStatus | None = None
+
+
+class SlamNode(Node):
+    """Publishes where the odometry frame is in the map.
+
+    Raises
+    ------
+    SettingError
+        If a parameter is wrong.
+    StartError
+        If gtsam or the map is missing.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("slam_node")
+        self._settings = ParameterSet(self, SlamNodeConfig, self._configure)
+        config = self._settings.value
+        try:
+            self._worker = SlamWorker(config, self.get_logger().warning)
+        except (GtsamMissingError, AtlasError) as error:
+            self.destroy_node()
+            raise StartError(str(error)) from None
+        self._parts: OrderedDict[HostNs, _Parts] = OrderedDict()
+        self._latest: tuple[HostNs, int, str] | None = None  # stamp, arrival, odom frame
+        self._stamped = 0
+        self._other_parent = ""
+        self._refused = 0
+        self._shown = (-1, -1)
+        self._open(config)
+
+    def _open(self, config: SlamNodeConfig) -> None:
+        topics = config.topics
+        inputs = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(Odometry, topics.odometry_topic, self._odometry, inputs)
+        self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, inputs)
+        self.create_subscription(
+            DiagnosticArray, topics.odometry_status_topic, self._status, inputs
+        )
+        self.create_subscription(
+            PoseWithCovarianceStamped, topics.initial_pose_topic, self._initial_pose, 1
+        )
+        self.create_subscription(TFMessage, "/tf", self._transforms, inputs)
+        self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, topics.pose_topic, 10)
+        self._map = self.create_publisher(PointCloud2, topics.map_topic, latched)
+        self._path = self.create_publisher(Path, topics.path_topic, latched)
+        self._graph = self.create_publisher(MarkerArray, topics.graph_topic, latched)
+        self._state = self.create_publisher(DiagnosticStatus, topics.status_topic, latched)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        worker = self._worker
+        for name, job in (
+            ("save", worker.save),
+            ("load", worker.load),
+            ("reset", worker.reset),
+            ("relocalize", worker.relocalize),
+        ):
+            self.create_service(Trigger, f"~/{name}", self._service(job))
+        self.create_timer(1.0 / topics.tf_rate, self._publish_transform)
+        self.create_timer(1.0, self._diagnose)
+        if topics.map_period_s > 0.0:
+            self.create_timer(topics.map_period_s, self._show)
+        if topics.autosave_s > 0.0 and config.slam.mode == "mapping":
+            self.create_timer(topics.autosave_s, self._autosave)
+
+    def destroy_node(self) -> None:
+        """End the worker with the node."""
+        if hasattr(self, "_worker"):
+            self._worker.close()
+        super().destroy_node()
+
+    def _configure(self, config: SlamNodeConfig) -> None:
+        self._worker.map_name = config.topics.map_name
+
+    # ---- input
+
+    def _odometry(self, message: Odometry) -> None:
+        stamp = from_time(message.header.stamp)
+        self._latest = stamp, time.monotonic_ns(), message.header.frame_id
+        self._part(stamp).odometry = message
+        self._publish_pose(message)
+        self._pair(stamp)
+
+    def _cloud(self, message: PointCloud2) -> None:
+        stamp = from_time(message.header.stamp)
+        self._part(stamp).cloud = message
+        self._pair(stamp)
+
+    def _status(self, message: DiagnosticArray) -> None:
+        if message.status:
+            stamp = from_time(message.header.stamp)
+            self._part(stamp).status = message.status[0]
+            self._pair(stamp)
+
+    def _part(self, stamp: HostNs) -> _Parts:
+        parts = self._parts.setdefault(stamp, _Parts())
+        while len(self._parts) > _PENDING:
+            self._parts.popitem(last=False)
+        return parts
+
+    def _pair(self, stamp: HostNs) -> None:
+        """Hand a sweep on as soon as all that belongs to it is there."""
+        parts = self._parts[stamp]
+        if parts.odometry is None or parts.cloud is None:
+            return
+        if parts.status is None and self.count_publishers(
+            self._settings.value.topics.odometry_status_topic
+        ):
+            return
+        del self._parts[stamp]
+        try:
+            self._worker.sweep(_sweep(stamp, parts.odometry, parts.cloud, parts.status))
+        except ValueError as error:
+            self._refused += 1
+            self.get_logger().warning(f"sweep dropped: {error}", throttle_duration_sec=5.0)
+
+    def _initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        frame = self._settings.value.topics.map_frame
+        if message.header.frame_id not in ("", frame):
+            self.get_logger().warning(
+                f"initial pose in '{message.header.frame_id}' ignored, expected '{frame}'"
+            )
+            return
+        matrix = messages.matrix(message.pose.pose)
+        if not np.isfinite(matrix).all():
+            self.get_logger().warning("initial pose ignored: it is not finite")
+            return
+        x, y = matrix[:2, 3].tolist()
+        yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+        worker = self._worker
+        worker.request(lambda: worker.set_pose(x, y, yaw), self._say)
+
+    def _transforms(self, message: TFMessage) -> None:
+        """Notice whether somebody else is the parent of the odometry frame already."""
+        if self._latest is None:
+            return
+        ours = self._settings.value.topics.map_frame
+        for transform in message.transforms:
+            parent = transform.header.frame_id
+            if transform.child_frame_id == self._latest[2] and parent != ours:
+                self._other_parent = parent
+
+    # ---- output
+
+    def _publish_transform(self) -> None:
+        T_map_odom, topics = self._worker.T_map_odom, self._settings.value.topics
+        if T_map_odom is None or self._latest is None:
+            return
+        if not topics.publish_tf or self._other_parent:
+            return
+        stamp, arrival, odom = self._latest
+        ahead = min(time.monotonic_ns() - arrival, round(_AHEAD_S * 1e9))
+        stamped = stamp + ahead + round(topics.tf_tolerance_s * 1e9)
+        if self._stamped - round(2e9 * _AHEAD_S) < stamped <= self._stamped:
+            return  # a transform of that instant is out already
+        self._stamped = stamped
+        transform = messages.transform(T_map_odom, HostNs(stamped), topics.map_frame, odom)
+        self._tf.publish(TFMessage(transforms=[transform]))
+
+    def _publish_pose(self, odometry: Odometry) -> None:
+        T_map_odom = self._worker.T_map_odom
+        if T_map_odom is None:
+            return
+        message = PoseWithCovarianceStamped()
+        message.header.stamp = odometry.header.stamp
+        message.header.frame_id = self._settings.value.topics.map_frame
+        matrix = T_map_odom @ messages.matrix(odometry.pose.pose)
+        if not np.isfinite(matrix).all():
+            return
+        message.pose.pose = messages.pose(matrix)
+        order = [3, 4, 5, 0, 1, 2]
+        message.pose.covariance = self._worker.covariance[np.ix_(order, order)].ravel()
+        self._pose.publish(message)
+
+    def _show(self) -> None:
+        """Publish map, path and graph if they changed and somebody listens."""
+        listeners = [self._map, self._path, self._graph]
+        wanted = tuple(publisher.get_subscription_count() for publisher in listeners)
+        worker = self._worker
+        now = (worker.submaps, hash((worker.loops, wanted)))
+        if self._latest is None or not any(wanted) or now == self._shown:
+            return
+        self._shown = now
+        stamp = self._latest[0]
+        worker.show(lambda built, loops: self._show_map(built, loops, stamp))
+
+    def _show_map(self, built: Map, loops: list[tuple[int, int]], stamp: HostNs) -> None:
+        """Publish map, path and graph; called in the worker's thread."""
+        frame = self._settings.value.topics.map_frame
+        if self._map.get_subscription_count():
+            points = built.points()
+            points = points[:: max(-(-len(points) // _SHOWN_POINTS), 1)]
+            self._map.publish(to_cloud(messages.as_cloud(points), stamp, frame))
+        if self._path.get_subscription_count():
+            places = built.trajectory()
+            some = places[:: max(len(places) // 5000, 1)]
+            path = Path(
+                poses=[
+                    messages.pose_stamped(pose, HostNs(int(at)), frame)
+                    for at, pose in zip(some["stamp"], some["pose"], strict=True)
+                ]
+            )
+            path.header.frame_id = frame
+            self._path.publish(path)
+        if self._graph.get_subscription_count():
+            self._graph.publish(_markers(built, loops, frame))
+
+    def _autosave(self) -> None:
+        self._worker.request(self._worker.autosave, lambda answer: None)
+
+    def _service(self, job: Any) -> Any:
+        """Return a callback that answers when the worker has done a job."""
+
+        async def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            del request
+            future: Future = Future(executor=self.executor)
+            self._worker.request(job, future.set_result)
+            response.success, response.message = await future
+            return response
+
+        return answer
+
+    def _say(self, answer: Answer) -> None:
+        worked, text = answer
+        if worked:
+            self.get_logger().info(f"initial pose {text}")
+        else:
+            self.get_logger().warning(text)
+
+    def _diagnose(self) -> None:
+        state = self._worker.state
+        text, level = state.value, _LEVELS[state]
+        if self._other_parent:
+            level = DiagnosticStatus.ERROR
+            text = (
+                f"'{self._other_parent}' is the parent of the odometry frame already: set "
+                "invert_tf of the odometry to false, or publish_tf of slam_node"
+            )
+        values = {**values_of(self._worker), "sweeps refused": self._refused}
+        status = DiagnosticStatus(
+            level=level,
+            name=f"{self.get_fully_qualified_name().lstrip('/')}: slam",
+            message=text,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+        self._state.publish(
+            DiagnosticStatus(
+                level=level, name="slam", message=state.name, values=list(status.values)
+            )
+        )
+
+
+def _sweep(
+    stamp: HostNs, odometry: Odometry, cloud: PointCloud2, status: DiagnosticStatus | None
+) -> OdometrySweep:
+    """Return messages of one stamp as a sweep.
+
+    Raises
+    ------
+    ValueError
+        If the cloud or the pose cannot be used.
+    """
+    if cloud.header.frame_id != odometry.child_frame_id:
+        raise ValueError(
+            f"the cloud is in '{cloud.header.frame_id}', the pose is that of "
+            f"'{odometry.child_frame_id}'; they have to be the same"
+        )
+    points = from_cloud(cloud)
+    if not {"x", "y", "z"} <= set(points.dtype.names or ()):
+        raise ValueError("the cloud has no x, y, z")
+    xyz = np.stack([points[axis].reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
+    pose = messages.matrix(odometry.pose.pose)
+    if not np.isfinite(pose).all():
+        raise ValueError("the pose is not finite")
+    remarks = status.message.split(",") if status is not None else []
+    covariance = np.array(odometry.pose.covariance, np.float64).reshape(6, 6)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    return OdometrySweep(stamp, pose, xyz, health_of(remarks), covariance)
+
+
+def _markers(built: Map, loops: list[tuple[int, int]], frame: str) -> MarkerArray:
+    """Return submaps, the way between them, and loops."""
+    places = built.poses[:, :3, 3].tolist()
+    pairs = [(n, n + 1) for n in range(len(places) - 1)]
+    return MarkerArray(
+        markers=[
+            _marker(0, Marker.SPHERE_LIST, 0.3, (0.2, 0.5, 1.0), places, frame),
+            _marker(1, Marker.LINE_LIST, 0.05, (0.2, 0.5, 1.0), _ends(places, pairs), frame),
+            _marker(2, Marker.LINE_LIST, 0.1, (1.0, 0.2, 0.2), _ends(places, loops), frame),
+        ]
+    )
+
+
+def _ends(places: list[list[float]], pairs: list[tuple[int, int]]) -> list[list[float]]:
+    return [places[number] for pair in pairs for number in pair]
+
+
+def _marker(
+    number: int,
+    kind: int,
+    size: float,
+    color: tuple[float, float, float],
+    places: list[list[float]],
+    frame: str,
+) -> Marker:
+    marker = Marker(ns="slam", id=number, type=kind, action=Marker.ADD)
+    marker.header.frame_id = frame
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = marker.scale.y = marker.scale.z = size
+    marker.color.r, marker.color.g, marker.color.b = color
+    marker.color.a = 1.0
+    marker.points = [Point(x=x, y=y, z=z) for x, y, z in places]
+    return marker
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the SLAM node; see :func:`l2lidar_node.ros.program.run`."""
+    return run("slam_node", SlamNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,236 @@
+"""The thread in which slam_node does everything but listening and TF."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from queue import Empty, Full, Queue
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc.slam import atlas
+from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
+from l2lidar_proc.slam.config import SlamNodeConfig, check_map_name
+from l2lidar_proc.slam.localization import Localizer
+from l2lidar_proc.slam.nodes import Map, OdometrySweep, SlamState
+from l2lidar_proc.slam.slam import Slam
+
+F64 = NDArray[np.float64]
+
+Answer = tuple[bool, str]
+"""Whether something worked, and what there is to say."""
+
+_DEPTH: Final = 400  # sweeps that may wait while a loop is verified: over a minute
+_END: Final = None
+
+
+class SlamWorker:
+    """Mapping or localization behind a queue.
+
+    What the node reads of it (:attr:`T_map_odom`, :attr:`state`, ...) is replaced in one step and
+    never changed in place, so that no lock is needed.
+
+    Parameters
+    ----------
+    config : SlamNodeConfig
+    warn : callable
+        Told what a person should know.
+
+    Attributes
+    ----------
+    T_map_odom : ndarray, shape (4, 4), or None
+    state : SlamState
+    covariance : ndarray, shape (6, 6)
+        Of the place in the map: turn, then translation, map axes.
+    counts : Counter of str
+        Candidates that were refused, by reason.
+    submaps, loops, dropped, saved_bytes : int
+
+    Raises
+    ------
+    GtsamMissingError
+    AtlasError
+        If there is no map to begin with, and one is needed.
+    """
+
+    def __init__(self, config: SlamNodeConfig, warn: Callable[[str], None]) -> None:
+        self._config = config
+        self._warn = warn
+        self.map_name = config.topics.map_name
+        self.dropped = self.saved_bytes = 0
+        self._given = False
+        self._writer: AtlasWriter | None = None
+        self._changed = False
+        saved = None
+        if config.topics.load_map or config.slam.mode == "localization":
+            saved = self._load()
+        self._map = saved
+        self._engine: Slam | Localizer = self._made(saved)
+        self._publish()
+        self._jobs: Queue[Callable[[], None] | None] = Queue(_DEPTH)
+        self._thread = threading.Thread(target=self._run, name="slam", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Number of sweeps and requests that wait."""
+        return self._jobs.qsize()
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the map."""
+        return Path(self._config.topics.data_dir).expanduser() / check_map_name(self.map_name)
+
+    # ---- called by the node
+
+    def sweep(self, sweep: OdometrySweep) -> None:
+        """Take a sweep; if too many wait already, it is counted as dropped."""
+        self._submit(lambda: self._add(sweep))
+
+    def request(self, job: Callable[[], Answer], done: Callable[[Answer], None]) -> None:
+        """Have one of the methods below run in the thread, and its answer given to ``done``."""
+        if not self._submit(lambda: done(job())):
+            done((False, "too much is waiting; try again"))
+
+    def show(self, show: Callable[[Map, list[tuple[int, int]]], None]) -> None:
+        """Have the map and its loops shown, in the thread."""
+        self._submit(lambda: show(*self._shown()))
+
+    def close(self) -> None:
+        """End the thread; what waits is forgotten."""
+        try:
+            while True:
+                self._jobs.get_nowait()
+        except Empty:
+            pass
+        self._jobs.put(_END)
+        self._thread.join(timeout=5.0)
+
+    # ---- run in the thread
+
+    def save(self) -> Answer:
+        """Save a growing map."""
+        if not isinstance(self._engine, Slam):
+            return False, "in localization mode the map stays as it was saved"
+        built = self._engine.map()
+        if not built.nodes:
+            return False, "there is no map yet"
+        try:
+            folder = self.folder
+            if self._writer is None or self._writer.folder != folder:
+                self._writer = AtlasWriter(folder)
+            self.saved_bytes = self._writer.save(built)
+        except AtlasError as error:
+            return False, str(error)
+        self._changed = False
+        return True, f"{len(built.nodes)} submaps, {self.saved_bytes} bytes in {folder.absolute()}"
+
+    def autosave(self) -> Answer:
+        """Save a map that has grown since; say so only if that fails."""
+        if not self._changed or not isinstance(self._engine, Slam):
+            return True, ""
+        worked, text = self.save()
+        if not worked:
+            self._warn(f"autosave: {text}")
+        return worked, text
+
+    def load(self) -> Answer:
+        """Begin anew with the saved map."""
+        try:
+            saved = self._load()
+        except AtlasError as error:
+            return False, str(error)
+        self._begin(saved)
+        return True, f"{len(saved.nodes)} submaps of {self.folder.absolute()}"
+
+    def reset(self) -> Answer:
+        """Begin anew: with an empty map, or in localization mode with the one that was loaded."""
+        self._begin(self._map if self._config.slam.mode == "localization" else None)
+        return True, "begun anew"
+
+    def relocalize(self) -> Answer:
+        """Search for the place in the map."""
+        if not isinstance(self._engine, Localizer):
+            return False, "only in localization mode"
+        self._engine.relocalize()
+        self._publish()
+        return True, "searching: move some meters"
+
+    def set_pose(self, x: float, y: float, yaw: float) -> Answer:
+        """Take the place in the map from a person [m, m, rad]."""
+        if not isinstance(self._engine, Localizer):
+            return False, "an initial pose is of use in localization mode only"
+        if not self._engine.set_pose(x, y, yaw):
+            return False, "an initial pose came before the first sweep; give it again"
+        self._publish()
+        return True, f"taken: {x:.2f} m, {y:.2f} m, {np.degrees(yaw):.0f} degrees"
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not _END:
+            job()
+
+    def _submit(self, job: Callable[[], None]) -> bool:
+        try:
+            self._jobs.put_nowait(job)
+        except Full:
+            self.dropped += 1
+            return False
+        return True
+
+    def _add(self, sweep: OdometrySweep) -> None:
+        self._changed |= self._engine.add(sweep)
+        if not self._given and isinstance(self._engine, Localizer):
+            self._given = True
+            x, y, degrees = self._config.topics.initial_pose
+            self._engine.set_pose(x, y, float(np.radians(degrees)))
+        self._publish()
+
+    def _load(self) -> Map:
+        saved, warnings = atlas.load(self.folder)
+        for warning in warnings:
+            self._warn(warning)
+        return saved
+
+    def _begin(self, saved: Map | None) -> None:
+        self._map, self._engine = saved, self._made(saved)
+        self._writer, self._changed = None, False
+        self._publish()
+
+    def _made(self, saved: Map | None) -> Slam | Localizer:
+        self._given = not self._config.topics.initial_pose
+        if self._config.slam.mode == "localization":
+            assert saved is not None
+            return Localizer(self._config.slam, saved)
+        return Slam(self._config.slam, saved)
+
+    def _publish(self) -> None:
+        engine = self._engine
+        self.T_map_odom: F64 | None = engine.T_map_odom
+        self.state: SlamState = engine.state
+        self.covariance: F64 = engine.covariance
+        self.counts: Counter[str] = engine.counts.copy()
+        nodes = engine.nodes if isinstance(engine, Slam) else self._shown()[0].nodes
+        self.submaps = len(nodes)
+        self.loops = len(engine.loops) if isinstance(engine, Slam) else 0
+
+    def _shown(self) -> tuple[Map, list[tuple[int, int]]]:
+        if isinstance(self._engine, Slam):
+            return self._engine.map(), list(self._engine.loops)
+        assert self._map is not None
+        return self._map, []
+
+
+def values_of(worker: SlamWorker) -> dict[str, Any]:
+    """Return the figures for diagnostics."""
+    return {
+        "submaps": worker.submaps,
+        "loops": worker.loops,
+        "waiting": worker.waiting,
+        "dropped": worker.dropped,
+        "saved bytes": worker.saved_bytes,
+        **{f"refused: {reason}": count for reason, count in worker.counts.items()},
+    }

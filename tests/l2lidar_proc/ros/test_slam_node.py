@@ -1,0 +1,241 @@
+"""slam_node over real topics: pairs, TF, pose, state, services, saved maps."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("gtsam")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from nav_msgs.msg import Path as PathMessage  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
+from l2lidar_node.ros.conversions import from_time, to_cloud, to_time  # noqa: E402
+from l2lidar_node.ros.program import StartError  # noqa: E402
+from l2lidar_proc.ros import odometry_messages as messages  # noqa: E402
+from l2lidar_proc.ros.slam_node import SlamNode  # noqa: E402
+from l2lidar_proc.slam import atlas, se3  # noqa: E402
+from l2lidar_proc.slam.nodes import OdometrySweep  # noqa: E402
+from l2lidar_proc.slam.slam import Slam  # noqa: E402
+from tests.l2lidar_proc.conftest import STEP  # noqa: E402
+from tests.l2lidar_proc.ros.bench import FRAME, Bench  # noqa: E402
+from tests.support.mapping_runs import MappingRun, drifting  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+
+class SlamBench(Bench):
+    """A SLAM node on the bench."""
+
+    def __init__(self, *overrides: str) -> None:
+        super().__init__(SlamNode, overrides)
+        self.transforms: list[TransformStamped] = []
+        self.poses: list[PoseWithCovarianceStamped] = []
+        self.states: list[str] = []
+        self.maps: list[PointCloud2] = []
+        self.paths: list[PathMessage] = []
+        self.graphs: list[MarkerArray] = []
+        self.hear(TFMessage, "/tf", self.take_transforms)
+        self.hear(PoseWithCovarianceStamped, "pose", self.poses.append)
+        self.hear(DiagnosticStatus, "slam_status", lambda m: self.states.append(m.message))
+        self.hear(PointCloud2, "map_points", self.maps.append)
+        self.hear(PathMessage, "map_path", self.paths.append)
+        self.hear(MarkerArray, "graph", self.graphs.append)
+        self.odometry_out = self.peer.create_publisher(Odometry, "odometry", 50)
+        self.deskewed_out = self.peer.create_publisher(PointCloud2, "deskewed_points", 50)
+        self.status_out = self.peer.create_publisher(DiagnosticArray, "odometry_status", 50)
+        self.given_out = self.peer.create_publisher(PoseWithCovarianceStamped, "/initialpose", 5)
+        self.tf_also = self.peer.create_publisher(TFMessage, "/tf", 50)
+        for publisher in (self.odometry_out, self.deskewed_out, self.status_out, self.given_out):
+            self.until(publisher.get_subscription_count)
+        self.until(self.node._tf.get_subscription_count)
+        self.until(self.node._pose.get_subscription_count)
+        self.until(lambda: self.node.count_publishers("odometry_status"))
+        self.sent = 0
+
+    def take_transforms(self, message: TFMessage) -> None:
+        self.transforms += [t for t in message.transforms if t.header.frame_id == "map"]
+
+    def send(self, sweep: OdometrySweep, frame: str = FRAME, remarks: str = "ALIGNED") -> None:
+        """Send the three messages of a sweep, and wait until the node has taken them."""
+        odometry = Odometry(child_frame_id=frame)
+        odometry.header.stamp = to_time(sweep.stamp)
+        odometry.header.frame_id = "odom"
+        odometry.pose.pose = messages.pose(sweep.T_odom_body)
+        status = DiagnosticArray(status=[DiagnosticStatus(name="odometry", message=remarks)])
+        status.header.stamp = odometry.header.stamp
+        self.odometry_out.publish(odometry)
+        self.status_out.publish(status)
+        cloud = messages.as_cloud(sweep.points)
+        self.deskewed_out.publish(to_cloud(cloud, sweep.stamp, FRAME))
+        self.until(lambda: self.is_taken(sweep.stamp))
+        self.sent += 1
+
+    def is_taken(self, stamp: int) -> bool:
+        latest = self.node._latest
+        return latest is not None and latest[0] >= stamp and stamp not in self.node._parts
+
+    def call(self, name: str) -> Any:
+        client = self.peer.create_client(Trigger, f"slam_node/{name}")
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        return future.result()
+
+    def drain(self) -> None:
+        """Wait until the worker has done all it was given."""
+        self.until(lambda: not self.node._worker.waiting)
+        self.call("relocalize")  # answered by the worker: all before it is done
+
+
+def sweeps_of(run: MappingRun, seed: int = 1) -> list[OdometrySweep]:
+    return list(run.sweeps(drifting(run.truth, 0.5, seed, STEP)))
+
+
+def test_a_walk_becomes_a_map_that_is_saved_and_shown(
+    office: MappingRun,
+    tmp_path: Path,
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}", "map_period_s:=0.3", "autosave_s:=0.0")
+    try:
+        some = sweeps_of(office)[:60]
+        for sweep in some:
+            bench.send(sweep)
+        bench.drain()
+        saved = bench.call("save")
+        bench.until(lambda: bench.maps and bench.paths and bench.graphs)
+        bench.until(lambda: bench.states)
+
+        assert saved.success
+        assert "submaps" in saved.message
+        loaded, warnings = atlas.load(tmp_path / "map")
+        assert warnings == []
+        assert len(loaded.nodes) >= 4
+        assert bench.states[-1] == "LOCALIZED"
+        assert bench.poses
+        assert all(m.header.frame_id == "map" for m in bench.poses)
+        stamps = [from_time(t.header.stamp) for t in bench.transforms]
+        assert len(stamps) > 10
+        assert np.all(np.diff(stamps) > 0)
+        assert stamps[0] >= some[0].stamp
+        assert {t.child_frame_id for t in bench.transforms} == {"odom"}
+        assert len(bench.maps[-1].data) > 10_000
+        assert len(bench.graphs[-1].markers) == 3
+    finally:
+        bench.close()
+
+
+def test_a_clouds_frame_that_is_not_that_of_the_pose_is_named_and_dropped(
+    office: MappingRun,
+    tmp_path: Path,
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}")
+    try:
+        for sweep in sweeps_of(office)[:3]:
+            bench.send(sweep, frame="base_link")
+        bad = dataclasses.replace(sweeps_of(office)[3], T_odom_body=np.full((4, 4), 0.0))
+        odometry = Odometry(child_frame_id=FRAME)
+        odometry.header.stamp = to_time(bad.stamp)
+        odometry.pose.pose.orientation.w = float("nan")
+        bench.odometry_out.publish(odometry)
+        bench.until(lambda: bench.node._latest[0] == bad.stamp)
+
+        assert bench.node._refused == 3
+        assert bench.node._worker.submaps == 0
+    finally:
+        bench.close()
+
+
+def test_another_parent_of_odom_silences_the_transform(
+    office: MappingRun,
+    tmp_path: Path,
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}")
+    try:
+        bench.send(sweeps_of(office)[0])
+        bench.until(lambda: bench.transforms)
+        inverted = messages.transform(np.eye(4), sweeps_of(office)[0].stamp, "base_link", "odom")
+        bench.until(bench.tf_also.get_subscription_count)
+        bench.tf_also.publish(TFMessage(transforms=[inverted]))
+        bench.until(lambda: bench.node._other_parent)
+        before = len(bench.transforms)
+        bench.diagnostics.clear()
+        bench.until(lambda: bench.diagnostics)
+
+        assert "invert_tf" in bench.diagnostics[-1].message
+        assert bench.diagnostics[-1].level == DiagnosticStatus.ERROR
+        assert len(bench.transforms) <= before + 2  # what was on its way
+    finally:
+        bench.close()
+
+
+def test_localization_says_nothing_until_it_knows_and_takes_an_initial_pose(
+    office: MappingRun,
+    mapped: Slam,
+    tmp_path: Path,
+) -> None:
+    atlas.AtlasWriter(tmp_path / "map").save(mapped.map())
+    before = {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()}
+    bench = SlamBench(f"data_dir:={tmp_path}", "mode:=localization", "relocalize:=never")
+    try:
+        run = office.part(20, 50)
+        true = se3.inverse(se3.leveled(office.truth[0])) @ run.truth
+        all_sweeps = sweeps_of(run, 9)
+        bench.send(all_sweeps[0])
+        bench.until(lambda: "SEARCHING" in bench.states)
+        assert bench.transforms == []
+        given = PoseWithCovarianceStamped()
+        given.header.frame_id = "map"
+        pose = se3.planar(true[0, 0, 3] + 0.3, true[0, 1, 3], se3.yaw_of(true[0]) + 0.1)
+        given.pose.pose = messages.pose(pose)
+        bench.given_out.publish(given)
+        bench.until(lambda: bench.node._worker.T_map_odom is not None)
+        for sweep in all_sweeps[1:]:
+            bench.send(sweep)
+        bench.until(lambda: not bench.node._worker.waiting)
+        bench.until(lambda: bench.states[-1] == "LOCALIZED")
+        refused = bench.call("save")
+
+        assert bench.transforms
+        found = bench.node._worker.T_map_odom @ all_sweeps[-1].T_odom_body
+        assert np.linalg.norm((found - true[-1])[:3, 3]) < 0.15
+        assert not refused.success
+        after = {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()}
+        assert after == before
+    finally:
+        bench.close()
+
+
+def test_without_a_map_localization_does_not_start(tmp_path: Path) -> None:
+    rclpy.init(
+        args=["test", "--ros-args", "-p", f"data_dir:={tmp_path}", "-p", "mode:=localization"]
+    )
+    try:
+        with pytest.raises(StartError, match=r"not a saved map: there is no atlas\.json"):
+            SlamNode()
+    finally:
+        rclpy.shutdown()
+
+
+@pytest.mark.parametrize("name", ["../outside", "/etc", "a/b", ""])
+def test_a_map_is_never_written_outside_its_folder(tmp_path: Path, name: str) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}")
+    try:
+        (result,) = bench.node.set_parameters([Parameter("map_name", value=name)])
+
+        assert not result.successful
+        assert "map_name" in result.reason
+    finally:
+        bench.close()
