@@ -28,6 +28,7 @@ RUN_BY = {
     r"l2lidar (discover|info|set \w+).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/recording/test_bag_readers.py",
+    r"l2lidar (slam|export) .*": "tests/l2lidar_proc/verbs/test_slam.py",
     r"l2lidar deskew .*": "tests/l2lidar_proc/verbs/test_deskew.py",
     r"l2lidar check .*\.pcap .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"l2lidar check .*\.mcap .*": "tests/l2lidar_node/check/test_recordings.py",
