@@ -113,7 +113,7 @@ class AtlasWriter:
 
     def _written(self, kind: str, **arrays: NDArray[Any]) -> str:
         stream = io.BytesIO()
-        np.savez(stream, allow_pickle=False, **arrays)
+        np.savez(stream, **arrays)
         content = stream.getvalue()
         name = f"{kind}-{_sha256(content)[:24]}.npz"
         if not (self.folder / name).exists():
