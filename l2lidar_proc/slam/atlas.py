@@ -111,7 +111,7 @@ class AtlasWriter:
             known = self._names[number] = node.submap, name
         return known[1]
 
-    def _written(self, kind: str, **arrays: NDArray[Any]) -> str:
+    def _written(self, kind: str, **arrays: Any) -> str:
         stream = io.BytesIO()
         np.savez(stream, **arrays)
         content = stream.getvalue()

@@ -258,7 +258,7 @@ def test_what_other_sensors_do_differently_is_recognized_and_said(bench: Any) ->
     assert np.allclose(bench.node._pipeline.odometry.T_cloud_imu, np.eye(4))
 
 
-def test_back_ends_get_deskewed_clouds_and_the_status_of_each_pose(bench):
+def test_back_ends_get_deskewed_clouds_and_the_status_of_each_pose(bench: Any) -> None:
     clouds: list[PointCloud2] = []
     statuses: list[DiagnosticArray] = []
     bench.hear(PointCloud2, "deskewed_points", clouds.append)

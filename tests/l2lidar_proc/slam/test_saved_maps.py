@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -191,14 +192,14 @@ def test_a_kidnapped_start_is_found_and_kept(mapped: Slam) -> None:
     assert len(mapped.map().points()) == before
 
 
-def off_by(pose: np.ndarray, run: MappingRun, number: int, mapped: Slam) -> float:
+def off_by(pose: Any, run: MappingRun, number: int, mapped: Slam) -> float:
     """Return the distance [m] from the truth; the map frame is that of the first sweep."""
     first = furnished_walk_start()
     true = se3.inverse(first) @ run.truth[number]
     return float(np.linalg.norm((pose - true)[:3, 3]))
 
 
-def furnished_walk_start() -> np.ndarray:
+def furnished_walk_start() -> Any:
     return se3.leveled(walk(furnished_office(), 0.1, step=STEP)[0])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,9 @@ from l2lidar_proc.slam import atlas
 from tests.l2lidar_proc.verbs.test_odometry import write_bag
 
 
-def test_a_recording_becomes_a_map_and_the_map_other_peoples_files(run, tmp_path: Path) -> None:
+def test_a_recording_becomes_a_map_and_the_map_other_peoples_files(
+    run: Any, tmp_path: Path
+) -> None:
     write_bag(tmp_path / "run.mcap", 14)
     out = tmp_path / "out"
 
@@ -38,7 +41,7 @@ def test_a_recording_becomes_a_map_and_the_map_other_peoples_files(run, tmp_path
     assert "'dxf' is not known; expected one of g2o" in unknown.err
 
 
-def test_what_is_not_a_map_is_not_exported(run, tmp_path: Path) -> None:
+def test_what_is_not_a_map_is_not_exported(run: Any, tmp_path: Path) -> None:
     (tmp_path / "map").mkdir()
     (tmp_path / "map" / atlas.MANIFEST).write_text(json.dumps({"map": {}}))
 
