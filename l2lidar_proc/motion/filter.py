@@ -216,10 +216,12 @@ def transition(rotation: F64, turn: F64, force: F64, dt: float) -> F64:
     f[ROTATION, ROTATION] = turn.T
     f[ROTATION, GYRO_BIAS] = -dt * eye
     f[VELOCITY, ROTATION] = dt * lean
+    f[VELOCITY, GYRO_BIAS] = -0.5 * dt * dt * lean
     f[VELOCITY, ACCEL_BIAS] = -dt * rotation
     f[VELOCITY, GRAVITY] = dt * eye
     f[POSITION, ROTATION] = 0.5 * dt * dt * lean
     f[POSITION, VELOCITY] = dt * eye
+    f[POSITION, GYRO_BIAS] = -(dt**3) / 6.0 * lean
     f[POSITION, ACCEL_BIAS] = -0.5 * dt * dt * rotation
     f[POSITION, GRAVITY] = 0.5 * dt * dt * eye
     return f

@@ -1,0 +1,209 @@
+"""The error-state filter: derivatives against differences, and an honest covariance (NEES)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
+from l2lidar_proc import rotations
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState, Noise
+from l2lidar_proc.motion.preintegration import integrate, segment
+from tests.l2lidar_proc.motion.analytic import EPOCH, G, Motion, at
+
+STEP = 1e-6
+LEVER = np.array([-0.2, 0.1, 0.3])
+
+
+def some_state(seed: int = 1) -> InertialState:
+    rng = np.random.default_rng(seed)
+    return InertialState(
+        at(0.0),
+        rotations.matrices(rotations.exp(rng.normal(0.0, 0.8, 3))),
+        rng.normal(0.0, 2.0, 3),
+        rng.normal(0.0, 1.0, 3),
+        rng.normal(0.0, 0.02, 3),
+        rng.normal(0.0, 0.1, 3),
+        np.array([0.1, -0.2, -G]),
+    )
+
+
+def predicted(state: InertialState, end: float) -> InertialState:
+    """Return the state at the end of a walk's samples."""
+    imu = segment(
+        Motion(turn=1.0, nod=0.2, speed=1.0).imu(0.0, end + 0.01),
+        [at(0.0), at(end)],
+        50_000_000,
+        np.zeros(3),
+    )
+    sums = integrate(
+        imu,
+        0,
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        rest_force=state.rest_force,
+    )
+    return state.at(sums, len(imu.stamps) - 1)
+
+
+def test_boxminus_undoes_boxplus() -> None:
+    state = some_state()
+    error = np.random.default_rng(2).normal(0.0, 0.3, eskf.ERRORS)
+    np.testing.assert_allclose(state.boxplus(error).boxminus(state), error, atol=1e-9)
+
+
+def test_the_transition_is_the_derivative_of_the_prediction() -> None:
+    dt = 0.04
+    state = some_state()
+    base = predicted(state, dt)
+    measured = np.empty((eskf.ERRORS, eskf.ERRORS))
+    for column in range(eskf.ERRORS):
+        error = np.zeros(eskf.ERRORS)
+        error[column] = STEP
+        measured[:, column] = predicted(state.boxplus(error), dt).boxminus(base) / STEP
+    turn = state.rotation.T @ base.rotation
+    gained = state.rotation.T @ (base.velocity - state.velocity - dt * state.gravity)
+    found = eskf.transition(state.rotation, turn, gained / dt, dt)
+    # first order in the turn within a step: 0.04 s at 1 rad/s
+    np.testing.assert_allclose(found, measured, atol=0.05 * dt)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_twist_jacobian_is_the_derivative_of_the_velocity(seed: int) -> None:
+    state, rate = some_state(seed), np.array([0.3, -0.5, 1.0])
+    base = eskf.body_velocity(state, rate, LEVER)
+    found = eskf.twist_jacobian(state, LEVER)
+    for column in range(eskf.ERRORS):
+        error = np.zeros(eskf.ERRORS)
+        error[column] = STEP
+        moved = eskf.body_velocity(state.boxplus(error), rate, LEVER)
+        np.testing.assert_allclose(found[:, column], (moved - base) / STEP, atol=1e-5)
+
+
+def test_a_twist_sets_the_velocity_and_reports_its_surprise() -> None:
+    state = some_state()
+    sigma = np.full(eskf.ERRORS, 1e-3)
+    sigma[eskf.VELOCITY] = 1.0
+    rate, wanted = np.array([0.0, 0.0, 1.0]), np.array([1.0, 2.0, -0.5])
+    noise = 0.01**2 * np.eye(3)
+    found = eskf.update_twist(state, np.diag(sigma**2), wanted, noise, rate, LEVER)
+    np.testing.assert_allclose(eskf.body_velocity(found.state, rate, LEVER), wanted, atol=2e-3)
+    innovation = wanted - eskf.body_velocity(state, rate, LEVER)
+    assert found.nis == pytest.approx(float(innovation @ innovation), rel=0.05)
+
+
+def test_a_static_stretch_measures_bias_and_gravity() -> None:
+    samples = np.zeros(500, IMU_SAMPLE)
+    samples["stamp"] = EPOCH + np.arange(500) * 4_000_000
+    state = some_state()
+    samples["angular_velocity"] = (0.03, -0.02, 0.01)
+    tilted = rotations.matrices(rotations.exp((0.02, -0.01, 0.0)))
+    samples["linear_acceleration"] = tilted.T @ state.rest_force
+    sigma = np.full(eskf.ERRORS, 0.05)
+    sigma[eskf.ACCEL_BIAS], sigma[eskf.GRAVITY] = 1e-4, 1e-4
+    noise = Noise(0.005, 0.01, 1e-4, 1e-3)
+    found, covariance = eskf.update_static(
+        state, np.diag(sigma**2), samples, noise, True, levels=True
+    )
+    np.testing.assert_allclose(found.gyro_bias, (0.03, -0.02, 0.01), atol=1e-3)
+    force = samples["linear_acceleration"][0]
+    np.testing.assert_allclose(found.rest_force + found.accel_bias, force, atol=0.01)
+    assert not found.velocity.any()
+    assert np.diag(covariance)[eskf.GYRO_BIAS].max() < 0.004**2
+    held, _ = eskf.update_static(state, np.diag(sigma**2), samples, noise, True)
+    np.testing.assert_array_equal(held.rotation, state.rotation)
+
+
+def test_the_prior_touches_only_a_velocity_that_is_hardly_known() -> None:
+    state = some_state()
+    tight = np.eye(eskf.ERRORS) * 0.1**2
+    assert eskf.apply_zero_velocity_prior(state, tight, 1.0)[0] is state
+    loose = np.eye(eskf.ERRORS)
+    slowed, covariance = eskf.apply_zero_velocity_prior(state, loose, 1.0)
+    np.testing.assert_allclose(slowed.velocity, 0.5 * state.velocity, atol=1e-9)
+    assert covariance[6, 6] == pytest.approx(0.5)
+
+
+def test_information_form_equals_the_ordinary_update() -> None:
+    state, rng = some_state(), np.random.default_rng(5)
+    covariance = np.diag(rng.uniform(0.01, 0.1, eskf.ERRORS) ** 2)
+    jacobian, residual = rng.normal(0, 1, (40, eskf.ERRORS)), rng.normal(0, 0.01, 40)
+    weight = 1.0 / 0.05**2
+    plain = eskf.update(state, covariance, residual, jacobian, np.eye(40) / weight)
+    found, posterior = eskf.update_with_information(
+        state, covariance, state, weight * jacobian.T @ jacobian, weight * jacobian.T @ residual
+    )
+    np.testing.assert_allclose(found.boxminus(plain.state), 0.0, atol=1e-9)
+    np.testing.assert_allclose(posterior, plain.covariance, atol=1e-12)
+
+
+def simulated_nees(seed: int, accel_scale: float = 1.0) -> F64:
+    """Return the NEES of velocity and rotation after each of some twists, one run."""
+    rng = np.random.default_rng(seed)
+    noise = Noise(0.002, 0.01, 1e-4, 1e-3)
+    rate_hz, sigma_twist = 250.0, 0.02
+    motion = Motion(turn=0.6, nod=0.15, speed=0.8)
+    samples = motion.imu(0.0, 6.0)
+    count = len(samples)
+    samples["angular_velocity"] += rng.normal(0, noise.gyro * rate_hz**0.5, (count, 3))
+    force = rng.normal(0, accel_scale * noise.accel * rate_hz**0.5, (count, 3))
+    samples["linear_acceleration"] += force
+    h, t0 = 1e-4, np.array([0.0])
+
+    def truth(t: F64) -> tuple[F64, F64]:
+        velocity = (motion.position(t + h) - motion.position(t - h)) / (2 * h)
+        return motion.rotation(t).as_matrix()[0], velocity[0]
+
+    rotation, velocity = truth(t0)
+    zero = np.zeros(3)
+    true = InertialState(at(0.0), rotation, zero, velocity, zero, zero, np.array([0.0, 0.0, -G]))
+    sigma = np.full(eskf.ERRORS, 1e-4)
+    sigma[eskf.ROTATION], sigma[eskf.VELOCITY] = 0.02, 0.1
+    sigma[eskf.GYRO_BIAS], sigma[eskf.ACCEL_BIAS] = 0.003, 0.02
+    covariance = np.diag(sigma**2)
+    off = rng.normal(0, 1, eskf.ERRORS) * sigma
+    off[eskf.GYRO_BIAS] = off[eskf.ACCEL_BIAS] = 0.0  # these errors are in the samples instead
+    state = true.boxplus(off)
+    samples["angular_velocity"] += rng.normal(0, 0.003, 3)
+    samples["linear_acceleration"] += rng.normal(0, 0.02, 3)
+    found = []
+    for k in range(1, 25):
+        stamp = HostNs(at(0.25 * k))
+        first, last = np.searchsorted(samples["stamp"], [state.stamp, stamp])
+        imu = segment(samples[first : last + 2], [state.stamp, stamp], 50_000_000, zero)
+        sums = integrate(
+            imu,
+            0,
+            gyro_bias=state.gyro_bias,
+            accel_bias=state.accel_bias,
+            rest_force=state.rest_force,
+        )
+        state, covariance = eskf.predict(state, covariance, imu, sums, len(imu.stamps) - 1, noise)
+        rotation, velocity = truth(np.array([0.25 * k]))
+        measured = rotation.T @ velocity + rng.normal(0, sigma_twist, 3)
+        state, covariance, _ = eskf.update_twist(
+            state, covariance, measured, sigma_twist**2 * np.eye(3), zero, zero
+        )
+        turn = rotations.log(rotations.from_matrix(rotation.T @ state.rotation))
+        error = np.concatenate((turn, state.velocity - velocity))
+        some = np.r_[eskf.ROTATION, eskf.VELOCITY]
+        found.append(error @ np.linalg.solve(covariance[np.ix_(some, some)], error))
+    return np.array(found)
+
+
+def test_the_covariance_is_honest() -> None:
+    """NEES over 30 runs: its mean within the 99.8 % band of 6 degrees of freedom."""
+    runs = np.array([simulated_nees(seed) for seed in range(30)])
+    means = runs[:, 4:].mean(axis=0)
+    low, high = chi2.ppf([0.001, 0.999], 6 * 30) / 30
+    # the IMU's lever arm of the analytic motion is 2 cm and is left out: a little above 6
+    assert (means > low).mean() > 0.9
+    assert (means < 1.3 * high).mean() > 0.9
+
+
+def test_noise_of_another_scale_shows_in_the_nees() -> None:
+    honest = np.mean([simulated_nees(seed)[8:].mean() for seed in range(6)])
+    louder = np.mean([simulated_nees(seed, 6.0)[8:].mean() for seed in range(6)])
+    assert louder > 2.0 * honest

@@ -1,0 +1,86 @@
+"""Scan alignment: derivatives against differences, and what a wrong range noise costs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc import rotations, tuning
+from l2lidar_proc.config import SurfaceConfig
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.odometry import alignment
+from l2lidar_proc.odometry.alignment import Source, align, residual_jacobian
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+from tests.l2lidar_proc.odometry.odometry_world import drive, errors, recording
+
+ZERO = np.zeros(3)
+STEP = 1e-6
+
+
+def some_state() -> InertialState:
+    turn = rotations.matrices(rotations.exp((0.3, -0.2, 1.0)))
+    gravity = np.array([0.0, 0.0, -9.8])
+    return InertialState(HostNs(0), turn, np.array([1.0, 2.0, 0.5]), ZERO, ZERO, ZERO, gravity)
+
+
+def residuals(prior: InertialState, error: F64, source: Source, normals: F64) -> F64:
+    """Return the distances of points from planes through the origin, for a state off by error."""
+    state = prior.boxplus(error)
+    points = alignment._deskewed_again(source, error, prior.rotation)
+    return np.asarray(((points @ state.rotation.T + state.position) * normals).sum(axis=1))
+
+
+def test_the_jacobian_is_the_derivative_of_the_residuals() -> None:
+    rng = np.random.default_rng(3)
+    prior = some_state()
+    points, times = rng.normal(0, 4, (50, 3)), rng.uniform(-0.12, 0.12, 50)
+    source = Source(points, times, np.linalg.norm(points, axis=1))
+    normals = rng.normal(0, 1, (50, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    found = residual_jacobian(points, times, normals, prior.rotation)
+    base = residuals(prior, np.zeros(eskf.ERRORS), source, normals)
+    for column in range(eskf.ERRORS):
+        error = np.zeros(eskf.ERRORS)
+        error[column] = STEP
+        moved = residuals(prior, error, source, normals)
+        np.testing.assert_allclose(found[:, column], (moved - base) / STEP, atol=2e-5)
+
+
+def box(rng: np.random.Generator, count: int) -> F64:
+    """Return points on the six walls of a room."""
+    points = rng.uniform((-5.0, -4.0, -1.5), (5.0, 4.0, 1.5), (count, 3))
+    side, axis = rng.integers(0, 2, count), rng.integers(0, 3, count)
+    half = np.array([5.0, 4.0, 1.5])
+    points[np.arange(count), axis] = np.where(side, half[axis], -half[axis])
+    return points + 0.011 * rng.standard_normal((count, 3))
+
+
+def test_a_displaced_start_comes_back() -> None:
+    rng = np.random.default_rng(7)
+    surfaces = SurfelMap((0.3, 0.6, 1.5))
+    for _ in range(6):
+        surfaces.add(box(rng, 6000))
+    state = InertialState(
+        HostNs(0), np.eye(3), ZERO, ZERO, ZERO, ZERO, np.array([0.0, 0.0, -9.80665])
+    )
+    sigma = np.full(eskf.ERRORS, 1e-3)
+    sigma[eskf.POSITION], sigma[eskf.ROTATION] = 0.1, 0.03
+    off = np.zeros(eskf.ERRORS)
+    off[eskf.POSITION], off[eskf.ROTATION] = (0.06, -0.05, 0.04), (0.01, -0.01, 0.02)
+    points = box(rng, 2000)
+    source = Source(points, rng.uniform(-0.1, 0.1, 2000), np.linalg.norm(points, axis=1))
+    found = align(state.boxplus(off), np.diag(sigma**2), source, surfaces, SurfaceConfig(), 100)
+    assert found is not None
+    left = found.state.boxminus(state)
+    assert np.abs(left[eskf.POSITION]).max() < 0.004
+    assert np.abs(left[eskf.ROTATION]).max() < 0.002
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_range_noise_costs_little(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = recording("yard", "walk")
+    right = errors(run, drive(run)).max()
+    monkeypatch.setattr(tuning, "RANGE_NOISE_SLOPE", factor * tuning.RANGE_NOISE_SLOPE)
+    assert errors(run, drive(run)).max() < right + 0.001

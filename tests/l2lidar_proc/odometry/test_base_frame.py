@@ -1,0 +1,87 @@
+"""Pose and twist of a frame fixed to the sensor, with their covariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import F64, POINT, HostNs
+from l2lidar_proc import rotations
+from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate
+
+ARM = np.array([0.4, -0.3, 0.2])
+MOUNT = rotations.transform(rotations.exp((0.2, -0.4, 1.1)), ARM)
+STEP = 1e-6
+
+
+def estimate(pose: F64, velocity: F64, rate: F64, covariance: F64, twist: F64) -> OdometryEstimate:
+    nothing = np.zeros(3)
+    return OdometryEstimate(
+        HostNs(0), pose, covariance, velocity, rate, twist, np.zeros(0, POINT), (),
+        AlignmentQuality(), nothing, nothing, nothing,
+    )  # fmt: skip
+
+
+def some_covariance(seed: int) -> F64:
+    root = np.random.default_rng(seed).normal(0.0, 0.1, (6, 6))
+    return np.asarray(root @ root.T)
+
+
+POSE = rotations.transform(rotations.exp((0.1, 0.3, -0.7)), (2.0, -1.0, 0.5))
+VELOCITY, RATE = np.array([0.7, -0.2, 0.1]), np.array([0.3, -0.6, 1.2])
+
+
+def test_the_twist_is_that_of_the_displaced_frame() -> None:
+    """Against the motion of a rigid body over a short time."""
+    found = BaseFrame(MOUNT).motion(estimate(POSE, VELOCITY, RATE, np.eye(6), np.eye(6)))
+    h = 1e-6
+    lidar = np.eye(4)
+    lidar[:3, :3] = rotations.matrices(rotations.exp(h * RATE))
+    lidar[:3, 3] = h * VELOCITY
+    moved = rotations.inverse(MOUNT) @ lidar @ MOUNT
+    np.testing.assert_allclose(found.velocity, moved[:3, 3] / h, atol=1e-5)
+    turn = rotations.log(rotations.from_matrix(moved[:3, :3])) / h
+    np.testing.assert_allclose(found.angular_velocity, turn, atol=1e-5)
+
+
+def test_the_covariance_of_the_twist_follows_its_derivatives() -> None:
+    base, spread = BaseFrame(MOUNT), some_covariance(1)
+    jacobian = np.empty((6, 6))
+    here = base.motion(estimate(POSE, VELOCITY, RATE, np.eye(6), spread))
+    for column in range(6):
+        off = np.zeros(6)
+        off[column] = STEP
+        moved = base.motion(estimate(POSE, VELOCITY + off[:3], RATE + off[3:], np.eye(6), spread))
+        change = np.concatenate(
+            (moved.velocity - here.velocity, moved.angular_velocity - here.angular_velocity)
+        )
+        jacobian[:, column] = change / STEP
+    expected = jacobian @ spread @ jacobian.T
+    np.testing.assert_allclose(here.twist_covariance, expected, atol=1e-7)
+    assert np.abs(expected[:3, 3:]).max() > 1e-3, "the arm couples velocity and rate"
+
+
+def test_the_covariance_of_the_pose_follows_its_derivatives() -> None:
+    """Errors are places and small turns about the axes of the fixed frame."""
+    base, spread = BaseFrame(MOUNT), some_covariance(2)
+    here = base.motion(estimate(POSE, VELOCITY, RATE, spread, np.eye(6)))
+    jacobian = np.empty((6, 6))
+    for column in range(6):
+        off = np.zeros(6)
+        off[column] = STEP
+        pose = POSE.copy()
+        pose[:3, :3] = rotations.matrices(rotations.exp(off[3:])) @ POSE[:3, :3]
+        pose[:3, 3] += off[:3]
+        moved = base.pose(pose)
+        turn = rotations.log(rotations.from_matrix(moved[:3, :3] @ here.T_odom_base[:3, :3].T))
+        step = moved[:3, 3] - here.T_odom_base[:3, 3]
+        jacobian[:, column] = np.concatenate((step, turn)) / STEP
+    np.testing.assert_allclose(here.covariance, jacobian @ spread @ jacobian.T, atol=1e-6)
+
+
+def test_the_first_pose_is_the_origin_with_yaw_zero() -> None:
+    base = BaseFrame(np.eye(4))
+    first = base.pose(POSE)
+    assert first[:3, 3] == pytest.approx(0.0, abs=1e-12)
+    assert np.arctan2(first[1, 0], first[0, 0]) == pytest.approx(0.0, abs=1e-12)
