@@ -23,6 +23,7 @@ UNCERTAIN_NS: Final = 1_000_000
 """Uncertainty from which users should know: at 1 m/s it moves points by 1 mm."""
 
 _SILENCE_NS: Final = 1_000_000_000
+_QUIET_NS: Final = 5_000_000_000  # between reports of the same kind
 _ROUND_TRIPS: Final = 16
 _EVENTS: Final = 64
 
@@ -105,6 +106,9 @@ class _Mode(Enum):
     SYSTEM = "system"
 
 
+# These begin a time line; whoever follows needs all of them.
+_RARE: Final = frozenset({ClockEventKind.LOCKED, ClockEventKind.REBOOT, ClockEventKind.LOST})
+
 _ESTIMATED, _SYSTEM = _Mode.ESTIMATED, _Mode.SYSTEM  # to look up a member of an Enum takes long
 
 
@@ -135,6 +139,8 @@ class DeviceClock:
         self._schedule = SyncSchedule(config)
         self.happened: deque[ClockEvent] = deque(maxlen=_EVENTS)
         self._counts: Counter[ClockEventKind] = Counter()
+        self._reported: dict[ClockEventKind, tuple[int | None, int]] = {}
+        self._now = 0  # arrival of the latest packet
         self._held = 0
         self._unlocked = 0
         self._last = {Stream.IMU: 0, Stream.POINTS: 0}
@@ -194,6 +200,7 @@ class DeviceClock:
         host = self._host
         device = self._device
         left = arrival - duration_ns
+        self._now = arrival
         u = device.place(stream, seq, stamp, arrival)
         if u is None:
             self._notice()
@@ -353,7 +360,16 @@ class DeviceClock:
             self._report(ClockEventKind.CORRECTED, text)
 
     def _report(self, kind: ClockEventKind, text: str) -> None:
+        """Count what happened and report it, what keeps happening once every few seconds."""
         self._counts[kind] += 1
+        if kind not in _RARE:
+            at, more = self._reported.get(kind, (None, 0))
+            if at is not None and 0 <= self._now - at < _QUIET_NS:
+                self._reported[kind] = (at, more + 1)
+                return
+            if more:
+                text = f"{text} (and {more} more since the last report)"
+            self._reported[kind] = (self._now, 0)
         self.happened.append(ClockEvent(kind, text))
 
 

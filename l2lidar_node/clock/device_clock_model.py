@@ -25,6 +25,8 @@ _SLACK_NS: Final = 50_000  # a sync may take effect that much beside its value
 _EARLY_NS: Final = -1 * _MS  # arrivals may seem that early without making a stamp impossible
 _LATE_NS: Final = 500 * _MS  # no path delays packets more than that
 _REACH_NS: Final = 150 * _MS  # sequence numbers are believed while arrivals agree with them so far
+# A sync cannot take effect before it is sent; that much is for the line, under load, and the path.
+_BEFORE_NS: Final = 20 * _MS
 _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
 _SILENT_NS: Final = 1_000 * _MS
@@ -178,6 +180,9 @@ class DeviceClockModel:
         counted = gap > 0 and self._agrees(track, seq, advance, arrival)
         if counted:
             slip = cadence.slip(gap)
+            is_elsewhere = abs(u - expected) > slip
+            if is_elsewhere and self._has_paused(track, epoch, stamp, expected):
+                return self._unexplained(track, epoch, seq, stamp, arrival, None)
             begun = self._begun(track, epoch, stamp, expected, cadence.noise(gap))
             if begun is not None:
                 return self._accept(track, begun, seq, stamp, arrival)
@@ -208,6 +213,21 @@ class DeviceClockModel:
         place = track.u + track.cadence.advance(-back)
         slip = track.cadence.slip(back)
         return any(abs(stamp - epoch.base - place) <= slip for epoch in self._epochs)
+
+    def _has_paused(self, track: _Track, epoch: _Epoch, stamp: int, expected: int) -> bool:
+        """Whether the stream paused in a way that its numbers do not show, as in standby.
+
+        The place that numbers predict would then have a sync of this host, which the stamp is just
+        after, take effect before it was sent.
+        """
+        base = stamp - expected
+        for sync in reversed(self._syncs):
+            if sync is epoch.sync:
+                break
+            if -_SLACK_NS <= stamp - sync.value <= expected - track.u + _MS:
+                before = self._lateness(sync.value - base, sync.sent)
+                return before is not None and before > _BEFORE_NS
+        return False
 
     def _begun(
         self, track: _Track, epoch: _Epoch, stamp: int, expected: int, noise: float
@@ -290,7 +310,7 @@ class DeviceClockModel:
         begins = expected is None and seq < _BOOT_SEQ and not track.cadence.ascends(seq)
         if begins or (stamp < track.stamp and stamp < _BOOT_NS):
             self.steps.append((Step.REBOOT, stamp - track.stamp))
-        elif expected is not None:
+        elif expected is not None and self._is_prompt(track, expected, arrival):
             self.steps.append((Step.FOREIGN_SYNC, stamp - epoch.base - expected))
             self.epochs += 1
             self._epochs.append(_Epoch(stamp - expected, None))
@@ -299,6 +319,13 @@ class DeviceClockModel:
             self.steps.append((Step.LOST, stamp - track.stamp))
         self.restart()
         return None
+
+    def _is_prompt(self, track: _Track, place: int, arrival: int) -> bool:
+        """Whether a packet at a place is not so late that the stream may have paused instead."""
+        late = self._lateness(place, arrival)
+        if late is None:
+            late = round(arrival - track.arrival - (place - track.u) * self.ratio)
+        return late < _REACH_NS
 
     def _join(self, track: _Track, seq: int, stamp: int, arrival: int) -> int | None:
         """Let a stream that is new onto the line once its cadence is known."""

@@ -66,6 +66,8 @@ class Case:
         What delays packets on their way, in seconds since power-on.
     stale : (float, float)
         How many old packets a second come again, and how old they are [s].
+    standbys : tuple of (float, float)
+        From when to when the driver puts the unit into standby [s].
     boot_scale : float
         How long the unit takes to come up, against a real one; 0 streams at once.
     imu : bool
@@ -82,6 +84,7 @@ class Case:
     faults: dict[str, Value] = field(default_factory=dict)
     loads: tuple[Load, ...] = ()
     stale: tuple[float, float] = (0.0, 0.0)
+    standbys: tuple[tuple[float, float], ...] = ()
     boot_scale: float = 0.25
     imu: bool = True
     latency: bool = False
@@ -163,6 +166,11 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
     way: list[tuple[int, int, bytes]] = []
     old: deque[tuple[int, bytes]] = deque()
     next_stale = EPOCH_NS
+    standbys = sorted(
+        (at, is_start)
+        for stop, start in case.standbys
+        for at, is_start in ((stop, False), (start, True))
+    )
     count = 0
     for now in range(EPOCH_NS, EPOCH_NS + round(case.seconds * 1e9), _TICK_NS):
         while commands and commands[0][0] <= now:
@@ -184,6 +192,12 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
         while way and way[0][0] <= now:
             arrival, _, datagram = heapq.heappop(way)
             driver.receive(datagram, HostNs(arrival))
+        while standbys and EPOCH_NS + standbys[0][0] * 1e9 <= now:
+            _, is_start = standbys.pop(0)
+            if is_start:
+                driver.start_rotation(HostNs(now))
+            else:
+                driver.stop_rotation(HostNs(now))
         driver.tick(HostNs(now))
         for data, _ in driver.outbox():
             latency = _COMMAND_NS + round(rng.exponential(_COMMAND_NS))

@@ -225,6 +225,15 @@ def test_a_step_that_is_noticed_late_costs_no_more_than_until_then() -> None:
     assert replay.clock.status().held == 0
 
 
+def test_what_keeps_happening_is_reported_every_few_seconds_and_counted() -> None:
+    steps = tuple((2.0 + 0.2 * number, 0.05) for number in range(40))
+    replay = Replay(Scenario(seconds=12.0, host_steps=steps, notice_ms=10.0), seed=3)
+
+    assert replay.kinds == [ClockEventKind.LOCKED, *[ClockEventKind.HOST_STEP] * 2]
+    assert "more since the last report" in replay.events[-1].text
+    assert replay.clock.status().events[ClockEventKind.HOST_STEP] == 40
+
+
 def test_a_clock_that_is_set_before_it_is_known_begins_anew() -> None:
     told = Scenario(seconds=4.0, host_steps=((0.2, 1.0),), notice_ms=10.0)
     replay = Replay(told, seed=3)

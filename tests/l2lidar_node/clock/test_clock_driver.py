@@ -50,3 +50,25 @@ def test_stale_packets_are_refuted_by_the_current_ones(rate: float, age: float, 
     assert len(locked) > 14 * 460
     stale = sum(counts.stale + counts.duplicates for counts in clock.sequence.values())
     assert stale > 0.8 * rate * (16.0 - age - 0.1)
+
+
+@pytest.mark.parametrize("jitter", ["none", "heavy"])
+@pytest.mark.parametrize(("pause", "scale"), [(0.3, 0.0), (0.7, 0.0), (1.1, 0.04), (2.0, 0.02)])
+def test_periodic_syncs_in_standby_leave_both_streams_in_the_right_epoch(
+    pause: float, scale: float, jitter: str
+) -> None:
+    """Numbers do not count through standby, while syncs go on stepping the device's clock."""
+    standbys = ((4.0, 4.0 + pause), (7.0 + pause, 7.0 + 2 * pause))
+    faults = {"jitter": jitter, "jitter_ms": 20.0, "loss": 0.03} if jitter == "heavy" else {}
+    case = Case(
+        ratio=1.99866, sync="periodic", standbys=standbys, boot_scale=scale, faults=faults,
+        seconds=11.0 + 2 * pause,
+    )  # fmt: skip
+    notes, clock = run(case, seed=round(10 * pause))
+    stamped = notes[notes["published"] != 0]
+    errors = (stamped["published"] - stamped["truth"]) * 1e-6
+
+    assert np.abs(errors - 0.15).max() < 0.25
+    assert len(clock.reported) <= 5  # locked, and lost and locked again, twice
+    for kind in (PacketType.IMU, PacketType.POINTS_3D):
+        assert np.any(stamped["type"][-100:] == kind)
