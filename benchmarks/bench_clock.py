@@ -1,7 +1,8 @@
 """Measures how true the driver's stamps are, against the virtual L2's own packet log.
 
 ``make bench-clock`` prints the table and writes ``out/bench/clock.json``; ``--docs`` renews the
-table in ``docs/clock.md`` too. The same packets also go through upstream's rule and through
+table in ``docs/clock.md`` too. Then come the shapes of load of ``tests/support/clock_loads.py``,
+in ``out/bench/clock-loads.json``. The same packets also go through upstream's rule and through
 stamping with the time of arrival.
 """
 
@@ -23,10 +24,13 @@ from rich.progress import track
 from benchmarks.results import Target, at_least, at_most, publish
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.settings import Value
-from tests.support.clock_rig import Case, run
+from tests.support.clock_loads import SHAPES, load_errors
+from tests.support.clock_rig import EPOCH_NS, Case, run
 
 RATIOS: Final = (1.0, 1.95, 1.99866, 2.0)
 SYNCS: Final = ("off", "once", "periodic")
+_AFTER_S: Final = 8.0  # that a run goes on after its load
+_PATH_NS: Final = 150_000  # what the virtual unit needs to send a packet
 _UPSTREAM_RATIO: Final = 2  # timeScaleNum / timeScaleDenom as shipped
 _MS: Final = 1e6
 _DRIFT: Final = {"clock_wave_ppm": 50.0, "clock_wave_s": 300.0}
@@ -140,6 +144,41 @@ def measure(row: Row, seed: int) -> dict[str, Any]:
         "arrival_p99_ms": _round(_p99(arrival)),
         "arrival_max_ms": _round(float(np.max(np.abs(arrival)))),
     }
+
+
+def measure_load(name: str, seed: int) -> dict[str, Any]:
+    """Return how far stamps are off under one shape of load and after it."""
+    loads = SHAPES[name]
+    seconds = max(load.stop for load in loads) + _AFTER_S
+    case = Case(
+        ratio=1.99866, sync="once", crystal=_DRIFT, loads=loads, boot_scale=0.0, seconds=seconds
+    )
+    notes, clock = run(case, seed)
+    found = load_errors(notes, loads, EPOCH_NS, _PATH_NS)
+    used = notes[notes["published"] != 0]
+    return {
+        "load": name,
+        "least_delay_ms": _round(found.least_ms),
+        "during_max_ms": _round(found.during_ms),
+        "after_p99_ms": _round(found.after_p99_ms),
+        "after_max_ms": _round(found.after_max_ms),
+        "backward": _backward(used),
+        "future": int(np.sum(used["published"] > used["arrival"])),
+        "held": clock.status().held,
+        "events": len(clock.reported) - 1,
+    }
+
+
+def load_targets(results: list[dict[str, Any]]) -> list[Target]:
+    """Return what was asked for under load."""
+    excess = max(item["during_max_ms"] - item["least_delay_ms"] for item in results)
+    return [
+        at_most("p99 from 1 s after the end of a load (ms)", _most(results, "after_p99_ms"), 1.0),
+        at_most("largest error from then on (ms)", _most(results, "after_max_ms"), 3.0),
+        at_most("error during a load beyond the path's own change (ms)", excess, 3.0),
+        at_most("backward steps under load", sum(item["backward"] for item in results), 0),
+        at_most("stamps after arrival under load", sum(item["future"] for item in results), 0),
+    ]
 
 
 def targets(results: list[dict[str, Any]]) -> list[Target]:
@@ -260,16 +299,24 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
     parser.add_argument("--docs", action="store_true", help=f"renew the table in {_DOCS}")
     parser.add_argument("--jobs", type=int, help="processes, as many as cores if left out")
+    parser.add_argument("--loads", type=int, default=1, help="seeds of every shape of load")
     arguments = parser.parse_args()
     todo = rows()
     seeds = [1000 * arguments.seed + number for number in range(len(todo))]
     with ProcessPoolExecutor(arguments.jobs) as pool:
         running = pool.map(measure, todo, seeds)
         results = list(track(running, "measuring", total=len(todo)))
+        shapes = [name for name in SHAPES for _ in range(arguments.loads)]
+        seeds = [1000 * arguments.seed + 500 + number for number in range(len(shapes))]
+        running = pool.map(measure_load, shapes, seeds)
+        loaded = list(track(running, "under load", total=len(shapes)))
     found = targets(results)
     publish(
         "clock", "Error of every published stamp, constant path delay set aside", results, found
     )
+    found_under_load = load_targets(loaded)
+    publish("clock-loads", "Error of stamps under load and after it", loaded, found_under_load)
+    found += found_under_load
     if arguments.docs:
         text = _DOCS.read_text()
         head, rest = text.split(_MARKS[0])

@@ -162,9 +162,13 @@ class Cadence:
         """Return by how much a packet may be off without a step being the reason [ns]."""
         return round(self._tolerance + max(_SLIP * gap, 1.0) * self._period)
 
+    def wander(self, gap: int) -> int:
+        """Return by how much a stream may be off by its own irregularity [ns]."""
+        return round(self.noise(gap) + _SLIP * gap * self._period)
+
     def regular(self, gap: int, advance: int) -> bool:
         """Whether two packets so many numbers apart are as far apart as they should be."""
-        return gap > 0 and abs(advance - gap * self._period) <= self.slip(gap)
+        return gap > 0 and abs(advance - gap * self._period) <= self.wander(gap)
 
     def _distance(self, first: int, second: int) -> int:
         gap = second - first

@@ -24,6 +24,7 @@ UNCERTAIN_NS: Final = 1_000_000
 
 _SILENCE_NS: Final = 1_000_000_000
 _QUIET_NS: Final = 5_000_000_000  # between reports of the same kind
+_AHEAD_NS: Final = 1_000_000_000  # system time: how far stamps may be ahead of arrivals
 _ROUND_TRIPS: Final = 16
 _EVENTS: Final = 64
 
@@ -144,6 +145,7 @@ class DeviceClock:
         self._held = 0
         self._unlocked = 0
         self._last = {Stream.IMU: 0, Stream.POINTS: 0}
+        self._ends = {Stream.IMU: 0, Stream.POINTS: 0}  # of the last packet's measurements
         self.configure(config)
         self.reset()
 
@@ -220,7 +222,12 @@ class DeviceClock:
                 self._unlocked += 1
                 return None
         elif mode is _SYSTEM:
-            result = max(arrival, self._last[stream] + 1)
+            # Points of packets that arrive at once must not overlap, nor stay behind a clock that
+            # was set back.
+            result = max(left, self._ends[stream] + 1)
+            if result > left + _AHEAD_NS:
+                self._held += 1
+                return None
         else:
             if not (self._schedule.in_force or self._config.publish_unlocked):
                 self._unlocked += 1
@@ -230,6 +237,7 @@ class DeviceClock:
             self._held += 1
             return None
         self._last[stream] = result
+        self._ends[stream] = result + duration_ns
         return HostNs(result)
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
@@ -326,6 +334,7 @@ class DeviceClock:
             if step is Step.REBOOT:
                 self._report(ClockEventKind.REBOOT, "device restarted, clock begins anew")
             elif step is Step.FOREIGN_SYNC:
+                self._host.reanchor()
                 self._report(
                     ClockEventKind.FOREIGN_SYNC,
                     f"somebody else stepped the device's clock by {change * 1e-9:+.3f} s",

@@ -27,6 +27,7 @@ _LATE_NS: Final = 500 * _MS  # no path delays packets more than that
 _REACH_NS: Final = 150 * _MS  # sequence numbers are believed while arrivals agree with them so far
 # A sync cannot take effect before it is sent; that much is for the line, under load, and the path.
 _BEFORE_NS: Final = 20 * _MS
+_PAUSE_NS: Final = 50 * _MS  # [device] no standby, in which numbers do not count, is shorter
 _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
 _SILENT_NS: Final = 1_000 * _MS
@@ -187,9 +188,12 @@ class DeviceClockModel:
             if begun is not None:
                 return self._accept(track, begun, seq, stamp, arrival)
             nearest = min(self._epochs, key=lambda item: abs(stamp - item.base - expected))
-            if abs(stamp - nearest.base - expected) <= slip and stamp - nearest.base > track.u:
+            off = abs(stamp - nearest.base - expected)
+            if off <= cadence.wander(gap) and stamp - nearest.base > track.u:
                 return self._accept(track, nearest, seq, stamp, arrival)
-        late = u > expected if counted else u > track.u and not self._synced_since(track)
+        late = (
+            u > expected + _PAUSE_NS if counted else u > track.u and not self._synced_since(track)
+        )
         if late and self._possible(track, u, arrival):
             return self._accept(track, epoch, seq, stamp, arrival)
         return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)

@@ -29,6 +29,10 @@ _SEGMENTS: Final = 8
 _STEP_NS: Final = 1_500_000
 _EARLY_NS: Final = 300_000  # a single block earlier than that is an error, more of them are news
 _SPREADS: Final = 2.0  # these margins grow by that many times the uncertainty
+# A foreign step that was bridged wrongly makes all packets late from then on.
+_SLIPPED_NS: Final = 100_000
+_SLIPPED_BLOCKS: Final = 4
+_REANCHOR_BLOCKS: Final = 20
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
 _LOADED_BLOCKS: Final = 3  # where steps are told, late packets that keep coming mean load
 _BACKWARD_BLOCKS: Final = 2  # early ones cannot have
@@ -73,7 +77,9 @@ class HostClockModel:
         "_low",
         "_low_at",
         "_packets",
+        "_reanchors",
         "_segments",
+        "_slipped",
         "_slope",
         "_suspects",
         "_u",
@@ -103,6 +109,8 @@ class HostClockModel:
         self._envelope: LowerEnvelope | None = None
         self._packets: list[tuple[int, int]] = []
         self._suspects: list[tuple[int, int]] = []
+        self._reanchors = 0
+        self._slipped: list[tuple[int, int]] = []
         self._segments: deque[tuple[int, int, float]] = deque(maxlen=_SEGMENTS)
         self._u = self._host = 0
         self._slope = self.line.ratio
@@ -142,6 +150,13 @@ class HostClockModel:
         self._envelope.host_stepped(by_ns)
         u = self._u + max(int((at - by_ns - self._host) / self._slope), 0)
         self._go(u, self.at(u) + by_ns, self._slope)
+
+    def reanchor(self) -> None:
+        """Let the next blocks say whether device time has slipped, as after a foreign step.
+
+        Packets that are late from then on are not taken for load.
+        """
+        self._reanchors = _REANCHOR_BLOCKS
 
     def at(self, u: int) -> int:
         """Return the host time [ns] of a place on the device line; needs ``ready``."""
@@ -218,6 +233,11 @@ class HostClockModel:
         self.late_ns = max(off, 0)
         margin = _SPREADS * envelope.uncertainty_ns
         suspects = self._suspects
+        if self._has_slipped(off > _SLIPPED_NS + margin):
+            suspects.clear()
+            envelope.move(self._slipped, widen=False)
+            self._slipped = []
+            return True
         is_early = off < -_EARLY_NS - margin
         # Bounds of a known ratio keep late blocks from doing harm.
         is_late = off > _STEP_NS + margin and not (self.is_told and envelope.is_known)
@@ -245,6 +265,14 @@ class HostClockModel:
         envelope.move(suspects)
         suspects.clear()
         return True
+
+    def _has_slipped(self, is_late: bool) -> bool:
+        """Whether all blocks in a row, soon after a foreign step, are late."""
+        if not self._reanchors:
+            return False
+        self._reanchors -= 1
+        self._slipped = [*self._slipped, self._low_at] if is_late else []
+        return len(self._slipped) >= _SLIPPED_BLOCKS
 
     def _go(self, u: int, host: int, slope: float) -> None:
         """Begin a new segment of what is published."""

@@ -46,6 +46,12 @@ _DRIFT_PER_S: Final = 1e-6
 _LEAST_WIDTH: Final = 5e-6
 _UNTOLD_WIDTH: Final = 600e-6
 
+# Blocks in which a trend is looked for once one is that late. The longer ones find it in spite of
+# batches and jitter.
+_TRENDS: Final = (15, 60, 120)
+_TREND_NS: Final = 50_000
+_STRAIGHT: Final = 2.5  # times the error of its ratio: a load that grows is less straight
+
 _VOTERS: Final = 8  # blocks that suffice to select an edge: two lie on it, the others confirm it
 _LEVEL: Final = 4.0  # blocks with bounds up to this many times the least ones are used as well
 _PARTS: Final = 4  # of the data, compared to see how well the minimum repeats
@@ -224,13 +230,7 @@ class LowerEnvelope:
             return False
         if _BETTER * error > self._evidence:
             return False
-        self._blocks.clear()
-        self._blocks.extend(recent)
-        self._reach = SHORT_BLOCKS
-        self.moves += 1
-        self.line = line
-        self._lo, self._hi = _RATIOS
-        self._learn(points, float(line.host - h0), 0.0)
+        self._begin(line, recent, points)
         return True
 
     def close(self, low: tuple[int, int], now: int) -> None:
@@ -242,17 +242,58 @@ class LowerEnvelope:
             blocks.popleft()
         self._age(now)
         recent = sorted(list(blocks)[-self._reach :])
+        off = low[1] - self.line.at(low[0])
         self._fit(recent)
+        if self.is_known and (off > _TREND_NS or not self._lo < self.line.ratio < self._hi):
+            self._follow_adjustment()
         wanted = SHORT_BLOCKS * (max(self.line.excess, 0.0) / _QUIET_NS) ** 0.5
         if self._reach < min(wanted, _LONG_BLOCKS):
             self._reach += 1
         elif self._reach > max(wanted, SHORT_BLOCKS):
             self._reach -= 1
 
-    def move(self, lows: list[tuple[int, int]]) -> None:
+    def _follow_adjustment(self) -> None:
+        """Follow the host's clock where its rate is being adjusted.
+
+        Load cannot be told from that by any single packet, but it makes the least delay vary, and
+        it sets in with a jump: only blocks on a straight line that began at the present one count.
+        """
+        for count in _TRENDS:
+            recent = sorted(list(self._blocks)[-count:])
+            if len(recent) < count:
+                return
+            line = supporting_line(recent, self.line.ratio)
+            if line is None or abs(line.ratio - self.line.ratio) > _UNTOLD_WIDTH * line.ratio:
+                continue
+            u0, h0 = recent[0]
+            points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]
+            error = self._error(points, float(line.host - h0), 0.0)
+            width = self._width(points, error) * line.ratio
+            grown = abs(line.ratio - self.line.ratio) * (recent[-1][0] - u0)
+            if abs(line.at(u0) - self.line.at(u0)) > grown:
+                continue
+            width *= _STRAIGHT
+            if line.ratio - width > self._hi or line.ratio + width < self._lo:
+                self._begin(line, recent, points)
+                return
+
+    def _begin(
+        self, line: Line, recent: list[tuple[int, int]], points: list[tuple[float, float]]
+    ) -> None:
+        """Take a line through the latest blocks for the one so far."""
+        self._blocks.clear()
+        self._blocks.extend(recent)
+        self._reach = SHORT_BLOCKS
+        self.moves += 1
+        self.line = line
+        self._lo, self._hi = _RATIOS
+        self._learn(points, float(line.host - recent[0][1]), 0.0)
+
+    def move(self, lows: list[tuple[int, int]], *, widen: bool = True) -> None:
         """Forget all packets but these and lay the line, its ratio unchanged, below them.
 
-        The bounds of the ratio widen by what the move says about the line so far.
+        Unless something else explains the move, the bounds of the ratio ``widen`` by what it says
+        about the line so far.
         """
         span = max((lows[-1][0] - self._blocks[0][0]) * self.line.ratio, float(BLOCK_NS))
         self._blocks.clear()
@@ -261,7 +302,7 @@ class LowerEnvelope:
         self.moves += 1
         before = self.line
         self._shift(sorted(lows))
-        off = abs(self.line.host - before.host)
+        off = abs(self.line.host - before.host) if widen else 0
         self._lo -= before.ratio * off / span
         self._hi += before.ratio * off / span
 

@@ -66,6 +66,10 @@ class Scenario:
         Probability that a packet is lost, or overtaken by later ones (``reorder_ms`` late).
     reboot_at, foreign_at : tuple of float
         When the device restarts (for ``reboot_s``), or another host sets its clock.
+    foreign_steps : tuple of (float, float)
+        When another host moves the device's clock, and by how many seconds.
+    host_slews : tuple of (float, float, float)
+        From when to when a time server adjusts the rate of the host's clock, and by how many ppm.
     host_steps : tuple of (float, float)
         When the host's clock is set, and by how many seconds.
     notice_ms : float
@@ -108,6 +112,8 @@ class Scenario:
     reboot_s: float = 1.0
     foreign_at: tuple[float, ...] = ()
     foreign_error: float = 5.0
+    foreign_steps: tuple[tuple[float, float], ...] = ()
+    host_slews: tuple[tuple[float, float, float], ...] = ()
     host_steps: tuple[tuple[float, float], ...] = ()
     notice_ms: float = -1.0
     delays: tuple[tuple[float, float, float], ...] = ()
@@ -211,7 +217,10 @@ class _DeviceClock:
     def at(self, instants: NDArray[np.float64]) -> NDArray[np.int64]:
         epoch = np.searchsorted(self._starts, instants, side="right") - 1
         elapsed = self._elapsed(instants) - self._elapsed(self._starts)[epoch]
-        return np.asarray(self._values[epoch] + np.floor(elapsed).astype(np.int64))
+        shown = self._values[epoch] + np.floor(elapsed).astype(np.int64)
+        for at, by in self._scenario.foreign_steps:
+            shown[instants >= at * 1e9] += round(by * 1e9)
+        return np.asarray(shown)
 
 
 def _packets(
@@ -290,6 +299,9 @@ def _host_shift(scenario: Scenario, instants: NDArray[np.int64]) -> NDArray[np.i
     shift = np.zeros(len(instants), np.int64)
     for at, step in scenario.host_steps:
         shift[instants >= at * 1e9] += int(step * 1e9)
+    for start, stop, ppm in scenario.host_slews:
+        slewed = np.clip(instants, start * 1e9, stop * 1e9) - start * 1e9
+        shift += np.round(slewed * ppm * 1e-6).astype(np.int64)
     return shift
 
 

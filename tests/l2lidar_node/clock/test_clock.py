@@ -10,6 +10,7 @@ from l2lidar_node.config import ClockConfig
 from l2lidar_node.settings import change
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 from tests.l2lidar_node.clock.clock_replay import Replay, observe_imu
+from tests.support.clock_loads import Load
 from tests.support.clock_truth import IMU, POINTS, STREAMS, SYNC, Scenario, simulate
 
 EVERYTHING = Scenario(
@@ -177,6 +178,58 @@ def test_a_sync_by_another_host_is_bridged_and_reported() -> None:
     replay.check_promises()
     assert replay.kinds == [ClockEventKind.LOCKED, ClockEventKind.FOREIGN_SYNC]
     assert replay.spread_ms.max() < 0.05
+
+
+@pytest.mark.parametrize("jitter_ms", [0.0, 3.0])
+@pytest.mark.parametrize("error", [0.0, 0.01, 5.0])
+@pytest.mark.parametrize("every", [0.05, 0.013])
+def test_seconds_of_foreign_syncs_leave_no_error(
+    every: float, error: float, jitter_ms: float
+) -> None:
+    foreign = tuple(np.arange(4.0, 7.5, every))
+    replay = Replay(
+        Scenario(
+            seconds=10.0, sync="once", foreign_at=foreign, foreign_error=error, notice_ms=10.0,
+            jitter="exponential", jitter_ms=jitter_ms,
+        ),
+        seed=3,
+    )  # fmt: skip
+
+    replay.check_promises()
+    assert ClockEventKind.FOREIGN_SYNC in replay.kinds
+    assert replay.spread_ms.max() < 0.5
+
+
+@pytest.mark.parametrize("jitter_ms", [0.0, 0.5])
+def test_small_foreign_steps_are_seen_and_bridged(jitter_ms: float) -> None:
+    steps = tuple((4.0 + number, 0.001 * (-1) ** (number // 3)) for number in range(12))
+    replay = Replay(
+        Scenario(
+            seconds=18.0, sync="once", foreign_steps=steps, notice_ms=10.0,
+            jitter="uniform", jitter_ms=jitter_ms,
+        ),
+        seed=3,
+    )  # fmt: skip
+
+    replay.check_promises()
+    assert replay.clock.status().events[ClockEventKind.FOREIGN_SYNC] >= 3  # to three new places
+    assert replay.spread_ms.max() < 0.1
+
+
+@pytest.mark.parametrize(("batch_ms", "worst_ms"), [(0.0, 1.2), (20.0, 2.5), (100.0, 3.2)])
+@pytest.mark.parametrize("ppm", [500.0, -500.0])
+def test_an_adjusted_rate_of_the_host_clock_is_followed(
+    ppm: float, batch_ms: float, worst_ms: float
+) -> None:
+    loads = (Load(start=0, stop=60, batch_ms=batch_ms),) if batch_ms else ()
+    replay = Replay(
+        Scenario(seconds=30.0, host_slews=((8.0, 20.0, ppm),), loads=loads, notice_ms=10.0), seed=3
+    )
+    at = (replay.stamped["truth"] - replay.stamped["truth"][0]) * 1e-9
+
+    replay.check_promises()
+    assert replay.spread_ms.max() < worst_ms
+    assert replay.spread_ms[at > 25.0].max() < (0.5 if batch_ms < 50.0 else worst_ms)
 
 
 @pytest.mark.parametrize("step", [0.02, 0.2, 3.0])
@@ -366,8 +419,23 @@ def test_without_correction_and_sync_stamps_count_from_power_on() -> None:
 def test_system_time_stamps_with_the_arrival() -> None:
     replay = Replay(Scenario(seconds=2.0), seed=1, config=ClockConfig(use_system_time=True))
 
-    assert np.array_equal(replay.packets["published"], replay.packets["arrival"])
+    left = replay.packets["arrival"] - replay.packets["duration"]
+    assert np.array_equal(replay.packets["published"], left)
     assert replay.clock.status().locked
+
+
+def test_system_time_never_goes_back_nor_overlaps() -> None:
+    """Packets of a batch arrive at once, and the host's clock is set back once."""
+    path = Scenario(
+        seconds=8.0, loads=(Load(start=0, stop=5, batch_ms=40),), host_steps=((6.0, -3.0),)
+    )
+    replay = Replay(path, seed=1, config=ClockConfig(use_system_time=True))
+
+    for kind in (IMU, POINTS):
+        stamped = replay.of(kind)
+        assert np.all(stamped["published"][1:] > (stamped["published"] + stamped["duration"])[:-1])
+    assert np.all(replay.stamped["published"] - replay.stamped["arrival"] < 10**9)
+    assert 400 < replay.clock.status().held < 1000  # until the clock has passed the latest stamp
 
 
 def test_the_switch_to_system_time_and_back_is_live_and_never_goes_backwards() -> None:

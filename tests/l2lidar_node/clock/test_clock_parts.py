@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2lidar_node.clock.cadence import Cadence
+from l2lidar_node.clock.host_clock_model import HostClockModel
 from l2lidar_node.clock.lower_envelope import supporting_line
 from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
@@ -133,3 +134,28 @@ def test_periodic_syncs_come_at_their_rate_even_if_the_host_clock_is_set_back() 
     assert not schedule.due(HostNs(now + 49 * MS))
     assert schedule.due(HostNs(now + 50 * MS))
     assert schedule.due(HostNs(now - 1))
+
+
+@pytest.mark.parametrize(("off", "follows"), [(1_900, True), (2_600, False)])
+def test_the_least_deviation_that_is_no_longer_regular(off: int, follows: bool) -> None:
+    """A clock of this resolution: steps of 5 us, as at ratios near 1, must not pass as noise."""
+    assert _learned(2 * MS).follows(9, 2 * MS + off) is follows
+
+
+def test_packets_from_before_a_told_step_do_not_count_in_the_new_time() -> None:
+    model = HostClockModel(2.0)
+    model.stepped(0, 0)
+    begin = 10**18
+    for number in range(500):
+        model.add(number * 2 * MS, begin + number * 4 * MS)
+        model.update(number * 2 * MS)
+    assert model.ready
+    stepped_at = begin + 500 * 4 * MS + 10**9
+    model.stepped(10**9, stepped_at)
+    before = model.at(500 * 2 * MS)
+    for number in range(500, 740):  # they waited in the socket, with the arrivals of then
+        model.add(number * 2 * MS, begin + number * 4 * MS)
+        model.update(number * 2 * MS)
+    assert model.at(500 * 2 * MS) == before
+    assert not model.steps
+    assert model.at(740 * 2 * MS) == pytest.approx(begin + 740 * 4 * MS + 10**9, abs=1000)
