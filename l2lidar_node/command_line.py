@@ -115,10 +115,14 @@ def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
+_MARKER: Final = "spelt for typer"
+
+
 def _optional(annotation: Any) -> Any:
     if get_origin(annotation) is Annotated:
         inner, *options = get_args(annotation)
-        return Annotated[(_optional(inner), *options)]
+        # Without the marker typing's cache gives back the alias of X | None: it holds both equal.
+        return Annotated[(_optional(inner), *options, _MARKER)]
     if isinstance(annotation, UnionType):
         return Union[get_args(annotation)]  # noqa: UP007 - which is the point
     return annotation

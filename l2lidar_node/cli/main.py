@@ -14,6 +14,7 @@ from l2lidar_node.command_line import (
     UNIT,
     CommandError,
     Verb,
+    for_typer,
     interruption_exits,
     registered_verbs,
 )
@@ -161,6 +162,7 @@ def app() -> typer.Typer:
     )
 
     @made.callback()
+    @for_typer
     def l2lidar(
         version: Annotated[
             bool,

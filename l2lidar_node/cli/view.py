@@ -1,17 +1,39 @@
-"""Looks at live topics: in a window, in the browser, or into a file for later."""
+"""`l2lidar view`: live topics or a recording in a window, the browser, or a file for later."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Final
 
 import typer
 
+from l2lidar_node import viewing
 from l2lidar_node.cli.console import say
-from l2lidar_node.cli.device import DeviceError
+from l2lidar_node.command_line import CommandError
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.recording import bag
+from l2lidar_node.recording.pcap import CaptureError, is_capture_file
+from l2lidar_node.recording.recording import Recording
+from l2lidar_node.recording.replay import measurements
+from l2lidar_node.settings import build
+from l2lidar_node.types import Sweep
+from l2lidar_node.viewing import Viewer
+
+_ODOMETRY: Final = "nav_msgs/msg/Odometry"
+_DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 def view(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Bag or capture (pcap) to show instead of live topics; needs no ROS.",
+            exists=True,
+            show_default=False,
+        ),
+    ] = None,
     web: Annotated[
         bool, typer.Option("--web", help="Serve it to a browser on this machine.")
     ] = False,
@@ -25,20 +47,42 @@ def view(
         str, typer.Option(help="Namespace of the topics, for example /front.")
     ] = "",
 ) -> None:
-    """Look at clouds raw and deskewed, path, map, IMU and health, in rerun. Needs ROS 2."""
+    """Look at clouds raw and deskewed, path, map, IMU and health, in rerun.
+
+    With the odometry's topics also at its standard deviations, the directions that it cannot see,
+    and the map as it grows. Live topics need ROS 2; a recording does not.
+    """
+    try:
+        sdk = viewing.open_viewer(web, save)
+    except viewing.ViewerError as error:
+        raise CommandError(str(error)) from None
+    try:
+        shown = (
+            _live(sdk, namespace, seconds)
+            if file is None
+            else _recorded(sdk, file, namespace, seconds)
+        )
+    except KeyboardInterrupt:
+        return
+    say(f"{shown} messages shown" + (f", written to {save}" if save else ""))
+    if not shown and file is None:
+        raise CommandError("no message came: is the driver running, in the same ROS_DOMAIN_ID?")
+    if not shown:
+        raise CommandError(f"{file} has no topic to show: no clouds, IMU, odometry, diagnostics")
+    if web:
+        _serve(seconds)
+
+
+def _live(sdk: Any, namespace: str, seconds: float | None) -> int:
     try:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
 
         from l2lidar_node.ros import topics, viewer
     except ImportError as error:
-        raise DeviceError(
-            f"viewing topics needs ROS 2 ({error}): source it, or run `make setup`"
+        raise CommandError(
+            f"viewing topics needs ROS 2 ({error}): source it, or name a recording"
         ) from None
-    try:
-        sdk = viewer.open_viewer(web, save)
-    except viewer.ViewerError as error:
-        raise DeviceError(str(error)) from None
     names = {
         "raw": topics.POINTS,
         "deskewed": topics.POINTS_DESKEWED,
@@ -48,13 +92,82 @@ def view(
     }
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        shown = viewer.view(
+        return viewer.view(
             sdk, {role: namespace.rstrip("/") + name for role, name in names.items()}, seconds
         )
-    except KeyboardInterrupt:
-        return
     finally:
         rclpy.try_shutdown()
-    say(f"{shown} messages shown" + (f", written to {save}" if save else ""))
-    if not shown:
-        raise DeviceError("no message came: is the driver running, in the same ROS_DOMAIN_ID?")
+
+
+def _recorded(sdk: Any, file: Path, namespace: str, seconds: float | None) -> int:
+    viewer = Viewer(sdk)
+    try:
+        if is_capture_file(file):
+            _show_capture(viewer, file, seconds)
+        else:
+            _show_bag(viewer, file, namespace.rstrip("/"), seconds)
+    except CaptureError as error:
+        raise CommandError(f"{file}: {error}") from None
+    if viewer.refused:
+        say(f"[yellow]{viewer.refused} clouds could not be read")
+    return viewer.messages
+
+
+def _show_capture(viewer: Viewer, file: Path, seconds: float | None) -> None:
+    config = build(DriverConfig, {"imu_adjust": False, "sweep_cut": "turn"})
+    messages = bag.Messages(config)
+    with file.open("rb") as stream:
+        recording = Recording(stream)
+        for now, event in measurements(recording, config):
+            if seconds is not None and now > recording.start + seconds * 1e9:
+                return
+            if isinstance(event, Sweep):
+                viewer.cloud(messages.cloud(event), "raw")
+            else:
+                viewer.imu(messages.imu(event))
+
+
+def _show_bag(viewer: Viewer, file: Path, namespace: str, seconds: float | None) -> None:
+    roles = {
+        f"{namespace}/points": "raw",
+        f"{namespace}/points_deskewed": "deskewed",
+        f"{namespace}/local_map": "map",
+    }
+    start = None
+    for topic, kind, now, message in _messages(file):
+        start = now if start is None else start
+        if seconds is not None and now > start + seconds * 1e9:
+            return
+        if kind == _DIAGNOSTICS:
+            viewer.diagnostics(message)
+        elif not topic.startswith(namespace):
+            continue
+        elif kind == bag.CLOUD and topic in roles:
+            viewer.cloud(message, roles[topic])
+        elif kind == bag.IMU:
+            viewer.imu(message)
+        elif kind == _ODOMETRY:
+            viewer.odometry(message)
+
+
+def _messages(file: Path) -> Iterator[tuple[str, str, int, Any]]:
+    """Yield topic, type, instant of recording and message of all that can be shown."""
+    kinds = (bag.CLOUD, bag.IMU, _ODOMETRY, _DIAGNOSTICS)
+    try:
+        with bag.open_bag(file) as reader:
+            for connection, now, data in bag.messages(reader):
+                if connection.msgtype in kinds:
+                    message = reader.deserialize(data, connection.msgtype)
+                    yield connection.topic, connection.msgtype, now, message
+    except Exception as error:
+        # Of a damaged file, any byte may lead anywhere in its readers.
+        raise CommandError(str(bag.unreadable(file, error))) from None
+
+
+def _serve(seconds: float | None) -> None:
+    """Keep the page of a recording until Ctrl-C, or for some seconds."""
+    say("Ctrl-C ends it")
+    try:
+        threading.Event().wait(seconds)
+    except KeyboardInterrupt:
+        return

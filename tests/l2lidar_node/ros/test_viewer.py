@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from l2lidar_node.ros import viewer
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
 
 pytestmark = [
@@ -70,23 +67,3 @@ def test_silence_is_said(tmp_path: Path) -> None:
     result = _view("--save", str(tmp_path / "none.rrd"), "--seconds", "1")
     assert result.returncode == 1
     assert "is the driver running" in result.stderr
-
-
-def test_without_a_display_it_says_what_else_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(viewer.ViewerError, match="try --web or --save"):
-        viewer.open_viewer(web=False, save=None)
-
-
-def test_the_window_is_found_where_the_environment_is_not_activated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    import rerun
-
-    found: list[str | None] = []
-    monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setenv("PATH", os.defpath)
-    monkeypatch.setattr(rerun, "spawn", lambda **_: found.append(shutil.which("rerun")))
-    viewer.open_viewer(web=False, save=None)
-    assert found == [str(Path(sys.executable).parent / "rerun")]
