@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
+from l2lidar_node.check.consumers import CONSUMERS as CHECKED
 from l2lidar_node.clouds.fields import RINGS, rings
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.config import DriverConfig, FrameConfig
@@ -225,6 +226,7 @@ def test_extrinsic_has_each_projects_own_sign() -> None:
 
 def test_rings_of_the_consumers_are_those_of_the_driver() -> None:
     lio_sam = parameters_for(CONSUMERS / "lio_sam/params.yaml", "any", "/any")
+    assert lio_sam["N_SCAN"] == CHECKED["lio_sam"].ring_count
     for name in ("driver", "deskew"):
         made = parameters_for(CONSUMERS / f"lio_sam/{name}.yaml", "any", "/any")
         assert made["ring_count"] == lio_sam["N_SCAN"]

@@ -14,7 +14,6 @@ from l2lidar_node.check.requirements import (
     TimeUnit,
     Use,
 )
-from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.types import Level
 
@@ -38,6 +37,8 @@ def _exactly(layout: str) -> dict[str, tuple[str, ...]]:
     kind = LAYOUTS[layout].without_time().dtype
     return {name: (kind[name].str[1:],) for name in kind.names or ()}
 
+
+_LIO_SAM_RINGS: Final = 75  # N_SCAN of config/consumers/lio_sam, which a test holds equal
 
 _KISS: Final = (
     Input(layout="native", fields=_XYZ, times=_any_of("t timestamp time", TimeUnit.SPREAD)),
@@ -65,7 +66,8 @@ _ALL: Final = (
         time=Use.NEEDED,
         order=Order.LAST,
         is_dense=Use.NEEDED,
-        ring_count=RINGS,
+        ring_count=_LIO_SAM_RINGS,
+        fragment=Level.ERROR,
         imu=Use.NEEDED,
         orientation=Use.NEEDED,
         imu_rate_hz=200.0,
@@ -118,6 +120,7 @@ _ALL: Final = (
         ),
         time=Use.NEEDED,
         late_first=Level.ERROR,
+        moves_cloud_frame=True,
         imu=Use.NEEDED,
         cloud_qos=Subscription("best_effort", 10),
         imu_qos=Subscription("best_effort", 100),
@@ -134,6 +137,7 @@ _ALL: Final = (
         ),
         time=Use.USED,
         order=Order.ASCENDING,
+        moves_cloud_frame=True,
         imu=Use.NEEDED,
         any_acceleration_unit=True,
         cloud_qos=_SENSOR_DATA,

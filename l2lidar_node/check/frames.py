@@ -40,6 +40,8 @@ def check_frames(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
     )
     if imus and consumer.tf is not Use.IGNORED:
         yield _check_mount(clouds[0], imus[0], seen, consumer)
+    if consumer.moves_cloud_frame:
+        yield _check_parent(clouds[0], seen, consumer)
     if consumer.tf is Use.NEEDED:
         yield _check_tree(clouds[0], imus[:1], seen, consumer)
 
@@ -54,6 +56,21 @@ def _check_mount(cloud: str, imu: str, seen: Observation, consumer: Consumer) ->
         f"no transform between '{cloud}' and '{imu}'; {consumer.title} takes it from TF "
         f"{'only' if consumer.tf is Use.NEEDED else 'or from its configuration'}",
         "set publish_tf: true, and record /tf_static",
+    )
+
+
+def _check_parent(cloud: str, seen: Observation, consumer: Consumer) -> Finding:
+    """Return whether the consumer can publish a transform to the cloud frame."""
+    parents = sorted({parent for parent, child in seen.transforms if child == cloud})
+    if not parents:
+        return ok(_FRAMES, "tf-parent", f"{consumer.title} can be the parent of '{cloud}' in TF")
+    return Finding(
+        Level.WARN,
+        _FRAMES,
+        "tf-parent",
+        f"'{cloud}' has the parent '{parents[0]}' in TF; {consumer.title} as we configure it "
+        "would be a second one, and TF allows one",
+        f"name '{parents[0]}' or its topmost frame as base frame in {consumer.title}'s own file",
     )
 
 

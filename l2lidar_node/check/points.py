@@ -26,7 +26,7 @@ from l2lidar_node.check.requirements import (
     not_judged,
     ok,
 )
-from l2lidar_node.clouds.fields import OPTICAL_CENTRE_M, Field
+from l2lidar_node.clouds.fields import OPTICAL_CENTRE_M, RINGS, Field
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.types import F64, Level
 
@@ -189,8 +189,11 @@ def _has_wrong_row_step(cloud: Cloud) -> bool:
 
 _FEW: Final = 100
 _MUCH_AT_ORIGIN: Final = 0.01
+# Of what as many rings as slots of an arc keep; half as many keep half.
 _KEPT_WELL: Final = 0.8
 _KEPT_AT_ALL: Final = 0.5
+_FRAGMENT: Final = 0.5
+_NEXT: Final = 3  # clouds that the first one is compared with
 
 
 def check_values(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
@@ -199,9 +202,27 @@ def check_values(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
     if not inside:
         return
     yield from _check_counts(inside, consumer)
+    if consumer.imu is Use.NEEDED:
+        yield _check_first(inside, consumer)
     yield from _check_finite(seen, consumer)
     if consumer.ring_count:
         yield from _check_rings(inside, consumer)
+
+
+def _check_first(inside: list[Contents], consumer: Consumer) -> Finding:
+    """Return whether the first cloud, with which a map begins, is whole."""
+    first, *others = (item.count - item.nonfinite for item in inside[: 1 + _NEXT])
+    if len(others) == _NEXT and first < _FRAGMENT * min(others):
+        does = "may crash on it" if consumer.fragment is Level.ERROR else "begins its map with it"
+        return Finding(
+            consumer.fragment,
+            _SUBJECT,
+            "first",
+            f"the first cloud has {first} points, the next ones {min(others)} and more: part of a "
+            f"turn; {consumer.title} {does}",
+            "set sweep_cut: turn, of which the driver publishes whole ones only",
+        )
+    return ok(_SUBJECT, "first", f"the first cloud is whole: {first} points")
 
 
 def _check_counts(inside: list[Contents], consumer: Consumer) -> Iterator[Finding]:
@@ -294,7 +315,8 @@ def _check_rings(inside: list[Contents], consumer: Consumer) -> Iterator[Finding
             "ring-range",
             f"rings are {least} to {greatest}; {consumer.title} drops points of rings not within "
             f"0 to N_SCAN - 1 (N_SCAN: {consumer.ring_count} in config/consumers)",
-            f"set point_layout: {layout}, or N_SCAN: {greatest + 1}",
+            f"set point_layout: {layout} and ring_count: {consumer.ring_count}, or N_SCAN: "
+            f"{greatest + 1}",
         )
     elif least == 1 and greatest > 1:
         yield Finding(
@@ -310,8 +332,9 @@ def _check_rings(inside: list[Contents], consumer: Consumer) -> Iterator[Finding
         f"{consumer.title}'s projection (a point for each ring and {360 / COLUMNS:g} deg of "
         f"azimuth) keeps {kept:.0%} of the points"
     )
-    if kept < _KEPT_WELL:
-        level = Level.WARN if kept >= _KEPT_AT_ALL else Level.ERROR
+    usual = consumer.ring_count / RINGS
+    if kept < _KEPT_WELL * usual:
+        level = Level.WARN if kept >= _KEPT_AT_ALL * usual else Level.ERROR
         fix = f"set point_layout: {layout} and imu_adjust: false"
         yield Finding(level, _SUBJECT, "ring-cells", text, fix)
     else:

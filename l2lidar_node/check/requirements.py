@@ -174,6 +174,10 @@ class Consumer:
         It takes y and z to follow x.
     ring_count : int
         Rows of its projection as in our configuration for it; 0 where it has none.
+    fragment : Level
+        How bad it is that the first cloud is part of a turn.
+    moves_cloud_frame : bool
+        With our configuration it makes the cloud frame the child of its odometry frame.
     imu, orientation : Use
     imu_rate_hz : float
         The least that it asks for.
@@ -198,6 +202,8 @@ class Consumer:
     exact: bool = False
     contiguous: bool = False
     ring_count: int = 0
+    fragment: Level = Level.WARN
+    moves_cloud_frame: bool = False
     imu: Use = Use.IGNORED
     orientation: Use = Use.IGNORED
     imu_rate_hz: float = 100.0

@@ -183,6 +183,13 @@ def zeros_for_no_return(made: Recording) -> None:
     made.points(zeroed)
 
 
+@defect("lio_sam", ERROR, "cloud.first")
+@defect("fast_lio point_lio rko_lio glim dlio", WARN, "cloud.first")
+def first_cloud_is_a_fragment(made: Recording) -> None:
+    points, stamp = recordings.points_of(made.clouds[0]), recordings.stamp_of(made.clouds[0])
+    made.clouds[0] = recordings.cloud(points[: len(points) // 5].copy(), stamp)
+
+
 @defect("lio_sam", ERROR, "cloud.ring-constant")
 def vendors_ring(made: Recording) -> None:
     made.points(lambda points: points["ring"].fill(1))
@@ -584,6 +591,11 @@ def no_tf(made: Recording) -> None:
 @defect("nav2 rtabmap", WARN, "frames.tf")
 def only_the_drivers_tf(made: Recording) -> None:
     made.transforms = [("l2lidar_link", "l2lidar_imu")]
+
+
+@defect("rko_lio glim", WARN, "frames.tf-parent")
+def cloud_frame_has_a_parent(made: Recording) -> None:
+    made.transforms = [("base_link", "l2lidar_link"), ("l2lidar_link", "l2lidar_imu")]
 
 
 @defect("fast_lio autoware", ERROR, "qos.qos-imu")

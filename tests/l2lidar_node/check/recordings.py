@@ -18,6 +18,7 @@ from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.imu import rotated
 from l2lidar_node.check.observation import CLOUD, IMU, TRANSFORMS, Gathering, Observation, Qos
 from l2lidar_node.clouds import fields
+from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.types import Sweep
 from tests.support import build
@@ -96,20 +97,24 @@ class Recording:
 @cache
 def good(consumer: str) -> Recording:
     """Return what the driver publishes with our configuration for a consumer."""
-    layout = LAYOUTS[CONSUMERS[consumer].inputs[0].layout]
+    asked = CONSUMERS[consumer]
+    layout = LAYOUTS[asked.inputs[0].layout].with_rings(asked.ring_count or RINGS)
     clouds, arrivals = [], []
     for sweep in sweeps():
         clouds.append(cloud(layout.convert(sweep.points, sweep.start), sweep.start))
         arrivals.append(sweep.end + 3_000_000)
     samples = imu_messages()
     reliability = "reliable" if consumer in RELIABLE else "best_effort"
-    return Recording(
+    made = Recording(
         clouds,
         arrivals,
         samples,
         [stamp_of(item) + 500_000 for item in samples],
         reliability=reliability,
     )
+    if asked.moves_cloud_frame:  # it is that frame's parent itself
+        made.transforms = [pair for pair in made.transforms if pair[1] != "l2lidar_link"]
+    return made
 
 
 @cache
