@@ -21,7 +21,7 @@ CONSUMERS = ("lio_sam", "fast_lio", "nav2")
 def rig() -> Iterator[Rig]:
     """A driver that streams as LIO-SAM wants it, but for the levelling."""
     with open_rig() as rig:
-        rig.driver(point_layout="velodyne", sweep_cut="turn", imu_adjust=True)
+        rig.driver(point_layout="velodyne", ring_count=75, sweep_cut="turn", imu_adjust=True)
         rig.emulator("--boot-scale", "0.02")
         rig.wait_for(lambda: len(rig.observer.clouds.stamps) > 3, "clouds")
         yield rig
