@@ -94,7 +94,7 @@ def test_the_input_that_fits_best_is_taken(consumer: str, name: str, code: str, 
 
 def test_an_ouster_cloud_is_judged_as_such() -> None:
     made = recordings.copied(recordings.good("lio_sam"))
-    layout = LAYOUTS["ouster_legacy"]
+    layout = LAYOUTS["ouster_legacy"].with_rings(CONSUMERS["lio_sam"].ring_count)
     made.clouds = [
         recordings.cloud(layout.convert(sweep.points, sweep.start), sweep.start)
         for sweep in recordings.sweeps()
