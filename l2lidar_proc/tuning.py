@@ -128,6 +128,18 @@ NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is n
 EDGE_SHARE: Final = 0.4  # of the points that may lack a flat surface where flat ones abound
 REFIT_GROWTH: Final = 1.12  # growth of the count before a cell is fitted again. Speed only
 
+# ---- odometry: uncertainty of the map
+
+DRIFT_GROUP: Final = 4  # sweeps that share an entry. Memory: 144 bytes per second
+DRIFT_MOST_FRESH: Final = 0.9  # share of a sweep that counts as new map at most
+# Of a unit whose block of calibration is not quite its own. Derived: captures of a real one show
+# beam angles 0.4 degrees off; with that, ranges 0.2 % off and an IMU turned by 0.5 degrees the
+# hard runs drift by 0.2 to 0.9 % of the distance from the start and turn by 0.1 to 0.7 degrees.
+UNIT_SHARE: Final = 0.004  # of the distance from the map's origin, each axis
+UNIT_TURN: Final = 0.005  # [rad] each axis
+UNIT_SHIFT: Final = 0.006  # [m] each axis
+UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
+
 # ---- odometry: matching. Tuned on: loose predictions after gaps and blockages in all scenes
 
 LOOSE_POSITION: Final = 0.06  # [m] a prediction less certain may be a surface off

@@ -68,6 +68,8 @@ class Alignment:
     residual : float
         Weighted root mean square of their distances [m].
     steps : int
+    support : tuple of ndarray
+        Numbers of the sweeps that opened the surfaces met, and the share of the weight of each.
     """
 
     state: InertialState
@@ -77,6 +79,7 @@ class Alignment:
     inlier_ratio: float
     residual: float
     steps: int
+    support: tuple[NDArray[np.int64], F64]
 
 
 def align(
@@ -139,8 +142,10 @@ def align(
         )
         residual = float(np.sqrt((weights * distances**2).sum() / weights.sum()))
         inlier_ratio = np.count_nonzero(np.abs(distances) < 2.0 * spread) / len(near)
+        born, place = np.unique(found.born[near], return_inverse=True)
+        support = born, np.bincount(place, weights) / weights.sum()
         result = Alignment(
-            state, posterior, information, len(index), inlier_ratio, residual, step + 1
+            state, posterior, information, len(index), inlier_ratio, residual, step + 1, support
         )
         change = state.boxminus(prior) - error
         if np.abs(change[:6]).max() < tuning.CONVERGED:

@@ -36,7 +36,7 @@ class FrameJump:
         carried[:3, 3:] = -skew(place - self.place)
         return np.asarray(carried @ self.covariance @ carried.T)
 
-    def added(self, state: InertialState, covariance: F64) -> FrameJump:
+    def added(self, state: InertialState, covariance: F64, drift: F64) -> FrameJump:
         """Return this and a further jump.
 
         Parameters
@@ -45,12 +45,14 @@ class FrameJump:
             Where it happens.
         covariance : ndarray, shape (18, 18)
             Of the state, relative to the map before.
+        drift : ndarray, shape (6, 6)
+            Of that map itself, at the state's place.
         """
         errors = np.r_[POSITION, ROTATION]
         axes = np.eye(6)
         axes[3:, 3:] = state.rotation
         jump = axes @ covariance[np.ix_(errors, errors)] @ axes.T
-        return FrameJump(state.position, self.at(state.position) + jump)
+        return FrameJump(state.position, self.at(state.position) + jump + drift)
 
     def unseen(self, state: InertialState) -> FrameJump:
         """Return this and what may have happened from a state on while no time was told."""

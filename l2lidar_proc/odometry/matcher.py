@@ -17,6 +17,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment, Source, align
 from l2lidar_proc.odometry.estimate import AlignmentQuality, degeneracy_ratio
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
+from l2lidar_proc.odometry.map_drift import MapDrift
 from l2lidar_proc.odometry.relocalization import pose_hypotheses, rotation_is_loose
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
@@ -55,6 +56,8 @@ class SweepMatcher:
     lever : ndarray, shape (3,)
     surfaces : SurfelMap
     kiss : KissMatcher
+    drift : MapDrift
+        How wrong the map may be where the latest sweep is.
     """
 
     def __init__(self, config: OdometryConfig, lever: F64) -> None:
@@ -68,6 +71,7 @@ class SweepMatcher:
             capacity=settings.surface_capacity,
         )
         self.kiss = KissMatcher(config)
+        self.drift = MapDrift()
         self._pruned_at = np.zeros(3)
         self._sweeps = 0
 
@@ -76,6 +80,7 @@ class SweepMatcher:
         self._sweeps = 0
         self.surfaces.clear()
         self.kiss.clear()
+        self.drift.clear()
 
     def deskewed(self, sweep: Sweep, motion: SweepMotion) -> NDArray[np.void]:
         """Return the points of a sweep as seen from the reference of a motion, shape (N,)."""
@@ -133,8 +138,10 @@ class SweepMatcher:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         return Match(best, False)
 
-    def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> None:
+    def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> float:
         """Add the deskewed points (N,) of a sweep to the maps.
+
+        Return the share of them that fell where there was no map before.
 
         Parameters
         ----------
@@ -145,9 +152,10 @@ class SweepMatcher:
             What was predicted: from it KISS-ICP learns how good predictions are.
         """
         state = motion.state
-        self._sweeps += 1
         points = xyz(moved) - self.lever
-        self.surfaces.add(points @ state.rotation.T + state.position)
+        fresh = self.surfaces.add(points @ state.rotation.T + state.position, self._sweeps)
+        self.drift.record(self._sweeps, state.position, pose_covariance(motion))
+        self._sweeps += 1
         self.kiss.update(points, _pose(state), _pose(guess))
         if (
             np.linalg.norm(state.position - self._pruned_at)
@@ -155,6 +163,7 @@ class SweepMatcher:
         ):
             self.surfaces.forget(state.position, self.config.max_range)
             self._pruned_at = state.position
+        return fresh
 
     def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
         """Return how well a sweep with so many points to align could be matched."""
@@ -196,7 +205,8 @@ class SweepMatcher:
         state, covariance = update_with_information(
             motion.state, motion.covariance, place, information, still
         )
-        return Alignment(state, covariance, information, 0, 0.0, 0.0, 1)
+        nobody = np.empty(0, np.int64), np.empty(0)
+        return Alignment(state, covariance, information, 0, 0.0, 0.0, 1, nobody)
 
     def _registered(
         self, source: Source, guess: InertialState, most: float = np.inf
@@ -206,6 +216,14 @@ class SweepMatcher:
         if better is None:
             return guess
         return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
+
+
+def pose_covariance(motion: SweepMotion) -> F64:
+    """Return the covariance (6, 6) of place and turn about the map's axes [m, rad]."""
+    errors = np.r_[POSITION, ROTATION]
+    axes = np.eye(6)
+    axes[3:, 3:] = motion.state.rotation
+    return np.asarray(axes @ motion.covariance[np.ix_(errors, errors)] @ axes.T)
 
 
 def xyz(points: NDArray[np.void]) -> F64:

@@ -137,7 +137,14 @@ class Odometry:
         nothing, noise = self._last.points[:0], self.config.inertial.gyro_noise
         quality = AlignmentQuality()
         return estimate_of(
-            motion, self._lever, nothing, (Status.PREDICTED,), quality, noise, self._jump
+            motion,
+            self._lever,
+            nothing,
+            (Status.PREDICTED,),
+            quality,
+            noise,
+            self._jump,
+            self.matcher.drift,
         )
 
     def map_points(self) -> F64:
@@ -186,6 +193,7 @@ class Odometry:
             posterior = predicted.state, predicted.covariance
         else:
             self._note_aligned(sweep, found.state, found.covariance)
+            self.matcher.drift.meet(found.support)
             posterior = found.state, found.covariance
         lasted = (predicted.state.stamp - state.stamp) * 1e-9
         motion = predicted.with_state(*eskf.apply_zero_velocity_prior(*posterior, lasted))
@@ -196,8 +204,22 @@ class Odometry:
         quality = self.matcher.quality(len(source.points), found)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None or uncharted or Status.LOST in status:
-            self.matcher.extend(estimate.points, motion, predicted.state)
+            fresh = self.matcher.extend(estimate.points, motion, predicted.state)
+            self._anchor_anew(fresh)
         return estimate
+
+    def _anchor_anew(self, fresh: float) -> None:
+        """Measure places from now on relative to what has just become map, by its share.
+
+        There the place is known by definition: how uncertain it is in the older map is what the
+        new part of the map is uncertain by. Else the next alignment, which compares with what was
+        put there at the same wrong place, would confirm velocity and biases that led to it.
+        """
+        assert self._belief is not None
+        state, covariance = self._belief
+        scale = np.ones(eskf.ERRORS)
+        scale[eskf.POSITION] = np.sqrt(1.0 - min(fresh, tuning.DRIFT_MOST_FRESH))
+        self._belief = state, covariance * np.outer(scale, scale)
 
     def _note_unmatched(self, sweep: Sweep, points: int, status: list[Status]) -> None:
         """Count a sweep that was not aligned: a few seconds of them, and the odometry is lost."""
@@ -215,7 +237,9 @@ class Odometry:
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map at the predicted pose."""
-        self._jump = self._jump.added(motion.state, motion.covariance)
+        self._jump = self._jump.added(
+            motion.state, motion.covariance, self.matcher.drift.at(motion.state.position)
+        )
         self.matcher.clear()
         self._unmatched_ns = 0
         self.phase = Phase.LOST
@@ -319,5 +343,6 @@ class Odometry:
             quality,
             self.config.inertial.gyro_noise,
             self._jump,
+            self.matcher.drift,
         )
         return self._last

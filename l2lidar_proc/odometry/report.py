@@ -10,6 +10,7 @@ from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, 
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry.frame_jump import FrameJump
+from l2lidar_proc.odometry.map_drift import MapDrift
 
 F64 = NDArray[np.float64]
 
@@ -37,6 +38,7 @@ def estimate_of(
     quality: AlignmentQuality,
     gyro_noise: float,
     jump: FrameJump,
+    drift: MapDrift,
 ) -> OdometryEstimate:
     """Return the estimate that a motion amounts to.
 
@@ -53,7 +55,8 @@ def estimate_of(
     gyro_noise : float
         Of an angular velocity [rad/s].
     jump : FrameJump
-        What the map's own place adds to the covariance.
+    drift : MapDrift
+        What the map's own place, and its own error, add to the covariance.
     """
     state, p = motion.state, motion.covariance
     if quality.matched and quality.degeneracy_ratio < tuning.DEGENERATE_SHARE:
@@ -70,7 +73,7 @@ def estimate_of(
     return OdometryEstimate(
         stamp=state.stamp,
         T_map_lidar=cloud_pose(state, lever),
-        covariance=pose @ p @ pose.T + jump.at(state.position),
+        covariance=pose @ p @ pose.T + jump.at(state.position) + drift.at(state.position),
         velocity=state.rotation.T @ state.velocity - rotations.cross(rate, lever),
         angular_velocity=rate,
         twist_covariance=twist_covariance,

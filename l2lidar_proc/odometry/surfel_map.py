@@ -30,6 +30,7 @@ CELL: Final = np.dtype(
         ("axes", "<f8", (3, 3)),  # rows: the normal, then the two axes of the surface; unit
         ("spread", "<f8", (3,)),  # [m^2] variance along each of the axes, ascending
         ("sweeps", "<f8"),  # in which points came
+        ("born", "<i8"),  # number of the sweep whose points opened it
         ("fitted", "<f8"),  # count when mean, axes and spread were computed
         ("flat", "?"),
         ("narrow", "<i1"),  # axes of a cell that is not flat along which its points lie close
@@ -64,6 +65,8 @@ class Matches:
         The other two axes of the surface, unit, map frame.
     tilts : ndarray, shape (M, 2)
         Variance of the normal towards each of these, for the noise of the points [rad^2].
+    born : ndarray, shape (M,)
+        Number of the sweep that opened the surface's cell.
     """
 
     index: I64
@@ -73,6 +76,7 @@ class Matches:
     scatter: F64
     across: F64
     tilts: F64
+    born: I64
 
 
 class SurfelMap:
@@ -109,11 +113,26 @@ class SurfelMap:
         for level in self._levels:
             level.clear()
 
-    def add(self, points: F64) -> None:
-        """Add points (N, 3) [m], map frame."""
-        if len(points):
-            for level in self._levels:
-                level.add(points)
+    def add(self, points: F64, sweep: int = 0) -> float:
+        """Add points, and return the share of them in places where there were none before.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            [m], map frame.
+        sweep : int
+            Number of the sweep that they come from.
+        """
+        if not len(points):
+            return 0.0
+        # the coarsest level tells what is new: finer ones open cells in known walls as well
+        *finer, coarsest = self._levels
+        fresh = float(coarsest.unknown(points).mean())
+        coarsest.add(points, np.full(len(points), sweep))
+        born = coarsest.born_at(points)
+        for level in finer:
+            level.add(points, born)
+        return fresh
 
     def match(self, points: F64, *, narrow: bool = False) -> Matches:
         """Return the surface of every point that has one: the finest at its place.
@@ -176,6 +195,7 @@ def _distances(points: F64, index: I64, cells: NDArray[np.void], axis: int) -> M
         scatter,
         cells["axes"][:, [1 - axis, 2]],
         np.minimum(tilts, 1.0),
+        cells["born"],
     )
 
 
@@ -224,13 +244,24 @@ class _Level:
         rows[known] = np.where(wanted[rows[known]], rows[known], -1)
         return rows
 
-    def add(self, points: F64) -> None:
+    def unknown(self, points: F64) -> NDArray[np.bool_]:
+        """Return which points lie in no cell yet."""
+        return np.asarray(self._find(self._key(points)) < 0)
+
+    def born_at(self, points: F64) -> I64:
+        """Return the number of the sweep that opened the cell of each point; all have one."""
+        return np.asarray(self.cells["born"][self._find(self._key(points))])
+
+    def add(self, points: F64, born: I64) -> None:
         every = self._key(points)
         rows = self._find(every)
         opened = (rows < 0) | (self._count[rows] < self._capacity)
         points = points[opened]
-        keys, inverse = np.unique(every[opened], return_inverse=True)
+        keys, first, inverse = np.unique(every[opened], return_index=True, return_inverse=True)
+        known = len(self._keys)
         rows = self._rows_of(keys)
+        new = rows >= known
+        self.cells["born"][rows[new]] = born[opened][first[new]]
         middles = self._middle(keys)
         offsets = points - middles[inverse]
         bins = len(keys)

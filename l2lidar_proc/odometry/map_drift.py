@@ -1,0 +1,83 @@
+"""Uncertainty of the map: what a sweep adds carries that of the pose which added it.
+
+A sweep that is aligned with what the last few sweeps have put into the map learns where it is
+relative to them, not where it is. So every cell remembers the sweep that opened it, every sweep
+how uncertain its pose was, and a pose is as uncertain as the surfaces that hold it, and by its
+alignment with them besides (VoxelMap, Yuan et al. 2022, carries the like in its planes).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import skew
+
+F64 = NDArray[np.float64]
+
+
+class MapDrift:
+    """How wrong the map may be where it is in use, as a small move of the whole map.
+
+    Covariances (6, 6) are of a shift and a turn of the map about its origin [m, rad], in its axes.
+    """
+
+    def __init__(self) -> None:
+        self._history = np.zeros((64, 6, 6), np.float32)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything: a new map begins, without error by definition."""
+        self._known = 0
+        self._current = np.zeros((6, 6))
+
+    def meet(self, support: tuple[NDArray[np.int64], F64]) -> None:
+        """Take the surfaces that hold the latest sweep.
+
+        Parameters
+        ----------
+        support : tuple of ndarray
+            Numbers of the sweeps that opened them (N,), and their shares of the weight (N,).
+        """
+        sweeps, shares = support
+        if len(sweeps) and self._known:
+            rows = np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
+            self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
+
+    def record(self, sweep: int, place: F64, covariance: F64) -> None:
+        """Remember how uncertain the pose was that added a sweep.
+
+        Parameters
+        ----------
+        sweep : int
+            Its number in this map.
+        place : ndarray, shape (3,)
+            Where it was, map frame [m].
+        covariance : ndarray, shape (6, 6)
+            Of place and turn relative to the surfaces around, map axes [m, rad].
+        """
+        row = sweep // tuning.DRIFT_GROUP
+        if row >= len(self._history):
+            grown = np.zeros((2 * row, 6, 6), np.float32)
+            grown[: len(self._history)] = self._history
+            self._history = grown
+        moved = _carried(-place)
+        self._history[self._known : row + 1] = self._current + moved @ covariance @ moved.T
+        self._known = max(self._known, row + 1)
+
+    def at(self, place: F64) -> F64:
+        """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m]."""
+        moved = _carried(place)
+        away = float(np.linalg.norm(place))
+        left = 1.0 - np.exp(-away / tuning.UNIT_FROM_M)  # the first pose defines the frame
+        shift = (tuning.UNIT_SHIFT * left) ** 2 + (tuning.UNIT_SHARE * away) ** 2
+        unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2] * 3)
+        return np.asarray(moved @ self._current @ moved.T + unit)
+
+
+def _carried(place: F64) -> F64:
+    """Return what a shift and a turn about the origin do at a place: (6, 6)."""
+    moved = np.eye(6)
+    moved[:3, 3:] = -skew(place)
+    return moved

@@ -1,0 +1,82 @@
+"""The uncertainty of the map: carried by what holds a pose, lost only back in old places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_proc import tuning
+from l2lidar_proc.odometry.map_drift import MapDrift
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+
+SURE = np.diag([1e-6] * 6)
+
+
+def unit_alone(place: np.ndarray) -> np.ndarray:
+    """Return what an undrifted map adds at a place."""
+    return MapDrift().at(place)
+
+
+def held_by(*sweeps: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(sweeps), np.full(len(sweeps), 1.0 / len(sweeps))
+
+
+def test_the_first_pose_has_no_error_by_definition() -> None:
+    np.testing.assert_array_equal(MapDrift().at(np.zeros(3)), np.zeros((6, 6)))
+
+
+def test_a_pose_is_as_uncertain_as_what_holds_it() -> None:
+    drift = MapDrift()
+    place = np.array([3.0, -2.0, 1.0])
+    drift.record(0, np.zeros(3), SURE)
+    doubt = np.diag([0.04, 0.01, 0.0, 0.0, 0.0, 1e-4])
+    later = 10 * tuning.DRIFT_GROUP
+    drift.meet(held_by(0))
+    drift.record(later, place, doubt)
+    drift.meet(held_by(later))
+    np.testing.assert_allclose(drift.at(place) - unit_alone(place) - SURE, doubt, atol=3e-5)
+    # a turn of the map there moves what is elsewhere
+    far = place + np.array([10.0, 0.0, 0.0])
+    moved = drift.at(far) - unit_alone(far)
+    assert moved[1, 1] == pytest.approx(0.01 + 10.0**2 * 1e-4, abs=2e-4)
+    # half of it held by the first part of the map
+    drift.meet(held_by(0, later))
+    half = drift.at(place) - unit_alone(place)
+    assert half[0, 0] == pytest.approx(0.02, abs=1e-4)
+    # back in the first part nothing of it is left
+    drift.meet(held_by(0))
+    np.testing.assert_allclose(drift.at(place) - unit_alone(place), SURE, atol=3e-5)
+
+
+def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
+    drift = MapDrift()
+    step = np.diag([1e-4] * 3 + [0.0] * 3)
+    for number in range(1000):
+        drift.record(number * tuning.DRIFT_GROUP, np.zeros(3), step)
+        drift.meet(held_by(number * tuning.DRIFT_GROUP))
+    assert drift.at(np.zeros(3))[0, 0] == pytest.approx(0.1, rel=1e-3)
+    assert np.linalg.eigvalsh(drift.at(np.array([5.0, 1.0, 0.0]))).min() > 0.0
+    drift.clear()
+    np.testing.assert_array_equal(drift.at(np.zeros(3)), np.zeros((6, 6)))
+    drift.meet(held_by(17))  # nothing is known yet
+    np.testing.assert_array_equal(drift.at(np.zeros(3)), np.zeros((6, 6)))
+
+
+def test_cells_remember_the_sweep_that_opened_their_place() -> None:
+    rng = np.random.default_rng(4)
+    surfaces = SurfelMap((0.15, 0.3, 0.6, 1.5))
+
+    def wall(start: float) -> np.ndarray:
+        points = rng.uniform((start, 0.0, 0.0), (start + 3.0, 0.0, 3.0), (6000, 3))
+        points[:, 1] = 0.07 + rng.normal(0.0, 0.003, len(points))
+        return points
+
+    assert surfaces.add(wall(0.0)[:300], 3) == 1.0  # sparse: fine cells come later
+    assert surfaces.add(wall(0.0), 8) == 0.0
+    assert 0.4 < surfaces.add(wall(1.5), 12) < 0.6
+    found = surfaces.match(wall(0.0))
+    assert len(found.index) > 5000
+    assert set(found.born.tolist()) == {3}
+    beyond = surfaces.match(wall(3.2)[:500])
+    assert set(beyond.born.tolist()) == {12}
+    assert surfaces.add(np.empty((0, 3)), 13) == 0.0
