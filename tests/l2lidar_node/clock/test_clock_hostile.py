@@ -11,6 +11,7 @@ from l2lidar_node.clock import DeviceClock
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 
+YEAR_NS = 365 * 24 * 3600 * 10**9
 SECONDS = st.integers(0, 2**32 - 1)
 STAMPS = st.one_of(
     st.builds(lambda sec, nsec: sec * 10**9 + nsec, SECONDS, st.integers(0, 2**32 - 1)),
@@ -119,3 +120,22 @@ def test_a_host_clock_set_before_the_lock_takes_nothing_but_time() -> None:
         begun = 10**18 if number >= 60 else 0
         checked.observe(Stream.IMU, number, instant // 2, begun + instant, 0)
     assert checked.last[Stream.IMU] > 10**18
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(-60 * YEAR_NS, 60 * YEAR_NS), max_size=4), st.booleans())
+def test_jumps_of_the_host_clock_by_decades_keep_the_promises(
+    jumps: list[int], told: bool
+) -> None:
+    checked = Promises(ClockConfig())
+    shown = 60 * YEAR_NS
+    if told:
+        checked.clock.host_stepped(0, HostNs(shown))
+    for part, jump in enumerate([0, *jumps]):
+        shown = max(shown + jump, 1)
+        if told and jump:
+            checked.clock.host_stepped(jump, HostNs(shown))
+        for number in range(part * 300, (part + 1) * 300):
+            shown += 4_000_000
+            checked.observe(Stream.IMU, number % 1025, number * 2_000_000, shown, 0)
+    assert len(pickle.dumps(checked.clock.__getstate__())) < 200_000
