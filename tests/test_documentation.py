@@ -26,6 +26,7 @@ RUN_BY = {
     r"(python3 -m venv|\.venv/bin/(pip|python -m colcon)) .*": "tests/test_packaging.py",
     r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
     r"l2lidar (discover|info|set \w+).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
+    r"l2lidar calibrate (still|scale) .*": "tests/l2lidar_node/cli/test_calibrate.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/recording/test_bag_readers.py",
     r"l2lidar (slam|export) .*": "tests/l2lidar_proc/verbs/test_slam.py",

@@ -94,11 +94,14 @@ def _cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8, size: float)
     return _thinned(found, points)
 
 
-def large(points: F64, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
+def large(
+    points: F64, is_far_half: NDArray[np.bool_], groups: I8, extent: float = _LARGE_M
+) -> Planes:
     """Return large flat surfaces, merged from neighboring cells; one half may see them alone.
 
     Takes ``is_far_half`` to be called as :func:`cells` is. The tolerance is wide enough for a
-    surface that a range bias of some centimeters bows.
+    surface that a range bias of some centimeters bows. ``extent`` is the least standard deviation
+    of a surface's points along its longer side [m].
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -129,8 +132,8 @@ def large(points: F64, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
     merged = _sorted(found.member, label[found.plane], points)
     for _ in range(3):
         merged = _trimmed(merged, points)
-    extent = np.sqrt(_eigen(merged, points)[0])
-    return _thinned(_kept(merged, extent[:, 2] > _LARGE_M), points, _MOST_LARGE)
+    sides = np.sqrt(_eigen(merged, points)[0])
+    return _thinned(_kept(merged, sides[:, 2] > extent), points, _MOST_LARGE)
 
 
 def joined(parts: Sequence[Planes]) -> Planes:

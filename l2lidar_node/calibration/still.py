@@ -40,6 +40,7 @@ _CONTRADICTION: Final = 0.1 * DEG  # between two places
 _REPEATABLE: Final = 0.05 * DEG  # alpha between places and power-ups
 _WHIRL_WORST: Final = 0.5 * DEG
 _WHIRL: Final = 0.03 * DEG  # smaller rocking is left in alpha and beta
+_LARGEST_DRIFT_M: Final = 5e-3  # noise alone makes 1 to 2 mm of it
 _DIRTIEST: Final = 5.0  # [%]
 _MODEL_SD: Final = np.array([0.02 * DEG, 0.02 * DEG, 0.005 * DEG, 0.15e-3])
 """What the model itself may be off, beside what the recording shows: xi, beta, alpha, b."""
@@ -94,6 +95,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     before, after = _qualities(scene, solution, corrections)
     directions = facing(solution.planes)
     refusals += _judged(solution, sd, scatter, together, directions, reports)
+    refusals += _moved(scene, solution)
     xi, beta = solution.values[0], solution.values[1]
     alphas = solution.values[2:]
     is_better = after.thickness < (1.0 - _LEAST_GAIN) * before.thickness
@@ -438,6 +440,26 @@ def _judged(
             )
         )
     return found
+
+
+def _moved(scene: Scene, solution: Solution) -> list[Refusal]:
+    """Return whether surfaces stand elsewhere in the second half of the recording."""
+    members = scene.part(solution.planes.member)
+    own = solution.planes.at()
+    height = own.heights(solver.points(members, solution.per_group(len(scene.known))))
+    last = np.array([scene.returns["packet"][scene.group == group].max()
+                     for group in range(len(scene.known))])  # fmt: skip
+    late = members.returns["packet"] * 2 > last[members.group]
+    drift = float(np.median(_half_gaps(height, late, own)))
+    if drift < _LARGEST_DRIFT_M:
+        return []
+    return [
+        Refusal(
+            f"surfaces moved by {1e3 * drift:.0f} mm between the first and the second half of the "
+            "recording",
+            "clamp the sensor, keep people out, and record again",
+        )
+    ]
 
 
 def _alpha(

@@ -73,6 +73,12 @@ VERBS: Final = (
         "Compare the unit's clock with this host's; leaves the clock alone.",
     ),
     Verb(
+        "calibrate",
+        f"{_CLI}.calibrate:app",
+        UNIT,
+        "Estimate what the unit's calibration is off by, and write a calibration file.",
+    ),
+    Verb(
         "record",
         f"{_CLI}.record:record",
         DATA,

@@ -7,8 +7,11 @@ from typing import Final
 import numpy as np
 
 from l2lidar_node.calibration.observation import Gathering, Place
-from l2lidar_node.emulator.physics import PhysicsConfig, assemble
-from l2lidar_node.emulator.unit.inertial import ImuNoise
+from l2lidar_node.emulator.motion.motion import Motion
+from l2lidar_node.emulator.motion.spline import PoseSpline
+from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
+from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
+from l2lidar_node.emulator.unit.scanner import Scanner
 from l2lidar_node.emulator.unit.units import Unit, unit
 
 POSES_DEG: Final = {
@@ -28,7 +31,7 @@ def still_places(
     *,
     seconds: float = 10.0,
     poses: tuple[str, ...] = tuple(POSES_DEG),
-    power_ups: int = 1,
+    power_up: int = 0,
     world: str = "room",
     seed: int = 0,
     imu: ImuNoise | None = None,
@@ -43,31 +46,71 @@ def still_places(
         At each place.
     poses : tuple of str
         Names of :data:`POSES_DEG`.
-    power_ups : int
-        After each of them all poses are measured.
+    power_up : int
+        How often the unit was switched on before.
     world : str
     seed : int
         Of the noise.
     imu : ImuNoise, optional
     """
+    made = unit(own, power_up) if isinstance(own, str) else own
     found = []
-    for power_up in range(power_ups):
-        made = unit(own, power_up) if isinstance(own, str) else own
-        for number, pose in enumerate(poses):
-            config = PhysicsConfig(
-                world=world,
-                motion="still",
-                mount_rpy_deg=POSES_DEG[pose],
-                seed=seed * 1009 + 17 * power_up + number,
-                imu=imu or ImuNoise(),
-            )
-            name = pose if power_ups == 1 else f"{pose}, power-up {power_up + 1}"
-            found.append(_place(config, made, seconds, name, power_up))
+    for number, pose in enumerate(poses):
+        config = PhysicsConfig(
+            world=world,
+            motion="still",
+            mount_rpy_deg=POSES_DEG[pose],
+            seed=seed * 1009 + 17 * power_up + number,
+            imu=imu or ImuNoise(),
+        )
+        name = pose if power_up == 0 else f"{pose}, power-up {power_up + 1}"
+        found.append(_place(config, made, seconds, name, power_up))
+    return found
+
+
+def slide(own: str | Unit, length: float, *, seconds: float = 10.0, seed: int = 0) -> list[Place]:
+    """Return what a virtual unit measures at both ends of a way along a tape in a room.
+
+    Parameters
+    ----------
+    own : str or Unit
+    length : float
+        Of the way [m], in the direction with most room.
+    seconds : float
+        At each end.
+    seed : int
+    """
+    made = unit(own) if isinstance(own, str) else own
+    found = []
+    for number, name in enumerate(("start", "end")):
+        config = PhysicsConfig(motion="still", seed=seed * 1009 + number, rest_s=0.0)
+        physics = assemble(config, made)
+        start, _ = physics.motion.poses(np.zeros(1))
+        angles = np.arange(4) * np.pi / 2
+        around = np.stack((np.cos(angles), np.sin(angles), 0 * angles), axis=-1)
+        free = physics.world.distances(np.repeat(start, 4, axis=0), around)
+        ahead = around[int(np.argmax(free + np.roll(free, 2)))]
+        # Half of the way lies behind the middle of the room.
+        place = start[0] + ahead * (number - 0.5) * length
+        knots = np.linspace(0.0, 2.0, 17)
+        turn = np.tile([1.0, 0.0, 0.0, 0.0], (17, 1))
+        curve = PoseSpline(knots, np.tile(place, (17, 1)), turn, periodic=True, degree=5)
+        motion = Motion(curve, rest_s=0.0)
+        moved = Physics(
+            physics.world,
+            motion,
+            Scanner(physics.world, motion, made, config.ranges, config.seed),
+            Inertial(motion, config.imu, config.seed, made),
+        )
+        found.append(_measured(moved, seconds, name, 0))
     return found
 
 
 def _place(config: PhysicsConfig, own: Unit, seconds: float, name: str, power_up: int) -> Place:
-    physics = assemble(config, own)
+    return _measured(assemble(config, own), seconds, name, power_up)
+
+
+def _measured(physics: Physics, seconds: float, name: str, power_up: int) -> Place:
     scanner, inertial = physics.scanner, physics.inertial
     packets, starts = scanner.packets(
         round(_SKIP_S / scanner.period_s), round(seconds / scanner.period_s)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
@@ -54,15 +55,39 @@ class Run:
     motion: Motion
 
 
-def record(scene: str, motion: str, seed: int, seconds: float, mount: str = "upright") -> Run:
-    """Return a recording of a built-in motion in a built-in scene."""
-    physics = assemble(PhysicsConfig(world=scene, motion=motion, seed=seed, mount=mount))
+def record(
+    scene: str,
+    motion: str,
+    seed: int,
+    seconds: float,
+    mount: str = "upright",
+    unit: str = "perfect",
+    calibration: CalibrationFile | None = None,
+) -> Run:
+    """Return a recording of a built-in motion in a built-in scene.
+
+    Parameters
+    ----------
+    scene, motion : str
+    seed : int
+    seconds : float
+    mount : str
+    unit : str
+        As the emulator names it.
+    calibration : CalibrationFile, optional
+        Used as the driver uses it.
+    """
+    physics = assemble(
+        PhysicsConfig(world=scene, motion=motion, seed=seed, mount=mount, unit=unit)
+    )
+    used = None if calibration is None else calibration.corrected
     projector = Projector(wire.PacketType.POINTS_3D)
     total = int(seconds / physics.scanner.period_s)
     points, instants, counts, starts, heads = [], [], [], [], []
     for first in range(0, total, BATCH):
         packets, times = physics.scanner.packets(first, min(BATCH, total - first))
-        batch = projector.points([packet.tobytes() for packet in packets], times - times[0])
+        payloads = [packet.tobytes() for packet in packets]
+        batch = projector.points(payloads, times - times[0], used=used)
         points.append(batch.points)
         instants.append(times[0] + batch.first_s + batch.points["time"].astype(np.float64))
         counts.append(batch.counts)

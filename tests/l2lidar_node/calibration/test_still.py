@@ -168,3 +168,11 @@ def test_real_captures() -> None:
     assert "not repeatable" in result.estimates["alpha"].reason
     assert result.estimates["bias"].verdict is Verdict.UNKNOWN
     assert result.after.thickness < 0.018 < result.before.thickness
+
+
+def test_a_cloud_that_moved_is_refused_without_an_imu() -> None:
+    (place,) = places(poses=("tilted",))
+    returns = place.returns.copy()
+    returns["theta"][len(returns) // 2 :] += 2 * DEG
+    result = calibrate([replace(place, returns=returns, gyro=np.empty(0, GYRO))])
+    assert any("moved" in item.reason for item in result.refusals)

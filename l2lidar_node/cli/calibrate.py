@@ -1,0 +1,474 @@
+"""`l2lidar calibrate`: estimates what a unit is off by, and writes its calibration file."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from l2lidar_node import __version__
+from l2lidar_node.calibration import picture, report
+from l2lidar_node.calibration.file import CalibrationFile, CalibrationFileError, load
+from l2lidar_node.calibration.observation import Gathering, Place
+from l2lidar_node.calibration.result import StillResult, Verdict
+from l2lidar_node.calibration.scale import by_tape
+from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate
+from l2lidar_node.cli.console import JsonOption, YesOption, out, print_json, say, with_network
+from l2lidar_node.cli.device import Device
+from l2lidar_node.command_line import CommandError, UsageError
+from l2lidar_node.config import NetworkConfig
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.protocol.framing import Frame, Framer
+from l2lidar_node.protocol.packets import DecodeError, ImuPacket, PointPacket, Version, decode
+from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.recording import Received, Recorder, Recording
+
+_POSES: Final = (
+    "upright, in the middle of the room",
+    "tilted by about 30 degrees, anywhere else in the room",
+    "on its side",
+    "on its side and turned by 90 degrees, or tilted the other way",
+)
+_BEFORE: Final = """\
+[bold]Before you begin[/]
+  - let the unit run for 10 minutes, so that it is warm; its IMU has to be on
+  - a furnished room of 4 to 10 m with a flat ceiling and free walls; not a corridor, not outdoors
+  - screw or clamp the sensor to something heavy: not foam, not a tripod, not your hand
+  - clean the cover; nobody walks about"""
+_SPIN_UP_S: Final = 60.0
+_LOOK_S: Final = 0.1
+
+app = typer.Typer(
+    help="Estimate what the unit is off by, and write its calibration file.",
+    no_args_is_help=True,
+)
+
+OutputOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--output", "-o", metavar="FILE.yaml", help="Calibration file to write or to add to."
+    ),
+]
+EmulatorOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="UNIT",
+        help="Calibrate a virtual unit instead: perfect, typical, poor or a number.",
+    ),
+]
+
+
+@app.command()
+@with_network
+def still(
+    network: NetworkConfig,
+    captures: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Captures of still places (l2lidar record), one each; live from the unit if "
+            "left out.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    again: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Capture made after the unit was switched off and on; may be repeated.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    emulator: EmulatorOption = None,
+    places: Annotated[
+        int, typer.Option(min=1, max=12, help="Places to measure live, before and after.")
+    ] = 4,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=120.0, help="Seconds to record at each place.")
+    ] = 10.0,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
+    ] = None,
+    keep_alpha: Annotated[
+        bool,
+        typer.Option(
+            "--keep-alpha",
+            help="Store alpha after one power-up: right until the unit is switched off.",
+        ),
+    ] = False,
+    output: OutputOption = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture", metavar="FILE.png", help="Picture of before and after to write."
+        ),
+    ] = None,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+) -> None:
+    """Estimate beam angles and range bias from places where the sensor stands still.
+
+    Measure at four places for 10 s each, then switch the unit off and on and measure once more:
+    alpha is stored only if it comes back. Nothing is ever written into the sensor.
+
+    Examples
+    --------
+    l2lidar calibrate still -o front.yaml --picture front.png
+
+    l2lidar calibrate still a.pcap b.pcap c.pcap --again d.pcap -o front.yaml
+
+    l2lidar calibrate still --emulator typical -o virtual.yaml
+    """
+    if emulator is not None and captures:
+        raise UsageError("--emulator measures by itself; leave the captures out")
+    firmware = ""
+    if emulator is not None:
+        gathered = _virtual(emulator, seconds, min(places, 4))
+    elif captures:
+        gathered, firmware = _captured(captures, again or [])
+    else:
+        gathered, firmware = _live(network, places, seconds, keep, yes or json_)
+    say("estimating ...") if not json_ else None
+    try:
+        result = calibrate(gathered, keep_alpha)
+    except CalibrationError as error:
+        raise CommandError(str(error)) from None
+    made = report.calibration_of(result, gathered, time.strftime("%Y-%m-%d"), firmware)
+    if figure is not None:
+        picture.save(result, figure)
+    if json_:
+        print_json(_as_data(result, made))
+    else:
+        _show(result)
+        if figure is not None:
+            say(f"picture in {figure}")
+    if result.refusals:
+        raise CommandError("nothing is written: " + result.refusals[0].reason)
+    _write(made, output, bool(result.stored), quiet=json_)
+
+
+@app.command()
+@with_network
+def scale(
+    network: NetworkConfig,
+    length: Annotated[
+        float, typer.Option(min=0.1, max=50.0, help="Way between the two places by tape [m].")
+    ],
+    captures: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Two captures, of the start and the end of the way; live if left out.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    tape_mm: Annotated[
+        float, typer.Option(min=0.1, max=100.0, help="What the tape is uncertain by [mm].")
+    ] = 2.0,
+    emulator: EmulatorOption = None,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=120.0, help="Seconds to record at each end.")
+    ] = 10.0,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
+    ] = None,
+    output: OutputOption = None,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+) -> None:
+    """Measure the scale of ranges with a tape measure: no sensor knows it by itself.
+
+    Slide the sensor along the tape straight towards a flat wall, without turning it: 3 m are
+    good, 2 mm of them are 0.07 %. A range bias cancels.
+
+    Examples
+    --------
+    l2lidar calibrate scale --length 3.000 -o front.yaml
+
+    l2lidar calibrate scale --length 3.000 start.pcap end.pcap -o front.yaml
+    """
+    firmware = ""
+    if emulator is not None:
+        from l2lidar_node.cli.virtual_places import slide
+
+        try:
+            gathered = slide(emulator, length, seconds=seconds)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    elif captures:
+        if len(captures) != 2:
+            raise UsageError(f"{len(captures)} captures; expected two, of start and end")
+        gathered, firmware = _captured(captures, [])
+    else:
+        gathered = []
+        with ExitStack() as stack:
+            folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            for name in ("start", "end"):
+                _ask(f"\nThe {name} of the tape; the sensor looks along it", yes or json_)
+                place, firmware = _recorded(network, folder / f"{name}.pcap", seconds, 0)
+                gathered.append(place)
+    try:
+        found = by_tape(gathered[0], gathered[1], length, tape_mm / 1e3)
+    except CalibrationError as error:
+        raise CommandError(str(error)) from None
+    is_significant = abs(found.scale) > 2.0 * found.sd
+    about = {
+        "tool": f"l2lidar {__version__}",
+        "date": time.strftime("%Y-%m-%d"),
+        "firmware": firmware,
+        "length_m": length,
+        "measured_m": round(found.measured, 5),
+        "surfaces": found.surfaces,
+    }
+    if json_:
+        print_json({"scale": found.scale, "sd": found.sd, **about})
+    else:
+        say(
+            f"the sensor measured {found.measured:.4f} m of {length:.4f} m, with "
+            f"{found.surfaces} surfaces: ranges have to be stretched by {100 * found.scale:+.3f} "
+            f"+- {100 * found.sd:.3f} %"
+        )
+    made = CalibrationFile(
+        gathered[0].block.octets,
+        {"range_scale": found.scale},
+        {"range_scale": found.sd},
+        None,
+        {"scale": about},
+    )
+    _write(made, output, is_significant, quiet=json_)
+
+
+def _write(made: CalibrationFile, output: Path | None, is_new: bool, quiet: bool) -> None:
+    """Write a calibration file, or say why there is none to write."""
+    words = ""
+    if not is_new:
+        words = "the block that the unit reports is right: nothing to correct"
+    elif output is None:
+        words = "nothing is written without --output FILE.yaml"
+    else:
+        old = None
+        if output.exists():
+            try:
+                old = load(output)
+            except CalibrationFileError as error:
+                raise CommandError(f"{error}; give --output another name") from None
+            if not old.matches(made.block):
+                raise CommandError(f"{output} is of another unit; give --output another name")
+        output.parent.mkdir(parents=True, exist_ok=True)
+        report.joined(made, old).save(output)
+        words = f"{output}: give it to the driver as calibration_file"
+    if not quiet:
+        say(words)
+
+
+def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
+    """Return what a capture holds of a still place, and the unit's firmware if it says so.
+
+    Raises
+    ------
+    CommandError
+        If it cannot be read or holds no 3D packets.
+    """
+    gathering = Gathering(path.stem, power_up)
+    framer = Framer()
+    firmware = ""
+    try:
+        with path.open("rb") as stream:
+            for entry in Recording(stream):
+                if not isinstance(entry, Received):
+                    continue
+                for item in framer.feed(entry.data):
+                    if isinstance(item, Frame):
+                        firmware = _gathered(gathering, item) or firmware
+        return gathering.place(), firmware
+    except OSError as error:
+        raise CommandError(f"{path}: {error.strerror}") from None
+    except (CaptureError, ValueError) as error:
+        raise CommandError(f"{path}: {error}") from None
+
+
+def _gathered(gathering: Gathering, frame: Frame) -> str:
+    """Add a frame to a place; return the firmware if it says so."""
+    packet = decode(frame)
+    if isinstance(packet, PointPacket):
+        if packet.packet_type == PacketType.POINTS_3D:
+            gathering.points(packet.stamp / 1e9, packet.payload)
+        else:
+            gathering.flat()
+    elif isinstance(packet, ImuPacket):
+        gathering.imu(packet.stamp / 1e9, frame.payload)
+    elif isinstance(packet, DecodeError):
+        gathering.rejected()
+    elif isinstance(packet, Version):
+        return packet.firmware
+    return ""
+
+
+def _captured(first: Sequence[Path], again: Sequence[Path]) -> tuple[list[Place], str]:
+    found = [capture_place(path, 0) for path in first]
+    found += [capture_place(path, 1) for path in again]
+    firmware = next((text for _, text in found if text), "")
+    return [place for place, _ in found], firmware
+
+
+def _virtual(name: str, seconds: float, places: int) -> list[Place]:
+    from l2lidar_node.cli.virtual_places import POSES_DEG, still_places
+
+    poses = tuple(POSES_DEG)[:places]
+    say(f"a virtual unit, '{name}', at {len(poses)} places, twice switched on")
+    try:
+        first = still_places(name, seconds=seconds, poses=poses)
+        second = still_places(name, seconds=seconds, poses=poses[:1], power_up=1)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    return [*first, *second]
+
+
+def _live(
+    network: NetworkConfig, places: int, seconds: float, keep: Path | None, unattended: bool
+) -> tuple[list[Place], str]:
+    """Guide through the places and return what was measured."""
+    found: list[Place] = []
+    firmware = ""
+    if not unattended:
+        say(_BEFORE)
+    with ExitStack() as stack:
+        folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        for number in range(places):
+            pose = _POSES[min(number, len(_POSES) - 1)]
+            _ask(f"\nPlace {number + 1} of {places}: {pose}", unattended)
+            place, text = _recorded(network, folder / f"place_{number + 1}.pcap", seconds, 0)
+            found.append(place)
+            firmware = text or firmware
+        if not unattended:
+            say(
+                "\nSwitch the unit off and on and wait until its head turns; alpha is stored only "
+                "if it is the same then."
+            )
+            if typer.confirm("Measure once more?", default=True):
+                place, _ = _recorded(network, folder / "again.pcap", seconds, 1)
+                found.append(place)
+    return found, firmware
+
+
+def _ask(text: str, unattended: bool) -> None:
+    if unattended:
+        return
+    say(text)
+    typer.prompt("Press Enter when it stands still", default="", show_default=False)
+
+
+def _recorded(
+    network: NetworkConfig, path: Path, seconds: float, power_up: int
+) -> tuple[Place, str]:
+    """Record a place with a bar, and return it."""
+    failures: list[str] = []
+    try:
+        recorder = Recorder(path, network, failures.append)
+    except OSError as error:
+        raise CommandError(f"cannot write {path}: {error.strerror}") from None
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    try:
+        with Device(network, tap=recorder) as device, Progress(*columns, console=out) as progress:
+            if device.wait_for(_sends_points, _SPIN_UP_S) is None:
+                raise CommandError(f"no points from the L2; {device.advice()}")
+            task = progress.add_task("recording", total=seconds)
+            begun = time.monotonic()
+            while (passed := time.monotonic() - begun) < seconds and not failures:
+                progress.update(task, completed=passed)
+                time.sleep(_LOOK_S)
+            progress.update(task, completed=seconds)
+    finally:
+        recorder.close()
+    if failures:
+        raise CommandError(failures[0])
+    place, firmware = capture_place(path, power_up)
+    return place, firmware
+
+
+def _sends_points(driver: Driver) -> bool:
+    return driver.counters.frames[PacketType.POINTS_3D] > 0
+
+
+def _show(result: StillResult) -> None:
+    """Print what was found."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "reported", "correction", "", "verdict"):
+        table.add_column(heading, overflow="fold")
+    own = result.block.values
+    for name, item in result.estimates.items():
+        unit, factor = report.UNITS[name]
+        scale = own["range_scale"] if name == "bias" else 1.0
+        reported = f"{own[report.ENTRIES[name]] * scale * factor:.3f}"
+        known = math.isfinite(item.value)
+        color = {"corrected": "green", "not known": "yellow", "shown, not stored": "yellow"}
+        verdict = item.verdict.value + (f": {item.reason}" if item.reason else "")
+        table.add_row(
+            f"{name} [{unit}]".replace("[", "\\["),
+            reported,
+            f"{item.value * factor:+.3f}" if known else "",
+            f"+- {item.sd * factor:.3f}" if known else "",
+            f"[{color.get(item.verdict.value, 'default')}]{verdict}[/]",
+        )
+    out.print(table)
+    say(
+        f"\nxi - 0.7 beta, which the data fix best: {result.side / DEG:+.3f} +- "
+        f"{result.side_sd / DEG:.3f} degrees"
+    )
+    say(f"known worst: {result.weakest}")
+    before, after = report.quality_mm(result.before), report.quality_mm(result.after)
+    say(
+        f"walls, median thickness: {before['thickness_median']:.1f} mm before, "
+        f"{after['thickness_median']:.1f} mm after ({result.planes} flat patches)"
+    )
+    say(
+        f"gap of the two halves of a turn, median (90th percentile): {before['gap_median']:.1f} "
+        f"({before['gap_p90']:.1f}) mm before, {after['gap_median']:.1f} ({after['gap_p90']:.1f}) "
+        "mm after"
+    )
+    say("")
+    for place in result.places:
+        rocks = (
+            "no IMU data"
+            if place.whirl is None
+            else f"mount rocks by {place.whirl.forward / DEG:.3f} degrees"
+        )
+        say(
+            f"{place.name}: xi {place.xi / DEG:+.3f}, beta {place.beta / DEG:+.3f}, alpha "
+            f"{place.alpha / DEG:+.3f} degrees; {place.turns:.0f} turns, {place.planes} patches; "
+            f"{rocks}"
+        )
+    for note in result.notes:
+        say(f"[yellow]note[/] {note}")
+    for refusal in result.refusals:
+        say(f"[red]refused[/] {refusal.reason}\n        {refusal.advice}")
+
+
+def _as_data(result: StillResult, made: CalibrationFile) -> dict[str, object]:
+    return {
+        "reported": result.block.values,
+        "block": result.block.octets.hex(),
+        "correction": {
+            name: value for name, value in made.correction.items() if not result.refusals
+        },
+        "estimates": {
+            name: {
+                "value": item.value if item.verdict is not Verdict.UNKNOWN else None,
+                "sd": item.sd if item.verdict is not Verdict.UNKNOWN else None,
+                "verdict": item.verdict.value,
+                "reason": item.reason,
+            }
+            for name, item in result.estimates.items()
+        },
+        "refusals": [list(refusal) for refusal in result.refusals],
+        **made.about,
+    }

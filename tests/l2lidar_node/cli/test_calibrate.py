@@ -1,0 +1,129 @@
+"""`l2lidar calibrate`, from captures and from virtual units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2lidar_node.calibration.file import load
+from l2lidar_node.emulator.physics import PhysicsConfig, assemble
+from l2lidar_node.protocol import wire
+from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.recording.capture import Endpoint
+from l2lidar_node.recording.recording import RecordingWriter
+from l2lidar_node.types import HostNs
+from tests.l2lidar_node.cli.conftest import Run, Unit
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def capture(path: Path, rpy: tuple[float, ...], seconds: float = 2.2, seed: int = 0) -> Path:
+    """Write what a typical unit sends at a still place."""
+    physics = assemble(PhysicsConfig(motion="still", mount_rpy_deg=rpy, unit="typical", seed=seed))
+    packets, starts = physics.scanner.packets(430, round(seconds / 0.004639))
+    samples, times = physics.inertial.samples(500, round(seconds * 250))
+    items = [(t, PacketType.POINTS_3D, packets[i]) for i, t in enumerate(starts.tolist())]
+    items += [(t, PacketType.IMU, samples[i]) for i, t in enumerate(times.tolist())]
+    with path.open("wb") as stream:
+        writer = RecordingWriter(
+            stream, Endpoint("127.0.0.1", wire.LIDAR_PORT), Endpoint("127.0.0.1", wire.HOST_PORT)
+        )
+        for t, kind, record in sorted(items, key=lambda item: item[0]):
+            stamp = round(t / 1.99866 * 1e9)
+            record["info"]["sec"], record["info"]["nsec"] = divmod(stamp, 10**9)
+            frame = wire.encode_frame(kind, record.tobytes())
+            writer.received(frame, HostNs(START_NS + round(t * 1e9) + 3_000_000))
+    return path
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("captures")
+    poses = {"flat": (0.0, 0.0, 0.0), "tilted": (0.0, 30.0, 40.0), "side": (90.0, 0.0, 100.0)}
+    return [
+        capture(folder / f"{name}.pcap", rpy, seed=seed)
+        for seed, (name, rpy) in enumerate(poses.items())
+    ]
+
+
+def test_captures_of_a_unit_become_its_calibration_file(
+    run: Run, captures: list[Path], tmp_path: Path
+) -> None:
+    output, picture = tmp_path / "unit.yaml", tmp_path / "unit.png"
+    paths = [str(path) for path in captures]
+    done = run(
+        "calibrate", "still", *paths, "-o", str(output), "--picture", str(picture), "--json"
+    )
+    assert done.code == 0
+    told = json.loads(done.out)
+    assert told["refusals"] == []
+    assert told["estimates"]["alpha"]["verdict"] == "shown, not stored"
+    made = load(output)
+    assert np.rad2deg(made.correction["xi_angle"]) == pytest.approx(0.19, abs=0.03)
+    assert np.rad2deg(made.correction["beta_angle"]) == pytest.approx(-0.28, abs=0.04)
+    assert "alpha_angle_bias" not in made.correction
+    assert [place["name"] for place in made.about["places"]] == ["flat", "tilted", "side"]
+    assert picture.stat().st_size > 50_000
+
+
+def test_too_short_a_capture_is_refused_with_what_to_do(run: Run, tmp_path: Path) -> None:
+    short = capture(tmp_path / "short.pcap", (0.0, 0.0, 0.0), 0.3)
+    output = tmp_path / "unit.yaml"
+    done = run("calibrate", "still", str(short), "-o", str(output))
+    assert done.code == 1
+    assert "record 10 s at each place" in done.out
+    assert "nothing is written" in done.err
+    assert not output.exists()
+
+
+def test_a_capture_without_an_l2_is_named(run: Run, tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.pcap"
+    wrong.write_bytes(b"nothing of the kind")
+    done = run("calibrate", "still", str(wrong))
+    assert done.code == 1
+    assert str(wrong) in done.err
+
+
+def test_a_file_of_another_unit_is_not_overwritten(
+    run: Run, captures: list[Path], tmp_path: Path
+) -> None:
+    output = tmp_path / "unit.yaml"
+    output.write_text("format: 7\n")
+    done = run("calibrate", "scale", "--length", "1", str(captures[0]))
+    assert done.code == 2
+    assert "expected two" in done.err
+    done = run("calibrate", "still", str(captures[1]), "-o", str(output))
+    assert done.code == 1
+    assert "format is 7" in done.err
+    assert output.read_text() == "format: 7\n"
+
+
+def test_a_virtual_unit_must_be_known(run: Run) -> None:
+    done = run("calibrate", "still", "--emulator", "good")
+    assert done.code == 2
+    assert "expected perfect, typical, poor" in done.err
+
+
+def test_the_scale_of_a_virtual_unit_is_written(run: Run, tmp_path: Path) -> None:
+    output = tmp_path / "unit.yaml"
+    done = run(
+        "calibrate", "scale", "--length", "3", "--emulator", "13", "--seconds", "4",
+        "-o", str(output),
+    )  # fmt: skip
+    assert done.code == 0
+    assert "of 3.0000 m" in done.out
+    assert output.exists() == ("give it to the driver" in done.out)
+
+
+def test_live_places_are_recorded_and_kept(run: Run, unit: Unit, tmp_path: Path) -> None:
+    """The unit sends a pattern without surfaces: it is measured, kept, and refused."""
+    done = run(
+        "calibrate", "still", "--places", "1", "--seconds", "1.5", "--keep", str(tmp_path),
+        "--yes", *unit.options,
+    )  # fmt: skip
+    assert done.code == 1
+    assert "flat surfaces" in done.err or "nothing is written" in done.err
+    assert (tmp_path / "place_1.pcap").stat().st_size > 100_000
