@@ -105,7 +105,9 @@ def by_tape(first: Place, second: Place, length: float, length_sd: float = 0.002
         # What no surface fixes stays as it is: across the way it hardly changes the length.
         weak = 1e-3 * np.eye(3)
         information = normals.T @ normals + weak
-        shift = np.linalg.solve(information, -normals.T @ nearer + weak @ shift)
+        shift = np.asarray(
+            np.linalg.solve(information, -normals.T @ nearer + weak @ shift), np.float64
+        )
         cover = np.linalg.inv(information)
         sd = float(_NOISE_M * np.sqrt(2.0 * along @ cover @ along))
     if not pairs:
