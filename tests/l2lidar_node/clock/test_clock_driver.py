@@ -7,6 +7,7 @@ import pytest
 
 from l2lidar_node.clock import ClockEventKind
 from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.settings import Value
 from tests.support.clock_rig import Case, run
 
 
@@ -59,7 +60,9 @@ def test_periodic_syncs_in_standby_leave_both_streams_in_the_right_epoch(
 ) -> None:
     """Numbers do not count through standby, while syncs go on stepping the device's clock."""
     standbys = ((4.0, 4.0 + pause), (7.0 + pause, 7.0 + 2 * pause))
-    faults = {"jitter": jitter, "jitter_ms": 20.0, "loss": 0.03} if jitter == "heavy" else {}
+    faults: dict[str, Value] = {}
+    if jitter == "heavy":
+        faults = {"jitter": jitter, "jitter_ms": 20.0, "loss": 0.03}
     case = Case(
         ratio=1.99866, sync="periodic", standbys=standbys, boot_scale=scale, faults=faults,
         seconds=11.0 + 2 * pause,
