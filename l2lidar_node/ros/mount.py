@@ -20,7 +20,7 @@ from l2lidar_node.types import F64, Level
 MAX_TILT_DEG: Final = 2.0
 """At 5 m a floor is 17 cm off: more than the sensor's own alignment error of about 1 degree."""
 _MAX_FRAMES: Final = 10_000
-_MAX_DEPTH: Final = 1000
+_MAX_DEPTH: Final = 100
 _UP: Final = np.array([0.0, 0.0, 1.0])
 
 
@@ -46,9 +46,9 @@ class MountMonitor:
         The cloud frame itself and 0 where nothing is above it.
         """
         frame, up = self._cloud_frame, _UP
-        for _ in range(_MAX_DEPTH):  # a loop has no end
-            if frame not in self._parents:
-                break
+        passed: set[str] = set()
+        while frame in self._parents and frame not in passed and len(passed) < _MAX_DEPTH:
+            passed.add(frame)
             frame, q_parent_child = self._parents[frame]
             up = _rotated(q_parent_child, up)
         return frame, math.degrees(math.acos(float(np.clip(up[2], -1.0, 1.0))))

@@ -19,7 +19,7 @@ from l2lidar_proc.motion.imu_buffer import Samples
 
 _MAX_REASONS: Final = 20  # senders choose field names and numbers, so reasons have no end
 _OTHER: Final = "other reasons"
-_FRAME_TIMEOUT_S: Final = 1.0  # without a message in its frame a node follows the next frame
+_FRAME_TIMEOUT_S: Final = 0.5  # without a message in its frame a node follows the next frame
 _BACK_NS: Final = 5_000_000  # sweeps of a driver that cuts between packets overlap by less
 _CLOCK_APART_S: Final = 10.0  # between stamps and the node's clock; /tf keeps 10 s
 _SECTORS: Final = 36  # of azimuth
@@ -32,7 +32,7 @@ class FollowedFrame:
     """The frame in which a node takes the messages of a topic.
 
     Messages of two sensors on one topic cannot be told apart but by their frames. The node stays
-    with the first frame until that one has been silent for a second.
+    with the first frame until that one has been silent for half a second.
     """
 
     def __init__(self) -> None:

@@ -130,3 +130,16 @@ def test_every_packet_is_received_or_counted_as_dropped() -> None:
     got = load_scale.crowd(2, 1, 2.0, 1.0)
     assert got["unsaid"] == got["failures"] == 0
     assert got["received"] > 500
+
+
+@pytest.mark.ros
+def test_nodes_survive_hostile_neighbors() -> None:
+    """A short run of ``make fuzz-nodes``: two rounds of attacks over DDS on three processes."""
+    pytest.importorskip("rclpy")
+    from benchmarks.fuzz_nodes import fuzz
+
+    campaign, _, ended = fuzz(seconds=0.0, seed=7, attacks=150)
+    assert ended == ""
+    assert campaign.stuck == []
+    assert campaign.fuzzer.errors == []
+    assert campaign.fuzzer.sent >= 300
