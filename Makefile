@@ -8,7 +8,7 @@ BENCH_ARGS ?=
 BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-noble docs docs-serve pages animation check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz fuzz-nodes clean
+.PHONY: help setup demo test test-noble docs docs-serve pages animation check lint format types imports pytest $(BENCHES:%=bench-%) faults soak fuzz fuzz-nodes mutants clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -67,6 +67,9 @@ soak: setup ## a long run, watched for growth, loss and drift
 
 fuzz: setup ## hostile input for everything that reads input from outside
 	$(RUN) -m benchmarks.fuzz $(BENCH_ARGS)
+
+mutants: setup ## small changes of the pure core: does a test notice each?
+	$(RUN) -m benchmarks.mutants $(BENCH_ARGS)
 
 fuzz-nodes: setup ## hostile messages, calls and parameters for the nodes, over DDS
 	$(RUN) -m benchmarks.fuzz_nodes $(BENCH_ARGS)

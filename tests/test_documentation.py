@@ -40,8 +40,9 @@ RUN_BY = {
 """Commands that a test runs, itself or the file behind them, by the test."""
 
 NOT_RUN = {
-    r"ros2 (topic|service|param|run|bag) .*": ROS,
+    r"ros2 (topic|service|param|run|bag|security) .*": ROS,
     r"source .*": ROS,
+    r"export ROS_SECURITY_.*": ROS,
     r"rosdep .*": ROS,
     r"mkdir -p ~/ros2_ws/src.*": ADMIN,
     r"cd .*": ADMIN,

@@ -94,7 +94,7 @@ def test_the_quaternion_is_normalised(norm: float) -> None:
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0.49, 0, 0, 0)])
 def test_an_imu_that_is_switched_off_is_dropped(quaternion: Any) -> None:
-    assert reason(104, build.imu(quaternion_wxyz=quaternion.tolist())) == "quaternion_norm"
+    assert reason(104, build.imu(quaternion_wxyz=list(quaternion))) == "quaternion_norm"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])

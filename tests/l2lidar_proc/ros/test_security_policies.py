@@ -1,0 +1,98 @@
+"""The example policies allow each node what it does, and nothing else."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from rclpy.node import Node  # noqa: E402  after importorskip
+
+from l2lidar_node.demo.processes import assigned, free_udp_ports  # noqa: E402
+from l2lidar_node.ros.driver_node import DriverNode  # noqa: E402
+from l2lidar_proc.ros.deskew_node import DeskewNode  # noqa: E402
+from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+FOLDER = Path(__file__).resolve().parents[3] / "config" / "security"
+NODES: dict[str, Callable[[], Node]] = {
+    "l2lidar_node": DriverNode,
+    "deskew_node": DeskewNode,
+    "odometry_node": OdometryNode,
+}
+AT_TIMES = {  # only in a replay, with use_sim_time, and once somebody publishes clouds
+    "l2lidar_node": {"publish /clock", "subscribe /clock"},
+    "deskew_node": {"subscribe /clock", "request /l2lidar_node/get_parameters"},
+    "odometry_node": {"subscribe /clock"},
+}
+
+
+def allowed(path: Path) -> set[str]:
+    """Return what a policy allows, such as ``publish /points``."""
+    root = ElementTree.parse(path).getroot()
+    assert (root.tag, root.get("version")) == ("policy", "0.2.0")
+    (profile,) = root.iter("profile")
+    name = profile.get("node")
+    found = set()
+    for group in profile:
+        for verb, permission in group.attrib.items():
+            assert permission == "ALLOW"
+            for item in group:
+                assert item.text
+                text = item.text.replace("~", f"/{name}", 1)
+                assert text.startswith("/")
+                assert f"{verb} {text}" not in found
+                found.add(f"{verb} {text}")
+    return found
+
+
+def used(node: Node) -> set[str]:
+    """Return what a running node does."""
+    name = node.get_name()
+    return {
+        f"{verb} {topic}"
+        for verb, look in (
+            ("publish", node.get_publisher_names_and_types_by_node),
+            ("subscribe", node.get_subscriber_names_and_types_by_node),
+            ("reply", node.get_service_names_and_types_by_node),
+            ("request", node.get_client_names_and_types_by_node),
+        )
+        for topic, _ in look(name, "/")
+    }
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_a_policy_allows_what_its_node_does_and_nothing_else(name: str) -> None:
+    host, lidar = free_udp_ports(2)
+    values: dict[str, object] = {
+        "l2_ip": "127.0.0.1",
+        "host_ip": "127.0.0.1",
+        "l2_port": lidar,
+        "host_port": host,
+        "enable_IMU_publishing": True,
+    }
+    rclpy.init(args=["test", *(assigned(values) if name == "l2lidar_node" else [])])
+    node = NODES[name]()
+    try:
+        does = used(node)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+    may = allowed(FOLDER / f"{name}.xml")
+    assert does <= may
+    assert may - does == AT_TIMES[name] - does
+
+
+def test_the_operator_may_call_every_service_that_is_theirs() -> None:
+    may = allowed(FOLDER / "operator.xml")
+    common = {"get_type_description"}
+    for name in NODES:
+        for permission in allowed(FOLDER / f"{name}.xml"):
+            verb, _, service = permission.partition(" ")
+            if verb == "reply" and service.rpartition("/")[2] not in common:
+                assert f"request {service}" in may
