@@ -57,13 +57,25 @@ def view(
     except viewing.ViewerError as error:
         raise CommandError(str(error)) from None
     try:
-        shown = (
-            _live(sdk, namespace, seconds)
-            if file is None
-            else _recorded(sdk, file, namespace, seconds)
-        )
+        _show(sdk, file, namespace, seconds, save, web)
     except KeyboardInterrupt:
         return
+    finally:
+        sdk.disconnect()  # with all that is still to be written
+
+
+def _show(
+    sdk: Any,
+    file: Path | None,
+    namespace: str,
+    seconds: float | None,
+    save: Path | None,
+    web: bool,
+) -> None:
+    if file is None:
+        shown = _live(sdk, namespace, seconds)
+    else:
+        shown = _recorded(sdk, file, namespace, seconds)
     say(f"{shown} messages shown" + (f", written to {save}" if save else ""))
     if not shown and file is None:
         raise CommandError("no message came: is the driver running, in the same ROS_DOMAIN_ID?")

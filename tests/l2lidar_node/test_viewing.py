@@ -6,6 +6,7 @@ import importlib.util
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,8 +51,10 @@ class Shown:
 
 
 @pytest.fixture
-def shown(tmp_path: Path) -> Shown:
-    return Shown(viewing.open_viewer(web=False, save=tmp_path / "shown.rrd"))
+def shown(tmp_path: Path) -> Iterator[Shown]:
+    sdk = viewing.open_viewer(web=False, save=tmp_path / "shown.rrd")
+    yield Shown(sdk)
+    sdk.disconnect()
 
 
 def header(stamp: int) -> Any:
