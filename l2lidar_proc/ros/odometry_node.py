@@ -49,7 +49,7 @@ from l2lidar_proc.ros.static_frames import StaticFrames, untied
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
 _JITTER_NS = 2_000_000  # a step may come by half an IMU period early, or it would miss one
 _MOST_SAMPLES = 250  # that wait for the next step of dead reckoning, whatever their stamps are
-_TIME_JUMP_NS = 1_000_000_000  # TF that is older than the last by more belongs to another time
+_TIME_JUMP_NS = 1_000_000_000  # samples older than the latest TF by more: time was set back
 
 
 class OdometryNode(Node):
@@ -278,7 +278,10 @@ class OdometryNode(Node):
     def _send_transform(self, T_odom_base: F64, stamp: HostNs) -> None:
         """Publish a pose on /tf, unless that already has a later one."""
         topics = self._settings.value.topics
-        is_late = 0 <= self._transform_ns - stamp < _TIME_JUMP_NS
+        # A sweep may be seconds late on a busy machine; only where the samples went back as well
+        # has time itself.
+        newest = self._pipeline.newest_imu or stamp
+        is_late = stamp <= self._transform_ns < max(newest, stamp) + _TIME_JUMP_NS
         if not topics.publish_tf or is_late:
             return
         self._transform_ns = stamp

@@ -205,6 +205,27 @@ def test_a_cloud_can_be_transformed_when_it_comes(bench: Any) -> None:
     assert np.diff(tracking).max() <= 24_000_000, "50 a second, a sample late at most"
 
 
+def test_transforms_ascend_where_sweeps_come_seconds_late(bench: OdometryBench) -> None:
+    """As on a busy machine: the samples are there, and the clouds behind them."""
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:9]
+    last = int(np.searchsorted(run.imu["stamp"], some[-1].end)) + 1
+    for sample in run.imu[:last]:
+        bench.send_sample(sample)
+        bench.executor.spin_once(timeout_sec=0.0)
+    newest = int(run.imu["stamp"][last - 1])
+    pipeline = bench.node._pipeline
+    bench.until(lambda: (pipeline.newest_imu or 0) >= newest)
+    for number, sweep in enumerate(some):
+        bench.send_cloud(sweep.points, sweep.start)
+        bench.until(lambda number=number: pipeline.sweeps > number)
+        bench.send_sample(run.imu[last + number])  # lets TF go on
+    bench.until(lambda: len(bench.poses) == len(some))
+    stamps = np.array([stamp for _, stamp in bench.transforms_out])
+    assert len(stamps) > 1
+    assert (np.diff(stamps) > 0).all()
+
+
 @pytest.mark.parametrize("bench", [("imu_rate:=0.0",)], indirect=True)
 def test_without_a_rate_there_is_one_transform_for_each_sweep(bench: Any) -> None:
     run = recording("room", "walk")
