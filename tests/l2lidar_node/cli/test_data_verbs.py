@@ -322,7 +322,7 @@ def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.pcap").write_bytes(b"")
     outcome = run("odometry", str(tmp_path / "a.pcap"), str(tmp_path / "out"))
     assert outcome.code == 1
-    assert "a.pcap: this is no capture file" in outcome.err
+    assert "a.pcap: not a capture file" in outcome.err
     outcome = run("odometry", str(tmp_path / "a.mcap"), str(tmp_path / "a.pcap" / "out"))
     assert outcome.code == 1
     assert "out: Not a directory" in outcome.err  # said before the recording is looked at
@@ -333,7 +333,8 @@ def test_odometry_of_nothing_says_so(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [(b"no capture at all", "no capture file"), (b"", "no capture file")]
+    ("content", "words"),
+    [(b"no capture at all", "not a capture file"), (b"", "not a capture file")],
 )
 def test_what_is_no_capture_is_refused(
     run: Run, tmp_path: Path, content: bytes, words: str

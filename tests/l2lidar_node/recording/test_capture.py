@@ -231,7 +231,7 @@ def test_a_file_cut_anywhere_gives_the_packets_before(length: Any) -> None:
     data = stream.getvalue()[:length]
     reader = CaptureReader(io.BytesIO(data))
     if length < 4:
-        with pytest.raises(CaptureError, match="no capture file"):
+        with pytest.raises(CaptureError, match="not a capture file"):
             list(reader)
         return
     size = 16 + 14 + 28 + len(IMU)
