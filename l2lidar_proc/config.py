@@ -42,6 +42,13 @@ class MotionConfig:
     imu_rpy: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), "roll, pitch, yaw of the IMU in the cloud frame", unit="deg"
     )
+    imu_time_offset_ms: float = setting(
+        0.0,
+        "lateness of the stamps of IMU samples; subtracted before they are used, never on a topic",
+        unit="ms",
+        lo=-100.0,
+        hi=100.0,
+    )
     max_gyro_bias: float = setting(
         0.1,
         "largest mean angular rate at rest that is accepted as gyro bias",
@@ -459,6 +466,13 @@ class OdometryConfig:
     )
     reference: str = setting(
         "middle", "instant of a sweep whose pose is estimated", choices=("start", "middle", "end")
+    )
+    imu_time_offset_ms: float = setting(
+        0.0,
+        "lateness of the stamps of IMU samples; subtracted before they are used, never on a topic",
+        unit="ms",
+        lo=-100.0,
+        hi=100.0,
     )
     min_range: float = setting(
         0.4,

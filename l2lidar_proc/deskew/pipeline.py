@@ -19,7 +19,7 @@ from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.filters import FilterError
 from l2lidar_proc.deskew.organise import organise
-from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_buffer import Samples, earlier
 from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, Quality
@@ -121,6 +121,7 @@ class Pipeline:
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples, shape (N,), in any order and state."""
+        samples = earlier(samples, self._config.motion.imu_time_offset_ms)
         if self.tracker.imu(samples):
             self._jumped()
             self._sequencer.jump()

@@ -14,6 +14,15 @@ Samples = NDArray[np.void]
 """Array of dtype IMU_SAMPLE, shape (N,)."""
 
 
+def earlier(samples: Samples, by_ms: float) -> Samples:
+    """Return samples with stamps that were late by so much [ms] put right."""
+    if not by_ms:
+        return samples
+    moved = samples.copy()
+    moved["stamp"] -= round(by_ms * 1e6)
+    return moved
+
+
 @dataclass(frozen=True, slots=True)
 class ImuCounts:
     """Counts of what has come into a buffer since it was made.

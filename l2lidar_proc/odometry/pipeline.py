@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig
-from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_buffer import Samples, earlier
 from l2lidar_proc.motion.imu_convention import ImuConvention
 from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.motion.sweep_trajectory import still_trajectory
@@ -127,7 +127,7 @@ class OdometryPipeline:
 
     def imu(self, samples: Samples) -> Samples:
         """Take IMU samples (N,) in any order and state; return them as they are used."""
-        samples = self.convention.corrected(samples)
+        samples = self.convention.corrected(earlier(samples, self._config.imu_time_offset_ms))
         if not self._uses_accelerometer:
             samples = samples.copy()
             samples["linear_acceleration"] = 0.0

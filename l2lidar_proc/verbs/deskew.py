@@ -16,6 +16,7 @@ from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_t
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.frames import FrameTree
+from l2lidar_proc.motion.imu_buffer import earlier
 from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.recording import bag
@@ -47,6 +48,7 @@ class _Deskewer:
         self.pipeline = Pipeline(config.proc)
         self.refused: dict[str, int] = {}
         self._unit = config.proc.deskew.time_unit
+        self._imu_time_offset_ms = config.proc.motion.imu_time_offset_ms
         self._uses_tf = config.topics.use_tf
         # A bag names topics in full; relative to the node they are below the root here.
         self._output = "/" + config.topics.output_topic.lstrip("/")
@@ -67,7 +69,7 @@ class _Deskewer:
             sample = bag.sample_of(message)
             self.pipeline.imu(sample)
             if self._odometry is not None:
-                self._odometry.imu(sample)
+                self._odometry.imu(earlier(sample, self._imu_time_offset_ms))
         elif topic == self._topics.velocity:
             self._velocity(message)
         elif kind == bag.TRANSFORMS and topic.endswith("tf_static") and self._uses_tf:

@@ -110,7 +110,7 @@ def test_a_virtual_unit_must_be_known(run: Run) -> None:
 def test_the_scale_of_a_virtual_unit_is_written(run: Run, tmp_path: Path) -> None:
     output = tmp_path / "unit.yaml"
     done = run(
-        "calibrate", "scale", "--length", "3", "--emulator", "13", "--seconds", "4",
+        "calibrate", "scale", "--length", "3", "--emulator", "typical", "--seconds", "4",
         "-o", str(output),
     )  # fmt: skip
     assert done.code == 0

@@ -209,3 +209,15 @@ def test_an_empty_sweep_goes_through() -> None:
     (item,) = pipeline.poll(0)
     assert len(item.points) == 0
     assert item.stamp == at(0.2)
+
+
+def test_stamps_of_the_imu_that_are_late_are_put_right() -> None:
+    samples = noisy(WALK.imu(0, 3.0), 0, 0, 0)
+    late = samples.copy()
+    late["stamp"] += 4 * MS
+    right = run(WALK, 3.0, samples=samples)
+    put_right = run(WALK, 3.0, {"imu_time_offset_ms": 4.0}, samples=late)
+    wrong = run(WALK, 3.0, samples=late)
+    last = [xyz(done[-1].points) for _, done in (right, put_right, wrong)]
+    np.testing.assert_allclose(last[1], last[0], atol=1e-6)
+    assert rms(last[2] - last[0]) > 1e-3
