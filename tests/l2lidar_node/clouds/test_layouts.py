@@ -147,3 +147,13 @@ def test_points_of_other_drivers_get_what_they_lack(points: Any) -> None:
     norms = np.linalg.norm([points["x"], points["y"], points["z"]], axis=0)
     np.testing.assert_allclose(converted["range"], norms, rtol=1e-6)
     assert not converted["intensity"].any()
+
+
+def test_return_type_is_that_of_a_single_strongest_return() -> None:
+    with_type = [
+        layout for layout in LAYOUTS.values() if "return_type" in (layout.dtype.names or ())
+    ]
+    assert with_type
+    for layout in with_type:
+        converted = layout.convert(np.zeros(3, POINT), HostNs(1_700_000_000_000_000_000))
+        assert converted["return_type"].tolist() == [1, 1, 1]

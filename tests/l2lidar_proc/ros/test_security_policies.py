@@ -16,6 +16,7 @@ from l2lidar_node.demo.processes import assigned, free_udp_ports  # noqa: E402
 from l2lidar_node.ros.driver_node import DriverNode  # noqa: E402
 from l2lidar_proc.ros.deskew_node import DeskewNode  # noqa: E402
 from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
+from l2lidar_proc.ros.slam_node import SlamNode  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
@@ -24,11 +25,13 @@ NODES: dict[str, Callable[[], Node]] = {
     "l2lidar_node": DriverNode,
     "deskew_node": DeskewNode,
     "odometry_node": OdometryNode,
+    "slam_node": SlamNode,
 }
 AT_TIMES = {  # only in a replay, with use_sim_time, and once somebody publishes clouds
     "l2lidar_node": {"publish /clock", "subscribe /clock"},
     "deskew_node": {"subscribe /clock", "request /l2lidar_node/get_parameters"},
     "odometry_node": {"subscribe /clock"},
+    "slam_node": {"subscribe /clock"},
 }
 
 
