@@ -63,6 +63,9 @@ class Verb(NamedTuple):
         module, _, attribute = self.target.partition(":")
         found = getattr(import_module(module), attribute)
         if isinstance(found, typer.Typer):
+            for item in found.registered_commands:
+                if item.callback is not None:
+                    item.callback = for_typer(item.callback)
             return typer.main.get_command(found)
         single = typer.Typer(add_completion=False, rich_markup_mode="rich")
         single.command(self.name, context_settings={"help_option_names": ["-h", "--help"]})(

@@ -20,7 +20,7 @@ from l2lidar_node.cli.stored import (
     work_mode_text,
 )
 from l2lidar_node.cli.stored import work_mode as parsed_mode
-from l2lidar_node.command_line import UsageError, for_typer
+from l2lidar_node.command_line import UsageError
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver.device import TRIES
 from l2lidar_node.protocol import commands
@@ -38,7 +38,6 @@ app = typer.Typer(
 
 
 @app.command("work-mode", context_settings={"ignore_unknown_options": True})  # -imu_off is none
-@for_typer
 @with_network
 def work_mode(
     network: NetworkConfig,
@@ -79,7 +78,6 @@ def work_mode(
 
 
 @app.command()
-@for_typer
 @with_network
 def parameters(
     network: NetworkConfig,
@@ -115,7 +113,6 @@ def parameters(
 
 
 @app.command("network")
-@for_typer
 @with_network
 def network_(
     network: NetworkConfig,
@@ -174,7 +171,6 @@ def network_(
 
 
 @app.command()
-@for_typer
 @with_network
 def mac(
     network: NetworkConfig,
