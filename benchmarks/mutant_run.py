@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.abc
 import importlib.machinery
+import resource
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 
 from benchmarks.mutants import ROOT, mutated
 
+_MAX_BYTES: Final = 6 << 30
 _OPTIONS: Final = ("-q", "-x", "--no-header", "-p", "no:cacheprovider", "-m", "not ros")
 
 
@@ -49,6 +51,8 @@ class _Finder(importlib.abc.MetaPathFinder):
 def main() -> int:
     """Run pytest with the mutant that the command line names; ``-`` for none."""
     module, path, number, *tests = sys.argv[1:]
+    # A mutant may ask for memory without end.
+    resource.setrlimit(resource.RLIMIT_AS, (_MAX_BYTES, _MAX_BYTES))
     if module != "-":
         if module in sys.modules:
             raise RuntimeError(f"{module} is imported already, so it cannot be mutated")
