@@ -297,7 +297,7 @@ def stranger(world: World) -> Finding:
 
 def closed(world: World) -> Finding:
     """Ask for a port that is not allowed and an address the host does not have."""
-    attempts = [(world.host("nowhere", host_ip="203.0.113.9"), "no address of this machine")]
+    attempts = [(world.host("nowhere", host_ip="203.0.113.9"), "not an address of this machine")]
     finding = Finding("no permission; address not of this host")
     finding.remark = "refused with exit code 1 and what to do"
     if _FREE_PORTS.exists() and int(_FREE_PORTS.read_text()) <= _PRIVILEGED_PORT:

@@ -156,7 +156,8 @@ class UdpTransport:
             self.send_errors += 1
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the socket; what the kernel dropped until then stays known."""
+        self._count_drops()
         self._socket.close()
 
     def _set_timeout(self, timeout_s: float) -> None:

@@ -131,7 +131,9 @@ def run(case: FaultCase, seed: int) -> Verdict:
     verdict = Verdict(counted=_counted(driver))
     placed = _placed(case, device, clock)
     _judge_packets(verdict, device, placed)
-    _judge_sweeps(verdict, case, device, placed, sweeps)
+    answers = [int(note[-1]) for note in clock.notes]
+    fragments = driver.counters.fragment_packets
+    _judge_sweeps(verdict, case, device, placed, answers, sweeps, fragments)
     starts = [sweep.start for sweep in sweeps]
     verdict.backwards = sum(b <= a for line in (stamps, starts) for a, b in pairwise(line))
     verdict.late = sum(counts.late for counts in driver.counters.sequence.values())
@@ -249,28 +251,38 @@ def _judge_sweeps(
     case: FaultCase,
     device: VirtualL2,
     placed: list[_Placed],
+    answers: list[int],
     sweeps: list[Sweep],
+    fragments: int,
 ) -> None:
-    """Compare every sweep with the points of the packets it must consist of, bit by bit."""
+    """Compare every sweep with the points of the packets it must consist of, bit by bit.
+
+    Between sweeps lie the packets of fragments of turns, as many as the driver has counted.
+    """
     kind = PacketType.POINTS_2D if case.flat else PacketType.POINTS_3D
     packets = device.packet_log.packets
-    rows = [row for row, answer, _ in placed if answer and packets["type"][row] == kind]
+    used = [item.published and packets["type"][item.row] == kind for item in placed]
+    rows = [item.row for item, is_used in zip(placed, used, strict=True) if is_used]
+    starts = [answer for answer, is_used in zip(answers, used, strict=True) if is_used]
     payloads, _ = PatternScanner(flat=case.flat).packets(
         0, int(packets["index"].max(initial=0)) + 1
     )
     projector = Projector(kind)
-    at = 0
+    stamps = {start: at for at, start in enumerate(starts)}
+    at = left_out = 0
     for sweep in sweeps:
-        indices = packets["index"][rows[at : at + sweep.packets]]
-        at += sweep.packets
+        begin = stamps.get(sweep.start, at)
+        left_out += begin - at
+        at = begin + sweep.packets
         truth = projector.points(
-            [payloads[index].tobytes() for index in indices],
-            np.arange(len(indices), dtype=np.float64) * wire.MIRROR_PERIOD_S,
+            [payloads[index].tobytes() for index in packets["index"][rows[begin:at]]],
+            np.arange(sweep.packets, dtype=np.float64) * wire.MIRROR_PERIOD_S,
         ).points
         verdict.wrong_sweeps += len(truth) != len(sweep.points) or any(
             not np.array_equal(truth[name], sweep.points[name]) for name in _EXACT
         )
-    verdict.wrong_sweeps += at != len(rows)
+    left_out += len(rows) - at
+    verdict.wrong_sweeps += left_out != fragments
 
 
 def _counted(driver: Driver) -> dict[str, int]:

@@ -324,7 +324,8 @@ def _version_bytes(name: str, text: str) -> bytes:
         numbers = b""
     if len(numbers) != 4:
         raise SettingError(
-            f"parameter '{name}': {text!r} is not a version; expected numbers such as 2.8.11.1"
+            f"parameter '{name}': {text!r} is not a version; "
+            "expected four numbers such as 2.8.11.1"
         )
     return numbers
 

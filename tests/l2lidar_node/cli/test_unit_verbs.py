@@ -361,9 +361,9 @@ def test_parameters_are_stored_and_read_back(run: Run, unit: Unit) -> None:
     [
         ("range_min", "NAME=VALUE"),
         ("range=1", "not known, expected one of range_min"),
-        ("range_min=far", "no finite number"),
-        ("range_min=nan", "no finite number"),
-        ("range_max=1e39", "no finite number"),
+        ("range_min=far", "not a finite number"),
+        ("range_min=nan", "not a finite number"),
+        ("range_max=1e39", "not a finite number"),
         ("range_min=60", "less than range_max"),
         ("work_mode=8", "not known"),
     ],

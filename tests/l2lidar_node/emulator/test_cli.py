@@ -193,7 +193,7 @@ def test_a_killed_measuring_process_is_one_message(host: socket.socket) -> None:
         (["--flash", "pyproject.toml"], ["pyproject.toml", "stored settings"]),
         (["--flash", "tests"], ["tests: Is a directory"]),
         (["--flash", "no/folder/flash.json"], ["flash.json", "no folder 'no/folder'"]),
-        pytest.param(["--world", "tests"], ["tests: is no file"], marks=needs_rays),
+        pytest.param(["--world", "tests"], ["tests: not a file"], marks=needs_rays),
         (["--worlds", "room"], ["--worlds"]),
     ],
 )
