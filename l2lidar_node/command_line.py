@@ -113,7 +113,7 @@ def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
         with interruption_exits():
             return command(*args, **named)
 
-    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {item.name: item.annotation for item in parameters}
     return run
 

@@ -1,6 +1,7 @@
 """Checks that what is built, installed and declared is what the code needs."""
 
 import ast
+import importlib
 import importlib.metadata
 import os
 import re
@@ -13,11 +14,16 @@ from xml.etree import ElementTree
 
 import pytest
 
+from l2lidar_node.command_line import Verb
+
 ROOT = Path(__file__).parent.parent
 NAME = "l2lidar_node"
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 SHARED_FOLDERS = ("config", "environment", "launch", "rviz", "urdf", "meshes")
-EXECUTABLES = {"l2lidar_node", "l2lidar_emulator", "deskew_node", "odometry_node", "l2lidar"}
+EXECUTABLES = {
+    *("l2lidar", "l2lidar_emulator", "l2lidar_node"),
+    *("companion_node", "deskew_node", "odometry_node", "slam_node"),
+}
 
 # Of ROS 2, by import name, where it is not the package's own.
 ROS_MODULES = re.compile(
@@ -124,7 +130,11 @@ def test_a_node_needs_what_the_page_on_installing_says(module: str, allowed: set
 def test_an_entry_point_leads_to_a_function(entry: importlib.metadata.EntryPoint) -> None:
     if ".ros." in entry.module:
         pytest.importorskip("rclpy", reason="needs rclpy")
-    assert callable(entry.load())
+    found = entry.load()
+    if isinstance(found, Verb):
+        module, _, name = found.target.partition(":")
+        found = getattr(importlib.import_module(module), name)
+    assert callable(found)
 
 
 @pytest.fixture(scope="module")

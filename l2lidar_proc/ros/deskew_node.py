@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -31,8 +31,10 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
-from l2lidar_proc.ros.odometry_node import OdometryNode
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
+
+if TYPE_CHECKING:
+    from l2lidar_proc.ros.odometry_node import OdometryNode  # brings kiss-icp along
 
 
 class DeskewNode(Node):

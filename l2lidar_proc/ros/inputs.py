@@ -208,6 +208,6 @@ def answer_or_error(
         except Exception as error:
             monitor.failed(error)
             response.success, response.message = False, f"{type(error).__name__}: {error}"
-            return response  # type: ignore[no-any-return]
+            return response  # type: ignore[no-any-return]  # rclpy has no types
 
     return run

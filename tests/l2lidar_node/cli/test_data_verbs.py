@@ -297,7 +297,7 @@ def test_record_writes_bags(run: Run, unit: Unit, tmp_path: Path) -> None:
 
 
 def test_odometry_of_a_capture(run: Run, unit: Unit, tmp_path: Path) -> None:
-    live(unit, tmp_path / "run.pcap", 5)
+    live(unit, tmp_path / "run.pcap", 9)
     outcome = run("odometry", str(tmp_path / "run.pcap"), str(tmp_path / "out"))
     assert (outcome.code, outcome.err) == (0, "")
     assert (tmp_path / "out" / "map.ply").exists()

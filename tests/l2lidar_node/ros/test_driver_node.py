@@ -154,7 +154,7 @@ def _set(rig: Rig, name: str, value: object) -> tuple[bool, str]:
         ("calRangeScale", 0.1, ("calRangeScale",)),
         ("sweep_cut", "circle", ("sweep_cut", "circle", "half_turn")),
         ("calRangeBias", math.nan, ("calRangeBias",)),
-        ("host_port", 6202, ("host_port", "starts")),
+        ("host_port", 6202, ("host_port", "read-only")),
         ("range_min", 100.0, ("range_min", "range_max")),
     ],
 )
