@@ -20,6 +20,7 @@ def start(
     unit: Sequence[str],
     values: Mapping[str, object] | None = None,
     nodes: Sequence[str] = (DRIVER, COMPANION),
+    base_frame: str | None = None,
 ) -> dict[str, Program]:
     """Start the nodes that there are and then a unit; return them by name.
 
@@ -32,6 +33,8 @@ def start(
         Parameters of the driver beside addresses and IMU.
     nodes : sequence of str
         Modules.
+    base_frame : str, optional
+        Of the odometry in the companion, for a sensor on a robot.
     """
     host_port, lidar_port = free_udp_ports(2)
     parameters = {
@@ -39,10 +42,11 @@ def start(
         "host_port": host_port, "enable_IMU_publishing": "true", "imu_adjust": "false",
         **(values or {}),
     }  # fmt: skip
+    arguments = {DRIVER: assigned(parameters)}
+    if base_frame is not None:
+        arguments[COMPANION] = assigned({"odometry_node:base_frame": base_frame})
     started = {
-        module.rpartition(".")[2]: programs.start(
-            module, assigned(parameters) if module == DRIVER else []
-        )
+        module.rpartition(".")[2]: programs.start(module, arguments.get(module, []))
         for module in nodes
         if find_spec(module)
     }
