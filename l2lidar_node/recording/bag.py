@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Connection,
@@ -22,7 +23,9 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
+from l2lidar_node.clouds import fields
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Event
@@ -34,10 +37,7 @@ _NS: Final = 1_000_000_000
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
-_DATATYPES: Final = {
-    "i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8,
-}  # fmt: skip
-"""Numbers of ``sensor_msgs/PointField`` by the kind and size of a NumPy type."""
+_DATATYPES: Final = {code: number for number, code in fields.DATATYPES.items()}
 
 
 class RecordingError(ValueError):
@@ -76,6 +76,8 @@ class BagFile:
         A new MCAP file where the name ends in ``.mcap``, else a new rosbag2 folder.
     keep_unfinished : bool
         Whether an exception leaves what was written until then, rather than removing it.
+    store : Typestore, optional
+        Message types; those of ROS 2 Jazzy unless given. A copy takes those of its source.
 
     Attributes
     ----------
@@ -88,7 +90,9 @@ class BagFile:
         If there is something of that name.
     """
 
-    def __init__(self, path: Path, *, keep_unfinished: bool = False) -> None:
+    def __init__(
+        self, path: Path, *, keep_unfinished: bool = False, store: Typestore | None = None
+    ) -> None:
         if path.exists():
             raise FileExistsError(errno.EEXIST, "it exists already", str(path))
         self.unfinished: Path | None = None
@@ -99,9 +103,10 @@ class BagFile:
         self._folder = self._scratch / name
         self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
+        self._copied: dict[tuple[str, str], Connection] = {}
         self._is_used = False
         self._keeps = keep_unfinished
-        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self.store = get_typestore(Stores.ROS2_JAZZY) if store is None else store
 
     def __enter__(self) -> BagFile:
         """Make the file."""
@@ -146,6 +151,64 @@ class BagFile:
         self._is_used = True
         self._writer.write(self._connections[topic], now, data)
 
+    def cloud(
+        self, topic: str, now: int, points: NDArray[np.void], stamp: HostNs, frame: str
+    ) -> None:
+        """Append points as a cloud; see :func:`cloud_message`. Announce the topic if it is new."""
+        if topic not in self._connections:
+            self.connect(topic, CLOUD, 10, reliable=True, latched=False)
+        message = cloud_message(self.store, points, stamp, frame)
+        self.write(topic, now, self.store.serialize_cdr(message, CLOUD))
+
+    def copy(self, source: Connection, now: int, data: bytes) -> None:
+        """Append a message of another bag as it is, on its topic and with its QoS."""
+        self._is_used = True
+        key = source.topic, source.msgtype
+        if key not in self._copied:
+            self._copied[key] = self._writer.add_connection(
+                *key,
+                typestore=self.store,
+                offered_qos_profiles=getattr(source.ext, "offered_qos_profiles", ()),
+            )
+        self._writer.write(self._copied[key], now, data)
+
+
+def cloud_message(store: Typestore, points: NDArray[np.void], stamp: HostNs, frame: str) -> Any:
+    """Return points as a PointCloud2.
+
+    Parameters
+    ----------
+    store : Typestore
+        Makes the message.
+    points : ndarray
+        Shape (N,) or (H, W), with fields x, y and z.
+    stamp : HostNs
+    frame : str
+    """
+    types: Any = store.types
+    fields = [
+        types["sensor_msgs/msg/PointField"](
+            name=name,
+            offset=offset,
+            datatype=_DATATYPES[item.base.str[1:]],
+            count=int(np.prod(item.shape)),
+        )
+        for name, (item, offset, *_) in (points.dtype.fields or {}).items()
+    ]
+    height, width = points.shape if points.ndim == 2 else (1, len(points))
+    time = types["builtin_interfaces/msg/Time"](*split_stamp(stamp))
+    return types[CLOUD](
+        header=types["std_msgs/msg/Header"](stamp=time, frame_id=frame),
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=False,
+        point_step=points.dtype.itemsize,
+        row_step=points.dtype.itemsize * width,
+        data=np.frombuffer(np.ascontiguousarray(points).tobytes(), np.uint8),
+        is_dense=all(bool(np.isfinite(points[axis]).all()) for axis in "xyz"),
+    )
+
 
 class Messages:
     """Makes the messages that the driver's node would publish, as values of rosbags.
@@ -180,26 +243,7 @@ class Messages:
     def cloud(self, sweep: Sweep) -> Any:
         """Return a sweep as a PointCloud2."""
         points = self._layout.convert(sweep.points, sweep.start)
-        fields = [
-            self._types["sensor_msgs/msg/PointField"](
-                name=name,
-                offset=offset,
-                datatype=_DATATYPES[f"{item.base.kind}{item.base.itemsize}"],
-                count=int(np.prod(item.shape)),
-            )
-            for name, (item, offset, *_) in (points.dtype.fields or {}).items()
-        ]
-        return self._types[CLOUD](
-            header=self._header(sweep.start, self._config.frames.cloud),
-            height=1,
-            width=len(points),
-            fields=fields,
-            is_bigendian=False,
-            point_step=points.dtype.itemsize,
-            row_step=points.nbytes,
-            data=np.frombuffer(points.tobytes(), np.uint8),
-            is_dense=True,
-        )
+        return cloud_message(self.store, points, sweep.start, self._config.frames.cloud)
 
     def imu(self, sample: ImuSample) -> Any:
         """Return a sample as an Imu."""

@@ -1,43 +1,30 @@
-"""Turns the messages of a recording into plain values and back; needs rosbags, not ROS."""
+"""Turns the messages of a recording into plain values; needs rosbags, not ROS."""
 
 from __future__ import annotations
 
-import shutil
-from pathlib import Path
-from types import MappingProxyType, TracebackType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys.store import Typestore
 
 from l2lidar_node.clouds import fields
 from l2lidar_node.recording.bag import (
+    CLOUD as CLOUD,
+    IMU as IMU,
+    TRANSFORMS as TRANSFORMS,
+    BagFile as BagFile,
     RecordingError as RecordingError,
-)
-from l2lidar_node.recording.bag import (
     messages as messages,
-)
-from l2lidar_node.recording.bag import (
     open_bag as open_bag,
-)
-from l2lidar_node.recording.bag import (
     unreadable as unreadable,
 )
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 
-CLOUD: Final = "sensor_msgs/msg/PointCloud2"
-IMU: Final = "sensor_msgs/msg/Imu"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 TWIST: Final = "geometry_msgs/msg/TwistStamped"
-TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 LIVOX: Final = ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")
 CLOUDS: Final = (CLOUD, *LIVOX)
 """Types of messages that clouds come in."""
-
-_NUMBERS: Final = {code: number for number, code in fields.DATATYPES.items()}
 
 
 def chosen(kinds: dict[str, str], wanted: str, kind: str | tuple[str, ...], parameter: str) -> str:
@@ -173,98 +160,3 @@ def twist_of(message: Any) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
         (linear.x, linear.y, linear.z),
         (angular.x, angular.y, angular.z),
     )
-
-
-class BagWriter:
-    """Writes a rosbag2 folder, or one MCAP file where the name ends so; use it in a ``with``.
-
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-    typestore : Typestore
-        Of the messages.
-
-    Raises
-    ------
-    FileExistsError
-        If there is something already.
-    """
-
-    def __init__(self, path: Path, typestore: Typestore) -> None:
-        if path.exists():
-            raise FileExistsError(f"{path} exists already")
-        self._path = path
-        self._is_file = path.suffix == ".mcap"
-        self._folder = path.with_suffix(".part") if self._is_file else path
-        if self._is_file:  # what a run that was killed left can be made again
-            shutil.rmtree(self._folder, ignore_errors=True)
-        self._types = typestore
-        self._connections: dict[tuple[str, str], Connection] = {}
-        self._writer = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
-
-    def __enter__(self) -> BagWriter:
-        """Open the bag."""
-        self._writer.open()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the bag; of a single file the folder around it goes, after an exception all."""
-        self._writer.close()
-        if kind is not None:
-            shutil.rmtree(self._folder)
-        elif self._is_file:
-            (content,) = self._folder.glob("*.mcap")
-            content.replace(self._path)
-            shutil.rmtree(self._folder)
-
-    def copy(self, connection: Connection, recorded_ns: int, data: bytes) -> None:
-        """Write a message as it is."""
-        self._writer.write(
-            self._connection(connection.topic, connection.msgtype), recorded_ns, data
-        )
-
-    def cloud(
-        self, topic: str, recorded_ns: int, points: NDArray[np.void], stamp: HostNs, frame: str
-    ) -> None:
-        """Write points, shape (N,) or (H, W), as a cloud."""
-        types = self._types.types
-        seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
-        time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-        layout = points.dtype
-        places = layout.fields or MappingProxyType({})
-        fields = [
-            types["sensor_msgs/msg/PointField"](
-                name=name,
-                offset=places[name][1],
-                datatype=_NUMBERS[layout[name].base.str[1:]],
-                count=int(np.prod(layout[name].shape)),
-            )
-            for name in layout.names or ()
-        ]
-        height, width = points.shape if points.ndim == 2 else (1, len(points))
-        message = types[CLOUD](
-            header=types["std_msgs/msg/Header"](stamp=time, frame_id=frame),
-            height=height,
-            width=width,
-            fields=fields,
-            is_bigendian=False,
-            point_step=layout.itemsize,
-            row_step=layout.itemsize * width,
-            data=np.frombuffer(np.ascontiguousarray(points).tobytes(), np.uint8),
-            is_dense=all(bool(np.isfinite(points[axis]).all()) for axis in "xyz"),
-        )
-        connection = self._connection(topic, CLOUD)
-        self._writer.write(connection, recorded_ns, self._types.serialize_cdr(message, CLOUD))
-
-    def _connection(self, topic: str, kind: str) -> Connection:
-        key = (topic, kind)
-        if key not in self._connections:
-            made = self._writer.add_connection(topic, kind, typestore=self._types)
-            self._connections[key] = made
-        return self._connections[key]

@@ -44,7 +44,7 @@ class Topics:
 class _Deskewer:
     """Feeds the pipeline with the messages of a recording and writes what comes out."""
 
-    def __init__(self, config: DeskewNodeConfig, topics: Topics, writer: bag.BagWriter) -> None:
+    def __init__(self, config: DeskewNodeConfig, topics: Topics, writer: bag.BagFile) -> None:
         self.pipeline = Pipeline(config.proc)
         self.refused: dict[str, int] = {}
         self._unit = config.proc.deskew.time_unit
@@ -152,7 +152,7 @@ def deskew_recording(
         with bag.open_bag(source) as reader:
             kinds = {item.topic: item.msgtype for item in reader.connections}
             topics = _topics(config, kinds)
-            with bag.BagWriter(target, reader.typestore) as writer:
+            with bag.BagFile(target, store=reader.typestore) as writer:
                 deskewer = _Deskewer(config, topics, writer)
                 for connection, recorded_ns, data in bag.messages(reader):
                     writer.copy(connection, recorded_ns, data)

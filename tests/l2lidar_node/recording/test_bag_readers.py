@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.recording.bag import BagFile, BagWriter
+from l2lidar_node.recording.bag import BagFile, BagWriter, open_bag
 from l2lidar_node.settings import build
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 from tests.l2lidar_proc.odometry.odometry_world import recording
@@ -87,6 +88,23 @@ def test_kiss_icp_gets_the_points_and_their_times(bag: Any) -> None:
         expected = np.stack([sweep.points[axis] for axis in "xyz"], axis=1)
         np.testing.assert_array_equal(points, expected)
         np.testing.assert_array_equal(times, sweep.points["time"])
+
+
+def test_a_copy_keeps_message_and_qos(bag: Path, tmp_path: Path) -> None:
+    with open_bag(bag) as source, BagFile(tmp_path / "copy.mcap", store=source.typestore) as copy:
+        for connection, now, data in source.messages():
+            copy.copy(connection, now, data)
+    with open_bag(bag) as source, open_bag(tmp_path / "copy.mcap") as copied:
+        offered = {item.topic: item.ext.offered_qos_profiles for item in source.connections}
+        assert offered == {
+            item.topic: item.ext.offered_qos_profiles for item in copied.connections
+        }
+        (latched,) = offered["/tf_static"]
+        assert latched.durability is QosDurability.TRANSIENT_LOCAL
+        for (at, now, data), (its, then, other) in zip(
+            source.messages(), copied.messages(), strict=True
+        ):
+            assert (at.topic, at.msgtype, now, data) == (its.topic, its.msgtype, then, other)
 
 
 @pytest.mark.parametrize("name", ["run", "run.mcap"])

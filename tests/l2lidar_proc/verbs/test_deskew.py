@@ -84,7 +84,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
             write(topic, when, message)
     # clouds by the writer under test, which needs a bag of its own
     source = path.parent / "walk_with_clouds"
-    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as copy:
+    with bag.open_bag(path) as reader, bag.BagFile(source) as copy:
         ends = [start + LENGTH for start in STARTS]
         for connection, recorded, data in bag.messages(reader):
             while ends and recorded > at(ends[0]):
@@ -180,7 +180,7 @@ def test_a_wrong_parameter_file_is_explained(
 
 def test_without_the_needed_topics_it_says_what_there_is(recording: Path, tmp_path: Path) -> None:
     source = tmp_path / "only"
-    with bag.open_bag(recording) as reader, bag.BagWriter(source, TYPES) as writer:
+    with bag.open_bag(recording) as reader, bag.BagFile(source) as writer:
         for connection, recorded, data in bag.messages(reader):
             if connection.msgtype != bag.IMU:
                 writer.copy(connection, recorded, data)
@@ -193,7 +193,7 @@ def test_clouds_without_plain_times_are_passed_on_without_them(
 ) -> None:
     source = tmp_path / "odd"
     points = np.zeros(5, dtype=POINT)
-    with bag.open_bag(recording) as reader, bag.BagWriter(source, TYPES) as writer:
+    with bag.open_bag(recording) as reader, bag.BagFile(source) as writer:
         for connection, recorded, data in bag.messages(reader):
             if connection.msgtype != bag.CLOUD:
                 writer.copy(connection, recorded, data)
@@ -216,7 +216,7 @@ def test_without_a_velocity_our_odometry_finds_it(tmp_path: Path) -> None:
             data = TYPES.serialize_cdr(imu(sample), bag.IMU)
             writer.write(line, int(sample["stamp"]), data)
     source, target = tmp_path / "source", tmp_path / "target"
-    with bag.open_bag(path) as reader, bag.BagWriter(source, TYPES) as copy:
+    with bag.open_bag(path) as reader, bag.BagFile(source) as copy:
         waiting = [item.sweep for item in walk.sweeps]
         for connection, recorded, raw in bag.messages(reader):
             while waiting and recorded > waiting[0].end + shift:

@@ -27,7 +27,8 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
     first = 0
-    with bag.BagWriter(path, store) as writer:
+    with bag.BagFile(path) as writer:
+        writer.connect("/imu/data", bag.IMU, 1000, reliable=False, latched=False)
         for sweep in some:
             last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
             for sample in run.imu[first:last]:
@@ -44,9 +45,8 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
                     linear_acceleration=vector(*sample["linear_acceleration"].tolist()),
                     linear_acceleration_covariance=np.zeros(9),
                 )
-                connection = writer._connection("/imu/data", bag.IMU)
                 data = store.serialize_cdr(message, bag.IMU)
-                writer._writer.write(connection, int(sample["stamp"]), data)
+                writer.write("/imu/data", int(sample["stamp"]), data)
             first = last
             writer.cloud("/points", sweep.end, sweep.points, sweep.start, FRAME)
     return some
