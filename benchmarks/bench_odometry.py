@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import odometry_methods as methods
-from benchmarks import odometry_pages
+from benchmarks import odometry_methods as methods, odometry_pages
 from benchmarks.odometry_plan import Plan, Rows, Task
 from benchmarks.results import Target, at_least, at_most, publish
 from tests.support.odometry_runs import CUTS, Run, count, record, truth

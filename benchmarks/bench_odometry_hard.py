@@ -21,8 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks import hard_pages
-from benchmarks import odometry_methods as methods
+from benchmarks import hard_pages, odometry_methods as methods
 from benchmarks.hard_recordings import Recording, recording
 from benchmarks.hard_scenarios import FAMILIES, SHORT, scenario
 from benchmarks.hard_scores import Track, score

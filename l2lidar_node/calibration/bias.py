@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration import solver
+from l2lidar_node.calibration import planes as flat, solver
 from l2lidar_node.calibration.model import BIAS, STRETCH, beams
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.result import Estimate, Verdict

@@ -8,8 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration import solver
+from l2lidar_node.calibration import planes as flat, solver
 from l2lidar_node.calibration.model import BIAS, STRETCH
 from l2lidar_node.calibration.result import Quality, StillResult
 from l2lidar_node.files import whole

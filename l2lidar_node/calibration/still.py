@@ -8,10 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration import solver
-from l2lidar_node.calibration.bias import FEWEST_DIRECTIONS, range_bias, significant
-from l2lidar_node.calibration.bias import directions as facing
+from l2lidar_node.calibration import planes as flat, solver
+from l2lidar_node.calibration.bias import (
+    FEWEST_DIRECTIONS,
+    directions as facing,
+    range_bias,
+    significant,
+)
 from l2lidar_node.calibration.model import ALPHA, BETA, NAMES, ROCK_COS, ROCK_SIN, XI, B
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.planes import Planes

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as NoAnswerError
+from concurrent.futures import Future, TimeoutError as NoAnswerError
 from types import TracebackType
 from typing import Final, TypeVar
 

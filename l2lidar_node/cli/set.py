@@ -17,9 +17,9 @@ from l2lidar_node.cli.stored import (
     needs_restart,
     parameter_fields,
     with_parameters,
+    work_mode as parsed_mode,
     work_mode_text,
 )
-from l2lidar_node.cli.stored import work_mode as parsed_mode
 from l2lidar_node.command_line import UsageError
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver.device import TRIES

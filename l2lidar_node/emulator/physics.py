@@ -13,8 +13,7 @@ from l2lidar_node.emulator.unit.errors import RockingMotion
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scanner, mean_angle
-from l2lidar_node.emulator.unit.units import Unit
-from l2lidar_node.emulator.unit.units import unit as named_unit
+from l2lidar_node.emulator.unit.units import Unit, unit as named_unit
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.settings import setting

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from filterpy.kalman import predict as kalman_predict
-from filterpy.kalman import update as kalman_update
+from filterpy.kalman import predict as kalman_predict, update as kalman_update
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs

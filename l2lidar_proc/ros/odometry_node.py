@@ -11,8 +11,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry as OdometryMessage
-from nav_msgs.msg import Path
+from nav_msgs.msg import Odometry as OdometryMessage, Path
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2

@@ -6,8 +6,7 @@ import tracemalloc
 from typing import Any
 
 import numpy as np
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig, ProcConfig

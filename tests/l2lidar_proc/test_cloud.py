@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from l2lidar_node.types import POINT, HostNs
 from l2lidar_proc.cloud import CloudError, to_sweep, without_time

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import Gathering

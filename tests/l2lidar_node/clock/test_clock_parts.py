@@ -3,8 +3,7 @@
 import itertools
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.clock.host_clock_model import HostClockModel

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from l2lidar_node.driver.reorder import REORDER_NS, Released, ReorderBuffer
 from l2lidar_node.protocol.framing import Frame

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from l2lidar_node.config import SweepConfig
 from l2lidar_node.driver.sweep import MAX_GAP_NS, MAX_PACKETS, SweepAssembler

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.integrate import trapezoid
 
 from l2lidar_node.emulator.config import CrystalConfig, DeviceConfig, FaultConfig, PowerConfig

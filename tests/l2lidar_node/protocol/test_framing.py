@@ -7,8 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from l2lidar_node.protocol import framing, wire
 from l2lidar_node.protocol.framing import Fault, Frame, FrameError, Framer

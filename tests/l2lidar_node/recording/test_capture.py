@@ -5,8 +5,7 @@ from typing import Any
 
 import dpkt
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from l2lidar_node.recording.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
 from l2lidar_node.recording.pcap import CaptureError, PacketReader, PacketWriter

@@ -13,8 +13,10 @@ rclpy = pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
 from geometry_msgs.msg import TransformStamped  # noqa: E402
-from nav_msgs.msg import Odometry  # noqa: E402  after importorskip
-from nav_msgs.msg import Path as PathMessage  # noqa: E402
+from nav_msgs.msg import (  # noqa: E402
+    Odometry,
+    Path as PathMessage,
+)
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
