@@ -3,6 +3,8 @@
 RUN := .venv/bin/python
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+# A process for every core; more than four find too little to do.
+WORKERS := -n logical --maxprocesses 4
 BENCH_ARGS ?=
 
 BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))
@@ -38,7 +40,7 @@ imports: setup
 	.venv/bin/lint-imports
 
 pytest: setup
-	$(RUN) -m pytest $(PYTEST_ARGS)
+	$(RUN) -m pytest $(WORKERS) $(PYTEST_ARGS)
 
 format: setup ## put every Python file into the project's format
 	$(RUN) -m ruff check --fix-only .

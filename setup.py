@@ -66,6 +66,7 @@ setup(
             "import-linter>=2.1",
             "mypy>=1.11",
             "pytest>=9",
+            "pytest-xdist>=3.6",
             "ruff>=0.9",
             "types-PyYAML",
             "xacro>=2.0",

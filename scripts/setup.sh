@@ -179,7 +179,7 @@ is_healthy() {
 import importlib.util as util
 import sys
 
-names = "rclpy tf2_msgs numpy scipy open3d kiss_icp filterpy rich pytest mypy l2lidar_node".split()
+names = "rclpy tf2_msgs numpy scipy open3d kiss_icp filterpy rich pytest xdist mypy l2lidar_node".split()
 sys.exit(any(util.find_spec(name) is None for name in names))
 PYTHON
 }

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import hypothesis
 import pytest
 
+from l2lidar_node.demo.processes import isolate_ros
 from tests.support.processes import end_all
 
-# Before anything imports rclpy. Fast DDS makes its ports from the domain, and those of domains
-# above 101 are in the range that Linux hands out to programs asking for any port.
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-os.environ.pop("ROS_LOCALHOST_ONLY", None)
+# Before anything imports rclpy. Each worker of pytest-xdist has a domain of its own.
+for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY"):
+    os.environ.pop(name, None)
+isolate_ros()
 
 # A shell has what runs in the background ignore interrupts, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -8,9 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+from collections import deque
 from collections.abc import Mapping
-from contextlib import ExitStack, suppress
-from itertools import cycle
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -21,6 +21,12 @@ GRACE_S: Final = 30.0  # for a program that ends; only one that hangs takes so l
 _HANDED_OUT: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _USUAL_LAST: Final = 60_999
 _LAST: Final = 65_535
+_PORTS_AT_ONCE: Final = 90  # that a process takes for itself
+# DDS makes its ports from the domain (DDSI-RTPS 9.6.1.1). Those of domains above 101 are in the
+# range that Linux hands out to programs asking for any port.
+_LAST_DOMAIN: Final = 100
+_DDS_BASE: Final = 7410
+_DDS_DOMAIN_STEP: Final = 250
 
 
 class ProgramError(RuntimeError):
@@ -115,32 +121,89 @@ def assigned(values: Mapping[str, object]) -> list[str]:
 def isolate_ros() -> None:
     """Keep the topics on this machine and apart from other nodes, unless told otherwise."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    if "ROS_DOMAIN_ID" not in os.environ:
+        os.environ["ROS_DOMAIN_ID"] = str(free_ros_domain())
+
+
+def free_ros_domain() -> int:
+    """Return a ROS domain in which no node of this machine is.
+
+    No other process is given it by this function until this one ends.
+
+    Raises
+    ------
+    OSError
+        If there is none.
+    """
+    domains = list(range(1, _LAST_DOMAIN + 1))
+    random.shuffle(domains)
+    for domain in domains:
+        port = _DDS_BASE + _DDS_DOMAIN_STEP * domain
+        if _is_free("", port) and _claim(f"domain {domain}"):
+            return domain
+    raise OSError(f"all ROS domains from 1 to {_LAST_DOMAIN} are in use")
 
 
 def free_udp_ports(count: int) -> list[int]:
     """Return UDP ports of the loopback interface that nobody uses right now.
 
     They lie beyond those that the system hands out to whoever asks for any port, as DDS does many
-    times at every start: nobody takes them before they are used. No port is returned twice until
-    all have been.
+    times at every start, and no other process is given them by this function until this one ends:
+    nobody takes them before they are used. No port is returned twice until all have been.
 
     Raises
     ------
     OSError
         If there are not so many.
     """
+    if not _ports:
+        _ports.extend(_own_ports())
     found: list[int] = []
-    for _ in range(_LAST - _beyond() + 1):
+    for _ in range(len(_ports)):
         if len(found) == count:
             break
-        port = next(_ports)
-        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", port))
-            found.append(port)
+        _ports.rotate(-1)
+        if _is_free("127.0.0.1", _ports[-1]):
+            found.append(_ports[-1])
     if len(found) < count:
         raise OSError(f"of {count} UDP ports, {len(found)} are free")
     return found
+
+
+def _own_ports() -> list[int]:
+    """Return some ports that this process has for itself; all there are if others have them."""
+    ports = range(_beyond(), _LAST + 1)
+    firsts = list(range(ports.start, _LAST + 2 - _PORTS_AT_ONCE, _PORTS_AT_ONCE))
+    random.shuffle(firsts)
+    for first in firsts:
+        if _claim(f"ports from {first}"):
+            ports = range(first, first + _PORTS_AT_ONCE)
+            break
+    return random.sample(ports, len(ports))
+
+
+def _is_free(address: str, port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, port))
+        except OSError:
+            return False
+    return True
+
+
+def _claim(name: str) -> bool:
+    """Take a name until this process ends; return whether no other process has it.
+
+    The name is that of a socket in Linux's abstract namespace, which leaves no file behind.
+    """
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        claim.bind(f"\0l2lidar {name}")
+    except OSError:
+        claim.close()
+        return False
+    _claims.append(claim)
+    return True
 
 
 def _beyond() -> int:
@@ -152,10 +215,5 @@ def _beyond() -> int:
     return last + 1 if last < _LAST - 1000 else _USUAL_LAST + 1
 
 
-def _shuffled() -> list[int]:
-    ports = list(range(_beyond(), _LAST + 1))
-    random.shuffle(ports)
-    return ports
-
-
-_ports = cycle(_shuffled())
+_claims: list[socket.socket] = []
+_ports: deque[int] = deque()

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from l2lidar_node.demo.processes import free_ros_domain
 from l2lidar_node.ros import program
 
 pytestmark = pytest.mark.ros
@@ -91,7 +92,7 @@ def test_a_listener_that_is_held_up_loses_no_cloud() -> None:
 def heard_after_a_stop() -> int:
     """Return how many clouds a process hears that were sent while it was stopped."""
     domain = {
-        "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 100),  # not that of this test run
+        "ROS_DOMAIN_ID": str(free_ros_domain()),  # not that of this test run
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
     environment = {name: value for name, value in os.environ.items() if name not in NAMES}
