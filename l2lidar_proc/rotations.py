@@ -15,14 +15,11 @@ def multiply(a_wxyz: ArrayLike, b_wxyz: ArrayLike) -> F64:
     """Return the products ``a b`` (first b, then a), shape (..., 4) by broadcasting."""
     aw, ax, ay, az = _parts(a_wxyz)
     bw, bx, by, bz = _parts(b_wxyz)
-    return np.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        axis=-1,
+    return _joined(
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
 
 
@@ -41,7 +38,7 @@ def cross(a: ArrayLike, b: ArrayLike) -> F64:
     """Return the cross products, shape (..., 3); ``numpy.cross`` is several times slower."""
     ax, ay, az = _parts(a)
     bx, by, bz = _parts(b)
-    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-1)
+    return _joined(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
 
 
 def exp(rotation_vectors: ArrayLike) -> F64:
@@ -86,20 +83,33 @@ def rotate(q_wxyz: ArrayLike, vectors: ArrayLike) -> F64:
 def matrices(q_wxyz: ArrayLike) -> F64:
     """Return the rotation matrices, shape (..., 3, 3); exactly I for (1, 0, 0, 0)."""
     w, x, y, z = _parts(q_wxyz)
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    entries = _joined(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+    return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
 def from_matrix(matrix: ArrayLike) -> F64:
-    """Return the quaternion of one rotation matrix, shape (4,), w not negative."""
-    from scipy.spatial.transform import Rotation
+    """Return the quaternion of one rotation matrix, shape (4,), w not negative.
 
-    xyzw = Rotation.from_matrix(np.asarray(matrix, dtype=np.float64)).as_quat(canonical=True)
-    return np.asarray(np.roll(xyzw, 1), dtype=np.float64)
+    The largest component comes from the diagonal, the others from it (Shepperd 1978); SciPy's
+    ``Rotation.from_matrix`` takes twenty times as long, and this is asked for at every pose.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(matrix, dtype=np.float64).tolist()
+    trace = xx + yy + zz
+    largest = max((trace, "w"), (xx, "x"), (yy, "y"), (zz, "z"))[1]
+    if largest == "w":
+        found = (1.0 + trace, zy - yz, xz - zx, yx - xy)
+    elif largest == "x":
+        found = (zy - yz, 1.0 + 2.0 * xx - trace, xy + yx, xz + zx)
+    elif largest == "y":
+        found = (xz - zx, xy + yx, 1.0 + 2.0 * yy - trace, yz + zy)
+    else:
+        found = (yx - xy, xz + zx, yz + zy, 1.0 + 2.0 * zz - trace)
+    q = normalised(found)
+    return -q if q[0] < 0.0 else q
 
 
 def cumulative(q_wxyz: ArrayLike) -> F64:
@@ -146,3 +156,12 @@ def _parts(values: ArrayLike) -> list[F64]:
     """Return the components, (...) each; ``numpy.moveaxis`` takes ten times as long."""
     array = np.asarray(values, dtype=np.float64)
     return [array[..., i] for i in range(array.shape[-1])]
+
+
+def _joined(*components: ArrayLike) -> F64:
+    """Return components (...) as the last axis; ``numpy.stack`` takes twice as long."""
+    first = np.asarray(components[0])
+    out = np.empty((*first.shape, len(components)))
+    for i, component in enumerate(components):
+        out[..., i] = component
+    return out

@@ -58,10 +58,15 @@ def test_running_product_equals_the_loop(length: int) -> None:
     np.testing.assert_allclose(rotations.cumulative(q), expected, atol=1e-12)
 
 
-def test_quaternion_of_a_matrix() -> None:
-    for q in rotations.exp(VECTORS):
-        back = rotations.from_matrix(rotations.matrices(q))
-        np.testing.assert_allclose(back * np.sign(back[0]), q * np.sign(q[0]), atol=1e-9)
+def test_quaternion_of_a_matrix_is_that_of_scipy_near_half_turns_too() -> None:
+    axes = np.concatenate((np.eye(3), -np.eye(3), VECTORS))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for angle in (0.0, 1e-9, 0.7, 2.0, np.pi - 1e-9, np.pi, 4.0):
+        for rotation in Rotation.from_rotvec(angle * axes):
+            found = rotations.from_matrix(rotation.as_matrix())
+            assert found[0] >= 0.0
+            assert abs(float(found @ np.roll(rotation.as_quat(), 1))) > 1.0 - 1e-14
+            np.testing.assert_allclose(rotations.matrices(found), rotation.as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize("target", [(0, 0, 2), (1, 0, 0), (0, 0, -1), (0.3, -0.2, 0.9)])
