@@ -1,9 +1,10 @@
 """Measures how true the driver's stamps are, against the virtual L2's own packet log.
 
-``make bench-clock`` prints the table and writes ``out/bench/clock.json``; ``--docs`` renews the
-table in ``docs/clock.md`` too. Then come the shapes of load of ``tests/support/clock_loads.py``,
+``make bench-clock`` prints the table and writes ``out/bench/clock.json``; ``--docs`` writes
+``docs/results/clock.md`` too. Then come the shapes of load of ``tests/support/clock_loads.py``,
 in ``out/bench/clock-loads.json``. The same packets also go through upstream's rule and through
-stamping with the time of arrival.
+stamping with the time of arrival. Every row is kept in ``out/bench/*.jsonl`` as soon as it is
+there: ``--resume`` goes on where a run was cut.
 """
 
 from __future__ import annotations
@@ -11,17 +12,17 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
-from benchmarks.results import Target, at_least, at_most, publish
+from benchmarks import clock_pages
+from benchmarks.results import FOLDER, KeptRows, Target, at_least, at_most, publish
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.settings import Value
 from tests.support.clock_loads import SHAPES, load_errors
@@ -53,12 +54,15 @@ _EVERYTHING: Final[dict[str, Value]] = {
     **_FAULTS["reordering 2 %"],
     **_FAULTS["reboot"],
 }
-_DOCS: Final = Path("docs") / "clock.md"
-_MARKS: Final = ("<!-- table: begin -->", "<!-- table: end -->")
+_AHEAD: Final = os.cpu_count() or 1  # runs handed to the processes at a time
+_KEY: Final = ("seed",)  # tells every run from the others
+
+Row = dict[str, Any]
+W = TypeVar("W")
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class Task:
     """A named case."""
 
     drift: str
@@ -72,27 +76,27 @@ class Row:
         return self.jitter != "none" or "burst" in self.fault or self.fault == "everything"
 
 
-def rows() -> list[Row]:
+def rows() -> list[Task]:
     """Return the benchmark: every ratio, sync mode and jitter with drift, then the faults."""
     out = [
-        Row("yes", name, "", Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=faults))
+        Task("yes", name, "", Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=faults))
         for ratio in RATIOS
         for sync in SYNCS
         for name, faults in _JITTERS.items()
     ]
     out += [
-        Row("no", name, "", Case(ratio=1.99866, sync=sync, faults=faults))
+        Task("no", name, "", Case(ratio=1.99866, sync=sync, faults=faults))
         for sync in SYNCS
         for name, faults in _JITTERS.items()
     ]
     out += [
-        Row("yes", "none", name, Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=faults))
+        Task("yes", "none", name, Case(ratio=ratio, sync=sync, crystal=_DRIFT, faults=faults))
         for name, faults in _FAULTS.items()
         for ratio in (1.0, 1.99866)
         for sync in SYNCS
     ]
     out += [
-        Row(
+        Task(
             "yes",
             "20 ms tail",
             "everything",
@@ -102,7 +106,7 @@ def rows() -> list[Row]:
         for sync in SYNCS
     ]
     out += [
-        Row(
+        Task(
             "yes",
             "0.5 ms",
             "IMU off",
@@ -113,7 +117,7 @@ def rows() -> list[Row]:
     return out
 
 
-def measure(row: Row, seed: int) -> dict[str, Any]:
+def measure(row: Task, seed: int) -> Row:
     """Return the figures of one row."""
     notes, _ = run(row.case, seed)
     used = notes[notes["published"] != 0]
@@ -139,6 +143,7 @@ def measure(row: Row, seed: int) -> dict[str, Any]:
         "backward": _backward(used),
         "future": int(np.sum(used["published"] > used["arrival"])),
         "lock_s": _round(_lock_s(notes)),
+        "seed": seed,
         "upstream_p99_ms": _round(_p99(upstream)),
         "upstream_max_ms": _round(float(np.max(np.abs(upstream)))),
         "arrival_p99_ms": _round(_p99(arrival)),
@@ -146,7 +151,7 @@ def measure(row: Row, seed: int) -> dict[str, Any]:
     }
 
 
-def measure_load(name: str, seed: int) -> dict[str, Any]:
+def measure_load(name: str, seed: int) -> Row:
     """Return how far stamps are off under one shape of load and after it."""
     loads = SHAPES[name]
     seconds = max(load.stop for load in loads) + _AFTER_S
@@ -166,10 +171,11 @@ def measure_load(name: str, seed: int) -> dict[str, Any]:
         "future": int(np.sum(used["published"] > used["arrival"])),
         "held": clock.status().held,
         "events": len(clock.reported) - 1,
+        "seed": seed,
     }
 
 
-def load_targets(results: list[dict[str, Any]]) -> list[Target]:
+def load_targets(results: list[Row]) -> list[Target]:
     """Return what was asked for under load."""
     excess = max(item["during_max_ms"] - item["least_delay_ms"] for item in results)
     return [
@@ -181,7 +187,7 @@ def load_targets(results: list[dict[str, Any]]) -> list[Target]:
     ]
 
 
-def targets(results: list[dict[str, Any]]) -> list[Target]:
+def targets(results: list[Row]) -> list[Target]:
     """Return what was asked for."""
     asked = [item for item in results if item["fault"] != "IMU off"]
     disturbed = [item for item in asked if _is_disturbed(item)]
@@ -249,15 +255,15 @@ def _p99(errors: NDArray[np.float64]) -> float:
     return float(np.percentile(np.abs(errors), 99))
 
 
-def _most(results: list[dict[str, Any]], key: str) -> float:
+def _most(results: list[Row], key: str) -> float:
     return max(float(item[key]) for item in results)
 
 
-def _least_gain(results: list[dict[str, Any]], key: str) -> float:
+def _least_gain(results: list[Row], key: str) -> float:
     return min(float(item[key]) / max(float(item["p99_ms"]), 1e-6) for item in results)
 
 
-def _is_disturbed(item: dict[str, Any]) -> bool:
+def _is_disturbed(item: Row) -> bool:
     return item["jitter"] != "none" or "burst" in item["fault"]
 
 
@@ -265,64 +271,74 @@ def _round(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def markdown(results: list[dict[str, Any]]) -> str:
-    """Return the results as a table in Markdown."""
-    heads = [
-        "ratio", "drift", "sync", "jitter", "fault", "mean", "p99", "max",
-        "IMU spacing p99 / max [us]", "lock [s]", "upstream p99 / max", "arrival p99 / max",
-    ]  # fmt: skip
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for item in results:
-        cells = [
-            f"{item['ratio']:g}",
-            item["drift"],
-            item["sync"],
-            item["jitter"],
-            item["fault"],
-            f"{item['mean_ms']:.4f}",
-            f"**{item['p99_ms']:.4f}**",
-            f"{item['max_ms']:.4f}",
-            f"{item['imu_spacing_p99_us']:.2f} / {item['imu_spacing_max_us']:.1f}",
-            f"{item['lock_s']:.2f}",
-            f"{item['upstream_p99_ms']:.4g} / {item['upstream_max_ms']:.4g}",
-            f"{item['arrival_p99_ms']:.4g} / {item['arrival_max_ms']:.4g}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def carry_out(
+    work: Callable[[W, int], Row],
+    todo: Iterable[tuple[W, int]],
+    kept: KeptRows,
+    pool: ProcessPoolExecutor,
+    until: float,
+) -> int:
+    """Measure and keep one row after the other; return how many were left out for want of time."""
+    waiting = list(todo)[::-1]
+    running: set[Future[Row]] = set()
+    while running or (waiting and time.monotonic() < until):
+        while waiting and time.monotonic() < until and len(running) < _AHEAD:
+            running.add(pool.submit(work, *waiting.pop()))
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            kept.append(future.result())
+    return len(waiting)
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; return 0 when every target is met."""
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", "240")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random")
-    parser.add_argument("--docs", action="store_true", help=f"renew the table in {_DOCS}")
+    parser.add_argument("--docs", action="store_true", help=f"write {clock_pages.PAGE}")
     parser.add_argument("--jobs", type=int, help="processes, as many as cores if left out")
-    parser.add_argument("--loads", type=int, default=1, help="seeds of every shape of load")
-    arguments = parser.parse_args()
-    todo = rows()
-    seeds = [1000 * arguments.seed + number for number in range(len(todo))]
-    with ProcessPoolExecutor(arguments.jobs) as pool:
-        running = pool.map(measure, todo, seeds)
-        results = list(track(running, "measuring", total=len(todo)))
-        shapes = [name for name in SHAPES for _ in range(arguments.loads)]
-        seeds = [1000 * arguments.seed + 500 + number for number in range(len(shapes))]
-        running = pool.map(measure_load, shapes, seeds)
-        loaded = list(track(running, "under load", total=len(shapes)))
-    found = targets(results)
+    parser.add_argument("--loads", type=int, default=3, help="seeds of every shape of load")
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no run after that")
+    parser.add_argument("--resume", action="store_true", help="keep the rows that there are")
+    given = parser.parse_args(arguments)
+    kept = KeptRows(FOLDER / "clock.jsonl", _KEY)
+    kept_loads = KeptRows(FOLDER / "clock-loads.jsonl", _KEY)
+    if not given.resume:
+        kept.clear()
+        kept_loads.clear()
+    seeded = [(row, 1000 * given.seed + number) for number, row in enumerate(rows())]
+    loads = [
+        (name, 1000 * given.seed + 500 + 10 * number + more)
+        for number, name in enumerate(SHAPES)
+        for more in range(given.loads)
+    ]
+    done = {row["seed"] for row in kept.read()} | {row["seed"] for row in kept_loads.read()}
+    until = time.monotonic() + 60.0 * given.minutes
+    with ProcessPoolExecutor(given.jobs) as pool:
+        todo = [(row, seed) for row, seed in seeded if seed not in done]
+        left = carry_out(measure, todo, kept, pool, until)
+        shapes = [(name, seed) for name, seed in loads if seed not in done]
+        left += carry_out(measure_load, shapes, kept_loads, pool, until)
+    if left:
+        print(f"{left} runs were left out; go on with --resume", file=sys.stderr)
+        return 1
+    results = _asked(kept, [seed for _, seed in seeded])
+    loaded = _asked(kept_loads, [seed for _, seed in loads])
+    found, found_under_load = targets(results), load_targets(loaded)
     publish(
         "clock", "Error of every published stamp, constant path delay set aside", results, found
     )
-    found_under_load = load_targets(loaded)
     publish("clock-loads", "Error of stamps under load and after it", loaded, found_under_load)
-    found += found_under_load
-    if arguments.docs:
-        text = _DOCS.read_text()
-        head, rest = text.split(_MARKS[0])
-        _, tail = rest.split(_MARKS[1])
-        _DOCS.write_text(f"{head}{_MARKS[0]}\n{markdown(results)}\n{_MARKS[1]}{tail}")
-    return 0 if all(target.met for target in found) else 1
+    if given.docs:
+        clock_pages.write(results, found, loaded, found_under_load)
+    return 0 if all(target.met for target in found + found_under_load) else 1
+
+
+def _asked(kept: KeptRows, seeds: Sequence[int]) -> list[Row]:
+    """Return the rows of these seeds, in their order."""
+    by_seed = {row["seed"]: row for row in kept.read()}
+    return [by_seed[seed] for seed in seeds]
 
 
 if __name__ == "__main__":

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from benchmarks.odometry_methods import REFEREES
+from benchmarks.results import KeptRows
 from tests.support.odometry_runs import CUTS
 
 SLOW = ("ct_icp", "lio_sam")
@@ -113,45 +112,13 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
-    """The rows found so far, one a line; several processes may append.
-
-    Attributes
-    ----------
-    path : Path
-    key : tuple of str
-        What tells one run from another.
-    """
+class Rows(KeptRows):
+    """The rows of the odometry's runs."""
 
     path: Path = Path("out") / "bench" / "odometry.jsonl"
     key: tuple[str, ...] = KEY
 
-    def clear(self) -> None:
-        """Forget all rows."""
-        self.path.unlink(missing_ok=True)
-
-    def append(self, row: Row) -> None:
-        """Keep a row, and tell of it on standard error."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a", encoding="utf-8") as file:
-            # the line before may have been cut off
-            file.write("\n" + json.dumps(row, default=float) + "\n")
+    def describe(self, row: Row) -> str:
+        """Return what is printed of a row."""
         words = ", ".join(str(row[name]) for name in self.key)
-        print(
-            f"{words}: {1e3 * row['ate_m']:.1f} mm, {row['real_time_factor']:.1f} x real time",
-            file=sys.stderr,
-            flush=True,
-        )
-
-    def read(self) -> list[Row]:
-        """Return the rows, the last of each run; a line that was cut off does not count."""
-        return list({tuple(row[name] for name in self.key): row for row in self._rows()}.values())
-
-    def _rows(self) -> Iterator[Row]:
-        if not self.path.exists():
-            return
-        for line in self.path.read_text(encoding="utf-8").splitlines():
-            try:
-                yield json.loads(line)
-            except ValueError:
-                continue
+        return f"{words}: {1e3 * row['ate_m']:.1f} mm, {row['real_time_factor']:.1f} x real time"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,54 @@ def at_least(name: str, value: float, bound: float) -> Target:
 def at_most(name: str, value: float, bound: float) -> Target:
     """Return a target that is met up to ``bound``."""
     return Target(name, value, bound, value <= bound)
+
+
+@dataclass(frozen=True, slots=True)
+class KeptRows:
+    """The rows found so far, one a line of a file; several processes may append.
+
+    Attributes
+    ----------
+    path : Path
+    key : tuple of str
+        What tells one run from another.
+    """
+
+    path: Path
+    key: tuple[str, ...]
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.path.unlink(missing_ok=True)
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Keep a row, and print it on standard error."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a", encoding="utf-8") as file:
+            # the line before may have been cut off
+            file.write("\n" + json.dumps(row, default=float) + "\n")
+        print(self.describe(row), file=sys.stderr, flush=True)
+
+    def describe(self, row: dict[str, Any]) -> str:
+        """Return what is printed of a row."""
+        return ", ".join(f"{name} {_text(value)}" for name, value in row.items())
+
+    def read(self) -> list[dict[str, Any]]:
+        """Return the rows, the last of each run; a line that was cut off does not count."""
+        return list({self.key_of(row): row for row in self._rows()}.values())
+
+    def key_of(self, row: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return what tells a row from those of other runs."""
+        return tuple(row[name] for name in self.key)
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        if not self.path.exists():
+            return
+        for line in self.path.read_text(encoding="utf-8").splitlines():
+            try:
+                yield json.loads(line)
+            except ValueError:
+                continue
 
 
 def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable[Target]) -> Path:
