@@ -25,13 +25,19 @@ from benchmarks import clock_pages
 from benchmarks.results import FOLDER, KeptRows, Target, at_least, at_most, publish
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.settings import Value
-from tests.support.clock_loads import SHAPES, load_errors
+from tests.support.clock_loads import SHAPES, Load, load_errors
 from tests.support.clock_rig import EPOCH_NS, Case, run
 
 RATIOS: Final = (1.0, 1.95, 1.99866, 2.0)
 SYNCS: Final = ("off", "once", "periodic")
 _AFTER_S: Final = 8.0  # that a run goes on after its load
 _PATH_NS: Final = 150_000  # what the virtual unit needs to send a packet
+_SLEWS: Final = ((10.0, 30.0, 500.0), (40.0, 50.0, -500.0))
+_SLEWED_LOADS: Final[dict[str, tuple[Load, ...]]] = {
+    "none": (),
+    "20 ms batches from 4 s": (Load(start=4, stop=60, batch_ms=20.0),),
+    "100 ms batches from 4 s": (Load(start=4, stop=60, batch_ms=100.0),),
+}
 _UPSTREAM_RATIO: Final = 2  # timeScaleNum / timeScaleDenom as shipped
 _MS: Final = 1e6
 _DRIFT: Final = {"clock_wave_ppm": 50.0, "clock_wave_s": 300.0}
@@ -69,11 +75,6 @@ class Task:
     jitter: str
     fault: str
     case: Case
-
-    @property
-    def is_disturbed(self) -> bool:
-        """Whether arrivals are."""
-        return self.jitter != "none" or "burst" in self.fault or self.fault == "everything"
 
 
 def rows() -> list[Task]:
@@ -113,6 +114,15 @@ def rows() -> list[Task]:
             Case(ratio=1.99866, sync=sync, crystal=_DRIFT, faults=_JITTERS["0.5 ms"], imu=False),
         )
         for sync in SYNCS
+    ]
+    out += [
+        Task(
+            "yes",
+            name,
+            "NTP slew 500 ppm",
+            Case(ratio=1.99866, sync="once", crystal=_DRIFT, loads=loads, slews=_SLEWS),
+        )
+        for name, loads in _SLEWED_LOADS.items()
     ]
     return out
 

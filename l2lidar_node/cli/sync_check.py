@@ -50,6 +50,9 @@ class _Collector:
     def stepped(self, by_ns: int, at: HostNs) -> None:
         """Ignore it."""
 
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        """Ignore it."""
+
     def close(self) -> None:
         """Do nothing."""
 

@@ -72,6 +72,8 @@ class ClockStatus:
         path delays every packet.
     late_ns : int
         How late even the least delayed of the latest packets was, beyond the path's constant part.
+    slew_ppm : float
+        How fast time servers are slewing the host's clock, where that is told [ppm].
     path_delay_ns : int
         Half the shortest measured round trip, which is taken off every stamp; 0 if not measured.
     synced : bool
@@ -93,6 +95,7 @@ class ClockStatus:
     residual_ns: int
     uncertainty_ns: int
     late_ns: int
+    slew_ppm: float
     path_delay_ns: int
     synced: bool
     epochs: int
@@ -261,6 +264,14 @@ class DeviceClock:
             self._report_step(by_ns, is_told=False)
         self._host.stepped(by_ns, at)
 
+    def host_slewed(self, by_ns: int, at: HostNs) -> None:
+        """Take note of how far slewing has moved the host's clock, at ``at``, in all [ns].
+
+        To be called whenever the last two calls do not predict it. From the first call on, slewing
+        is not inferred from arrivals.
+        """
+        self._host.slewed(by_ns, at)
+
     def sync_due(self, now: HostNs) -> bool:
         """Return whether a time-sync command should be sent now."""
         return self._schedule.due(now)
@@ -283,6 +294,7 @@ class DeviceClock:
             residual_ns=round(line.excess),
             uncertainty_ns=round(self._host.uncertainty_ns),
             late_ns=self._host.late_ns,
+            slew_ppm=1e6 * self._host.slew_rate,
             path_delay_ns=self._host.advance_ns,
             synced=self._schedule.in_force,
             epochs=self._device.epochs,

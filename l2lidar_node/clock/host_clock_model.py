@@ -36,7 +36,70 @@ _REANCHOR_BLOCKS: Final = 20
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
 _LOADED_BLOCKS: Final = 3  # where steps are told, late packets that keep coming mean load
 _BACKWARD_BLOCKS: Final = 2  # early ones cannot have
+_KNOTS: Final = 64  # of the slewing, told every 100 ms where it is steady
+_SUDDEN: Final = 1e-3  # a rate that changes by more is followed at once
+_FASTEST_SLEW: Final = 0.1  # adjtimex(2) allows a tenth, by the length of the tick
 _FLOWING: Final = 0.7  # a backlog that drains arrives in no time, a stepped clock goes on
+
+
+class HostSlewing:
+    """How far slewing has moved the host's clock: a piecewise linear function of host time.
+
+    Host time minus this is *even* host time, which runs at the rate of the host's oscillator.
+
+    Attributes
+    ----------
+    is_told : bool
+        Whether anything was told; until then nothing has moved.
+    """
+
+    __slots__ = ("_base", "_knots", "is_told")
+
+    def __init__(self) -> None:
+        self.is_told = False
+        self._base = 0
+        self._knots: deque[tuple[int, int]] = deque([(0, 0)], maxlen=_KNOTS)
+
+    def told(self, by_ns: int, at: int) -> None:
+        """Take note of how far it has been moved [ns] when it shows ``at``."""
+        if not self.is_told:
+            self.is_told = True
+            self._base = by_ns
+            self._knots.clear()
+        knots = self._knots
+        while knots and knots[-1][0] >= at:  # the clock was set back, and nobody told
+            knots.pop()
+        knots.append((at, by_ns - self._base))
+
+    def stepped(self, by_ns: int) -> None:
+        """Take note that the host's clock was set."""
+        self._knots = deque(((at + by_ns, by) for at, by in self._knots), maxlen=_KNOTS)
+
+    @property
+    def rate(self) -> float:
+        """Slewing of late [ns per ns of host time]."""
+        knots = self._knots
+        if len(knots) < 2:
+            return 0.0
+        (t0, s0), (t1, s1) = knots[-2], knots[-1]
+        return min(max((s1 - s0) / (t1 - t0), -_FASTEST_SLEW), _FASTEST_SLEW)
+
+    def at(self, host: int) -> int:
+        """Return how far the clock was moved when it showed ``host`` [ns]."""
+        knots = self._knots
+        at, by = knots[-1]
+        if host >= at:
+            return by + round((host - at) * self.rate)
+        for begin in range(len(knots) - 2, -1, -1):
+            t0, s0 = knots[begin]
+            if host >= t0:
+                return s0 + (by - s0) * (host - t0) // (at - t0)
+            at, by = t0, s0
+        return by
+
+    def host(self, even: int) -> int:
+        """Return the host time of an even host time."""
+        return even + self.at(even + self._knots[-1][1])
 
 
 class HostClockModel:
@@ -68,6 +131,9 @@ class HostClockModel:
     continuous, strictly rising line that runs at the fitted ratio and closes in on the fit with a
     time constant of 0.5 s, never more than 0.2 % faster or slower: samples 4 ms apart stay 4 ms
     apart.
+
+    Where slewing of the host's clock is told, the fit is in even host time: its ratio is that of
+    two oscillators, which no time server changes. What is published follows the slewing.
     """
 
     __slots__ = (
@@ -79,6 +145,7 @@ class HostClockModel:
         "_packets",
         "_reanchors",
         "_segments",
+        "_slewing",
         "_slipped",
         "_slope",
         "_suspects",
@@ -99,6 +166,7 @@ class HostClockModel:
         self.is_told = False
         self._from = 0  # arrivals before may be told in a time before the clock was set
         self.steps: deque[int] = deque(maxlen=64)
+        self._slewing = HostSlewing()
         self.reset()
 
     def reset(self) -> None:
@@ -115,7 +183,7 @@ class HostClockModel:
         self._u = self._host = 0
         self._slope = self.line.ratio
         self._low: float | None = None
-        self._low_at = (0, 0)
+        self._low_at = (0, 0)  # in even host time, once the block has ended
         self.due = 0
 
     def add(self, u: int, arrival: int) -> None:
@@ -123,7 +191,7 @@ class HostClockModel:
         if arrival < self._from:
             return
         if not self.ready:
-            self._packets.append((u, arrival))
+            self._packets.append((u, arrival - self._slewing.at(arrival)))
             if len(self._packets) > _MOST:
                 del self._packets[: _MOST // 2]
             return
@@ -142,6 +210,7 @@ class HostClockModel:
         if not by_ns:
             return
         self._from = at
+        self._slewing.stepped(by_ns)
         self._suspects.clear()
         self._low = None
         if self._envelope is None:
@@ -150,6 +219,23 @@ class HostClockModel:
         self._envelope.host_stepped(by_ns)
         u = self._u + max(int((at - by_ns - self._host) / self._slope), 0)
         self._go(u, self.at(u) + by_ns, self._slope)
+
+    def slewed(self, by_ns: int, at: int) -> None:
+        """Take note of how far slewing has moved the host's clock in all [ns], at ``at``."""
+        before = self._slewing.rate
+        self._slewing.told(by_ns, at)
+        if self._envelope is None:
+            return
+        self._envelope.is_slewing_told = True
+        after = self._slewing.rate
+        if abs(after - before) > _SUDDEN and at > self._host:
+            u = self._u + int((at - self._host) / self._slope)
+            self._go(u, self.at(u), self._slope * (1.0 - before) / (1.0 - after))
+
+    @property
+    def slew_rate(self) -> float:
+        """How fast the host's clock is being slewed [ns per ns], as far as that is told."""
+        return self._slewing.rate
 
     def reanchor(self) -> None:
         """Let the next blocks say whether device time has slipped, as after a foreign step.
@@ -195,8 +281,9 @@ class HostClockModel:
         if span < _LOCK_NS and line.excess > _QUIET_NS:
             return
         self._envelope = LowerEnvelope(line, packets, is_told=self.is_told)
+        self._envelope.is_slewing_told = self._slewing.is_told
         self._packets = []
-        self._go(u, line.at(u) - self.advance_ns, line.ratio)
+        self._go(u, self._wanted(line, u), line.ratio / (1.0 - self._slewing.rate))
         self.line = line
         self.uncertainty_ns = self._envelope.uncertainty_ns
         self.ready = True
@@ -208,6 +295,9 @@ class HostClockModel:
 
     def _follow(self, envelope: LowerEnvelope, u: int) -> None:
         low, self._low = self._low, None
+        if low is not None:
+            at, arrival = self._low_at
+            self._low_at = at, arrival - self._slewing.at(arrival)
         moves = envelope.moves
         if low is not None and envelope.begins_anew(self._low_at):
             self._suspects.clear()
@@ -215,16 +305,21 @@ class HostClockModel:
             envelope.close(self._low_at, u)
         self.line = line = envelope.line
         self.uncertainty_ns = envelope.uncertainty_ns
-        wanted = line.at(u) - self.advance_ns
+        wanted = self._wanted(line, u)
+        ratio = line.ratio / (1.0 - self._slewing.rate)
         host = self.at(u)
         is_new = envelope.moves != moves or (self.is_told and not envelope.is_known)
         if is_new and abs(wanted - host) > _STEP_NS:
             self.steps.append(wanted - host)
-            self._go(u, wanted, line.ratio)
+            self._go(u, wanted, ratio)
             return
         self.uncertainty_ns += abs(wanted - host)
         pull = (wanted - host) / _SETTLE_NS
-        self._go(u, host, line.ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
+        self._go(u, host, ratio * (1.0 + min(max(pull, -_SLEW), _SLEW)))
+
+    def _wanted(self, line: Line, u: int) -> int:
+        """Return the host time of a place on a fitted line."""
+        return self._slewing.host(line.at(u)) - self.advance_ns
 
     def _stepped(self, envelope: LowerEnvelope, u: int) -> bool:
         """Look for a step of the host's clock; return whether the block was dealt with."""

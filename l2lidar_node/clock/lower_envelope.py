@@ -165,6 +165,8 @@ class LowerEnvelope:
     Attributes
     ----------
     line : Line
+    is_slewing_told : bool
+        Whether the slewing of the host's clock is taken off the arrivals; else it is inferred.
     moves : int
         How often the line was laid elsewhere at once, instead of following the blocks.
     uncertainty_ns : float
@@ -183,12 +185,13 @@ class LowerEnvelope:
     a new line.
     """
 
-    __slots__ = ("_blocks", "_evidence", "_fitted_u", "_hi", "_latest", "_lo", "_reach", "is_told",
-                 "line", "moves", "uncertainty_ns")  # fmt: skip
+    __slots__ = ("_blocks", "_evidence", "_fitted_u", "_hi", "_latest", "_lo", "_reach",
+                 "is_slewing_told", "is_told", "line", "moves", "uncertainty_ns")  # fmt: skip
 
     def __init__(self, line: Line, packets: list[tuple[int, int]], *, is_told: bool) -> None:
         self.line = line
         self.is_told = is_told
+        self.is_slewing_told = False
         self._blocks: deque[tuple[int, int]] = deque(maxlen=_LONG_BLOCKS)
         self._latest: deque[tuple[int, int]] = deque(maxlen=_VOTERS)
         self.moves = 0
@@ -257,13 +260,15 @@ class LowerEnvelope:
 
         Load cannot be told from that by any single packet, but it makes the least delay vary, and
         it sets in with a jump: only blocks on a straight line that began at the present one count.
+        Where slewing is told, all that is left is what two crystals can differ by.
         """
+        most = _KNOWN if self.is_slewing_told else _UNTOLD_WIDTH
         for count in _TRENDS:
             recent = sorted(list(self._blocks)[-count:])
             if len(recent) < count:
                 return
             line = supporting_line(recent, self.line.ratio)
-            if line is None or abs(line.ratio - self.line.ratio) > _UNTOLD_WIDTH * line.ratio:
+            if line is None or abs(line.ratio - self.line.ratio) > most * line.ratio:
                 continue
             u0, h0 = recent[0]
             points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]

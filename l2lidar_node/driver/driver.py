@@ -1,9 +1,9 @@
 """Composes the driver's parts: bytes with their arrival in, sweeps and samples out; no socket.
 
 Every method takes the time as an argument and returns what happened. What comes out depends on
-the calls of :meth:`Driver.receive`, :meth:`Driver.sent`, :meth:`Driver.settle` and
-:meth:`Driver.host_stepped`, their order and their arguments alone, so a recording of those gives
-what the live sensor gave, bit for bit.
+the calls of :meth:`Driver.receive`, :meth:`Driver.sent`, :meth:`Driver.settle`,
+:meth:`Driver.host_stepped` and :meth:`Driver.host_slewed`, their order and their arguments alone,
+so a recording of those gives what the live sensor gave, bit for bit.
 """
 
 from __future__ import annotations
@@ -159,6 +159,14 @@ class Driver:
         """
         self._clock.host_stepped(by_ns, at)
         return [*self._clock.events()]
+
+    def host_slewed(self, by_ns: int, at: HostNs) -> None:
+        """Take note of how far slewing has moved the clock of arrivals since a fixed instant.
+
+        To be called whenever the last two calls do not predict it; see
+        :meth:`DeviceClock.host_slewed`.
+        """
+        self._clock.host_slewed(by_ns, at)
 
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would do anything."""

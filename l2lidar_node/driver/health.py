@@ -235,6 +235,7 @@ def _clock(
         "residual [ms]": f"{status.residual_ns / 1e6:.3f}",
         "uncertainty [ms]": f"{status.uncertainty_ns / 1e6:.3f}",
         "latency [ms]": f"{status.late_ns / 1e6:.3f}",
+        "host clock slewed [ppm]": f"{status.slew_ppm:+.1f}",
         "path delay [ms]": f"{status.path_delay_ns / 1e6:.3f}",
         "epochs": str(status.epochs),
         "packets without stamp": str(sum(new.unlocked.values())),

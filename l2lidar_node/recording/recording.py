@@ -25,7 +25,16 @@ WAITED: Final = b"l2lidar_node: nothing that was due is waited for from here on"
 STEPPED: Final = b"l2lidar_node: the host's clock was set by %+d ns"
 """Likewise for :class:`Stepped`."""
 
-_STEP: Final = re.compile(re.escape(STEPPED).replace(re.escape(b"%+d"), rb"([+-][0-9]{1,18})"))
+SLEWED: Final = b"l2lidar_node: the host's clock was slewed by %+d ns since the host started"
+"""Likewise for :class:`Slewed`."""
+
+
+def _pattern(note: bytes) -> re.Pattern[bytes]:
+    return re.compile(re.escape(note).replace(re.escape(b"%+d"), rb"([+-][0-9]{1,18})"))
+
+
+_STEP: Final = _pattern(STEPPED)
+_SLEW: Final = _pattern(SLEWED)
 
 _FROM_DEVICE: Final = frozenset(
     int(kind)
@@ -69,7 +78,14 @@ class Stepped(NamedTuple):
     time: HostNs
 
 
-Entry = Received | Sent | Waited | Stepped
+class Slewed(NamedTuple):
+    """How far slewing had moved the host's clock [ns] when the driver was told."""
+
+    by_ns: int
+    time: HostNs
+
+
+Entry = Received | Sent | Waited | Stepped | Slewed
 
 
 class Recording:
@@ -182,13 +198,20 @@ class RecordingWriter:
         """Append that the driver was told that the host's clock was set."""
         self._capture.write(UdpDatagram(at, self._host, self._host, STEPPED % by_ns))
 
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        """Append that the driver was told how far slewing had moved the host's clock."""
+        self._capture.write(UdpDatagram(at, self._host, self._host, SLEWED % by_ns))
 
-def _noted(data: bytes, time: HostNs) -> Waited | Stepped | None:
+
+def _noted(data: bytes, time: HostNs) -> Waited | Stepped | Slewed | None:
     """Return what a datagram from the host to itself stands for."""
     if data == WAITED:
         return Waited(time)
     step = _STEP.fullmatch(data)
-    return None if step is None else Stepped(int(step[1]), time)
+    if step is not None:
+        return Stepped(int(step[1]), time)
+    slew = _SLEW.fullmatch(data)
+    return None if slew is None else Slewed(int(slew[1]), time)
 
 
 def _sent(frame: Frame, time: HostNs) -> Iterator[Sent]:
@@ -296,6 +319,10 @@ class Recorder:
     def stepped(self, by_ns: int, at: HostNs) -> None:
         """Write that the driver was told that the host's clock was set."""
         self._write(lambda: self._writer.stepped(by_ns, at), at)
+
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        """Write that the driver was told how far slewing had moved the host's clock."""
+        self._write(lambda: self._writer.slewed(by_ns, at), at)
 
     def close(self) -> None:
         """Write what is left and close the file; may be called more than once."""

@@ -10,7 +10,7 @@ from typing import Final
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Entry, Received, Recording, Sent, Stepped
+from l2lidar_node.recording.recording import Entry, Received, Recording, Sent, Slewed, Stepped
 from l2lidar_node.transport.session import Loop
 from l2lidar_node.types import LAST_STAMP, Datagram, HostNs, ImuSample, Sweep, is_ros_time
 
@@ -35,6 +35,9 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
         return driver.sent(entry.command, entry.time)
     if isinstance(entry, Stepped):
         return driver.host_stepped(entry.by_ns, entry.time)
+    if isinstance(entry, Slewed):
+        driver.host_slewed(entry.by_ns, entry.time)
+        return []
     return driver.settle(entry.time)
 
 

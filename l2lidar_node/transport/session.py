@@ -172,6 +172,9 @@ class Tap(Protocol):
     def stepped(self, by_ns: int, at: HostNs) -> None:
         """Take note that the driver is told that the host's clock was set."""
 
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        """Take note that the driver is told how far slewing has moved the host's clock."""
+
     def close(self) -> None:
         """Take note that this was all."""
 
@@ -210,6 +213,7 @@ class Session(Loop):
     def _work(self) -> None:
         now = next_tick = self._now()
         self._stepped(0, now)
+        self._watch_slewing(now)
         while not self._stopping.is_set():
             batch = self.transport.receive(TICK_S)
             for data, arrival in batch:
@@ -227,6 +231,7 @@ class Session(Loop):
                 if step:
                     now = self._now()
                     self._stepped(step, now)
+                self._watch_slewing(now)
                 next_tick = HostNs(now + _TICK_NS)
                 # More may wait in the socket than one batch holds.
                 self._tick(now, batch[-1].arrival if batch else before)
@@ -244,6 +249,13 @@ class Session(Loop):
         if self._tap:
             self._tap.stepped(by_ns, at)
         self._hand_out(self.driver.host_stepped(by_ns, at))
+
+    def _watch_slewing(self, now: HostNs) -> None:
+        slewed = self._clock.slewed_ns()
+        if slewed is not None:
+            if self._tap:
+                self._tap.slewed(slewed, now)
+            self.driver.host_slewed(slewed, now)
 
     def _send(self) -> None:
         for frame, at in self.driver.outbox():

@@ -26,6 +26,7 @@ from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType, WorkMode
 from l2lidar_node.settings import Value, build
+from l2lidar_node.transport.host_clock import HostClock
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 from tests.support.clock_loads import Load, LoadedPath
 
@@ -66,6 +67,10 @@ class Case:
         What delays packets on their way, in seconds since power-on.
     stale : (float, float)
         How many old packets a second come again, and how old they are [s].
+    slews : tuple of (float, float, float)
+        From when to when [s] a time server slews the host's clock, and by how much [ppm].
+    are_slews_told : bool
+        Whether the driver is told, as by a session.
     standbys : tuple of (float, float)
         From when to when the driver puts the unit into standby [s].
     boot_scale : float
@@ -84,6 +89,8 @@ class Case:
     faults: dict[str, Value] = field(default_factory=dict)
     loads: tuple[Load, ...] = ()
     stale: tuple[float, float] = (0.0, 0.0)
+    slews: tuple[tuple[float, float, float], ...] = ()
+    are_slews_told: bool = True
     standbys: tuple[tuple[float, float], ...] = ()
     boot_scale: float = 0.25
     imu: bool = True
@@ -145,6 +152,18 @@ class _UnevenScanner(PatternScanner):
         return payloads, np.asarray(self._starts[first : first + count])
 
 
+class _SlewedClock(HostClock):
+    """The host's clock as a session watches it."""
+
+    def __init__(self, case: Case) -> None:
+        super().__init__()
+        self.true_ns = EPOCH_NS
+        self._case = case
+
+    def _read_slewing(self) -> tuple[int, int, int]:
+        return self.true_ns, slewed_ns(self._case, self.true_ns), 0
+
+
 def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
     """Return what happened to every packet, shape (N,), dtype NOTE, and the clock at the end."""
     device = _device(case, seed)
@@ -160,6 +179,7 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
     driver._clock = clock
     clock.sequence = driver.counters.sequence
     driver.host_stepped(0, HostNs(EPOCH_NS))  # nobody sets the host's clock, as a session knows
+    host = _SlewedClock(case)
     rng = np.random.default_rng([seed, 106])
     commands: list[tuple[int, int, bytes]] = []
     path = LoadedPath(case.loads, seed)
@@ -191,19 +211,31 @@ def run(case: Case, seed: int) -> tuple[NDArray[np.void], RecordingClock]:
                 count += 1
         while way and way[0][0] <= now:
             arrival, _, datagram = heapq.heappop(way)
-            driver.receive(datagram, HostNs(arrival))
+            driver.receive(datagram, HostNs(arrival + slewed_ns(case, arrival)))
+        host.true_ns = now
+        shown = HostNs(now + slewed_ns(case, now))
+        slewed = host.slewed_ns()
+        if slewed is not None and case.are_slews_told:
+            driver.host_slewed(slewed, shown)
         while standbys and EPOCH_NS + standbys[0][0] * 1e9 <= now:
             _, is_start = standbys.pop(0)
             if is_start:
-                driver.start_rotation(HostNs(now))
+                driver.start_rotation(shown)
             else:
-                driver.stop_rotation(HostNs(now))
-        driver.tick(HostNs(now))
+                driver.stop_rotation(shown)
+        driver.tick(shown)
         for data, _ in driver.outbox():
             latency = _COMMAND_NS + round(rng.exponential(_COMMAND_NS))
             heapq.heappush(commands, (now + latency, count, data))
             count += 1
-    return _with_truth(clock, device), clock
+    return _with_truth(clock, device, case), clock
+
+
+def slewed_ns(case: Case, instant: int) -> int:
+    """Return how far the host's clock has been moved by slewing at a true instant [ns]."""
+    at = (instant - EPOCH_NS) * 1e-9
+    seconds = (max(min(at, stop) - start, 0.0) * ppm for start, stop, ppm in case.slews)
+    return round(sum(seconds) * 1e3)
 
 
 def _device(case: Case, seed: int) -> VirtualL2:
@@ -220,7 +252,7 @@ def _device(case: Case, seed: int) -> VirtualL2:
     return VirtualL2(config, scanner, StillInertial(), power_on_ns=EPOCH_NS)
 
 
-def _with_truth(clock: RecordingClock, device: VirtualL2) -> NDArray[np.void]:
+def _with_truth(clock: RecordingClock, device: VirtualL2, case: Case) -> NDArray[np.void]:
     """Join what the clock saw with the emulator's packet log; stamp and number name a packet."""
     packet_log = device.packet_log.packets
     truth = {
@@ -233,5 +265,6 @@ def _with_truth(clock: RecordingClock, device: VirtualL2) -> NDArray[np.void]:
     notes = np.zeros(len(clock.notes), NOTE)
     for at, (kind, seq, stamp, arrival, duration, sync, answer) in enumerate(clock.notes):
         boot, start = truth[kind, seq, stamp]
+        start += slewed_ns(case, start)
         notes[at] = (kind, boot, seq, stamp, start, arrival, duration, sync, answer)
     return notes

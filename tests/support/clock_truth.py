@@ -17,9 +17,9 @@ from tests.support.clock_loads import Load, LoadedPath
 
 EVENT: Final = np.dtype(
     [
-        ("kind", "u1"),  # IMU, POINTS, SYNC or STEP
+        ("kind", "u1"),  # IMU, POINTS, SYNC, STEP or SLEW
         ("seq", "<i8"),
-        ("stamp", "<i8"),  # [ns] device clock; of a SYNC: the value sent; of a STEP: its size
+        ("stamp", "<i8"),  # [ns] device clock; SYNC: the value sent; STEP, SLEW: by how much
         ("arrival", "<i8"),  # [ns] host clock; of a SYNC: when it was sent; a STEP: was noticed
         ("duration", "<i8"),  # [ns] from the stamped instant to the last measurement
         ("truth", "<i8"),  # [ns] host clock at the stamped instant
@@ -31,6 +31,7 @@ IMU: Final = 0
 POINTS: Final = 1
 SYNC: Final = 2
 STEP: Final = 3
+SLEW: Final = 4
 STREAMS: Final = {IMU: Stream.IMU, POINTS: Stream.POINTS}
 
 _MS: Final = 1_000_000
@@ -70,6 +71,9 @@ class Scenario:
         When another host moves the device's clock, and by how many seconds.
     host_slews : tuple of (float, float, float)
         From when to when a time server adjusts the rate of the host's clock, and by how many ppm.
+    are_slews_told : bool
+        Whether the host tells by how much it was slewed, to 0.2 us: every 100 ms, and when the
+        rate changes.
     host_steps : tuple of (float, float)
         When the host's clock is set, and by how many seconds.
     notice_ms : float
@@ -114,6 +118,7 @@ class Scenario:
     foreign_error: float = 5.0
     foreign_steps: tuple[tuple[float, float], ...] = ()
     host_slews: tuple[tuple[float, float, float], ...] = ()
+    are_slews_told: bool = False
     host_steps: tuple[tuple[float, float], ...] = ()
     notice_ms: float = -1.0
     delays: tuple[tuple[float, float, float], ...] = ()
@@ -146,7 +151,7 @@ def simulate(scenario: Scenario, seed: int) -> NDArray[np.void]:
         parts.append(_packets(scenario, POINTS, instants, _SWEEP, clock))
     syncs, packets = parts[0], np.concatenate(parts[1:])
     packets = _travel(scenario, packets[np.argsort(packets["arrival"], kind="stable")], rng)
-    events = np.concatenate([_told(scenario), syncs, packets])
+    events = np.concatenate([_told(scenario), _slewed(scenario, rng), syncs, packets])
     events = events[np.argsort(events["arrival"], kind="stable")]
     return _on_host_clock(scenario, events)
 
@@ -160,6 +165,25 @@ def _told(scenario: Scenario) -> NDArray[np.void]:
     for event, (at, by) in zip(events[1:], scenario.host_steps, strict=True):
         event["arrival"] = round(at * 1e9 + scenario.notice_ms * _MS)
         event["stamp"] = round(by * 1e9)
+    return events
+
+
+def _slewed(scenario: Scenario, rng: np.random.Generator) -> NDArray[np.void]:
+    """Return what the host says of slewing; times still on the ideal line that starts at 0."""
+    if not scenario.are_slews_told:
+        return np.zeros(0, EVENT)
+    changes = [
+        round(at * 1e9) + delay * _MS
+        for slew in scenario.host_slews
+        for at in slew[:2]
+        for delay in (10, 20)
+    ]
+    steady = np.arange(0, round(scenario.seconds * 1e9), 100 * _MS)
+    instants = np.union1d(steady, np.array(changes, np.int64))
+    events = np.zeros(len(instants), EVENT)
+    events["kind"] = SLEW
+    events["arrival"] = instants
+    events["stamp"] = _host_slewed(scenario, instants) + rng.integers(-200, 200, len(instants))
     return events
 
 
@@ -299,6 +323,11 @@ def _host_shift(scenario: Scenario, instants: NDArray[np.int64]) -> NDArray[np.i
     shift = np.zeros(len(instants), np.int64)
     for at, step in scenario.host_steps:
         shift[instants >= at * 1e9] += int(step * 1e9)
+    return shift + _host_slewed(scenario, instants)
+
+
+def _host_slewed(scenario: Scenario, instants: NDArray[np.int64]) -> NDArray[np.int64]:
+    shift = np.zeros(len(instants), np.int64)
     for start, stop, ppm in scenario.host_slews:
         slewed = np.clip(instants, start * 1e9, stop * 1e9) - start * 1e9
         shift += np.round(slewed * ppm * 1e-6).astype(np.int64)

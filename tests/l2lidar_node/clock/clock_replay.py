@@ -11,7 +11,17 @@ from l2lidar_node.clock import ClockEvent, ClockEventKind, DeviceClock
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.driver.reorder import SequenceOrder
 from l2lidar_node.types import DeviceNs, HostNs, Stream
-from tests.support.clock_truth import EVENT, IMU, POINTS, STEP, STREAMS, SYNC, Scenario, simulate
+from tests.support.clock_truth import (
+    EVENT,
+    IMU,
+    POINTS,
+    SLEW,
+    STEP,
+    STREAMS,
+    SYNC,
+    Scenario,
+    simulate,
+)  # fmt: skip
 
 STAMPED = np.dtype([*EVENT.descr, ("published", "<i8")])
 Packet = tuple[int, int, int, int, int, int]
@@ -87,6 +97,9 @@ class Replay:
                 continue
             if kind == STEP:
                 self.clock.host_stepped(stamp, HostNs(arrival))
+                continue
+            if kind == SLEW:
+                self.clock.host_slewed(stamp, HostNs(arrival))
                 continue
             if seq < 40 and arrival - boots[kind] > 400_000_000:
                 yield from (item for _, item in orders[kind].restart())

@@ -216,20 +216,49 @@ def test_small_foreign_steps_are_seen_and_bridged(jitter_ms: float) -> None:
     assert replay.spread_ms.max() < 0.1
 
 
-@pytest.mark.parametrize(("batch_ms", "worst_ms"), [(0.0, 1.2), (20.0, 2.5), (100.0, 3.2)])
+@pytest.mark.parametrize(
+    ("batch_ms", "told", "worst_ms"),
+    [
+        (0.0, True, 0.15), (20.0, True, 0.4), (100.0, True, 1.0),
+        (0.0, False, 1.2), (20.0, False, 2.5), (100.0, False, 3.2),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("ppm", [500.0, -500.0])
-def test_an_adjusted_rate_of_the_host_clock_is_followed(
-    ppm: float, batch_ms: float, worst_ms: float
+def test_slewing_of_the_host_clock_is_followed(
+    ppm: float, batch_ms: float, told: bool, worst_ms: float
 ) -> None:
     loads = (Load(start=0, stop=60, batch_ms=batch_ms),) if batch_ms else ()
+    slews = ((8.0, 20.0, ppm),)
     replay = Replay(
-        Scenario(seconds=30.0, host_slews=((8.0, 20.0, ppm),), loads=loads, notice_ms=10.0), seed=3
-    )
+        Scenario(
+            seconds=30.0, host_slews=slews, are_slews_told=told, loads=loads, notice_ms=10.0
+        ),
+        seed=3,
+    )  # fmt: skip
     at = (replay.stamped["truth"] - replay.stamped["truth"][0]) * 1e-9
 
     replay.check_promises()
     assert replay.spread_ms.max() < worst_ms
     assert replay.spread_ms[at > 25.0].max() < (0.5 if batch_ms < 50.0 else worst_ms)
+    if told:
+        spacing = np.diff(replay.of(IMU)["published"]) - np.diff(replay.of(IMU)["truth"])
+        assert np.abs(spacing).max() < 10_000
+        ratio = replay.clock.status().ratio
+        assert ratio == pytest.approx(1.99866, rel=1e-5 if batch_ms < 50.0 else 5e-5)
+
+
+def test_slewing_a_tenth_as_fast_as_time_itself_is_followed_across_a_step() -> None:
+    replay = Replay(
+        Scenario(
+            seconds=20.0, host_slews=((6.0, 9.0, 83_000.0), (11.0, 13.0, -83_000.0)),
+            are_slews_told=True, host_steps=((10.0, 0.5), (12.0, 0.3)), notice_ms=0.0,
+        ),
+        seed=3,
+    )  # fmt: skip
+
+    replay.check_promises()
+    assert replay.spread_ms.max() < 2.0
+    assert replay.clock.status().events[ClockEventKind.HOST_STEP] == 2
 
 
 @pytest.mark.parametrize("step", [0.02, 0.2, 3.0])

@@ -110,6 +110,27 @@ def test_load_that_lasts_since_the_start_is_said_to_make_stamps_uncertain() -> N
     assert replay.clock.status().uncertainty_ns < 0.1 * UNCERTAIN_NS  # and certain again later
 
 
+@pytest.mark.parametrize(
+    "load",
+    [
+        Load(start=8, stop=20, least_ms=6, mean_ms=0.3, rising=1.0),
+        Load(start=8, stop=58, least_ms=18, mean_ms=0.1, rising=1.0),
+    ],
+    ids=["6 ms", "18 ms"],
+)
+def test_a_delay_that_grows_evenly_is_no_slewing_where_slewing_is_told(load: Load) -> None:
+    scenario = Scenario(
+        seconds=load.stop + QUIET_S, loads=(load,), notice_ms=10.0, are_slews_told=True,
+        jitter="uniform", jitter_ms=0.2, drift_ppm=50.0, drift_period=300.0,
+    )  # fmt: skip
+    replay = Replay(scenario, 4)
+
+    found = errors(replay, (load,))
+    assert found.during_ms < 0.3 * found.least_ms
+    assert found.after_max_ms < 0.3
+    assert ClockEventKind.EARLIER not in replay.kinds
+
+
 @pytest.mark.parametrize("sync", ["once", "periodic"])
 @pytest.mark.parametrize("kind", ["imu", "points"])
 def test_load_on_one_stream_keeps_both_on_one_time_line(kind: str, sync: str) -> None:

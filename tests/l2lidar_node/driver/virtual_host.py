@@ -41,22 +41,37 @@ class MemoryTap(RecordingWriter):
 
 
 class VirtualClock(HostClock):
-    """A clock that shows what it is told, and is set at given instants."""
+    """A clock that shows what it is told, is set at given instants and slewed in between."""
 
-    def __init__(self, steps: Sequence[tuple[float, float]]) -> None:
+    def __init__(
+        self, steps: Sequence[tuple[float, float]], slews: Sequence[tuple[float, float, float]]
+    ) -> None:
+        super().__init__()
         self.true_ns = EPOCH_NS
+        self._slews = slews
         self._steps = [(EPOCH_NS + round(at * 1e9), round(by * 1e9)) for at, by in steps]
         self._noticed = 0
 
     def shown(self, true_ns: int) -> HostNs:
-        return HostNs(true_ns + sum(by for at, by in self._steps if at <= true_ns))
+        stepped = sum(by for at, by in self._steps if at <= true_ns)
+        return HostNs(true_ns + stepped + self.slewed(true_ns))
+
+    def slewed(self, true_ns: int) -> int:
+        at = (true_ns - EPOCH_NS) * 1e-9
+        moved = (max(min(at, stop) - start, 0.0) * ppm for start, stop, ppm in self._slews)
+        return round(sum(moved) * 1e3)
 
     def now(self) -> HostNs:
         return self.shown(self.true_ns)
 
     def step_ns(self) -> int:
-        before, self._noticed = self._noticed, self.now() - self.true_ns
+        ahead = self.now() - self.true_ns - self.slewed(self.true_ns)
+        before, self._noticed = self._noticed, ahead
         return self._noticed - before
+
+    def _read_slewing(self) -> tuple[int, int, int]:
+        slewed = self.slewed(self.true_ns)
+        return self.true_ns + slewed, slewed + int(self.true_ns * 7919 % 401) - 200, 200
 
 
 class VirtualHost:
@@ -124,6 +139,7 @@ def live_run(
     busy: float = 0.0,
     calls: Sequence[tuple[float, Callable[[Driver, HostNs], object]]] = (),
     host_steps: Sequence[tuple[float, float]] = (),
+    host_slews: Sequence[tuple[float, float, float]] = (),
     late: Sequence[tuple[float, float, float]] = (),
     seed: int = 1,
     power: PowerConfig = READY,
@@ -139,7 +155,7 @@ def live_run(
     )
     scanner = PatternScanner(flat=bool(mode & WorkMode.MODE_2D), empty=empty)
     device = VirtualL2(unit, scanner, StillInertial(), power_on_ns=EPOCH_NS, modes={mode: scanner})
-    clock = VirtualClock(host_steps)
+    clock = VirtualClock(host_steps, host_slews)
     host = VirtualHost(device, clock, seconds, busy, late, seed)
     config = build(DriverConfig, {"watchdog_action": "wait", **(settings or {})})
     tap = MemoryTap()

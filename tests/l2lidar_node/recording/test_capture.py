@@ -10,11 +10,13 @@ from hypothesis import given, strategies as st
 from l2lidar_node.recording.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
 from l2lidar_node.recording.pcap import CaptureError, PacketReader, PacketWriter
 from l2lidar_node.recording.recording import (
+    SLEWED,
     STEPPED,
     WAITED,
     Received,
     Recording,
     Sent,
+    Slewed,
     Stepped,
     Waited,
 )
@@ -304,13 +306,14 @@ def test_a_recording_takes_what_its_host_and_device_said() -> None:
 
 
 def test_only_exact_notes_of_the_host_to_itself_count() -> None:
-    wrong = [b"", STEPPED, STEPPED % 10**30, STEPPED % 5 + b"!", WAITED[:-1]]
-    notes = [STEPPED % 0, STEPPED % -3_600_000_000_000, WAITED]
+    wrong = [b"", STEPPED, STEPPED % 10**30, STEPPED % 5 + b"!", WAITED[:-1], SLEWED % 10**30]
+    notes = [STEPPED % 0, STEPPED % -3_600_000_000_000, WAITED, SLEWED % -5_000]
     packets = [udp_packet(data, HOST, HOST) for data in wrong + notes]
     packets = [(1.0, bytes(packet)) for packet in [udp_packet(IMU), *packets]]
     items = list(Recording(tcpdump(packets, 101)))
-    assert [type(item) for item in items] == [Received, Stepped, Stepped, Waited]
-    assert [item.by_ns for item in items[1:3]] == [0, -3_600_000_000_000]
+    assert [type(item) for item in items] == [Received, Stepped, Stepped, Waited, Slewed]
+    assert items[1:3] == [(0, items[0].time), (-3_600_000_000_000, items[0].time)]
+    assert items[4] == (-5_000, items[0].time)
 
 
 def test_cooked_captures_of_the_loopback_interface_show_everything_once() -> None:

@@ -2,13 +2,14 @@ import io
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 
 from l2lidar_node.clock import ClockEvent, ClockEventKind
-from l2lidar_node.recording.recording import Recording, Stepped, Waited
+from l2lidar_node.recording.recording import Recording, Slewed, Stepped, Waited
 from l2lidar_node.recording.replay import events, shifted
 from l2lidar_node.types import ImuSample, Sweep
-from tests.l2lidar_node.driver.virtual_host import EPOCH_NS, essence, live_run
+from tests.l2lidar_node.driver.virtual_host import EPOCH_NS, VirtualClock, essence, live_run
 
 ROUGH = {
     "loss": 0.01,
@@ -132,6 +133,25 @@ def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step: float) -> Non
         + (f", stamps are held for {-step:.3f} s" if step < 0 else "")
     ]
     assert essence(list(events(Recording(tap.stream), config))) == essence(live)
+
+
+def test_slewing_of_the_host_clock_is_told_when_it_changes_and_replayed() -> None:
+    slews = [(3.0, 5.0, 500.0)]
+    config, live, tap = live_run(7.0, host_slews=slews, settings={"imu_adjust": False})
+
+    told = [entry for entry in Recording(tap.stream) if isinstance(entry, Slewed)]
+    assert 5 <= len(told) < 30  # at the start, at its beginning and end; not while it goes on
+    assert told[-1].by_ns == pytest.approx(1_000_000, abs=5_000)
+    clock = VirtualClock((), slews)
+    for entry in told:
+        since = entry.time - clock.slewed(entry.time)
+        assert entry.by_ns == pytest.approx(clock.slewed(since), abs=1_000)
+    assert essence(list(events(Recording(tap.stream), config))) == essence(live)
+    stamps = np.array([event.stamp for event in live if isinstance(event, ImuSample)])
+    at = (stamps - EPOCH_NS) * 1e-9
+    rate = np.diff(stamps) / 4e6 - 1.0
+    assert np.abs(rate[at[1:] < 2.9]).max() < 5e-6
+    assert np.median(rate[(at[1:] > 4.0) & (at[1:] < 4.9)]) == pytest.approx(500e-6, abs=20e-6)
 
 
 @pytest.mark.parametrize("late", [1.0, 5.0])

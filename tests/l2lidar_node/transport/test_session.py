@@ -302,6 +302,9 @@ class Notes:
     def stepped(self, by_ns: int, at: HostNs) -> None:
         self.steps.append(by_ns)
 
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        pass
+
     def close(self) -> None:
         self.closed += 1
 
