@@ -355,6 +355,17 @@ class FileConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LifecycleConfig:
+    """Who configures and activates a node."""
+
+    autostart: bool = setting(
+        True,
+        "configure and activate the node when it starts; false waits for a lifecycle manager, or "
+        "for ros2 lifecycle set",
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DriverConfig:
     """Everything the driver can be told."""
 
@@ -366,3 +377,4 @@ class DriverConfig:
     topics: TopicConfig = field(default_factory=TopicConfig)
     watchdog: WatchdogConfig = field(default_factory=WatchdogConfig)
     files: FileConfig = field(default_factory=FileConfig)
+    lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.config import LifecycleConfig
 from l2lidar_node.settings import FILE_NAME, FRAME, TOPIC, SettingError, setting
 from l2lidar_node.types import F64
 from l2lidar_proc import rotations
@@ -328,6 +329,7 @@ class DeskewNodeConfig:
 
     topics: DeskewTopics = field(default_factory=DeskewTopics)
     proc: ProcConfig = field(default_factory=ProcConfig)
+    lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -633,3 +635,4 @@ class OdometryNodeConfig:
     topics: OdometryTopics = field(default_factory=OdometryTopics)
     files: DataConfig = field(default_factory=DataConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)

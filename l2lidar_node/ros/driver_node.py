@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import rclpy
+from lifecycle_msgs.msg import Transition
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -30,6 +31,7 @@ from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import Playback
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher
+from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.transport import session
@@ -109,13 +111,18 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
 _ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 1.0
 _NOT_IN_TIME = "the driver did not get to it in time"
 _NO_DEVICE = "a recording is replayed, there is no device to command"
+_NOT_CONFIGURED = "the node is not configured; ros2 lifecycle set {name} configure does that"
 # 4 s, of half turns, for reliable subscribers that are held up.
 _CLOUD_DEPTH = 40
 _IMU_DEPTH = 1000
 
 
-class DriverNode(Node):
+class DriverNode(ManagedNode):
     """Publishes clouds, IMU samples and the static transform of one L2.
+
+    Configured, it listens and says in ``/diagnostics`` what the device does. Active, it publishes.
+    A manager that activates or deactivates it starts or stops the device as well, as ``~/enable``
+    does, which in turn changes the state. A replay begins when the node is first activated.
 
     Raises
     ------
@@ -129,20 +136,39 @@ class DriverNode(Node):
         super().__init__("l2lidar_node")
         self.exit_code = 0
         self._answers: dict[int, Future[Answer]] = {}  # touched by the session's thread only
+        self._session: Loop | None = None
         self._settings = ParameterSet(self, DriverConfig, self._configure)
+        self.create_service(SetBool, "~/enable", self._enable)
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.start(self._settings.value.lifecycle.autostart)
+
+    @property
+    def session(self) -> Loop:
+        """What receives; only while the node is configured."""
+        assert self._session is not None
+        return self._session
+
+    def set_up(self) -> None:
+        """Open publishers and the socket, device or recording, and listen."""
         config = self._settings.value
         self._open_publishers(config)
         self._session = open_loop(self, config, self._handle)
-        self.create_service(SetBool, "~/enable", self._enable)
-        self.create_service(Trigger, "~/reset", self._reset)
         self._health = HealthPublisher(self, self._session)
-        self._session.start()
+        self._is_started = not config.files.replay_file
+        if self._is_started:
+            self._session.start()
 
-    def destroy_node(self) -> None:
-        """End the session, hand out what it still holds, and destroy the node."""
-        if hasattr(self, "_session"):
+    def begin(self) -> None:
+        """Begin a replay."""
+        if not self._is_started:
+            self._is_started = True
+            self.session.start()
+
+    def tear_down(self) -> None:
+        """End the session, what it still holds handed out."""
+        if self._session is not None:
             self._session.stop()
-        super().destroy_node()
+            self._session = None
 
     def _open_publishers(self, config: DriverConfig) -> None:
         topics = config.topics
@@ -153,7 +179,7 @@ class DriverNode(Node):
         )
         self._layout = layouts.LAYOUTS[topics.point_layout].with_rings(topics.ring_count)
         self._cloud_template = CloudTemplate(self._layout.dtype, config.frames.cloud)
-        self._cloud_publisher = self.create_publisher(
+        self._cloud_publisher = self.create_lifecycle_publisher(
             PointCloud2,
             topics.point_cloud_topic_id,
             QoSProfile(depth=_CLOUD_DEPTH, reliability=reliability),
@@ -161,7 +187,7 @@ class DriverNode(Node):
         self._imu_publisher = None
         if config.imu.enable_publishing:
             self._imu_template = ImuTemplate(config.frames.imu, config.imu)
-            self._imu_publisher = self.create_publisher(
+            self._imu_publisher = self.create_lifecycle_publisher(
                 Imu, topics.imu_topic_id, QoSProfile(depth=_IMU_DEPTH, reliability=reliability)
             )
         if config.frames.publish_tf:
@@ -171,14 +197,17 @@ class DriverNode(Node):
             self._tf_publisher.publish(TFMessage(transforms=[imu_transform(config.frames, now)]))
 
     def _configure(self, config: DriverConfig) -> None:
-        self._session.call(lambda driver, now: driver.configure(config))
+        if self._session is not None:
+            self._session.call(lambda driver, now: driver.configure(config))
 
     def _handle(self, event: Event) -> None:
         try:
             if isinstance(event, ImuSample):
-                if self._imu_publisher is not None:
+                if self._imu_publisher is not None and self._imu_publisher.is_activated:
                     self._imu_publisher.publish(self._imu_template.serialize(event))
             elif isinstance(event, Sweep):
+                if not self._cloud_publisher.is_activated:
+                    return
                 points = self._layout.convert(event.points, event.start)
                 self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
             else:
@@ -209,7 +238,7 @@ class DriverNode(Node):
             f"no data from the L2 at {config.network.l2_ip} for {silence.duration_ns / 1e9:.1f} s "
             f"(watchdog_timeout_ms {config.watchdog.timeout_ms})"
         )
-        if config.watchdog.action == "wait":
+        if config.watchdog.action == "wait" or not self.is_active:
             self.get_logger().error(f"{text}; waiting for it to come back")
             return
         self.get_logger().fatal(f"{text}; shutting down")
@@ -221,16 +250,45 @@ class DriverNode(Node):
         if future is not None:
             future.set_result(answer)
 
+    async def allows(self, transition: int) -> bool:
+        """Start or stop the device before the node is activated or deactivated.
+
+        A device that does not answer keeps the node from becoming active, but not from becoming
+        inactive.
+        """
+        starts = transition == Transition.TRANSITION_ACTIVATE
+        if not starts and transition != Transition.TRANSITION_DEACTIVATE:
+            return True
+        if self._settings.value.files.replay_file:
+            return True
+        worked, text = await self._command(starts)
+        if not worked:
+            self.get_logger().warning(f"{'activate' if starts else 'deactivate'}: {text}")
+        return worked or not starts
+
     async def _enable(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
-        if self._settings.value.files.replay_file:
-            response.success, response.message = False, _NO_DEVICE
+        response.success, response.message = False, self._refusal()
+        if response.message:
             return response
+        response.success, response.message = await self._command(request.data)
+        if response.success and self.is_configured and self.is_active != request.data:
+            (self.trigger_activate if request.data else self.trigger_deactivate)()
+        return response
+
+    def _refusal(self) -> str:
+        """Return why the device cannot be commanded, empty if it can."""
+        if self._session is None:
+            return _NOT_CONFIGURED.format(name=self.get_fully_qualified_name())
+        return _NO_DEVICE if self._settings.value.files.replay_file else ""
+
+    async def _command(self, starts: bool) -> tuple[bool, str]:
+        """Start or stop the device; return whether it did, and what it or the driver says."""
         future: Future[Answer] = Future()
 
         def command(driver: Driver, now: HostNs) -> None:
-            if request.data:
+            if starts:
                 ticket, events = driver.start_rotation(now), list[Event]()
             else:
                 ticket, events = driver.stop_rotation(now)
@@ -238,20 +296,16 @@ class DriverNode(Node):
             for event in events:
                 self._handle(event)
 
-        await self._completed(self._session.call(command))
+        await self._completed(self.session.call(command))
         answer = await self._completed(future)
-        if answer is None:
-            response.success, response.message = False, _NOT_IN_TIME
-        else:
-            response.success, response.message = answer.ok, answer.text
-        return response
+        return (answer.ok, answer.text) if answer is not None else (False, _NOT_IN_TIME)
 
     async def _reset(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         del request
-        if self._settings.value.files.replay_file:
-            response.success, response.message = False, _NO_DEVICE
+        response.success, response.message = False, self._refusal()
+        if response.message:
             return response
 
         def command(driver: Driver, now: HostNs) -> bool:
@@ -259,7 +313,7 @@ class DriverNode(Node):
                 self._handle(event)
             return True
 
-        if await self._completed(self._session.call(command)):
+        if await self._completed(self.session.call(command)):
             response.success = True
             response.message = (
                 "reset sent; the device does not acknowledge it and is back in about 25 s"

@@ -13,22 +13,22 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistStamped, Vector3
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.ros.conversions import CloudTemplate, from_time, to_cloud
 from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
+from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import HostNs, Level, is_ros_time
+from l2lidar_node.types import HostNs, Level, Sweep, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.motion.tracker import carried_over
+from l2lidar_proc.motion.tracker import KnownMotion, carried_over
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from l2lidar_proc.ros.odometry_node import OdometryNode  # brings kiss-icp along
 
 
-class DeskewNode(Node):
+class DeskewNode(ManagedNode):
     """Publishes every cloud as a sensor at rest would have seen it.
 
     Parameters
@@ -55,62 +55,93 @@ class DeskewNode(Node):
 
     def __init__(self, companion: OdometryNode | None = None) -> None:
         super().__init__("deskew_node")
+        self._pipeline: Pipeline | None = None
         self._settings = ParameterSet(self, DeskewNodeConfig, self._configure)
+        topics = self._settings.value.topics
+        shared = companion.intake_of(self, topics) if companion is not None else None
+        self._intake = shared or SensorIntake(
+            self, topics.cloud_topic, topics.imu_topic, topics.input_reliability
+        )
+        self._odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
+        if companion is not None and companion.publishes(self, topics) and shared is not None:
+            self._odometry_motion = companion.motion_of
+        self.start(self._settings.value.lifecycle.autostart)
+
+    def set_up(self) -> None:
+        """Open publishers and begin without a past."""
         config = self._settings.value
+        topics = config.topics
         self._pipeline = Pipeline(config.proc)
-        self._frames = StaticFrames(self) if config.topics.use_tf else None
+        self._pipeline.odometry_motion = self._odometry_motion
+        self._frames = StaticFrames(self) if topics.use_tf else None
         self._mounted: tuple[str, str, int] | None = None
         self._cloud_frame = ""
         self._template: tuple[tuple[np.dtype[np.void], str], CloudTemplate] | None = None
-        topics = config.topics
         velocity = [topics.velocity_topic] if topics.velocity_type != "none" else []
         self._inputs = InputMonitor(self, (topics.cloud_topic, topics.imu_topic, *velocity))
         self._untied = ""
         self._last: report.Report | None = None
         self._before = self._pipeline.counts
-        self._open(config, companion)
-        self._imu_adjust = ImuAdjustClient(
-            self, config.topics.cloud_topic, on_leveling=self._warn_of_leveling
-        )
-        steady_timer(self, 1.0, self._guarded(self._diagnose))
-
-    def _open(self, config: DeskewNodeConfig, companion: OdometryNode | None) -> None:
-        topics = config.topics
         speaking = QoSProfile(depth=10, reliability=RELIABILITY[topics.qos_reliability])
         self._output = self.create_publisher(PointCloud2, topics.output_topic, speaking)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._statistics = self.create_publisher(DiagnosticStatus, "~/statistics", 10)
-        shared = companion.intake_of(self, topics) if companion is not None else None
-        self._intake = shared or SensorIntake(
-            self, topics.cloud_topic, topics.imu_topic, topics.input_reliability
-        )
+
+    def begin(self) -> None:
+        """Listen."""
+        topics = self._settings.value.topics
         self._intake.add(self, self._guarded)
-        if companion is not None and companion.publishes(self, topics) and shared is not None:
-            self._pipeline.odometry_motion = companion.motion_of
         guarded, hear = self._guarded, self.create_subscription
         velocities = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
             hear(Odometry, topics.velocity_topic, guarded(self._odometry), velocities)
         elif topics.velocity_type == "twist":
             hear(TwistStamped, topics.velocity_topic, guarded(self._twist), velocities)
+        self._imu_adjust = ImuAdjustClient(
+            self, topics.cloud_topic, on_leveling=self._warn_of_leveling
+        )
+        steady_timer(self, 1.0, guarded(self._diagnose))
+
+    def pause(self) -> None:
+        """Listen no more; publish what still waits, and forget how the sensor moved."""
+        self._intake.remove(self)
+        for item in self.pipeline.finish(time.monotonic_ns()):
+            self._publish(item)
+        self.pipeline.reset()
+
+    def tear_down(self) -> None:
+        """Forget everything."""
+        self._intake.remove(self)
+        self._pipeline = None
+
+    def shared_entities(self) -> list[Any]:
+        """Return those of the intake."""
+        return self._intake.entities
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """What deskews; only while the node is configured."""
+        assert self._pipeline is not None
+        return self._pipeline
 
     def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
-        return self._inputs.guarded(callback, self._pipeline.reset)
+        return self._inputs.guarded(callback, self.pipeline.reset)
 
     def _configure(self, config: DeskewNodeConfig) -> None:
-        self._pipeline.configure(config.proc)
+        if self._pipeline is not None:
+            self._pipeline.configure(config.proc)
 
     @property
     def is_waiting(self) -> bool:
         """Whether a sweep waits for IMU samples."""
-        return self._pipeline.is_waiting
+        return self.pipeline.is_waiting
 
     def take_samples(self, samples: Samples, frame: str) -> None:
         """Take IMU samples (N,) of a frame."""
         samples = self._inputs.usable(samples, frame)
         if len(samples):
             self._mount(frame)
-            self._pipeline.imu(samples)
+            self.pipeline.imu(samples)
 
     def _mount(self, imu_frame: str) -> None:
         """Take the place of the IMU from TF as soon as both frames are in it."""
@@ -121,7 +152,7 @@ class DeskewNode(Node):
             self._mounted = asked
             T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
             if T_cloud_imu is not None and self._cloud_frame != imu_frame:
-                self._pipeline.tracker.mount(T_cloud_imu)
+                self.pipeline.tracker.mount(T_cloud_imu)
 
     def take_cloud(self, item: OneCloud) -> None:
         """Take a cloud; one without usable times is passed on as it came."""
@@ -142,7 +173,7 @@ class DeskewNode(Node):
             self._refuse(error, "dropped")
             return
         self._inputs.sweep(sweep)
-        self._pipeline.sweep(sweep, time.monotonic_ns())
+        self.pipeline.sweep(sweep, time.monotonic_ns())
 
     def refuse_cloud(self, error: ValueError) -> None:
         """Count a cloud that could not be read."""
@@ -151,9 +182,9 @@ class DeskewNode(Node):
     def _follow(self, frame: str) -> None:
         """Begin anew where clouds come in another frame than before."""
         if self._cloud_frame not in ("", frame):
-            for item in self._pipeline.finish(time.monotonic_ns()):
+            for item in self.pipeline.finish(time.monotonic_ns()):
                 self._publish(item)
-            self._pipeline.reset()
+            self.pipeline.reset()
         self._cloud_frame = frame
 
     def _refuse(self, error: ValueError, fate: str) -> None:
@@ -196,11 +227,11 @@ class DeskewNode(Node):
         if covariance is not None:
             turn = T_cloud_body[:3, :3]
             covariance = turn @ covariance @ turn.T
-        self._pipeline.velocity(from_time(message.header.stamp), velocity, source, covariance)
+        self.pipeline.velocity(from_time(message.header.stamp), velocity, source, covariance)
 
     def advance(self) -> None:
         """Publish what is finished."""
-        for item in self._pipeline.poll(time.monotonic_ns()):
+        for item in self.pipeline.poll(time.monotonic_ns()):
             self._publish(item)
 
     def _publish(self, item: Deskewed) -> None:
@@ -232,10 +263,10 @@ class DeskewNode(Node):
         )
 
     def _diagnose(self) -> None:
-        tracker = self._pipeline.tracker
+        tracker = self.pipeline.tracker
         judged = report.of_period(
             self._before,
-            self._pipeline.counts,
+            self.pipeline.counts,
             self._last,
             tracker.buffer.counts,
             tracker.filter,
@@ -243,7 +274,7 @@ class DeskewNode(Node):
             is_levelled=bool(self._imu_adjust.answer),
             untied=self._untied,
         )
-        self._before = self._pipeline.counts
+        self._before = self.pipeline.counts
         level, text = self._inputs.judge(judged.level, judged.message)
         if self._frames is not None and self._frames.refused:
             level, text = max(level, Level.WARN), f"{text}; {self._frames.refused}"

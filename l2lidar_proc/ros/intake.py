@@ -14,6 +14,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, PointCloud2
 
 from l2lidar_node.types import Sweep
@@ -119,8 +120,17 @@ class _Feed(NamedTuple):
     advance: Callable[..., None]
 
 
+class _Entities(NamedTuple):
+    """What an intake listens with."""
+
+    imu: Subscription
+    clouds: Subscription
+    look: Timer
+    soon: Timer
+
+
 class SensorIntake:
-    """Clouds and IMU samples of a pair of topics.
+    """Clouds and IMU samples of a pair of topics, subscribed to as long as somebody listens.
 
     Parameters
     ----------
@@ -141,50 +151,83 @@ class SensorIntake:
         reliability: str,
         period_s: float = SLOW_LOOK_S,
     ) -> None:
-        asked = RELIABILITY[reliability]
+        self._node = node
+        self._topics = cloud_topic, imu_topic
+        self._reliability = RELIABILITY[reliability]
+        self._period_s = min(period_s, SLOW_LOOK_S)
         self._listeners: list[Listener] = []
         self._feeds: list[_Feed] = []
-        self._imu = node.create_subscription(
-            Imu,
-            imu_topic,
-            lambda message: None,
-            QoSProfile(depth=IMU_DEPTH, reliability=asked),
-            callback_group=NeverExecuted(),
-            raw=True,
-        )
-        node.create_subscription(
-            PointCloud2,
-            cloud_topic,
-            self._cloud,
-            QoSProfile(depth=CLOUD_DEPTH, reliability=asked),
-            raw=True,
-        )
-        steady_timer(node, min(period_s, SLOW_LOOK_S), self.look)
-        self._soon = steady_timer(node, _WAIT_S, self.look)
-        self._soon.cancel()
+        self._open: _Entities | None = None
 
-    def add(self, listener: Listener, guard: Guard) -> None:
-        """Feed a listener, after those that were added before it.
+    @property
+    def entities(self) -> list[Any]:
+        """Subscriptions and timers that there are at the moment."""
+        return list(self._open) if self._open is not None else []
+
+    def add(self, listener: Listener, guard: Guard, *, is_first: bool = False) -> None:
+        """Feed a listener.
 
         Parameters
         ----------
         listener : Listener
         guard : callable
             Makes a callback survive its own errors: one listener must not stop another.
+        is_first : bool
+            Feed it before the others rather than after them.
         """
-        self._listeners.append(listener)
-        self._feeds.append(
-            _Feed(
-                guard(listener.take_samples),
-                guard(listener.take_cloud),
-                guard(listener.refuse_cloud),
-                guard(listener.advance),
-            )
+        feed = _Feed(
+            guard(listener.take_samples),
+            guard(listener.take_cloud),
+            guard(listener.refuse_cloud),
+            guard(listener.advance),
         )
+        at = 0 if is_first else len(self._feeds)
+        self._listeners.insert(at, listener)
+        self._feeds.insert(at, feed)
+        if self._open is None:
+            self._open = self._subscribed()
+
+    def remove(self, listener: Listener) -> None:
+        """Feed a listener no more."""
+        if listener not in self._listeners:
+            return
+        at = self._listeners.index(listener)
+        del self._listeners[at], self._feeds[at]
+        if not self._listeners and self._open is not None:
+            node, opened = self._node, self._open
+            self._open = None
+            node.destroy_timer(opened.soon)
+            node.destroy_timer(opened.look)
+            node.destroy_subscription(opened.clouds)
+            node.destroy_subscription(opened.imu)
+
+    def _subscribed(self) -> _Entities:
+        node, (cloud_topic, imu_topic) = self._node, self._topics
+        imu = node.create_subscription(
+            Imu,
+            imu_topic,
+            lambda message: None,
+            QoSProfile(depth=IMU_DEPTH, reliability=self._reliability),
+            callback_group=NeverExecuted(),
+            raw=True,
+        )
+        clouds = node.create_subscription(
+            PointCloud2,
+            cloud_topic,
+            self._cloud,
+            QoSProfile(depth=CLOUD_DEPTH, reliability=self._reliability),
+            raw=True,
+        )
+        look = steady_timer(node, self._period_s, self.look)
+        soon = steady_timer(node, _WAIT_S, self.look)
+        soon.cancel()
+        return _Entities(imu, clouds, look, soon)
 
     def drain(self) -> None:
         """Hand out the IMU samples that have come."""
-        messages = [bytes(message) for message in waiting(self._imu, IMU_DEPTH)]
+        if self._open is None:
+            return
+        messages = [bytes(message) for message in waiting(self._open.imu, IMU_DEPTH)]
         for samples, frame in serialized.imu_batches(messages):
             for feed in self._feeds:
                 feed.samples(samples, frame)
@@ -194,10 +237,12 @@ class SensorIntake:
         self.drain()
         for feed in self._feeds:
             feed.advance()
+        if self._open is None:
+            return
         if any(listener.is_waiting for listener in self._listeners):
-            self._soon.reset()
+            self._open.soon.reset()
         else:
-            self._soon.cancel()
+            self._open.soon.cancel()
 
     def _cloud(self, message: bytes) -> None:
         self.drain()

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -20,6 +21,7 @@ from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.files import DataFolder, FileNameError, write_whole
 from l2lidar_node.ros.conversions import to_cloud
+from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.settings import SettingError
@@ -51,7 +53,7 @@ _MOST_SAMPLES = 250  # that wait for the next step of dead reckoning, whatever t
 _TIME_JUMP_NS = 1_000_000_000  # samples older than the latest TF by more: time was set back
 
 
-class OdometryNode(Node):
+class OdometryNode(ManagedNode):
     """Publishes where the sensor, or what carries it, is.
 
     Raises
@@ -62,7 +64,17 @@ class OdometryNode(Node):
 
     def __init__(self) -> None:
         super().__init__("odometry_node")
+        self._pipeline: OdometryPipeline | None = None
         self._settings = ParameterSet(self, OdometryNodeConfig, self._configure)
+        topics = self._settings.value.topics
+        period_s = 1.0 / topics.imu_rate if topics.imu_rate > 0.0 else SLOW_LOOK_S
+        self.intake = SensorIntake(
+            self, topics.cloud_topic, topics.imu_topic, "best_effort", period_s
+        )
+        self.start(self._settings.value.lifecycle.autostart)
+
+    def set_up(self) -> None:
+        """Open publishers and services, and begin without a map."""
         config = self._settings.value
         topics = config.topics
         self._pipeline = OdometryPipeline(config.odometry, topics.T_cloud_imu, topics.imu_wait_ms)
@@ -80,10 +92,36 @@ class OdometryNode(Node):
         self._samples: list[Samples] = []  # since the latest step of dead reckoning
         self._reckoned_ns = self._transform_ns = 0
         self._open(config)
+
+    def begin(self) -> None:
+        """Listen. After a pause the map is the one of before."""
+        self._samples.clear()
+        self._reckoning.reset(None)
+        self.intake.add(self, self._guarded, is_first=True)  # a deskew uses what it finds
         guarded = self._guarded
         steady_timer(self, 1.0, guarded(self._diagnose))
-        if topics.map_period_s > 0.0:
-            steady_timer(self, topics.map_period_s, guarded(self._show_map))
+        map_period_s = self._settings.value.topics.map_period_s
+        if map_period_s > 0.0:
+            steady_timer(self, map_period_s, guarded(self._show_map))
+
+    def pause(self) -> None:
+        """Listen no more."""
+        self.intake.remove(self)
+
+    def tear_down(self) -> None:
+        """Forget map and path."""
+        self.intake.remove(self)
+        self._pipeline = None
+
+    def shared_entities(self) -> list[Any]:
+        """Return those of the intake."""
+        return self.intake.entities
+
+    @property
+    def pipeline(self) -> OdometryPipeline:
+        """What estimates; only while the node is configured."""
+        assert self._pipeline is not None
+        return self._pipeline
 
     def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
         return self._inputs.guarded(callback, self._begin_again)
@@ -103,11 +141,6 @@ class OdometryNode(Node):
         self._status = self.create_publisher(DiagnosticArray, topics.status_topic, out)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        period_s = 1.0 / topics.imu_rate if topics.imu_rate > 0.0 else SLOW_LOOK_S
-        self.intake = SensorIntake(
-            self, topics.cloud_topic, topics.imu_topic, "best_effort", period_s
-        )
-        self.intake.add(self, self._guarded)
         for name, answer in (
             ("reset", self._reset),
             ("save_map", self._save_map),
@@ -116,7 +149,8 @@ class OdometryNode(Node):
             self.create_service(Trigger, f"~/{name}", answer_or_error(self._inputs, answer))
 
     def _configure(self, config: OdometryNodeConfig) -> None:
-        self._pipeline.configure(config.odometry)
+        if self._pipeline is not None:
+            self._pipeline.configure(config.odometry)
 
     def intake_of(self, node: Node, topics: DeskewTopics) -> SensorIntake | None:
         """Return the intake if it has just what a deskew node listens to."""
@@ -137,31 +171,32 @@ class OdometryNode(Node):
         SettingError
             If it expects twists on the topic of this odometry.
         """
-        if node.resolve_topic_name(topics.velocity_topic) != self._odometry.topic_name:
+        own = self.resolve_topic_name(self._settings.value.topics.odometry_topic)
+        if node.resolve_topic_name(topics.velocity_topic) != own:
             return False
         if topics.velocity_type == "twist":
             raise SettingError(
-                f"parameter 'velocity_topic': {self._odometry.topic_name} carries the odometry of "
+                f"parameter 'velocity_topic': {own} carries the odometry of "
                 "this process, not twists; set velocity_type to odometry, or another topic"
             )
         return topics.velocity_type == "odometry"
 
     def motion_of(self, sweep: Sweep) -> KnownMotion | None:
         """Return the motion that was estimated for a sweep, None if there is none."""
-        return self._pipeline.motion_of(sweep)
+        return self._pipeline.motion_of(sweep) if self._pipeline is not None else None
 
     @property
     def is_waiting(self) -> bool:
         """Whether a sweep waits for IMU samples."""
-        return self._pipeline.due_ns is not None
+        return self.pipeline.due_ns is not None
 
     def take_samples(self, samples: Samples, frame: str) -> None:
         """Take IMU samples (N,) of a frame."""
         samples = self._inputs.usable(samples, frame)
         if not len(samples):
             return
-        samples = self._pipeline.imu(samples)
-        for note in self._pipeline.convention.notes:
+        samples = self.pipeline.imu(samples)
+        for note in self.pipeline.convention.notes:
             self._say(f"{frame}: {note}")
         if self._settings.value.topics.imu_rate > 0.0:
             self._samples.append(samples)
@@ -188,7 +223,7 @@ class OdometryNode(Node):
         self._inputs.sweep(sweep)
         # Whoever shows the deskewed cloud needs the transform up to its end, and needs it first.
         self._carry_on(at_once=True)
-        self._pipeline.sweep(sweep, time.monotonic_ns())
+        self.pipeline.sweep(sweep, time.monotonic_ns())
 
     def refuse_cloud(self, error: ValueError) -> None:
         """Count a cloud that cannot be used."""
@@ -207,13 +242,13 @@ class OdometryNode(Node):
         self._mounted = asked
         if imu_frame and imu_frame != self._cloud_frame:
             T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
-            odometry = self._pipeline.odometry
+            odometry = self.pipeline.odometry
             if (
                 T_cloud_imu is not None
                 and isinstance(odometry, Odometry)
                 and not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6)
             ):
-                self._pipeline.mount(T_cloud_imu)
+                self.pipeline.mount(T_cloud_imu)
                 self._reckoning = DeadReckoning(T_cloud_imu)
         base = self._settings.value.topics.base_frame
         if base and base != self._cloud_frame:
@@ -229,7 +264,7 @@ class OdometryNode(Node):
 
     def _share_frame(self, imu_frame: str) -> None:
         """Put the IMU where the clouds' frame is, if it says that it is measured in that one."""
-        odometry, topics = self._pipeline.odometry, self._settings.value.topics
+        odometry, topics = self.pipeline.odometry, self._settings.value.topics
         if (
             imu_frame
             and imu_frame == self._cloud_frame
@@ -237,7 +272,7 @@ class OdometryNode(Node):
             and isinstance(odometry, Odometry)
             and not np.allclose(odometry.T_cloud_imu, np.eye(4), atol=1e-6)
         ):
-            self._pipeline.mount(np.eye(4))
+            self.pipeline.mount(np.eye(4))
             self._say(
                 f"IMU and clouds have the same frame '{imu_frame}': the IMU is taken to be "
                 "at its origin"
@@ -246,7 +281,7 @@ class OdometryNode(Node):
     def advance(self) -> None:
         """Publish what is finished, and the pose at the newest IMU sample."""
         self._carry_on()
-        for estimate in self._pipeline.poll(time.monotonic_ns()):
+        for estimate in self.pipeline.poll(time.monotonic_ns()):
             self._publish(estimate)
 
     @property
@@ -279,7 +314,7 @@ class OdometryNode(Node):
         topics = self._settings.value.topics
         # A sweep may be seconds late on a busy machine; only where the samples went back as well
         # has time itself.
-        newest = self._pipeline.newest_imu or stamp
+        newest = self.pipeline.newest_imu or stamp
         is_late = stamp <= self._transform_ns < max(newest, stamp) + _TIME_JUMP_NS
         if not topics.publish_tf or is_late:
             return
@@ -305,7 +340,7 @@ class OdometryNode(Node):
 
     def _go_on_from_here(self) -> None:
         """Let dead reckoning go on from the latest sweep."""
-        odometry, newest = self._pipeline.odometry, self._pipeline.newest_imu
+        odometry, newest = self.pipeline.odometry, self.pipeline.newest_imu
         if newest is not None and isinstance(odometry, Odometry):
             self._reckoning.reset(odometry.extrapolated(newest))
 
@@ -345,7 +380,7 @@ class OdometryNode(Node):
             self._fast.publish(messages.odometry(motion, estimate.stamp, odom, self._base_name))
 
     def _show_map(self) -> None:
-        last = self._pipeline.last
+        last = self.pipeline.last
         if last is not None and self._map.get_subscription_count():
             points = messages.as_cloud(self._map_points(last))
             odom = self._settings.value.topics.odom_frame
@@ -354,7 +389,7 @@ class OdometryNode(Node):
     def _map_points(self, last: OdometryEstimate) -> F64:
         """Return the local map in the odometry frame [m], shape (N, 3)."""
         turn = self._base.odom_from_map(last.T_map_lidar)
-        return self._pipeline.odometry.map_points() @ turn[:3, :3].T + turn[:3, 3]
+        return self.pipeline.odometry.map_points() @ turn[:3, :3].T + turn[:3, 3]
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         del request
@@ -363,7 +398,7 @@ class OdometryNode(Node):
         return response
 
     def _begin_again(self) -> None:
-        self._pipeline.reset()
+        self.pipeline.reset()
         self._base.reset()
         self._reckoning.reset(None)
         self._samples.clear()
@@ -373,7 +408,7 @@ class OdometryNode(Node):
 
     def _save_map(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         del request
-        last = self._pipeline.last
+        last = self.pipeline.last
         if last is None:
             response.success, response.message = False, "there is no map yet"
             return response
@@ -390,7 +425,7 @@ class OdometryNode(Node):
     ) -> Trigger.Response:
         del request
         name = self._settings.value.files.trajectory_file
-        poses = self._base.poses(self._pipeline.trajectory.poses)
+        poses = self._base.poses(self.pipeline.trajectory.poses)
         try:
             path, beside = self._folder.new_files(name, f"{FilePath(name).stem}.kitti")
             write_whole(path, trajectory.tum(poses))
@@ -412,13 +447,13 @@ class OdometryNode(Node):
         return text
 
     def _diagnose(self) -> None:
-        since = self._pipeline.sweeps - self._looked_at
-        self._looked_at = self._pipeline.sweeps
+        since = self.pipeline.sweeps - self._looked_at
+        self._looked_at = self.pipeline.sweeps
         level, text, values = health.judged(
-            self._pipeline.last,
-            self._pipeline.sweeps,
+            self.pipeline.last,
+            self.pipeline.sweeps,
             since,
-            self._pipeline.counts,
+            self.pipeline.counts,
             self._inputs.refused,
             self._untied(),
         )

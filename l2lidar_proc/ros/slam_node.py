@@ -12,7 +12,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
@@ -21,6 +20,7 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.types import HostNs
@@ -52,7 +52,7 @@ class _Parts:
     status: DiagnosticStatus | None = None
 
 
-class SlamNode(Node):
+class SlamNode(ManagedNode):
     """Publishes where the odometry frame is in the map.
 
     Raises
@@ -65,12 +65,22 @@ class SlamNode(Node):
 
     def __init__(self) -> None:
         super().__init__("slam_node")
+        self._worker: SlamWorker | None = None
         self._settings = ParameterSet(self, SlamNodeConfig, self._configure)
+        self.start(self._settings.value.lifecycle.autostart)
+
+    @property
+    def worker(self) -> SlamWorker:
+        """What builds or searches the map; only while the node is configured."""
+        assert self._worker is not None
+        return self._worker
+
+    def set_up(self) -> None:
+        """Start the worker, load the map where one is to be used, open publishers and services."""
         config = self._settings.value
         try:
             self._worker = SlamWorker(config, self.get_logger().warning)
         except (GtsamMissingError, AtlasError) as error:
-            self.destroy_node()
             raise StartError(str(error)) from None
         self._parts: OrderedDict[HostNs, _Parts] = OrderedDict()
         self._latest: tuple[HostNs, int, str] | None = None  # stamp, arrival, odom frame
@@ -80,10 +90,10 @@ class SlamNode(Node):
         self._shown = (-1, -1)
         self._open(config)
 
-    def _open(self, config: SlamNodeConfig) -> None:
-        topics = config.topics
+    def begin(self) -> None:
+        """Listen."""
+        topics = self._settings.value.topics
         inputs = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(Odometry, topics.odometry_topic, self._odometry, inputs)
         self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, inputs)
         self.create_subscription(
@@ -93,6 +103,26 @@ class SlamNode(Node):
             PoseWithCovarianceStamped, topics.initial_pose_topic, self._initial_pose, 1
         )
         self.create_subscription(TFMessage, "/tf", self._transforms, inputs)
+        self.create_timer(1.0 / topics.tf_rate, self._publish_transform)
+        self.create_timer(1.0, self._diagnose)
+        if topics.map_period_s > 0.0:
+            self.create_timer(topics.map_period_s, self._show)
+        if topics.autosave_s > 0.0 and self._settings.value.slam.mode == "mapping":
+            self.create_timer(topics.autosave_s, self._autosave)
+
+    def pause(self) -> None:
+        """Forget messages whose counterparts have not come."""
+        self._parts.clear()
+
+    def tear_down(self) -> None:
+        """End the worker."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
+    def _open(self, config: SlamNodeConfig) -> None:
+        topics = config.topics
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._pose = self.create_publisher(PoseWithCovarianceStamped, topics.pose_topic, 10)
         self._map = self.create_publisher(PointCloud2, topics.map_topic, latched)
@@ -100,7 +130,7 @@ class SlamNode(Node):
         self._graph = self.create_publisher(MarkerArray, topics.graph_topic, latched)
         self._state = self.create_publisher(DiagnosticStatus, topics.status_topic, latched)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        worker = self._worker
+        worker = self.worker
         for name, job in (
             ("save", worker.save),
             ("load", worker.load),
@@ -108,21 +138,10 @@ class SlamNode(Node):
             ("relocalize", worker.relocalize),
         ):
             self.create_service(Trigger, f"~/{name}", self._service(job))
-        self.create_timer(1.0 / topics.tf_rate, self._publish_transform)
-        self.create_timer(1.0, self._diagnose)
-        if topics.map_period_s > 0.0:
-            self.create_timer(topics.map_period_s, self._show)
-        if topics.autosave_s > 0.0 and config.slam.mode == "mapping":
-            self.create_timer(topics.autosave_s, self._autosave)
-
-    def destroy_node(self) -> None:
-        """End the worker with the node."""
-        if hasattr(self, "_worker"):
-            self._worker.close()
-        super().destroy_node()
 
     def _configure(self, config: SlamNodeConfig) -> None:
-        self._worker.map_name = config.topics.map_name
+        if self._worker is not None:
+            self._worker.map_name = config.topics.map_name
 
     # ---- input
 
@@ -161,7 +180,7 @@ class SlamNode(Node):
             return
         del self._parts[stamp]
         try:
-            self._worker.sweep(_sweep(stamp, parts.odometry, parts.cloud, parts.status))
+            self.worker.sweep(_sweep(stamp, parts.odometry, parts.cloud, parts.status))
         except ValueError as error:
             self._refused += 1
             self.get_logger().warning(f"sweep dropped: {error}", throttle_duration_sec=5.0)
@@ -179,7 +198,7 @@ class SlamNode(Node):
             return
         x, y = matrix[:2, 3].tolist()
         yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
-        worker = self._worker
+        worker = self.worker
         worker.request(lambda: worker.set_pose(x, y, yaw), self._say)
 
     def _transforms(self, message: TFMessage) -> None:
@@ -195,7 +214,7 @@ class SlamNode(Node):
     # ---- output
 
     def _publish_transform(self) -> None:
-        T_map_odom, topics = self._worker.T_map_odom, self._settings.value.topics
+        T_map_odom, topics = self.worker.T_map_odom, self._settings.value.topics
         if T_map_odom is None or self._latest is None:
             return
         if not topics.publish_tf or self._other_parent:
@@ -210,7 +229,7 @@ class SlamNode(Node):
         self._tf.publish(TFMessage(transforms=[transform]))
 
     def _publish_pose(self, odometry: Odometry) -> None:
-        T_map_odom = self._worker.T_map_odom
+        T_map_odom = self.worker.T_map_odom
         if T_map_odom is None:
             return
         message = PoseWithCovarianceStamped()
@@ -221,14 +240,14 @@ class SlamNode(Node):
             return
         message.pose.pose = messages.pose(matrix)
         order = [3, 4, 5, 0, 1, 2]
-        message.pose.covariance = self._worker.covariance[np.ix_(order, order)].ravel()
+        message.pose.covariance = self.worker.covariance[np.ix_(order, order)].ravel()
         self._pose.publish(message)
 
     def _show(self) -> None:
         """Publish map, path and graph if they changed and somebody listens."""
         listeners = [self._map, self._path, self._graph]
         wanted = tuple(publisher.get_subscription_count() for publisher in listeners)
-        worker = self._worker
+        worker = self.worker
         now = (worker.submaps, hash((worker.loops, wanted)))
         if self._latest is None or not any(wanted) or now == self._shown:
             return
@@ -258,7 +277,7 @@ class SlamNode(Node):
             self._graph.publish(_markers(built, loops, frame))
 
     def _autosave(self) -> None:
-        self._worker.request(self._worker.autosave, lambda answer: None)
+        self.worker.request(self.worker.autosave, lambda answer: None)
 
     def _service(self, job: Any) -> Any:
         """Return a callback that answers when the worker has done a job."""
@@ -266,7 +285,7 @@ class SlamNode(Node):
         async def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             del request
             future: Future = Future(executor=self.executor)
-            self._worker.request(job, future.set_result)
+            self.worker.request(job, future.set_result)
             response.success, response.message = await future
             return response
 
@@ -280,7 +299,7 @@ class SlamNode(Node):
             self.get_logger().warning(text)
 
     def _diagnose(self) -> None:
-        state = self._worker.state
+        state = self.worker.state
         text, level = state.value, _LEVELS[state]
         if self._other_parent:
             level = DiagnosticStatus.ERROR
@@ -288,7 +307,7 @@ class SlamNode(Node):
                 f"'{self._other_parent}' is the parent of the odometry frame already: set "
                 "invert_tf of the odometry to false, or publish_tf of slam_node"
             )
-        values = {**values_of(self._worker), "sweeps refused": self._refused}
+        values = {**values_of(self.worker), "sweeps refused": self._refused}
         status = DiagnosticStatus(
             level=level,
             name=f"{self.get_fully_qualified_name().lstrip('/')}: slam",

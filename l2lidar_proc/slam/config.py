@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
+from l2lidar_node.config import LifecycleConfig
 from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 
 
@@ -177,6 +178,7 @@ class SlamNodeConfig:
 
     topics: SlamTopics = field(default_factory=SlamTopics)
     slam: SlamConfig = field(default_factory=SlamConfig)
+    lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
 
 
 def check_map_name(name: str) -> str:

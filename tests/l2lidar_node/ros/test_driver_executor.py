@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,8 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402  after importorskip
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
@@ -52,10 +55,11 @@ class Rig:
         self.parameters = self.peer.create_client(GetParameters, "/l2lidar_node/get_parameters")
         self.enable = self.peer.create_client(SetBool, "/l2lidar_node/enable")
         self.reset = self.peer.create_client(Trigger, "/l2lidar_node/reset")
+        self.lifecycle = self.peer.create_client(ChangeState, "/l2lidar_node/change_state")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.executor.add_node(self.peer)
-        for client in (self.parameters, self.enable, self.reset):
+        for client in (self.parameters, self.enable, self.reset, self.lifecycle):
             self.until(client.service_is_ready)
 
     def _hear(self, message: DiagnosticArray) -> None:
@@ -72,6 +76,13 @@ class Rig:
         future = self.parameters.call_async(GetParameters.Request(names=["l2_ip"]))
         self.until(future.done)
         return bool(future.result().values[0].string_value == "127.0.0.1")
+
+    def change(self, label: str) -> bool:
+        """Ask for a transition and return whether it took place."""
+        request = ChangeState.Request(transition=Transition(label=label))
+        future = self.lifecycle.call_async(request)
+        self.until(future.done)
+        return bool(future.result().success)
 
 
 @pytest.fixture
@@ -130,3 +141,23 @@ def test_a_host_clock_after_2038_ends_nothing(rig: Rig) -> None:
         rig.node._handle(Sweep(HostNs(start), HostNs(start + 200_000_000), points, 38, 0))
     rig.until(lambda: rig.clouds)
     assert [cloud.header.stamp.sec for cloud in rig.clouds] == [2_000_000_000]
+
+
+def test_a_manager_is_told_what_cannot_be_done_and_nothing_ends(rig: Rig) -> None:
+    assert rig.node.state_label == "active"
+    assert not rig.change("activate")  # it is
+    assert not rig.change("dance")
+    assert rig.change("deactivate")  # whether the device obeys or not
+    assert not rig.change("activate")  # there is no device to start
+    assert rig.node.state_label == "inactive"
+    assert rig.change("cleanup")
+    enabling = rig.enable.call_async(SetBool.Request(data=True))
+    rig.until(enabling.done)
+    assert "not configured" in enabling.result().message
+    network = rig.node._settings.value.network
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((network.host_ip, network.host_port))  # it was given up
+        assert not rig.change("configure")
+        assert rig.node.state_label == "unconfigured"
+    assert rig.change("configure")
+    assert rig.answers()

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -219,6 +221,36 @@ def test_enable_stops_and_starts_the_device(rig: Rig) -> None:
     rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
     rig.wait_for(lambda: len(rig.observer.clouds.stamps) > seen + 2, "clouds after the start")
     assert rig.observer.clouds.backward_steps == 0
+
+
+def _state(rig: Rig) -> str:
+    response = rig.call(GetState, "/l2lidar_node/get_state", GetState.Request())
+    return str(response.current_state.label)
+
+
+def _change(rig: Rig, label: str) -> bool:
+    request = ChangeState.Request(transition=Transition(label=label))
+    return bool(rig.call(ChangeState, "/l2lidar_node/change_state", request).success)
+
+
+def test_the_state_of_the_life_cycle_and_enable_agree(rig: Rig) -> None:
+    rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=False))
+    assert _state(rig) == "inactive"
+    rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
+    assert _state(rig) == "active"
+    assert _change(rig, "deactivate")
+    rig.wait_for(
+        lambda: rig.observer.checks.get("device", {}).get("state") == "standby", "standby"
+    )
+    assert _change(rig, "cleanup")
+    rig.wait_for(lambda: not publishers(rig.observer, "/points"), "no publisher of clouds")
+    assert _change(rig, "configure")
+    rig.wait_for(lambda: publishers(rig.observer, "/points"), "a publisher of clouds")
+    seen = len(rig.observer.clouds.stamps)
+    deadline = time.monotonic() + 60.0
+    while not _change(rig, "activate"):  # a busy machine may not acknowledge in time
+        assert time.monotonic() < deadline
+    rig.wait_for(lambda: len(rig.observer.clouds.stamps) > seen + 2, "clouds once it is active")
 
 
 def test_reset_reboots_the_device_and_stamps_go_on(rig: Rig) -> None:

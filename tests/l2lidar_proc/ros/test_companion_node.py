@@ -106,6 +106,33 @@ def test_each_cloud_comes_in_once_and_out_of_both(bench: CompanionBench) -> None
     assert np.median(np.linalg.norm(at_start[kept] - expected, axis=1)) < 0.01
 
 
+def test_one_goes_on_while_a_manager_takes_the_other_out_and_back(bench: CompanionBench) -> None:
+    """Clouds are still deskewed, and poses come again, each before its cloud."""
+    odometry, deskew = bench.nodes
+    run = recording("room", "walk", 6.0)
+    sent = play(bench, run, 2.0)
+    bench.until(lambda: len(bench.poses) >= len(sent) - 1)
+    odometry.trigger_deactivate()
+    odometry.trigger_cleanup()
+    assert odometry.state_label == "unconfigured"
+    assert bench.clouds_out.get_subscription_count() == 1  # the deskew's, on the same intake
+    bench.poses.clear()
+    bench.clouds.clear()
+    play(bench, run, 1.0)
+    assert not bench.poses
+    assert deskew._last.values["velocity source"] != "odometry"
+    odometry.trigger_configure()
+    odometry.trigger_activate()
+    bench.clouds.clear()
+    play(bench, run, 3.0)
+    bench.until(lambda: bench.poses)
+    assert deskew._last.values["velocity source"] == "odometry"
+    for node in bench.nodes:
+        node.trigger_deactivate()
+    bench.until(lambda: not bench.clouds_out.get_subscription_count())
+    assert not bench.imu_out.get_subscription_count()
+
+
 @pytest.mark.parametrize("bench", [("deskew_node:imu_topic:=/other/imu",)], indirect=True)
 def test_other_topics_have_an_intake_of_their_own(bench: CompanionBench) -> None:
     odometry, deskew = bench.nodes

@@ -1,0 +1,234 @@
+"""A managed node: a life cycle of states (https://design.ros2.org/articles/node_lifecycle.html).
+
+A manager, or ``ros2 lifecycle``, configures, activates, deactivates and cleans it up. With
+``autostart``, the default, it is active as soon as it is made: a plain node to whoever does not
+ask.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from typing import Any, Final
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.lifecycle import (
+    LifecycleNode,
+    LifecyclePublisher,
+    LifecycleState,
+    TransitionCallbackReturn as Return,
+)
+
+from l2lidar_node.ros.program import StartError
+from l2lidar_node.settings import SettingError
+
+_IDS: Final = {
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+}
+
+
+class ManagedNode(LifecycleNode):
+    """Base of the nodes: a subclass says what each transition does.
+
+    Whatever ROS entities :meth:`set_up` and :meth:`begin` create are destroyed by the transition
+    that undoes them; a subclass only gives up what else it holds.
+
+    Parameters
+    ----------
+    name : str
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._problem: Exception | None = None
+        self._before_set_up: set[Any] = set()
+        self._before_begin: set[Any] = set()
+        # rclpy's own answer raises where a transition is impossible now, which ends the program.
+        self._answer_change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._change_state
+
+    # ---- for subclasses
+
+    def set_up(self) -> None:
+        """Configure: open publishers, sockets, files.
+
+        Raises
+        ------
+        SettingError, StartError
+        """
+
+    def begin(self) -> None:
+        """Activate: take input, publish.
+
+        Raises
+        ------
+        SettingError, StartError
+        """
+
+    def pause(self) -> None:
+        """Deactivate: take no more input."""
+
+    def tear_down(self) -> None:
+        """Clean up: give up all that :meth:`set_up` opened, even if it got half way only."""
+
+    def shared_entities(self) -> list[Any]:
+        """Return entities that others use as well and that no transition may destroy."""
+        return []
+
+    async def allows(self, transition: int) -> bool:
+        """Return whether a transition that somebody asked for may take place.
+
+        Parameters
+        ----------
+        transition : int
+            Of ``lifecycle_msgs/Transition``; it is possible in the node's state.
+        """
+        del transition
+        return True
+
+    # ---- state
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the node is at work."""
+        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+
+    @property
+    def is_configured(self) -> bool:
+        """Whether the node is active or could be at once."""
+        configured = (State.PRIMARY_STATE_INACTIVE, State.PRIMARY_STATE_ACTIVE)
+        return self._state_machine.current_state[0] in configured
+
+    @property
+    def state_label(self) -> str:
+        """Name of the state: unconfigured, inactive, active, finalized, or on the way to one."""
+        return str(self._state_machine.current_state[1])
+
+    def start(self, autostart: bool) -> None:
+        """Configure and activate the node if it is to start by itself; the end of a constructor.
+
+        Raises
+        ------
+        Exception
+            Whatever kept it from that.
+        """
+        if not autostart:
+            self.get_logger().info("waiting to be configured (autostart is false)")
+            return
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() is not Return.SUCCESS:
+                assert self._problem is not None
+                raise self._problem
+
+    def destroy_node(self) -> None:
+        """Give everything up, then destroy the node."""
+        if self.is_configured:
+            self.tear_down()
+        super().destroy_node()
+
+    # ---- transitions, as rclpy calls them
+
+    def on_configure(self, state: LifecycleState) -> Return:
+        """Run :meth:`set_up`; what it began is undone if it fails."""
+        del state
+        self._before_set_up = self._entities()
+        if self._succeeds(self.set_up):
+            return Return.SUCCESS
+        self._succeeds(self.tear_down, keeps_problem=True)
+        self._destroy_since(self._before_set_up)
+        return Return.FAILURE
+
+    def on_activate(self, state: LifecycleState) -> Return:
+        """Let the publishers publish and run :meth:`begin`."""
+        self._before_begin = self._entities()
+        super().on_activate(state)
+        if self._succeeds(self.begin):
+            return Return.SUCCESS
+        super().on_deactivate(state)
+        self._destroy_since(self._before_begin)
+        return Return.FAILURE
+
+    def on_deactivate(self, state: LifecycleState) -> Return:
+        """Run :meth:`pause` and silence the publishers."""
+        self._succeeds(self.pause)
+        self._destroy_since(self._before_begin)
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> Return:
+        """Run :meth:`tear_down`."""
+        del state
+        self._succeeds(self.tear_down)
+        self._destroy_since(self._before_set_up)
+        return Return.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> Return:
+        """Give up what the node holds in the state it is in."""
+        if state.state_id == State.PRIMARY_STATE_ACTIVE:
+            self._succeeds(self.pause)
+        if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
+            self.on_cleanup(state)
+        return Return.SUCCESS
+
+    def _succeeds(self, step: Callable[[], None], keeps_problem: bool = False) -> bool:
+        try:
+            step()
+        except Exception as error:
+            if not keeps_problem:
+                self._problem = error
+            self._log(error)
+            return False
+        return True
+
+    def _log(self, error: Exception) -> None:
+        """Name an error in the log, unless the program ends with it anyway."""
+        if self.executor is None or not self.context.ok():
+            return
+        is_foreseen = isinstance(error, SettingError | StartError)
+        self.get_logger().error(str(error) if is_foreseen else traceback.format_exc())
+
+    async def _change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        asked = request.transition
+        response.success = False
+        transition = _IDS.get(asked.label, 0) if asked.label else int(asked.id)
+        possible = {item[0] for item in self._state_machine.available_transitions}
+        if transition in possible and not await self.allows(transition):
+            return response
+        try:
+            return self._answer_change_state(request, response)  # rclpy has no types
+        except RCLError as error:
+            what = f"transition '{asked.label or asked.id}' in state '{self.state_label}'"
+            self.get_logger().warning(f"{what} refused: {str(error).partition(', at ')[0]}")
+            return response
+
+    # ---- entities
+
+    def _entities(self) -> set[Any]:
+        """Return what there is."""
+        lists = (self.publishers, self.subscriptions, self.clients, self.services, self.timers)
+        return {entity for some in (*lists, self.guards) for entity in some}
+
+    def _destroy_since(self, before: set[Any]) -> None:
+        """Destroy what has been created since there was what there is in ``before``."""
+        kept = before | set(self.shared_entities())
+        for publisher in [found for found in self.publishers if found not in kept]:
+            if isinstance(publisher, LifecyclePublisher):
+                self.destroy_lifecycle_publisher(publisher)
+            else:
+                self.destroy_publisher(publisher)
+        for found, destroy in (
+            (self.subscriptions, self.destroy_subscription),
+            (self.clients, self.destroy_client),
+            (self.services, self.destroy_service),
+            (self.timers, self.destroy_timer),
+            (self.guards, self.destroy_guard_condition),
+        ):
+            for entity in [some for some in found if some not in kept]:
+                if getattr(entity, "topic_name", "") != "/clock":  # use_sim_time is set live
+                    destroy(entity)
