@@ -92,6 +92,7 @@ TRACKER_GYRO_WALK: Final = 1e-4  # [rad/s/sqrt(s)] tuned on: room walk
 TRACKER_ACCEL_WALK: Final = 1e-3  # [m/s^2/sqrt(s)]
 TWIST_SIGMA: Final = 0.01  # [m/s] of a velocity that comes without a covariance
 TWIST_SIGMA_LEAST: Final = 0.005  # [m/s] a smaller one is not believed
+TWIST_AHEAD_NS: Final = 1_000_000_000  # [ns] before the newest IMU sample; more is another clock
 TWIST_STEP_NS: Final = 10_000_000  # [ns] faster sources are thinned to this
 TWIST_NIS: Final = 50.0  # of 3 components; beyond it the velocity of the filter is dropped
 TWIST_STILL_SPEED: Final = 0.1  # [m/s] at a higher one the IMU cannot claim rest

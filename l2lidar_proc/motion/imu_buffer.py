@@ -39,6 +39,8 @@ class ImuCounts:
         Samples with a number that is not finite or that no sensor can measure; refused.
     stale : int
         Samples older than everything that is kept; refused.
+    outlier : int
+        Samples far from those before and after them; refused.
     jumps : int
         Times the clock went back, or far ahead, and the buffer was emptied.
     """
@@ -48,6 +50,7 @@ class ImuCounts:
     duplicate: int = 0
     invalid: int = 0
     stale: int = 0
+    outlier: int = 0
     jumps: int = 0
 
 
@@ -59,8 +62,8 @@ class ImuBuffer:
     length_s : float
         How much is kept behind the newest sample [s].
     jump_s : float
-        A sample this much behind the newest one, or ahead of it, means a changed clock: the buffer
-        starts afresh with it [s].
+        A sample this much behind the newest one, or ahead of it, means a changed clock if the next
+        one confirms it: the buffer starts afresh with both [s].
     """
 
     def __init__(self, length_s: float = 4.0, jump_s: float = 1.0) -> None:
@@ -69,6 +72,7 @@ class ImuBuffer:
         self._buffer = np.empty(2048, dtype=IMU_SAMPLE)
         self._head = 0
         self._tail = 0
+        self._suspect: Samples | None = None  # a sample of another time, not confirmed yet
         self._tally = dict.fromkeys(ImuCounts.__dataclass_fields__, 0)
 
     @property
@@ -93,6 +97,7 @@ class ImuBuffer:
     def clear(self) -> None:
         """Forget all samples; the counts stay."""
         self._head = self._tail = 0
+        self._suspect = None
 
     def between(self, start: HostNs, end: HostNs) -> Samples:
         """Return a copy of the samples of a span with a neighbour on either side, shape (M,)."""
@@ -131,6 +136,7 @@ class ImuBuffer:
         newest = self.newest
         steps = np.diff(stamps, prepend=stamps[0] - 1 if newest is None else newest)
         if (steps > 0).all() and (steps <= self._jump_ns).all():
+            self._drop_suspect()
             self._append(samples)
             return samples
         in_order = [self._push_one(samples[i : i + 1]) for i in range(len(samples))]
@@ -140,12 +146,13 @@ class ImuBuffer:
         """Take one sample wherever it belongs; return whether it continues the buffer."""
         stamp = int(sample["stamp"][0])
         newest = self.newest
-        if newest is None or 0 < stamp - newest <= self._jump_ns:
+        if newest is None:
             self._append(sample)
             return True
         if abs(stamp - newest) > self._jump_ns:
-            self._tally["jumps"] += 1
-            self.clear()
+            return self._is_jump(sample, newest)
+        self._drop_suspect()
+        if stamp > newest:
             self._append(sample)
             return True
         place = int(np.searchsorted(self.samples["stamp"], stamp))
@@ -159,6 +166,27 @@ class ImuBuffer:
             self.samples[place] = sample[0]
             self._tally["reordered"] += 1
         return False
+
+    def _is_jump(self, sample: Samples, newest: int) -> bool:
+        """Start afresh if a sample of another time is not the first; else wait for the next."""
+        suspect = self._suspect
+        stamp = int(sample["stamp"][0])
+        if suspect is not None:
+            since = stamp - int(suspect["stamp"][0])
+            if 0 < since < abs(stamp - newest):
+                self._tally["jumps"] += 1
+                self.clear()
+                self._append(suspect)
+                self._append(sample)
+                return True
+            self._drop_suspect()
+        self._suspect = sample.copy()
+        return False
+
+    def _drop_suspect(self) -> None:
+        if self._suspect is not None:
+            self._tally["outlier"] += 1
+            self._suspect = None
 
     def _append(self, samples: Samples) -> None:
         self._tally["accepted"] += len(samples)

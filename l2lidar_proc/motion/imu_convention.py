@@ -81,7 +81,10 @@ class ImuConvention:
             samples["linear_acceleration"] *= -factor if self.reversed else factor
         if len(self._stamps) > _MOST_KEPT:  # no poses come that would let them go
             self._drop(self._stamps[_MOST_KEPT // 2])
-        self._stamps += samples["stamp"].tolist()
+        stamps = samples["stamp"].tolist()
+        if stamps and self._stamps and abs(stamps[0] - self._stamps[-1]) > _KEPT_NS:
+            self.forget_motion()  # the clock was set
+        self._stamps += stamps
         self._forces += list(samples["linear_acceleration"].astype(np.float64))
         return samples
 
@@ -91,11 +94,13 @@ class ImuConvention:
         Parameters
         ----------
         stamp : HostNs
-            Later than that of the pose before.
+            Where it is before that of the pose before, the clock was set.
         R_odom_imu : ndarray, shape (3, 3)
         position : ndarray, shape (3,)
             Of the IMU in the odometry frame [m].
         """
+        if self._poses and stamp < self._poses[-1][0]:
+            self._poses = []
         if self._poses and stamp - self._poses[-1][0] < _SHORTEST_NS:
             return False
         pose = np.column_stack([R_odom_imu, position])

@@ -144,7 +144,10 @@ class MotionTracker:
     def velocity(
         self, stamp: HostNs, velocity: ArrayLike, source: str, covariance: F64 | None = None
     ) -> bool:
-        """Take a velocity; one that is not finite or not later than the newest is refused.
+        """Take a velocity; return whether it is used.
+
+        Refused are those that are not finite, not later than the newest one, or more than a second
+        ahead of the IMU samples.
 
         Parameters
         ----------

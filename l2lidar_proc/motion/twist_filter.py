@@ -162,7 +162,13 @@ class TwistFilter:
         vector = np.array(velocity, dtype=np.float64)
         if vector.shape != (3,) or not (np.abs(vector) <= tuning.MAX_SPEED).all():
             return False
-        if source != self.source:
+        latest = self._latest_credible
+        if latest is not None and stamp > latest:
+            return False
+        if source != self.source or (
+            # it came before the samples that show it to be of another time
+            latest is not None and self.newest_twist is not None and self.newest_twist > latest
+        ):
             self._forget_twists()
             self.source = source
         if self.newest_twist is not None and stamp <= self.newest_twist:
@@ -172,6 +178,12 @@ class TwistFilter:
         self._pending.append(Twist(stamp, vector, _believed(covariance)))
         self._update()
         return True
+
+    @property
+    def _latest_credible(self) -> int | None:
+        """Latest stamp that a velocity can have by now, None before the first sample."""
+        newest = self._buffer.newest
+        return None if newest is None else newest + tuning.TWIST_AHEAD_NS
 
     def follow(self) -> None:
         """Follow the samples that have come into the buffer."""

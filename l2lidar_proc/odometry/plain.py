@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc import rotations
+from l2lidar_proc import rotations, tuning
 from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
@@ -44,7 +44,11 @@ class PlainOdometry:
         """Take IMU samples and ignore them."""
 
     def register(self, sweep: Sweep) -> list[OdometryEstimate]:
-        """Return the pose of the sweep's last point, as KISS-ICP registers it."""
+        """Return the pose of the sweep's last point, as KISS-ICP registers it.
+
+        A sweep that is late by less than a second is refused. Further back, or far ahead, the
+        clock was set: the map is kept, the velocity is unknown.
+        """
         points = sweep.points
         xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
         times = points["time"].astype(np.float64)
@@ -55,8 +59,15 @@ class PlainOdometry:
         few = np.count_nonzero(inside) < LEAST_POINTS
         last = float(times.max()) if len(times) else (sweep.end - sweep.start) * 1e-9
         stamp = HostNs(sweep.start + round(last * 1e9))
-        if self._last is not None and stamp <= self._last.stamp:
-            return [dataclasses.replace(self._last, points=points[:0], status=(Status.REFUSED,))]
+        status: tuple[Status, ...] = ()
+        if self._last is not None:
+            step = stamp - self._last.stamp
+            if -tuning.LONG_GAP_NS < step <= 0:
+                refused = (Status.REFUSED,)
+                return [dataclasses.replace(self._last, points=points[:0], status=refused)]
+            if not 0 < step <= tuning.TIME_JUMP_NS:
+                self._last = None
+                status = (Status.RESTARTED,)
         if not few:
             # KISS-ICP takes equal times of all points inside its limits for a reason to abort
             spread = np.ptp(times[inside]) > 0.0
@@ -67,7 +78,8 @@ class PlainOdometry:
                 points = np.zeros(len(frame), points.dtype)
             for axis, column in zip("xyz", frame.T, strict=True):
                 points[axis] = column
-        status = (Status.PREDICTED, Status.SPARSE) if few else ()
+        if few:
+            status += (Status.PREDICTED, Status.SPARSE)
         self._last = self._estimate(stamp, points, status, int(inside.sum()))
         return [self._last]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.motion.imu_buffer import ImuBuffer
@@ -70,8 +71,29 @@ def test_a_jump_of_the_clock_starts_afresh() -> None:
     window.push(samples(100, 104))
     assert kept(window) == [100, 104]
     window.push(samples(5_000))
-    assert kept(window) == [5_000]
-    assert window.counts.jumps == 2
+    window.push(samples(5_004))
+    assert kept(window) == [5_000, 5_004]
+    window.push(samples(8_000))
+    window.push(samples(11_000))  # slower than any IMU, but no outlier
+    assert kept(window) == [8_000, 11_000]
+    assert window.counts.jumps == 3
+    assert window.counts.outlier == 0
+
+
+@pytest.mark.parametrize("at", [10**9, -(10**9), 2_000])
+def test_one_sample_of_another_time_changes_nothing(at: int) -> None:
+    window = ImuBuffer(jump_s=1.0)
+    window.push(samples(0, 4))
+    assert not len(window.push(samples(at)))
+    window.push(samples(8))
+    assert len(window.push(samples(12, at, 16))) == 2
+    assert len(window.push(samples(at, 20))) == 1
+    assert kept(window) == [0, 4, 8, 12, 16, 20]
+    assert (window.counts.jumps, window.counts.outlier) == (0, 3)
+    window.push(samples(at))
+    window.clear()
+    window.push(samples(at + 4, at + 8))
+    assert kept(window) == [at + 4, at + 8]
 
 
 def test_between_includes_a_neighbour_on_either_side() -> None:

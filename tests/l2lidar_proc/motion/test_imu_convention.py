@@ -23,11 +23,15 @@ def samples_of(motion: Any, seconds: float, factor: float = 1.0) -> np.ndarray:
     return samples
 
 
-def watched(name: str, factor: float, noise_m: float = 0.001) -> tuple[ImuConvention, int]:
+def watched(
+    name: str, factor: float, noise_m: float = 0.001, first_pose: int | None = None
+) -> tuple[ImuConvention, int]:
     """Return a convention after 20 s, and the number of poses until the sign was changed."""
     motion = trajectories.make(name, scenes.make("room"), seed=1)
     samples = samples_of(motion, 20.0, factor)
     convention, rng, first = ImuConvention(), np.random.default_rng(5), 0
+    if first_pose is not None:
+        convention.watch(HostNs(first_pose), np.eye(3), np.zeros(3))
     for number, t in enumerate(np.arange(0.2, 20.0, 0.23)):
         last = int(np.searchsorted(samples["stamp"], (t + 0.115) * 1e9))
         convention.corrected(samples[first:last])
@@ -54,6 +58,12 @@ def test_the_opposite_sign_is_found_within_seconds_of_motion(factor: float) -> N
     assert convention.reversed
     assert "points the other way" in convention.notes[-1]
     assert convention.in_g == (abs(factor) < 0.5)
+
+
+def test_a_pose_of_another_time_does_not_end_the_watch() -> None:
+    convention, changed = watched("walk", -1.0, first_pose=10**18)
+    assert 20 <= changed < 50
+    assert convention.reversed
 
 
 def test_at_rest_nothing_can_be_said_of_the_sign() -> None:

@@ -161,3 +161,23 @@ def test_turned_axes_turn_the_vertical() -> None:
         samples[name] = samples[name] @ turn.T
     found = follow(samples)
     np.testing.assert_allclose(found.up, (0, -1, 0), atol=0.01)
+
+
+@pytest.mark.parametrize("first", [False, True], ids=["amid", "before the samples"])
+@pytest.mark.parametrize("ahead_s", [2.0, 3_600.0, 1e9])
+def test_a_velocity_from_the_future_does_not_block_its_source(ahead_s: float, first: bool) -> None:
+    walk = Motion(turn=0.5, speed=1.0)
+    samples = noisy(walk.imu(0, 3, BIAS))
+    buffer = ImuBuffer(25.0)
+    found = TwistFilter(buffer, T_CLOUD_IMU[:3, 3], 0.1)
+    used = []
+    for i in range(0, len(samples), 10):
+        t = (int(samples["stamp"][i]) - EPOCH) * 1e-9
+        if i == (0 if first else 400):
+            assert found.take(at(t + ahead_s), (9.0, 0.0, 0.0), "odometry") == first
+        buffer.push(samples[i : i + 10])
+        found.follow()
+        used.append(found.take(at(t), walk.velocity(np.array([t]))[0], "odometry"))
+    assert all(used)
+    assert found.newest_twist == at(t)
+    assert found.speed_near(at(t), 10**9) == pytest.approx(1.0, abs=0.3)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+import itertools
 
+import numpy as np
+import pytest
+
+from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.plain import PlainOdometry
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
@@ -24,3 +29,18 @@ def test_points_that_its_deskew_moves_across_the_limit_are_left_out() -> None:
         out = np.stack([found.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
         assert np.linalg.norm(out, axis=1).max() < 4.001
     assert fewer > 5
+
+
+@pytest.mark.parametrize("seconds", [3_600, 10**9, -3_600])
+def test_one_cloud_of_another_time_costs_no_other(seconds: int) -> None:
+    odometry = PlainOdometry(OdometryConfig(mode="plain"))
+    found = []
+    for number, sweep in enumerate(itertools.islice(sweeps(recording("room", "walk"), "turn"), 8)):
+        by = seconds * 10**9 if number == 4 else 0
+        moved = Sweep(HostNs(sweep.start + by), HostNs(sweep.end + by), sweep.points, 0, 0)
+        found += odometry.register(moved)
+    status = [item.status for item in found]
+    assert status == [(), (), (), (), (Status.RESTARTED,), (Status.RESTARTED,), (), ()]
+    assert all(np.linalg.norm(item.velocity) < 3.0 for item in found)
+    again = odometry.register(moved)
+    assert again[0].status == (Status.REFUSED,)
