@@ -12,6 +12,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
@@ -131,13 +132,17 @@ class SlamNode(ManagedNode):
         self._state = self.create_publisher(DiagnosticStatus, topics.status_topic, latched)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         worker = self.worker
+        # A callback that waits holds its group. In the node's own, neither messages nor timers
+        # would come through, and nothing would wake the executor when the answer is there.
+        waiting = ReentrantCallbackGroup()
         for name, job in (
             ("save", worker.save),
             ("load", worker.load),
             ("reset", worker.reset),
             ("relocalize", worker.relocalize),
         ):
-            self.create_service(Trigger, f"~/{name}", self._service(job))
+            service = self._service(job)
+            self.create_service(Trigger, f"~/{name}", service, callback_group=waiting)
 
     def _configure(self, config: SlamNodeConfig) -> None:
         if self._worker is not None:
@@ -284,8 +289,14 @@ class SlamNode(ManagedNode):
 
         async def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             del request
-            future: Future = Future(executor=self.executor)
-            self.worker.request(job, future.set_result)
+            executor = self.executor
+            future: Future = Future(executor=executor)
+
+            def done(result: Answer) -> None:
+                future.set_result(result)
+                executor.wake()  # it may sleep: nothing else tells it of the worker's answer
+
+            self.worker.request(job, done)
             response.success, response.message = await future
             return response
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+import traceback
 from collections import Counter
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
-from queue import Empty, Full, Queue
+from queue import Empty, PriorityQueue
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +27,8 @@ Answer = tuple[bool, str]
 """Whether something worked, and what there is to say."""
 
 _DEPTH: Final = 400  # sweeps that may wait while a loop is verified: over a minute
-_END: Final = None
+_MOST_REQUESTS: Final = 50  # that may wait besides
+_NOW, _IN_TURN = 0, 1  # a job that does not depend on those before it, one that does
 
 
 class SlamWorker:
@@ -48,7 +51,8 @@ class SlamWorker:
         Of the place in the map: turn, then translation, map axes.
     counts : Counter of str
         Candidates that were refused, by reason.
-    submaps, loops, dropped, saved_bytes : int
+    submaps, loops, dropped, failures, saved_bytes : int
+        ``failures`` are errors that nobody foresaw.
 
     Raises
     ------
@@ -61,7 +65,7 @@ class SlamWorker:
         self._config = config
         self._warn = warn
         self.map_name = config.topics.map_name
-        self.dropped = self.saved_bytes = 0
+        self.dropped = self.failures = self.saved_bytes = 0
         self._given = False
         self._writer: AtlasWriter | None = None
         self._changed = False
@@ -71,7 +75,8 @@ class SlamWorker:
         self._map = saved
         self._engine: Slam | Localizer = self._made(saved)
         self._publish()
-        self._jobs: Queue[Callable[[], None] | None] = Queue(_DEPTH)
+        self._jobs: PriorityQueue[tuple[int, int, Callable[[], None] | None]] = PriorityQueue()
+        self._numbers = count()
         self._thread = threading.Thread(target=self._run, name="slam", daemon=True)
         self._thread.start()
 
@@ -89,16 +94,26 @@ class SlamWorker:
 
     def sweep(self, sweep: OdometrySweep) -> None:
         """Take a sweep; if too many wait already, it is counted as dropped."""
-        self._submit(lambda: self._add(sweep))
+        if self.waiting >= _DEPTH:
+            self.dropped += 1
+            return
+        self._submit(_IN_TURN, lambda: self._add(sweep))
 
     def request(self, job: Callable[[], Answer], done: Callable[[Answer], None]) -> None:
-        """Have one of the methods below run in the thread, and its answer given to ``done``."""
-        if not self._submit(lambda: done(job())):
+        """Have one of the methods below run in the thread, and its answer given to ``done``.
+
+        The map is saved as it is now; everything else waits for the sweeps that came before.
+        """
+        if self.waiting >= _DEPTH + _MOST_REQUESTS:
             done((False, "too much is waiting; try again"))
+            return
+        rank = _NOW if job in (self.save, self.autosave) else _IN_TURN
+        self._submit(rank, lambda: done(self._answered(job)))
 
     def show(self, show: Callable[[Map, list[tuple[int, int]]], None]) -> None:
         """Have the map and its loops shown, in the thread."""
-        self._submit(lambda: show(*self._shown()))
+        if self.waiting < _DEPTH:
+            self._submit(_IN_TURN, lambda: show(*self._shown()))
 
     def close(self) -> None:
         """End the thread; what waits is forgotten."""
@@ -107,7 +122,7 @@ class SlamWorker:
                 self._jobs.get_nowait()
         except Empty:
             pass
-        self._jobs.put(_END)
+        self._submit(_NOW, None)
         self._thread.join(timeout=5.0)
 
     # ---- run in the thread
@@ -170,16 +185,25 @@ class SlamWorker:
         return True, f"taken: {x:.2f} m, {y:.2f} m, {np.degrees(yaw):.0f} degrees"
 
     def _run(self) -> None:
-        while (job := self._jobs.get()) is not _END:
-            job()
+        while (job := self._jobs.get()[2]) is not None:
+            try:
+                job()
+            except Exception as error:  # nobody foresaw it: the node stays alive and says so
+                self._failed(error)
 
-    def _submit(self, job: Callable[[], None]) -> bool:
+    def _submit(self, rank: int, job: Callable[[], None] | None) -> None:
+        self._jobs.put((rank, next(self._numbers), job))
+
+    def _answered(self, job: Callable[[], Answer]) -> Answer:
         try:
-            self._jobs.put_nowait(job)
-        except Full:
-            self.dropped += 1
-            return False
-        return True
+            return job()
+        except Exception as error:
+            self._failed(error)
+            return False, f"internal error: {type(error).__name__}: {error}"
+
+    def _failed(self, error: Exception) -> None:
+        self.failures += 1
+        self._warn(f"internal error: {error}\n{traceback.format_exc()}")
 
     def _add(self, sweep: OdometrySweep) -> None:
         self._changed |= self._engine.add(sweep)
@@ -231,6 +255,7 @@ def values_of(worker: SlamWorker) -> dict[str, Any]:
         "loops": worker.loops,
         "waiting": worker.waiting,
         "dropped": worker.dropped,
+        "internal errors": worker.failures,
         "saved bytes": worker.saved_bytes,
         **{f"refused: {reason}": count for reason, count in worker.counts.items()},
     }

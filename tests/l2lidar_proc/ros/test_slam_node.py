@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,73 @@ def test_a_walk_becomes_a_map_that_is_saved_and_shown(
         assert {t.child_frame_id for t in bench.transforms} == {"odom"}
         assert len(bench.maps[-1].data) > 10_000
         assert len(bench.graphs[-1].markers) == 3
+    finally:
+        bench.close()
+
+
+def test_while_a_service_waits_for_the_worker_everything_else_goes_on(
+    office: MappingRun,
+    tmp_path: Path,
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}", "autosave_s:=0.0")
+    first, last, began = threading.Event(), threading.Event(), threading.Event()
+
+    def busy(release: threading.Event) -> tuple[bool, str]:
+        began.set()
+        release.wait()
+        return True, ""
+
+    try:
+        some = sweeps_of(office)[:40]
+        for sweep in some[:30]:
+            bench.send(sweep)
+        bench.drain()
+        worker = bench.node._worker
+        worker.request(lambda: busy(first), lambda answer: None)
+        bench.until(began.is_set)
+        for sweep in some[30:]:
+            worker.sweep(sweep)
+        worker.request(lambda: busy(last), lambda answer: None)
+        client = bench.peer.create_client(Trigger, "slam_node/save")
+        bench.until(client.service_is_ready)
+        saved = client.call_async(Trigger.Request())
+        bench.until(lambda: worker.waiting == 12)
+        before = len(bench.transforms)
+        bench.until(lambda: len(bench.transforms) > before + 5)
+        assert not saved.done()
+
+        first.set()
+        bench.until(saved.done)  # before the sweeps, and what comes after them
+
+        assert not last.is_set()
+        assert saved.result().success
+        assert atlas.load(tmp_path / "map")[1] == []
+    finally:
+        first.set()
+        last.set()
+        bench.close()
+
+
+def test_an_error_of_the_worker_is_answered_and_counted(
+    office: MappingRun,
+    tmp_path: Path,
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}", "autosave_s:=0.0")
+    try:
+        worker = bench.node._worker
+        broken = dataclasses.replace(sweeps_of(office)[0], points=np.zeros((3, 2)))
+        worker.sweep(broken)
+        bench.until(lambda: worker.failures)
+        for sweep in sweeps_of(office)[1:15]:
+            bench.send(sweep)
+        bench.drain()
+
+        assert bench.call("save").success
+        assert worker.failures == 1
+        bench.diagnostics.clear()
+        bench.until(lambda: any("slam" in status.name for status in bench.diagnostics))
+        (said,) = [s for s in bench.diagnostics if "slam" in s.name][:1]
+        assert {v.key: v.value for v in said.values}["internal errors"] == "1"
     finally:
         bench.close()
 
