@@ -15,6 +15,7 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseMotion
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.slam.nodes import Keyframe
 
 UNKNOWN_VARIANCE: Final = 9999.0
 """What rtabmap takes for a pose or velocity that is not known."""
@@ -67,6 +68,27 @@ def odometry_status(estimate: OdometryEstimate, base_frame: str) -> DiagnosticAr
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
     ]
+    return message
+
+
+def keyframe(given: Keyframe, odom_frame: str, frame: str) -> Odometry:
+    """Return a keyframe: its pose, and as covariance that of the motion since the one before.
+
+    In the axes of the odometry frame, as ROS wants it; 9999 where the motion is not known. The
+    twist, where rtabmap looks for the covariance of a link, has the same in the keyframe's axes.
+    """
+    message = Odometry(child_frame_id=frame)
+    message.header.stamp = to_time(given.stamp)
+    message.header.frame_id = odom_frame
+    message.pose.pose = pose(given.T_odom_node)
+    if given.covariance is None:
+        set_unknown(message)
+        return message
+    order = [3, 4, 5, 0, 1, 2]
+    own = given.covariance[np.ix_(order, order)]
+    turn = np.kron(np.eye(2), given.T_odom_node[:3, :3])
+    message.pose.covariance = (turn @ own @ turn.T).ravel()
+    message.twist.covariance = own.ravel()
     return message
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -24,16 +25,16 @@ from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.ros import odometry_messages as messages
+from l2lidar_proc.ros.map_transform import MapTransform
 from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
 from l2lidar_proc.slam.atlas import AtlasError
 from l2lidar_proc.slam.config import SlamNodeConfig
-from l2lidar_proc.slam.nodes import Map, OdometrySweep, SlamState, health_of
+from l2lidar_proc.slam.nodes import Keyframe, Map, OdometrySweep, SlamState, health_of
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 
 _PENDING: Final = 40  # stamps that wait for their other messages
-_AHEAD_S: Final = 1.0  # the transform is carried on so long after the last odometry
 _SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
 _LEVELS: Final = {
     SlamState.LOCALIZED: DiagnosticStatus.OK,
@@ -42,6 +43,16 @@ _LEVELS: Final = {
     SlamState.DEAD_RECKONING: DiagnosticStatus.ERROR,
     SlamState.LOST: DiagnosticStatus.ERROR,
 }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Latest:
+    """The newest odometry: stamp, arrival on the monotonic clock [ns], frame, pose (4, 4)."""
+
+    stamp: HostNs
+    arrival_ns: int
+    frame: str
+    pose: F64
 
 
 @dataclass(slots=True)
@@ -80,13 +91,11 @@ class SlamNode(ManagedNode):
         """Start the worker, load the map where one is to be used, open publishers and services."""
         config = self._settings.value
         try:
-            self._worker = SlamWorker(config, self.get_logger().warning)
+            self._worker = SlamWorker(config, self.get_logger().warning, self._show_keyframe)
         except (GtsamMissingError, AtlasError) as error:
             raise StartError(str(error)) from None
         self._parts: OrderedDict[HostNs, _Parts] = OrderedDict()
-        self._latest: tuple[HostNs, int, str] | None = None  # stamp, arrival, odom frame
-        self._stamped = 0
-        self._other_parent = ""
+        self._latest: _Latest | None = None
         self._refused = 0
         self._shown = (-1, -1)
         self._open(config)
@@ -108,7 +117,7 @@ class SlamNode(ManagedNode):
         self.create_timer(1.0, self._diagnose)
         if topics.map_period_s > 0.0:
             self.create_timer(topics.map_period_s, self._show)
-        if topics.autosave_s > 0.0 and self._settings.value.slam.mode == "mapping":
+        if topics.autosave_s > 0.0:
             self.create_timer(topics.autosave_s, self._autosave)
 
     def pause(self) -> None:
@@ -124,25 +133,30 @@ class SlamNode(ManagedNode):
     def _open(self, config: SlamNodeConfig) -> None:
         topics = config.topics
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
+        self._transform = MapTransform(self)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, topics.pose_topic, 10)
         self._map = self.create_publisher(PointCloud2, topics.map_topic, latched)
         self._path = self.create_publisher(Path, topics.path_topic, latched)
         self._graph = self.create_publisher(MarkerArray, topics.graph_topic, latched)
+        reliable = QoSProfile(depth=50)
+        self._keyframe = self.create_publisher(Odometry, topics.keyframe_topic, reliable)
+        self._keyframe_points = self.create_publisher(
+            PointCloud2, topics.keyframe_points_topic, reliable
+        )
         self._state = self.create_publisher(DiagnosticStatus, topics.status_topic, latched)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         worker = self.worker
         # A callback that waits holds its group. In the node's own, neither messages nor timers
         # would come through, and nothing would wake the executor when the answer is there.
         waiting = ReentrantCallbackGroup()
-        for name, job in (
-            ("save", worker.save),
-            ("load", worker.load),
-            ("reset", worker.reset),
-            ("relocalize", worker.relocalize),
+        for kind, name, answer in (
+            (Trigger, "save", self._answered(lambda _: worker.save(), at_once=True)),
+            (Trigger, "load", self._answered(lambda _: worker.load())),
+            (Trigger, "reset", self._answered(lambda _: worker.reset())),
+            (Trigger, "relocalize", self._answered(lambda _: worker.relocalize())),
+            (SetBool, "set_localization", self._answered(worker.set_localization)),
         ):
-            service = self._service(job)
-            self.create_service(Trigger, f"~/{name}", service, callback_group=waiting)
+            self.create_service(kind, f"~/{name}", answer, callback_group=waiting)
 
     def _configure(self, config: SlamNodeConfig) -> None:
         if self._worker is not None:
@@ -152,7 +166,10 @@ class SlamNode(ManagedNode):
 
     def _odometry(self, message: Odometry) -> None:
         stamp = from_time(message.header.stamp)
-        self._latest = stamp, time.monotonic_ns(), message.header.frame_id
+        pose = messages.matrix(message.pose.pose)
+        if np.isfinite(pose).all():
+            frame = message.header.frame_id
+            self._latest = _Latest(stamp, time.monotonic_ns(), frame, pose)
         self._part(stamp).odometry = message
         self._publish_pose(message)
         self._pair(stamp)
@@ -207,31 +224,22 @@ class SlamNode(ManagedNode):
         worker.request(lambda: worker.set_pose(x, y, yaw), self._say)
 
     def _transforms(self, message: TFMessage) -> None:
-        """Notice whether somebody else is the parent of the odometry frame already."""
-        if self._latest is None:
-            return
-        ours = self._settings.value.topics.map_frame
-        for transform in message.transforms:
-            parent = transform.header.frame_id
-            if transform.child_frame_id == self._latest[2] and parent != ours:
-                self._other_parent = parent
+        if self._latest is not None:
+            self._transform.watch(message, self._settings.value.topics, self._latest.frame)
 
     # ---- output
 
     def _publish_transform(self) -> None:
-        T_map_odom, topics = self.worker.T_map_odom, self._settings.value.topics
-        if T_map_odom is None or self._latest is None:
-            return
-        if not topics.publish_tf or self._other_parent:
-            return
-        stamp, arrival, odom = self._latest
-        ahead = min(time.monotonic_ns() - arrival, round(_AHEAD_S * 1e9))
-        stamped = stamp + ahead + round(topics.tf_tolerance_s * 1e9)
-        if self._stamped - round(2e9 * _AHEAD_S) < stamped <= self._stamped:
-            return  # a transform of that instant is out already
-        self._stamped = stamped
-        transform = messages.transform(T_map_odom, HostNs(stamped), topics.map_frame, odom)
-        self._tf.publish(TFMessage(transforms=[transform]))
+        latest = self._latest
+        if latest is not None:
+            self._transform.publish(
+                self.worker.T_map_odom,
+                latest.pose,
+                latest.stamp,
+                latest.arrival_ns,
+                latest.frame,
+                self._settings.value.topics,
+            )
 
     def _publish_pose(self, odometry: Odometry) -> None:
         T_map_odom = self.worker.T_map_odom
@@ -257,7 +265,7 @@ class SlamNode(ManagedNode):
         if self._latest is None or not any(wanted) or now == self._shown:
             return
         self._shown = now
-        stamp = self._latest[0]
+        stamp = self._latest.stamp
         worker.show(lambda built, loops: self._show_map(built, loops, stamp))
 
     def _show_map(self, built: Map, loops: list[tuple[int, int]], stamp: HostNs) -> None:
@@ -281,22 +289,39 @@ class SlamNode(ManagedNode):
         if self._graph.get_subscription_count():
             self._graph.publish(_markers(built, loops, frame))
 
+    def _show_keyframe(self, keyframe: Keyframe) -> None:
+        """Publish a submap for other back ends; called in the worker's thread."""
+        latest = self._latest
+        frame = f"keyframe_{keyframe.number}"
+        if latest is not None:
+            self._keyframe.publish(messages.keyframe(keyframe, latest.frame, frame))
+        if self._keyframe_points.get_subscription_count() and keyframe.submap is not None:
+            points = messages.as_cloud(keyframe.submap.xyz)
+            self._keyframe_points.publish(to_cloud(points, keyframe.stamp, frame))
+
     def _autosave(self) -> None:
-        self.worker.request(self.worker.autosave, lambda answer: None)
+        self.worker.request(self.worker.autosave, lambda answer: None, at_once=True)
 
-    def _service(self, job: Any) -> Any:
-        """Return a callback that answers when the worker has done a job."""
+    def _answered(self, job: Callable[[bool], Answer], *, at_once: bool = False) -> Any:
+        """Return a callback of a service that answers when the worker has done a job.
 
-        async def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            del request
-            executor = self.executor
+        Parameters
+        ----------
+        job : callable
+            Given what a SetBool asks for; True from a Trigger.
+        at_once : bool
+            See :meth:`SlamWorker.request`.
+        """
+
+        async def answer(request: Any, response: Any) -> Any:
+            wanted, executor = bool(getattr(request, "data", True)), self.executor
             future: Future = Future(executor=executor)
 
             def done(result: Answer) -> None:
                 future.set_result(result)
                 executor.wake()  # it may sleep: nothing else tells it of the worker's answer
 
-            self.worker.request(job, done)
+            self.worker.request(lambda: job(wanted), done, at_once=at_once)
             response.success, response.message = await future
             return response
 
@@ -312,10 +337,11 @@ class SlamNode(ManagedNode):
     def _diagnose(self) -> None:
         state = self.worker.state
         text, level = state.value, _LEVELS[state]
-        if self._other_parent:
+        parent = self._transform.other_parent
+        if parent:
             level = DiagnosticStatus.ERROR
             text = (
-                f"'{self._other_parent}' is the parent of the odometry frame already: set "
+                f"'{parent}' is the parent of the odometry frame already: set "
                 "invert_tf of the odometry to false, or publish_tf of slam_node"
             )
         values = {**values_of(self.worker), "sweeps refused": self._refused}

@@ -18,7 +18,8 @@ from l2lidar_proc.slam import atlas
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
 from l2lidar_proc.slam.config import SlamNodeConfig, check_map_name
 from l2lidar_proc.slam.localization import Localizer
-from l2lidar_proc.slam.nodes import Map, OdometrySweep, SlamState
+from l2lidar_proc.slam.nodes import Keyframe, Map, OdometrySweep, SlamState
+from l2lidar_proc.slam.pose_graph import GtsamMissingError
 from l2lidar_proc.slam.slam import Slam
 
 F64 = NDArray[np.float64]
@@ -42,6 +43,8 @@ class SlamWorker:
     config : SlamNodeConfig
     warn : callable
         Told what a person should know.
+    on_keyframe : callable
+        Told, in the thread, of each submap that is closed.
 
     Attributes
     ----------
@@ -61,16 +64,22 @@ class SlamWorker:
         If there is no map to begin with, and one is needed.
     """
 
-    def __init__(self, config: SlamNodeConfig, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        config: SlamNodeConfig,
+        warn: Callable[[str], None],
+        on_keyframe: Callable[[Keyframe], None],
+    ) -> None:
         self._config = config
-        self._warn = warn
+        self._warn, self._on_keyframe = warn, on_keyframe
+        self._is_localizing = config.slam.mode == "localization"
         self.map_name = config.topics.map_name
         self.dropped = self.failures = self.saved_bytes = 0
         self._given = False
         self._writer: AtlasWriter | None = None
         self._changed = False
         saved = None
-        if config.topics.load_map or config.slam.mode == "localization":
+        if config.topics.load_map or self._is_localizing:
             saved = self._load()
         self._map = saved
         self._engine: Slam | Localizer = self._made(saved)
@@ -99,15 +108,21 @@ class SlamWorker:
             return
         self._submit(_IN_TURN, lambda: self._add(sweep))
 
-    def request(self, job: Callable[[], Answer], done: Callable[[Answer], None]) -> None:
+    def request(
+        self, job: Callable[[], Answer], done: Callable[[Answer], None], *, at_once: bool = False
+    ) -> None:
         """Have one of the methods below run in the thread, and its answer given to ``done``.
 
-        The map is saved as it is now; everything else waits for the sweeps that came before.
+        Parameters
+        ----------
+        job, done : callable
+        at_once : bool
+            Before the sweeps that wait. A pose that is given has to wait for them, for instance.
         """
         if self.waiting >= _DEPTH + _MOST_REQUESTS:
             done((False, "too much is waiting; try again"))
             return
-        rank = _NOW if job in (self.save, self.autosave) else _IN_TURN
+        rank = _NOW if at_once else _IN_TURN
         self._submit(rank, lambda: done(self._answered(job)))
 
     def show(self, show: Callable[[Map, list[tuple[int, int]]], None]) -> None:
@@ -164,8 +179,30 @@ class SlamWorker:
 
     def reset(self) -> Answer:
         """Begin anew: with an empty map, or in localization mode with the one that was loaded."""
-        self._begin(self._map if self._config.slam.mode == "localization" else None)
+        self._begin(self._map if self._is_localizing else None)
         return True, "begun anew"
+
+    def set_localization(self, is_localizing: bool) -> Answer:
+        """Keep the map as it is from now on, or let it grow; a place that is known stays known."""
+        engine, known = self._engine, self.state is SlamState.LOCALIZED
+        if is_localizing and isinstance(engine, Slam):
+            worked, text = self.save()
+            if not worked:
+                return False, f"the map could not be saved: {text}"
+            localizer = Localizer(self._config.slam, engine.map())
+            if known and engine.T_map_odom is not None:
+                localizer.take_over(engine.T_map_odom, engine.covariance)
+            self._map, self._engine = engine.map(), localizer
+        elif not is_localizing and isinstance(engine, Localizer):
+            try:
+                self._engine = self._mapping(self._map, engine.place)
+            except GtsamMissingError as error:
+                return False, str(error)
+        self._is_localizing = is_localizing
+        self._given = True
+        self._publish()
+        text = "localization: the map stays" if is_localizing else "mapping: the map grows"
+        return True, text
 
     def relocalize(self) -> Answer:
         """Search for the place in the map."""
@@ -226,10 +263,13 @@ class SlamWorker:
 
     def _made(self, saved: Map | None) -> Slam | Localizer:
         self._given = not self._config.topics.initial_pose
-        if self._config.slam.mode == "localization":
+        if self._is_localizing:
             assert saved is not None
             return Localizer(self._config.slam, saved)
-        return Slam(self._config.slam, saved)
+        return self._mapping(saved, None)
+
+    def _mapping(self, saved: Map | None, place: tuple[F64, F64] | None) -> Slam:
+        return Slam(self._config.slam, saved, place=place, on_keyframe=self._on_keyframe)
 
     def _publish(self) -> None:
         engine = self._engine

@@ -54,7 +54,7 @@ class DriftConfig:
 class LoopConfig:
     """When a loop is looked for, and what it needs to be accepted."""
 
-    loops: bool = setting(True, "whether loops are closed", live=True)
+    loops: bool = setting(True, "whether loops are closed; without, gtsam is not needed")
     loop_min_way_m: float = setting(
         20.0, "way since a place before it is looked for again", unit="m", lo=5.0, hi=1000.0
     )
@@ -141,6 +141,15 @@ class SlamTopics:
     path_topic: str = setting("map_path", "corrected path in map_frame", form=TOPIC)
     graph_topic: str = setting("graph", "submaps and loops as markers", form=TOPIC)
     status_topic: str = setting("slam_status", "state of the back end", form=TOPIC)
+    keyframe_topic: str = setting(
+        "keyframes",
+        "pose in the odometry frame of each submap that was closed, with the covariance of the "
+        "motion since the one before; for other back ends",
+        form=TOPIC,
+    )
+    keyframe_points_topic: str = setting(
+        "keyframe_points", "points of that submap, same stamp and frame", form=TOPIC
+    )
     map_frame: str = setting("map", "frame of the map", form=FRAME)
     publish_tf: bool = setting(True, "publish the transform from odom to map_frame")
     tf_rate: float = setting(
@@ -148,6 +157,14 @@ class SlamTopics:
     )
     tf_tolerance_s: float = setting(
         0.1, "how far ahead the transform is stamped", unit="s", lo=0.0, hi=1.0
+    )
+    blend_s: float = setting(
+        0.0,
+        "time over which the transform follows a correction; 0 = at once",
+        unit="s",
+        lo=0.0,
+        hi=30.0,
+        live=True,
     )
     map_period_s: float = setting(
         5.0, "time between publications of map and path, 0 = none", unit="s", lo=0.0, hi=3600.0

@@ -205,14 +205,14 @@ FORMATS: Final[dict[str, Callable[[Map, Path], list[Path]]]] = {
 """Writers by name."""
 
 
-def draw(built: Map, path: Path) -> None:
+def draw(built: Map, path: Path, title: str = "") -> None:
     """Draw the map from above with the way and the loops."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 9), layout="constrained")
-    axes = figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axes = figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
     points = built.points()
     shown = points[:: max(len(points) // 200_000, 1)]
     axes.scatter(shown[:, 0], shown[:, 1], s=0.3, c="0.6", linewidths=0, rasterized=True)

@@ -89,7 +89,8 @@ class Localizer:
         self.state = SlamState.SEARCHING
         self.covariance = np.zeros((6, 6))
         self.counts: Counter[str] = Counter()
-        self._eligible = np.array([node.submap is not None for node in saved.nodes])
+        self._eligible = saved.largest_part()
+        self._eligible &= np.array([node.submap is not None for node in saved.nodes])
         self._views = ViewCache()
         self._search = PlaceSearch(self._view_of)
         self._sweeps: deque[tuple[float, OdometrySweep]] = deque()
@@ -143,6 +144,19 @@ class Localizer:
         self._confirmed_at = self._looked_at = self._way
         self.state = SlamState.TENTATIVE
         return True
+
+    def take_over(self, T_map_odom: F64, covariance: F64) -> None:
+        """Take a place that is known already, with its covariance as in :attr:`covariance`."""
+        self._forget()
+        self.T_map_odom, self.covariance = T_map_odom, covariance
+        self.state = SlamState.LOCALIZED
+
+    @property
+    def place(self) -> tuple[F64, F64] | None:
+        """``T_map_odom`` and its covariance where they are known, else None."""
+        if self.T_map_odom is None or self.state is not SlamState.LOCALIZED:
+            return None
+        return self.T_map_odom, self.covariance
 
     @property
     def sigma(self) -> float:

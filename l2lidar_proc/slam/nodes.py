@@ -8,6 +8,8 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.base_frame import BaseFrame
@@ -15,7 +17,7 @@ from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses, Trajectory
 from l2lidar_proc.slam.candidates import odometry_covariance
 from l2lidar_proc.slam.config import SlamConfig
-from l2lidar_proc.slam.pose_graph import ODOMETRY
+from l2lidar_proc.slam.pose_graph import CUT, ODOMETRY
 from l2lidar_proc.slam.se3 import (
     SHIFT,
     TURN,
@@ -133,6 +135,31 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A submap that was closed, as other back ends want it.
+
+    Attributes
+    ----------
+    number : int
+    stamp : HostNs
+        Of its first sweep.
+    T_odom_node : ndarray, shape (4, 4)
+        z up.
+    covariance : ndarray, shape (6, 6), or None
+        Of the motion since the keyframe before: turn, then translation, axes of this one. None
+        where that motion is not known: at the beginning, and where the odometry lost its way.
+    submap : Submap or None
+        None if it has no points.
+    """
+
+    number: int
+    stamp: HostNs
+    T_odom_node: F64
+    covariance: F64 | None
+    submap: Submap | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Map:
     """Nodes and edges, as they are saved.
 
@@ -156,6 +183,22 @@ class Map:
             if node.submap is not None
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 3))
+
+    def largest_part(self) -> NDArray[np.bool_]:
+        """Return which nodes belong to the largest part that no cut divides, shape (N,).
+
+        Where the odometry lost its way and no loop led back, the poses of the parts to each
+        other mean nothing.
+        """
+        count = len(self.nodes)
+        edges = self.edges[self.edges["kind"] != CUT]
+        joined = csr_array(
+            (np.ones(len(edges)), (edges["first"], edges["second"])), shape=(count, count)
+        )
+        _, part = connected_components(joined, directed=False)
+        has_points = [node.submap is not None for node in self.nodes]
+        largest = np.bincount(part, has_points, minlength=1).argmax()
+        return np.asarray(part == largest)
 
     def trajectory(self) -> StampedPoses:
         """Return the poses of all sweeps in the map frame.

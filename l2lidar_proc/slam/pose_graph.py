@@ -44,7 +44,7 @@ class GtsamMissingError(ImportError):
     def __init__(self) -> None:
         super().__init__(
             "SLAM needs gtsam, which is not installed: python3 -m pip install 'gtsam>=4.3,<5', or "
-            "this package with its extra 'slam'"
+            "this package with its extra 'slam'; or set 'loops' to false"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,15 @@ from l2lidar_proc.slam import pose_graph
 from l2lidar_proc.slam.admission import LARGEST_DEVIATION, Admission, Loop
 from l2lidar_proc.slam.candidates import Graph
 from l2lidar_proc.slam.config import SlamConfig
-from l2lidar_proc.slam.nodes import Health, Map, Node, OdometrySweep, OpenNode, SlamState
+from l2lidar_proc.slam.nodes import (
+    Health,
+    Keyframe,
+    Map,
+    Node,
+    OdometrySweep,
+    OpenNode,
+    SlamState,
+)
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, GtsamMissingError
 from l2lidar_proc.slam.se3 import adjoint, error, inverse, magnitude, transformed
@@ -21,9 +30,12 @@ from l2lidar_proc.slam.verification import verify
 
 F64 = NDArray[np.float64]
 
+_TIE: Final = (np.radians(0.1), 0.02)  # [rad, m] by which a saved map is bent itself
 _CUT_SIGMA: Final = (3.0, 1000.0)  # [rad, m] an edge that says nothing
 _DISAGREE: Final = (np.radians(1.0), 0.15)  # [rad, m] places one query may have at once
-_KNOWN_OVERLAP: Final = 0.85  # a closed submap that shows this little new keeps no points
+_KNOWN: Final = 0.85  # a submap of which so much was seen before keeps no points
+_KNOWN_CELL_M: Final = 0.5
+_KNOWN_REACH_M: Final = 10.0  # submaps farther away do not show a place
 
 
 class Slam:
@@ -34,6 +46,11 @@ class Slam:
     config : SlamConfig
     saved : Map, optional
         A map to extend: it stands still until the place in it is found.
+    place : tuple of ndarray, optional
+        ``T_map_odom`` (4, 4) in that map, and its covariance (6, 6) as in :attr:`covariance`,
+        where it is known already.
+    on_keyframe : callable, optional
+        Told of each submap that is closed.
 
     Attributes
     ----------
@@ -50,8 +67,15 @@ class Slam:
     GtsamMissingError
     """
 
-    def __init__(self, config: SlamConfig, saved: Map | None = None) -> None:
-        if not pose_graph.is_available():
+    def __init__(
+        self,
+        config: SlamConfig,
+        saved: Map | None = None,
+        *,
+        place: tuple[F64, F64] | None = None,
+        on_keyframe: Callable[[Keyframe], None] | None = None,
+    ) -> None:
+        if config.loop.loops and not pose_graph.is_available():
             raise GtsamMissingError
         self.config = config
         self.nodes: list[Node] = list(saved.nodes) if saved else []
@@ -61,15 +85,21 @@ class Slam:
             (int(edge["second"]), int(edge["first"]))
             for edge in self.edges[self.edges["kind"] == LOOP]
         ]
-        self.state = SlamState.SEARCHING if saved else SlamState.LOCALIZED
-        self.T_map_odom: F64 | None = None if saved else np.eye(4)
+        self.state = SlamState.LOCALIZED
+        self.T_map_odom: F64 | None = np.eye(4)
         self.covariance = np.zeros((6, 6))
+        if place is not None:
+            self.T_map_odom, self.covariance = place
+        elif saved is not None:
+            self.state, self.T_map_odom = SlamState.SEARCHING, None
         self.admission = Admission(config.loop)
         self._views = ViewCache()
         self._search = PlaceSearch(self.view_of)
+        self._on_keyframe = on_keyframe
         self._open: OpenNode | None = None
-        self._way = 0.0
+        self._way = max((node.way for node in self.nodes), default=0.0)
         self._join_by = CUT if saved else ODOMETRY
+        self._place = place
         self._pending_edge: tuple[F64, F64, float] | None = None
 
     # ---- input
@@ -115,17 +145,48 @@ class Slam:
     def _append(self, node: Node, open_node: OpenNode) -> None:
         self._way += open_node.way
         number = len(self.nodes)
+        self._tell(number, node)
         self.nodes.append(node)
         if self._pending_edge is None and not number:
             self.poses = node.T_odom_node[None].copy()
-        elif self._pending_edge is None:  # first of a session in a saved map
-            self._connect(number, inverse(self.poses[-1]) @ node.T_odom_node, _cut(), 0.0)
-        else:
+        elif self._pending_edge is not None:
             self._connect(number, *self._pending_edge)
-        self._pending_edge = None
+        elif self._place is not None:  # first of a session in a saved map
+            self._tie(number, *self._place)
+        else:
+            self._connect(number, inverse(self.poses[-1]) @ node.T_odom_node, _cut(), 0.0)
+        self._pending_edge = self._place = None
+        entered: list[Loop] = []
         if self.config.loop.loops and node.is_comparable:
-            self._look_for_loops(number)
+            entered = self._look_for_loops(number)
+        self._forget_known({number, *(loop.query for loop in entered)})
         self._publish()
+
+    def _tell(self, number: int, node: Node) -> None:
+        if self._on_keyframe is None:
+            return
+        covariance = None
+        if self._pending_edge is not None and self._join_by != CUT:
+            covariance = self._pending_edge[1]
+        self._on_keyframe(Keyframe(number, node.stamp, node.T_odom_node, covariance, node.submap))
+
+    def _tie(self, number: int, T_map_odom: F64, covariance: F64) -> None:
+        """Join the first node of a session to the nearest one of a map it is known in."""
+        T_map_node = T_map_odom @ self.nodes[number].T_odom_node
+        distance = np.linalg.norm(self.poses[:, :3, 3] - T_map_node[:3, 3], axis=1)
+        distance[~self.map(number).largest_part()] = np.inf
+        nearest = int(np.argmin(distance))
+        turned = np.eye(4)
+        turned[:3, :3] = T_map_node[:3, :3]
+        ad = adjoint(inverse(turned))
+        edge = np.zeros(1, EDGE)
+        edge["first"], edge["second"], edge["kind"] = nearest, number, LOOP
+        edge["pose"] = inverse(self.poses[nearest]) @ T_map_node
+        edge["covariance"] = ad @ covariance @ ad.T + np.diag(np.repeat(np.square(_TIE), 3))
+        self.edges = np.concatenate((self.edges, edge))
+        self.poses = np.concatenate((self.poses, T_map_node[None]))
+        self.loops.append((number, nearest))
+        self._join_by = ODOMETRY
 
     def _connect(self, number: int, pose: F64, covariance: F64, way: float) -> None:
         edge = np.zeros(1, EDGE)
@@ -136,20 +197,20 @@ class Slam:
         self.edges = np.concatenate((self.edges, edge))
         self.poses = np.concatenate((self.poses, (self.poses[-1] @ pose)[None]))
 
-    def _look_for_loops(self, number: int) -> None:
+    def _look_for_loops(self, number: int) -> list[Loop]:
+        """Return the loops that entered the graph."""
         graph = Graph(self.poses, self.edges, number, self.config)
         verified = self._near(graph, number)
         if not np.isfinite(graph.ways[0]):
             verified += self._anywhere(graph, number)
         if _contradict(self.poses, verified):
             self.admission.rejected["ambiguous"] += len(verified)
-            return
+            return []
         for loop in verified:
             known = np.isfinite(graph.ways[loop.target])
             self.admission.judge(graph.relation(loop.target) if known else None, loop)
         batch = self.admission.batch(self.poses)
-        if batch:
-            self._enter(batch)
+        return batch if batch and self._enter(batch) else []
 
     def _near(self, graph: Graph, number: int) -> list[Loop]:
         """Return verified pairs with the nodes that the odometry says may be near."""
@@ -189,29 +250,45 @@ class Slam:
             self.state = SlamState.TENTATIVE
         return [Loop(number, found.node, found.match, self._way)]
 
-    def _enter(self, batch: list[Loop]) -> None:
+    def _enter(self, batch: list[Loop]) -> bool:
         """Put loops into the graph, unless the optimized graph cannot hold them."""
         edges = np.concatenate((self.edges, _edges_of(batch)))
         anchors = np.zeros(1, np.int64)
         poses = pose_graph.optimized(self.poses, edges, anchors)
         if pose_graph.deviations(poses, edges).max() > LARGEST_DEVIATION:
             self.admission.bar(batch)
-            return
+            return False
         self.poses, self.edges = poses, edges
         self.admission.accept(batch)
         self.loops += [loop.pair for loop in batch]
-        for loop in batch:
-            self._forget_points(loop)
+        return True
 
-    def _forget_points(self, loop: Loop) -> None:
-        """Drop the points of a submap that shows next to nothing new."""
-        node, target = self.nodes[loop.query], self.nodes[loop.target]
-        if node.submap is None or target.submap is None:
-            return
-        seen = voxel_keys(target.submap.xyz, 0.5)
-        own = voxel_keys(transformed(loop.match.T_target_query, node.submap.xyz), 0.5)
-        if np.isin(own, seen).mean() > _KNOWN_OVERLAP:
-            node.submap = None
+    def _forget_known(self, numbers: Iterable[int]) -> None:
+        """Drop the points of submaps that show next to nothing that was not seen before.
+
+        Before means on an earlier pass that the graph ties to this one: so ground that is passed
+        again and again takes no more memory.
+        """
+        least = self.config.loop.loop_min_way_m
+        ways = np.array([node.way for node in self.nodes])
+        for number in sorted(numbers):
+            node = self.nodes[number]
+            if node.submap is None:
+                continue
+            graph = Graph(self.poses, self.edges, number, self.config)
+            distance = np.linalg.norm(self.poses[:, :3, 3] - self.poses[number, :3, 3], axis=1)
+            known = (ways[number] - ways > least) & (graph.ways < 2.0 * least)
+            known &= distance < _KNOWN_REACH_M
+            seen = [
+                voxel_keys(transformed(self.poses[other], submap.xyz), _KNOWN_CELL_M)
+                for other in np.flatnonzero(known).tolist()
+                if (submap := self.nodes[other].submap) is not None
+            ]
+            if not seen:
+                continue
+            own = voxel_keys(transformed(self.poses[number], node.submap.xyz), _KNOWN_CELL_M)
+            if np.isin(own, np.concatenate(seen)).mean() > _KNOWN:
+                node.submap = None
 
     def _publish(self) -> None:
         """Renew state and ``T_map_odom``."""
@@ -235,9 +312,12 @@ class Slam:
         assert submap is not None
         return self._views.of(number, submap)
 
-    def map(self) -> Map:
-        """Return the map as it is now."""
-        return Map(list(self.nodes), self.poses.copy(), self.edges.copy())
+    def map(self, count: int | None = None) -> Map:
+        """Return the map as it is now, or its first ``count`` nodes."""
+        edges = self.edges
+        if count is not None:
+            edges = edges[(edges["first"] < count) & (edges["second"] < count)]
+        return Map(list(self.nodes[:count]), self.poses[:count].copy(), edges.copy())
 
 
 def _contradict(poses: F64, loops: list[Loop]) -> bool:

@@ -21,16 +21,17 @@ from nav_msgs.msg import (  # noqa: E402
 )
 from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_time, to_cloud, to_time  # noqa: E402
 from l2lidar_node.ros.program import StartError  # noqa: E402
 from l2lidar_proc.ros import odometry_messages as messages  # noqa: E402
+from l2lidar_proc.ros.map_transform import Blend  # noqa: E402
 from l2lidar_proc.ros.slam_node import SlamNode  # noqa: E402
 from l2lidar_proc.slam import atlas, se3  # noqa: E402
-from l2lidar_proc.slam.nodes import OdometrySweep  # noqa: E402
+from l2lidar_proc.slam.nodes import Map, OdometrySweep, SlamState  # noqa: E402
 from l2lidar_proc.slam.slam import Slam  # noqa: E402
 from tests.l2lidar_proc.conftest import STEP  # noqa: E402
 from tests.l2lidar_proc.ros.bench import FRAME, Bench  # noqa: E402
@@ -50,12 +51,16 @@ class SlamBench(Bench):
         self.maps: list[PointCloud2] = []
         self.paths: list[PathMessage] = []
         self.graphs: list[MarkerArray] = []
+        self.keyframes: list[Odometry] = []
+        self.keyframe_points: list[PointCloud2] = []
         self.hear(TFMessage, "/tf", self.take_transforms)
         self.hear(PoseWithCovarianceStamped, "pose", self.poses.append)
         self.hear(DiagnosticStatus, "slam_status", lambda m: self.states.append(m.message))
         self.hear(PointCloud2, "map_points", self.maps.append)
         self.hear(PathMessage, "map_path", self.paths.append)
         self.hear(MarkerArray, "graph", self.graphs.append)
+        self.hear(Odometry, "keyframes", self.keyframes.append)
+        self.hear(PointCloud2, "keyframe_points", self.keyframe_points.append)
         self.odometry_out = self.peer.create_publisher(Odometry, "odometry", 50)
         self.deskewed_out = self.peer.create_publisher(PointCloud2, "deskewed_points", 50)
         self.status_out = self.peer.create_publisher(DiagnosticArray, "odometry_status", 50)
@@ -63,7 +68,7 @@ class SlamBench(Bench):
         self.tf_also = self.peer.create_publisher(TFMessage, "/tf", 50)
         for publisher in (self.odometry_out, self.deskewed_out, self.status_out, self.given_out):
             self.until(publisher.get_subscription_count)
-        self.until(self.node._tf.get_subscription_count)
+        self.until(self.node._transform._publisher.get_subscription_count)
         self.until(self.node._pose.get_subscription_count)
         self.until(lambda: self.node.count_publishers("odometry_status"))
         self.sent = 0
@@ -88,19 +93,24 @@ class SlamBench(Bench):
 
     def is_taken(self, stamp: int) -> bool:
         latest = self.node._latest
-        return latest is not None and latest[0] >= stamp and stamp not in self.node._parts
+        return latest is not None and latest.stamp >= stamp and stamp not in self.node._parts
 
-    def call(self, name: str) -> Any:
-        client = self.peer.create_client(Trigger, f"slam_node/{name}")
+    def call(self, name: str, wanted: bool | None = None) -> Any:
+        kind: Any = Trigger if wanted is None else SetBool
+        client = self.peer.create_client(kind, f"slam_node/{name}")
         self.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
+        request = kind.Request()
+        if wanted is not None:
+            request.data = wanted
+        future = client.call_async(request)
         self.until(future.done)
         return future.result()
 
     def drain(self) -> None:
         """Wait until the worker has done all it was given."""
-        self.until(lambda: not self.node._worker.waiting)
-        self.call("relocalize")  # answered by the worker: all before it is done
+        done: list[object] = []
+        self.node._worker.request(lambda: (True, ""), done.append)  # all before it is done
+        self.until(lambda: done)
 
 
 def sweeps_of(run: MappingRun, seed: int = 1) -> list[OdometrySweep]:
@@ -136,8 +146,91 @@ def test_a_walk_becomes_a_map_that_is_saved_and_shown(
         assert {t.child_frame_id for t in bench.transforms} == {"odom"}
         assert len(bench.maps[-1].data) > 10_000
         assert len(bench.graphs[-1].markers) == 3
+        assert_is_chain(bench, loaded)
     finally:
         bench.close()
+
+
+def assert_is_chain(bench: SlamBench, built: Map) -> None:
+    """Compare what other back ends are given with the edges of the map."""
+    bench.until(lambda: len(bench.keyframes) == len(built.nodes))
+    bench.until(lambda: len(bench.keyframe_points) == len(built.nodes))
+    poses = [messages.matrix(item.pose.pose) for item in bench.keyframes]
+    for number, (item, cloud) in enumerate(
+        zip(bench.keyframes, bench.keyframe_points, strict=True)
+    ):
+        assert item.header.frame_id == "odom"
+        assert item.child_frame_id == cloud.header.frame_id == f"keyframe_{number}"
+        assert item.header.stamp == cloud.header.stamp
+        covariance = np.array(item.pose.covariance).reshape(6, 6)
+        if number == 0:
+            assert np.array_equal(covariance, 9999.0 * np.eye(6))
+            continue
+        edge = built.edges[number - 1]
+        assert np.allclose(se3.inverse(poses[number - 1]) @ poses[number], edge["pose"])
+        turn = poses[number][:3, :3]
+        assert np.allclose(covariance[:3, :3], turn @ edge["covariance"][3:, 3:] @ turn.T)
+        assert np.allclose(covariance[3:, 3:], turn @ edge["covariance"][:3, :3] @ turn.T)
+        own = np.array(item.twist.covariance).reshape(6, 6)
+        assert np.allclose(own[:3, :3], edge["covariance"][3:, 3:])
+
+
+def test_the_map_stays_while_it_localizes_and_grows_again_afterwards(
+    office: MappingRun,
+    tmp_path: Path,
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}", "autosave_s:=0.0", "blend_s:=0.5")
+    worker = bench.node._worker
+    try:
+        some = sweeps_of(office)
+        assert not bench.call("set_localization", True).success  # there is no map yet
+        for sweep in some[:50]:
+            bench.send(sweep)
+        bench.drain()
+        known = worker.T_map_odom
+        assert bench.call("set_localization", True).success
+        saved = len(atlas.load(tmp_path / "map")[0].nodes)
+        for sweep in some[50:70]:
+            bench.send(sweep)
+        bench.drain()
+        assert worker.state is SlamState.LOCALIZED  # without searching
+        assert worker.submaps == saved
+        assert known is not None
+        assert worker.T_map_odom is not None
+        there = (worker.T_map_odom - known) @ some[60].T_odom_body
+        assert np.linalg.norm(there[:3, 3]) < 0.1
+
+        assert bench.call("set_localization", False).success
+        for sweep in some[70:100]:
+            bench.send(sweep)
+        bench.drain()
+        assert worker.state is SlamState.LOCALIZED
+        assert worker.submaps > saved
+        assert bench.call("save").success
+        grown, _ = atlas.load(tmp_path / "map")
+        assert grown.largest_part().all()
+        true = se3.inverse(se3.leveled(office.truth[0])) @ office.true_pose(grown.nodes[-1].stamp)
+        assert np.linalg.norm((grown.poses[-1] - true)[:3, 3]) < 0.3
+    finally:
+        bench.close()
+
+
+def test_a_correction_is_blended_where_the_body_is() -> None:
+    blend, body = Blend(), se3.planar(100.0, 0.0, 0.0)
+    first, second = np.eye(4), se3.planar(0.0, 0.0, 0.02)
+    assert blend.toward(None, body, 0.0, 2.0) is None
+    assert blend.toward(first, body, 1.0, 2.0) is first  # nothing to come from
+    places = []
+    for instant in (10.0, 10.5, 11.0, 11.5, 12.0, 13.0):
+        shown = blend.toward(second, body, instant, 2.0)
+        assert shown is not None
+        places.append((shown @ body)[:3, 3])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert np.allclose(places[0], (first @ body)[:3, 3])
+    assert np.allclose(steps[:4], 0.5, atol=1e-3)
+    assert np.allclose(places[-1], (second @ body)[:3, 3])
+    third = np.eye(4)
+    assert blend.toward(third, body, 14.0, 0.0) is third  # at once
 
 
 def test_while_a_service_waits_for_the_worker_everything_else_goes_on(
@@ -220,7 +313,7 @@ def test_a_clouds_frame_that_is_not_that_of_the_pose_is_named_and_dropped(
         odometry.header.stamp = to_time(bad.stamp)
         odometry.pose.pose.orientation.w = float("nan")
         bench.odometry_out.publish(odometry)
-        bench.until(lambda: bench.node._latest[0] == bad.stamp)
+        bench.until(lambda: bad.stamp in bench.node._parts)
 
         assert bench.node._refused == 3
         assert bench.node._worker.submaps == 0
@@ -239,7 +332,7 @@ def test_another_parent_of_odom_silences_the_transform(
         inverted = messages.transform(np.eye(4), sweeps_of(office)[0].stamp, "base_link", "odom")
         bench.until(bench.tf_also.get_subscription_count)
         bench.tf_also.publish(TFMessage(transforms=[inverted]))
-        bench.until(lambda: bench.node._other_parent)
+        bench.until(lambda: bench.node._transform.other_parent)
         before = len(bench.transforms)
         bench.diagnostics.clear()
         bench.until(lambda: bench.diagnostics)

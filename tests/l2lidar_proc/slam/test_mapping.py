@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,16 @@ from l2lidar_proc.slam import se3
 from l2lidar_proc.slam.admission import Admission, Loop
 from l2lidar_proc.slam.candidates import Graph
 from l2lidar_proc.slam.config import LoopConfig, SlamConfig
-from l2lidar_proc.slam.nodes import Health, SlamState
-from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, deviations, optimized
+from l2lidar_proc.slam.nodes import Health, Keyframe, SlamState
+from l2lidar_proc.slam.pose_graph import (
+    CUT,
+    EDGE,
+    LOOP,
+    ODOMETRY,
+    GtsamMissingError,
+    deviations,
+    optimized,
+)
 from l2lidar_proc.slam.se3 import F64
 from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.slam.verification import Fit, Match
@@ -153,6 +162,41 @@ def test_a_lap_and_a_third_closes_right_loops_and_mends_the_drift(
         turn, way = se3.magnitude(se3.error(expected, edge["pose"]))
         assert way < 0.05
         assert np.degrees(turn) < 0.5
+
+
+def test_ground_that_was_seen_before_takes_no_memory(mapped: Slam) -> None:
+    assert all(node.submap is not None for node in mapped.nodes[:12])
+    assert all(node.submap is None for node in mapped.nodes[-5:])
+
+
+def test_the_largest_part_of_a_map_leaves_out_what_a_cut_divides(mapped: Slam) -> None:
+    built = mapped.map()
+    edges = built.edges[built.edges["kind"] != LOOP]
+    edges["kind"][4] = CUT
+    parts = dataclasses.replace(built, edges=edges).largest_part()
+
+    assert built.largest_part().all()
+    assert not parts[:5].any()
+    assert parts[5:].all()
+
+
+def test_without_gtsam_there_are_keyframes_but_no_loops(
+    office: MappingRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(GtsamMissingError, match="pip install"):
+        Slam(SlamConfig())
+    keyframes: list[Keyframe] = []
+    slam = Slam(SlamConfig(loop=LoopConfig(loops=False)), on_keyframe=keyframes.append)
+    for sweep in list(office.sweeps(drifting(office.truth, 0.5, 1, STEP)))[:40]:
+        slam.add(sweep)
+    slam.finish()
+
+    assert [item.number for item in keyframes] == list(range(len(slam.nodes)))
+    assert keyframes[0].covariance is None
+    for item in keyframes[1:]:
+        assert item.covariance is not None
+        assert np.linalg.eigvalsh(item.covariance)[0] > 0.0
 
 
 def test_without_drift_the_map_is_as_good_as_the_odometry(office: MappingRun) -> None:
