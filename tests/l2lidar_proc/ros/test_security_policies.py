@@ -41,7 +41,7 @@ OWN_SERVICES = {
     f"reply /{node}/{service}"
     for node, services in {
         "odometry_node": ("reset", "save_map", "save_trajectory"),
-        "slam_node": ("save", "load", "reset", "relocalize"),
+        "slam_node": ("save", "load", "reset", "relocalize", "set_localization"),
     }.items()
     for service in services
 }
