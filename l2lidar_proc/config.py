@@ -324,10 +324,83 @@ class DeskewTopics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ScanConfig:
+    """A level slice of the deskewed clouds as a LaserScan."""
+
+    publish: str = setting(
+        "subscribed",
+        "when to publish scans: while somebody subscribes, always, or never",
+        name="publish_scan",
+        choices=("subscribed", "always", "never"),
+    )
+    topic: str = setting("scan", "LaserScan of the deskewed clouds", name="scan_topic", form=TOPIC)
+    frame: str = setting(
+        "",
+        "frame of the scan, tied to the cloud's by /tf_static, its z axis up, such as base_link; "
+        "empty means <l2_name>_level: at the sensor, level by gravity, published on /tf",
+        name="scan_frame",
+        form=FRAME,
+    )
+    height_min: float = setting(
+        -0.1,
+        "lowest point of the slice above the origin of the scan's frame",
+        name="scan_height_min",
+        unit="m",
+        lo=-100.0,
+        hi=100.0,
+        live=True,
+    )
+    height_max: float = setting(
+        0.1,
+        "highest point of the slice above the origin of the scan's frame",
+        name="scan_height_max",
+        unit="m",
+        lo=-100.0,
+        hi=100.0,
+        live=True,
+    )
+    angle_increment: float = setting(
+        0.0174533,
+        "angle between two ranges of the scan; made to divide a full turn",
+        name="scan_angle_increment",
+        unit="rad",
+        lo=0.001,
+        hi=0.5,
+        live=True,
+    )
+    range_min: float = setting(
+        0.1, "shortest range of the scan", name="scan_range_min", unit="m", lo=0.0, hi=100.0,
+        live=True,
+    )  # fmt: skip
+    range_max: float = setting(
+        30.0, "longest range of the scan", name="scan_range_max", unit="m", lo=0.0, hi=100.0,
+        live=True,
+    )  # fmt: skip
+    sweeps: int = setting(
+        4,
+        "sweeps in a scan: one sees about every fourth degree, the ones before fill the rest",
+        name="scan_sweeps",
+        lo=1,
+        hi=40,
+        live=True,
+    )
+
+    def __post_init__(self) -> None:
+        """Check limits against each other."""
+        for low, high in (("height_min", "height_max"), ("range_min", "range_max")):
+            if getattr(self, low) >= getattr(self, high):
+                raise SettingError(
+                    f"parameter 'scan_{low}': {getattr(self, low)} is out of range, expected less "
+                    f"than scan_{high} ({getattr(self, high)})"
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DeskewNodeConfig:
     """Everything the deskew node can be told."""
 
     topics: DeskewTopics = field(default_factory=DeskewTopics)
+    scan: ScanConfig = field(default_factory=ScanConfig)
     proc: ProcConfig = field(default_factory=ProcConfig)
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,6 +67,9 @@ class Quality:
     is_still: bool
     is_gravity_trusted: bool
     flags: tuple[Flag, ...]
+
+
+_LONGEST_MOTION_NS: Final = 2_000_000_000  # between two sweeps that follow each other
 
 
 class KnownMotion(NamedTuple):
@@ -205,6 +208,28 @@ class MotionTracker:
             age=max(int(end - newest), 0) if has_velocity and newest is not None else None,
             flags=flags,
         )
+
+    def up(self, stamp: HostNs) -> F64 | None:
+        """Return the vertical at an instant, cloud axes, unit, shape (3,), None if not known."""
+        found = self.filter.up_at(stamp)
+        return found if found.any() and not self.filter.is_faulty else None
+
+    def motion(self, source: HostNs, target: HostNs) -> F64 | None:
+        """Return cloud coordinates at one instant to those at a later one, (4, 4).
+
+        None where no IMU samples tell the rotation. Without a velocity it is a rotation alone.
+        """
+        stamps = self.buffer.samples["stamp"]
+        if not len(stamps) or stamps[0] > source or not 0 < target - source < _LONGEST_MOTION_NS:
+            return None
+        if self._is_still(source, target):
+            return np.eye(4)
+        has_velocity = self.filter.knows_velocity(
+            source, self._config.velocity_max_age_ms * 1_000_000
+        )
+        hold_ns = self._config.hold_ms * 1_000_000
+        found = self.filter.trajectory(source, target, hold_ns, has_velocity)
+        return rotations.transform(*found.between(target, source))
 
     def _quality_of(
         self,

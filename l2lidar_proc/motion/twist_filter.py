@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node.types import HostNs
-from l2lidar_proc import tuning
+from l2lidar_proc import rotations, tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
@@ -121,6 +121,16 @@ class TwistFilter:
         if self._state is None or not self._state.gravity.any():
             return np.zeros(3)
         return np.asarray(self._state.rest_force / np.linalg.norm(self._state.rest_force))
+
+    def up_at(self, stamp: HostNs) -> F64:
+        """Return :attr:`up` at an instant in the buffer; zero where it is not known."""
+        up, state = self.up, self._state
+        if state is None or abs(state.stamp - stamp) > tuning.TIME_JUMP_NS:
+            return np.zeros(3)
+        first, last = min(stamp, state.stamp), max(stamp, state.stamp)
+        found = self.trajectory(first, last, tuning.TRACKER_LAG_NS, translates=False)
+        turn, _ = found.between(stamp, state.stamp)
+        return rotations.rotate(turn, up)
 
     @property
     def is_trusted(self) -> bool:

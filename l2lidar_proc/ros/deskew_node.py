@@ -31,6 +31,7 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, carried_over
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
+from l2lidar_proc.ros.scan_publisher import ScanPublisher
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ class DeskewNode(ManagedNode):
         self._output = self.create_publisher(PointCloud2, topics.output_topic, speaking)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._statistics = self.create_publisher(DiagnosticStatus, "~/statistics", 10)
+        self._scan = ScanPublisher(self, config.scan, self._frames)
 
     def begin(self) -> None:
         """Listen."""
@@ -130,6 +132,7 @@ class DeskewNode(ManagedNode):
     def _configure(self, config: DeskewNodeConfig) -> None:
         if self._pipeline is not None:
             self._pipeline.configure(config.proc)
+            self._scan.configure(config.scan)
 
     @property
     def is_waiting(self) -> bool:
@@ -236,6 +239,7 @@ class DeskewNode(ManagedNode):
 
     def _publish(self, item: Deskewed) -> None:
         self._output.publish(self._serialised(item.points, item.stamp))
+        self._scan.publish(item, self._cloud_frame, self.pipeline.tracker)
         self._last = report.of_sweep(item.quality, item.waited_ns)
         if self._statistics.get_subscription_count():
             self._statistics.publish(self._status(self._last, "sweep"))

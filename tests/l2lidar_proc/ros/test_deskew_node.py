@@ -15,7 +15,8 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402  after importorsk
 from geometry_msgs.msg import TransformStamped, TwistStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-from sensor_msgs.msg import PointCloud2  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+from sensor_msgs.msg import LaserScan, PointCloud2  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_cloud, from_time, to_time  # noqa: E402
@@ -108,6 +109,41 @@ def test_a_cloud_is_deskewed_with_odometry_once_the_imu_covers_it(
     bench.until(lambda: bench.statistics)
     values = {item.key: item.value for item in bench.statistics[-1].values}
     assert values["velocity source"] == "odometry"
+
+
+def test_a_scan_and_its_level_frame_come_while_somebody_listens(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not bench.peer.count_publishers("/scan") or not bench.node._scan._builder._slices
+    scans: list[LaserScan] = []
+    transforms: list[TransformStamped] = []
+    bench.hear(LaserScan, "scan", scans.append)
+    bench.hear(TFMessage, "/tf", lambda message: transforms.extend(message.transforms))
+    bench.until(bench.node._scan._scans.get_subscription_count)
+    bench.until(bench.node._scan._transforms.get_subscription_count)
+    prime(bench, 2.1)
+    stop_time(monkeypatch)
+    bench.send_odometry(2.0, WALK.velocity(np.array([2.0]))[0])
+    bench.until(lambda: bench.known(2.0))
+    points, truth = seen(WALK, 2.0, 2.23, 2.0, count=3000)
+    bench.send_cloud(points, at(2.0))
+    bench.send_imu(WALK.imu(2.104, 2.232))
+    bench.until(lambda: scans and transforms)
+    scan, transform = scans[-1], transforms[-1]
+    assert from_time(scan.header.stamp) == from_time(transform.header.stamp) == at(2.0)
+    assert transform.header.frame_id == FRAME
+    assert scan.header.frame_id == transform.child_frame_id == "l2lidar_level"
+    assert len(scan.ranges) == 360
+    assert scan.angle_max == pytest.approx(np.pi - scan.angle_increment, abs=1e-5)
+    q = transform.transform.rotation
+    level = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv().apply(truth)
+    kept = np.abs(level[:, 2]) < 0.1
+    reach = np.hypot(level[kept, 0], level[kept, 1])
+    ranges = np.array(scan.ranges)
+    assert np.isfinite(ranges).sum() > 50
+    # every range is that of a point, all but some at the edges of the slice
+    off = np.abs(ranges[np.isfinite(ranges)][:, None] - reach).min(axis=1)
+    assert np.mean(off < 0.03) > 0.9
 
 
 def test_without_imu_the_cloud_passes_and_the_diagnostics_say_so(bench: Any) -> None:
