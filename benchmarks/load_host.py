@@ -1,8 +1,8 @@
 """Drivers of several sensors in one process, without ROS; says at the end what they got.
 
-``python -m benchmarks.load_host FIRST PORT...`` hears the sensors of
-:mod:`benchmarks.load_sender` from number FIRST on, one at each port, until it is interrupted, and
-prints what it counted as JSON.
+``python -m benchmarks.load_host BUFFER FIRST PORT...`` hears the sensors of
+:mod:`benchmarks.load_sender` from number FIRST on, one at each port with a receive buffer of so
+many bytes, until it is interrupted, and prints what it counted as JSON.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tests.support.cpu import process_cpu_s
 
 def main() -> int:
     """Run the sessions."""
-    first = int(sys.argv[1])
+    buffer, first = int(sys.argv[1]), int(sys.argv[2])
     latencies: list[float] = []
 
     def handle(event: Event) -> None:
@@ -38,10 +38,11 @@ def main() -> int:
             latencies.append((time.time_ns() - event.end) / 1e6)
 
     sessions = []
-    for number, host_port in enumerate(sys.argv[2:], start=first):
+    for number, host_port in enumerate(sys.argv[3:], start=first):
         values = {
             "l2_ip": address(number), "host_ip": "127.0.0.1", "host_port": int(host_port),
             "watchdog_action": "wait", "imu_adjust": False, "enable_l2_host_sync": False,
+            "receive_buffer_bytes": buffer,
             "publish_unlocked": True,  # a unit so fast that its clock is not believed counts too
         }  # fmt: skip
         config = build(DriverConfig, values)

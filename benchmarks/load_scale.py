@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from l2lidar_node.config import DriverConfig
+from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
@@ -25,6 +25,7 @@ LENGTHS: Final = (1, 10, 50, 200, 1000, 4000)
 CROWDS: Final = ((1, 1), (4, 1), (8, 1), (16, 1), (8, 2), (8, 4))
 """Sensors, and processes that they are shared among."""
 RATES: Final = (1, 5, 10, 20, 50, 100, 200)
+_BUFFER: Final = NetworkConfig().receive_buffer_bytes
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
 
 
@@ -48,8 +49,12 @@ def by_length(seconds: float) -> list[tuple[int, float]]:
     return found
 
 
-def crowd(sensors: int, processes: int, rate: float, seconds: float) -> dict[str, Any]:
+def crowd(
+    sensors: int, processes: int, rate: float, seconds: float, buffer: int = _BUFFER
+) -> dict[str, Any]:
     """Return what drivers got of sensors that send ``rate`` times as fast as real ones.
+
+    Each driver asks for a receive buffer of ``buffer`` bytes.
 
     Returns
     -------
@@ -64,7 +69,7 @@ def crowd(sensors: int, processes: int, rate: float, seconds: float) -> dict[str
     share = sensors // processes
     hosts = [
         subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.load_host", str(first),
+            [sys.executable, "-m", "benchmarks.load_host", str(buffer), str(first),
              *map(str, ports[first : first + share])],
             stdout=subprocess.PIPE, text=True,
         )

@@ -14,7 +14,6 @@ from l2lidar_node.types import F64, I64, Level
 
 _RATIO_MIN_S: Final = 1.0
 _RATIO_TOLERANCE: Final = 0.05
-_LATENCY_TOLERANCE_S: Final = 0.5  # on a busy machine messages come late at either end
 _HALF: Final = (0.45, 0.55)
 _MUCH_LOST: Final = 0.2
 _OLD_S: Final = 2.0
@@ -52,7 +51,7 @@ class Track:
     def latency_s(self) -> float:
         """Usual time from the end of a measurement to its arrival [s]; or from its stamp.
 
-        Exceeded by nine of ten messages, so that those held up on a busy machine do not count.
+        Exceeded by nine of ten messages, so that single ones that were held up do not count.
         """
         lengths = self.lengths_s if self.has_lengths else np.zeros(len(self.stamps))
         return float(np.nanpercentile((self.arrivals - self.stamps) / 1e9 - lengths, 10))
@@ -169,6 +168,17 @@ def _check_gaps(track: Track, period: float, forward: F64) -> Iterator[Finding]:
     )
 
 
+def _pace(track: Track) -> float:
+    """Return how fast stamps advance [s/s], by the medians of the first and the last third.
+
+    So single messages that were held up do not count.
+    """
+    third = -(-len(track.stamps) // 3)
+    stamps = np.median(track.stamps[-third:]) - np.median(track.stamps[:third])
+    arrivals = np.median(track.arrivals[-third:]) - np.median(track.arrivals[:third])
+    return float(stamps / arrivals) if arrivals else float("nan")
+
+
 def _check_pace(track: Track) -> Iterator[Finding]:
     """Check how fast stamps advance and how old they are when they come."""
     passed = (track.arrivals[-1] - track.arrivals[0]) / 1e9
@@ -176,7 +186,7 @@ def _check_pace(track: Track) -> Iterator[Finding]:
         why = "no times of arrival" if not track.has_arrivals else f"only {passed:.2g} s"
         yield not_judged(track.subject, "clock", f"pace of the stamps, {why}")
         return
-    ratio = float(track.stamps[-1] - track.stamps[0]) / 1e9 / float(passed)
+    ratio = _pace(track)
     latency = track.latency_s
     text = f"stamps advance {ratio:.4g} s per s"
     if _HALF[0] <= ratio <= _HALF[1]:
@@ -187,7 +197,7 @@ def _check_pace(track: Track) -> Iterator[Finding]:
             f"{text}: that is the L2's own clock, which is half as fast",
             "set enable_l2_time_correction: true and timeScaleNum: 2",
         )
-    elif abs(ratio - 1.0) > _RATIO_TOLERANCE + _LATENCY_TOLERANCE_S / passed:
+    elif abs(ratio - 1.0) > _RATIO_TOLERANCE:
         yield Finding(
             Level.WARN,
             track.subject,

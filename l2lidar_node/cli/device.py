@@ -22,58 +22,10 @@ from l2lidar_node.transport import session
 from l2lidar_node.transport.session import Session, Tap
 from l2lidar_node.types import HostNs
 
-_PAUSE_S: Final = 0.3  # nobody oversleeps by that much without one
-_MOMENT_S: Final = 0.2  # in which what came during a pause is taken
-
-
-def rest(seconds: float) -> None:
-    """Sleep; where the machine paused meanwhile, a moment longer.
-
-    Or what came during the pause would not have been taken yet, and looks as if it were missing.
-    """
-    while True:
-        begun = time.monotonic()
-        time.sleep(seconds)
-        if time.monotonic() - begun < seconds + _PAUSE_S:
-            return
-        seconds = _MOMENT_S
-
-
-class Patience:
-    """Seconds to wait for something.
-
-    While the machine pauses nothing is heard: that counts for twice what was asked at the most.
-
-    Parameters
-    ----------
-    seconds : float
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self._left_s = seconds
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the time has passed."""
-        return self._left_s <= 0.0
-
-    def pause(self, seconds: float) -> None:
-        """Rest, but not beyond the end."""
-        asked = max(min(seconds, self._left_s), 0.0)
-        begun = time.monotonic()
-        rest(asked)
-        self.count(max(time.monotonic() - begun, asked), asked)
-
-    def count(self, passed: float, asked: float) -> None:
-        """Take off what a wait took that was to take so long [s]."""
-        self._left_s -= min(passed, 2.0 * asked)
-
-
 T = TypeVar("T")
 
-ANSWER_S: Final = TRIES * REPEAT_NS / 1e9 + 0.5
+ANSWER_S: Final = TRIES * REPEAT_NS / 1e9 + 1.0  # the driver says sooner that nothing came
 _LOOK_S: Final = 0.02
-_BUSY_S: Final = 10.0  # that the thread which gives up after ANSWER_S may be late
 
 
 class DeviceError(CommandError):
@@ -143,14 +95,15 @@ class Device:
 
     def wait_for(self, question: Callable[[Driver], T | None], timeout_s: float) -> T | None:
         """Ask until the answer is neither None nor False; None if that takes too long."""
-        patience = Patience(timeout_s)
+        deadline = time.monotonic() + timeout_s
         while True:
+            is_late = time.monotonic() >= deadline
             answer = self.ask(question)
             if answer is not None and answer is not False:
                 return answer
-            if patience.is_over:
+            if is_late:
                 return None
-            patience.pause(_LOOK_S)
+            time.sleep(_LOOK_S)
 
     def command(self, start: Callable[[Driver, HostNs], int]) -> Answer:
         """Send what ``start`` queues, wait for its answer and return it.
@@ -167,7 +120,7 @@ class Device:
 
         self._session.call(begin).result()
         try:
-            answer = future.result(ANSWER_S + _BUSY_S)
+            answer = future.result(ANSWER_S)
         except NoAnswerError:
             raise DeviceError("the device did not answer") from None
         if not answer.ok:

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from l2lidar_node.cli.addresses import hardware_address, local_addresses
 from l2lidar_node.cli.console import JsonOption, out, print_json, say
-from l2lidar_node.cli.device import DeviceError, Patience
+from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import Parameters, Version, decode
@@ -130,16 +130,14 @@ def listen(host_port: int, ask: list[tuple[str, int]], seconds: float) -> dict[A
             ) from None
         item.settimeout(_LOOK_S)
         next_probe = 0.0
-        patience = Patience(seconds)
-        while not patience.is_over:
-            begun = time.monotonic()
-            if begun >= next_probe:
-                next_probe = begun + _PROBE_S
+        deadline = time.monotonic() + seconds
+        while (now := time.monotonic()) < deadline:
+            if now >= next_probe:
+                next_probe = now + _PROBE_S
                 _probe(item, ask)
             with suppress(OSError):  # nothing in time, or nobody at an address that was asked
                 data, sender = item.recvfrom(_MAX_DATAGRAM)
                 speakers.setdefault(sender, Speaker()).hear(data)
-            patience.count(time.monotonic() - begun, _LOOK_S)
     return speakers
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +23,7 @@ from l2lidar_node.cli.console import (
     print_json,
     with_network,
 )
-from l2lidar_node.cli.device import Device, DeviceError, Patience, rest
+from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.cli.stored import work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver import health
@@ -31,6 +32,7 @@ from l2lidar_node.driver.metadata import metadata
 from l2lidar_node.types import Level
 
 _WAIT_S = 3.0
+_PERIOD_S = 1.0  # that is judged at a time
 
 
 @with_network
@@ -58,7 +60,7 @@ def info(
             raise DeviceError(f"nothing heard from the L2; {device.advice()}")
         device.wait_for(_is_known, _WAIT_S)
         before = device.period()
-        rest(1.0)
+        time.sleep(_PERIOD_S)
         checks, _ = device.checks(before)
         about: dict[str, Any] = dataclasses.asdict(device.ask(metadata))
     if json_:
@@ -147,10 +149,10 @@ def monitor(
 
 
 def _seconds(device: Device, duration: float) -> Iterator[list[health.Check]]:
-    patience = Patience(duration)
     before = device.period()
-    while not patience.is_over:
-        patience.pause(1.0)
+    while duration > 0.0:
+        time.sleep(min(_PERIOD_S, duration))
+        duration -= _PERIOD_S
         checks, before = device.checks(before)
         yield checks
 

@@ -253,6 +253,11 @@ def test_a_serial_line_carries_the_same_packets_and_commands() -> None:
     os.close(line)
 
 
+def octets(device: VirtualL2) -> int:
+    """Return how many bytes a device has sent."""
+    return sum(wire.FRAME_SIZES[kind] * count for kind, count in device.sent.items())
+
+
 def test_a_serial_line_sets_the_pace_of_a_race() -> None:
     device = serial_unit()
     port = SerialPort("pty")
@@ -261,7 +266,10 @@ def test_a_serial_line_sets_the_pace_of_a_race() -> None:
     thread = threading.Thread(target=server.run, args=(4.0,))
     thread.start()
     stream = b""
-    while thread.is_alive() or select.select([line], [], [], 0.0)[0]:
+    deadline = time.monotonic() + LIMIT_S
+    # What was written may not have reached the other end yet when the device has ended.
+    while thread.is_alive() or len(stream) < octets(device):
+        assert time.monotonic() < deadline
         if select.select([line], [], [], 0.05)[0]:
             stream += os.read(line, 65536)
     port.close()

@@ -34,9 +34,9 @@ class Rig:
         world = [] if "--world" in arguments else ["--world", "pattern"]
         return self.programs.start("l2lidar_node.emulator", [*ports, *world, *arguments])
 
-    def driver(self, **parameters: Any) -> Program:
+    def driver(self, module: str = "l2lidar_node.ros.driver_node", **parameters: Any) -> Program:
         """Start the driver node for this rig's virtual L2."""
-        return self.programs.start("l2lidar_node.ros.driver_node", self.arguments(**parameters))
+        return self.programs.start(module, self.arguments(**parameters))
 
     def arguments(self, **parameters: Any) -> list[str]:
         """Return the driver's command line."""
@@ -81,16 +81,6 @@ class Rig:
         self.wait_for(is_answered, f"an answer of {name}")
         self.observer.destroy_client(client)
         return next(future.result() for future in futures if future.done())
-
-    def insist(self, kind: type, name: str, request: Any) -> None:
-        """Call a service until the device has acknowledged.
-
-        One that is not given the processor for a second acknowledges nothing in time.
-        """
-        deadline = time.monotonic() + TIMEOUT_S
-        while not (response := self.call(kind, name, request)).success:
-            assert "did not acknowledge" in response.message
-            assert time.monotonic() < deadline, response.message
 
 
 @contextmanager
