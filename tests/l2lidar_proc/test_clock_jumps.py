@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tracemalloc
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from l2lidar_proc.motion.tracker import Flag
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, seen
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording
+from tests.support import memory
 from tests.support.odometry_runs import sweeps
 
 YEAR_NS = 365 * 86_400 * 1_000_000_000
@@ -52,6 +53,13 @@ def moved(sweep: Sweep, by: int) -> Sweep:
     return Sweep(HostNs(sweep.start + by), HostNs(sweep.end + by), sweep.points, 0, 0)
 
 
+@cache
+def walked(number: int) -> tuple[Any, Any]:
+    """Return points and samples of a step of the walk."""
+    start, end = 0.2 * number, 0.2 * (number + 1)
+    return seen(WALK, start, end, start, count=300)[0], WALK.imu(start, end + 0.01)
+
+
 class Deskewing:
     """The deskew pipeline on a walk, with velocities."""
 
@@ -65,10 +73,10 @@ class Deskewing:
         self.pipeline.velocity(
             HostNs(at(start) + cloud_by), WALK.velocity(np.array([start]))[0], "odometry"
         )
-        points = seen(WALK, start, end, start, count=300)[0]
+        points, samples = walked(number)
         stamps = HostNs(at(start) + cloud_by), HostNs(at(end) + cloud_by)
         self.pipeline.sweep(Sweep(*stamps, points, 0, 0), now)
-        self.pipeline.imu(shifted(WALK.imu(start, end + 0.01), imu_by))
+        self.pipeline.imu(shifted(samples, imu_by))
         self.out += self.pipeline.poll(now + 1_000_000_000)
 
 
@@ -80,13 +88,10 @@ class Deskewing:
 @example(YEAR_NS, "one sample", 5)
 def test_deskew_goes_on_after_any_jump(by: Any, who: Any, when: Any) -> None:
     deskewing = Deskewing()
-    tracemalloc.start()
-    for number in range(14):
-        cloud_by, imu_by = offsets(who, by, number, when)
-        deskewing.step(number, cloud_by, imu_by)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < MOST_BYTES
+    with memory.at_most(MOST_BYTES):
+        for number in range(14):
+            cloud_by, imu_by = offsets(who, by, number, when)
+            deskewing.step(number, cloud_by, imu_by)
     assert len(deskewing.out) == 14  # none is lost
     for item in deskewing.out[when + 4 :]:
         assert Flag.NO_IMU not in item.quality.flags, (by, who, when)
@@ -108,22 +113,19 @@ IMU = recording("room", "walk").imu
 @example(-int(ROOM[0].start), "both")
 def test_odometry_goes_on_after_any_jump(by: Any, who: Any) -> None:
     when, pipeline, first, poses = 9, OdometryPipeline(OdometryConfig(), T_CLOUD_IMU), 0, []
-    tracemalloc.start()
-    for number, sweep in enumerate(ROOM[:22]):
-        last = int(np.searchsorted(IMU["stamp"], sweep.end)) + 1
-        cloud_by, imu_by = offsets(who, by, number, when)
-        samples = IMU[first:last].copy()
-        if who == "one sample":
-            samples["stamp"][-1:] += imu_by
-        else:
-            samples["stamp"] += imu_by
-        pipeline.imu(samples)
-        first = last
-        pipeline.sweep(moved(sweep, cloud_by), number * 200_000_000)
-        poses += [(number, item) for item in pipeline.poll(number * 200_000_000 + 10**9)]
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < MOST_BYTES
+    with memory.at_most(MOST_BYTES):
+        for number, sweep in enumerate(ROOM[:22]):
+            last = int(np.searchsorted(IMU["stamp"], sweep.end)) + 1
+            cloud_by, imu_by = offsets(who, by, number, when)
+            samples = IMU[first:last].copy()
+            if who == "one sample":
+                samples["stamp"][-1:] += imu_by
+            else:
+                samples["stamp"] += imu_by
+            pipeline.imu(samples)
+            first = last
+            pipeline.sweep(moved(sweep, cloud_by), number * 200_000_000)
+            poses += [(number, item) for item in pipeline.poll(number * 200_000_000 + 10**9)]
     assert [number for number, _ in poses][-4:] == [18, 19, 20, 21], (by, who)
     for _, item in poses:
         assert np.isfinite(item.T_map_lidar).all()

@@ -22,10 +22,13 @@ from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
 from l2lidar_node.demo.processes import free_udp_ports  # noqa: E402
+from l2lidar_node.driver import driver  # noqa: E402
+from l2lidar_node.protocol import wire  # noqa: E402
 from l2lidar_node.ros import driver_node  # noqa: E402
 from l2lidar_node.ros.driver_node import DriverNode  # noqa: E402
 from l2lidar_node.types import LAST_STAMP, HostNs, Sweep  # noqa: E402
 from tests.l2lidar_proc.motion.analytic import Motion, seen  # noqa: E402
+from tests.support.build import PERIOD_NS, frames_3d, points_3d  # noqa: E402
 
 pytestmark = pytest.mark.ros
 TIMEOUT_S = 30.0
@@ -34,13 +37,14 @@ TIMEOUT_S = 30.0
 class Rig:
     """A driver's node without a device, and a peer, in one thread."""
 
-    def __init__(self) -> None:
-        host, lidar = free_udp_ports(2)
+    def __init__(self, **parameters: str) -> None:
+        self.host_port, self.lidar_port = free_udp_ports(2)
         values = {
             "l2_ip": "127.0.0.1",
             "host_ip": "127.0.0.1",
-            "l2_port": lidar,
-            "host_port": host,
+            "l2_port": self.lidar_port,
+            "host_port": self.host_port,
+            **parameters,
         }
         given = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
         rclpy.init(args=["test", "--ros-args", *given])
@@ -86,8 +90,8 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    made = Rig()
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    made = Rig(**getattr(request, "param", {}))
     yield made
     made.executor.shutdown()
     made.peer.destroy_node()
@@ -132,6 +136,33 @@ def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(
     rig.said.clear()
     rig.until(lambda: any("nothing heard from 127.0.0.1" in text for text in rig.said))
     assert not any("has not answered" in text for text in rig.said[-5:])
+
+
+@pytest.mark.parametrize("how", ["enable", "reset", "end"])
+@pytest.mark.parametrize(
+    "rig", [{"UseSystemTimeTS": "true", "imu_adjust": "false"}], indirect=True, ids=[""]
+)
+def test_what_was_collected_is_published_at_a_stop(
+    rig: Rig, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "MAX_GAP_NS", 10**18)  # else it is after 200 ms without points
+    rig.until(rig.node._cloud_publisher.get_subscription_count)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+        device.bind(("127.0.0.1", rig.lidar_port))
+        for frame in frames_3d(points_3d(number, number * PERIOD_NS) for number in range(7)):
+            device.sendto(frame, ("127.0.0.1", rig.host_port))
+    counters = rig.node._session.driver.counters
+    rig.until(lambda: counters.frames[wire.PacketType.POINTS_3D] == 7)
+    assert rig.clouds == []
+    if how == "enable":
+        rig.enable.call_async(SetBool.Request(data=False))
+    elif how == "reset":
+        rig.reset.call_async(Trigger.Request())
+    else:
+        rig.node._session.stop()
+    rig.until(lambda: rig.clouds)
+    (cloud,) = rig.clouds
+    assert cloud.width == 7 * wire.POINTS_PER_3D_PACKET
 
 
 def test_a_host_clock_after_2038_ends_nothing(rig: Rig) -> None:

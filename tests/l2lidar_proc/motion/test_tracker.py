@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import SettingError, build
+from l2lidar_node.types import HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.config import MotionConfig
 from l2lidar_proc.deskew.deskew import deskew
@@ -96,6 +97,45 @@ def test_a_smooth_ride_is_not_taken_for_rest_when_a_velocity_says_otherwise() ->
     _, quality = tracked(samples, Motion(speed=0.5)).trajectory(at(START), at(END))
     assert not quality.is_still
     assert quality.translation_m == pytest.approx(0.115, abs=0.02)
+
+
+def creeping(speed: float, last: float, still_speed: float = 0.05) -> MotionTracker:
+    """Return a tracker whose IMU says rest and whose velocities end at an instant [s]."""
+    tracker = MotionTracker(replace(MotionConfig(), still_speed=still_speed))
+    tracker.imu(noisy(Motion().imu(0, END + 0.3)))
+    for t in np.arange(last - 1.0, last + 0.01, 0.1):
+        tracker.velocity(at(t), (speed, 0.0, 0.0), "odometry")
+    return tracker
+
+
+@pytest.mark.parametrize(
+    ("speed", "still_speed", "is_still"),
+    [(0.04, 0.05, True), (0.07, 0.05, False), (0.07, 0.08, True), (0.09, 0.08, False)],
+)
+def test_rest_is_believed_up_to_the_velocity_that_is_configured(
+    speed: float, still_speed: float, is_still: bool
+) -> None:
+    _, quality = creeping(speed, END, still_speed).trajectory(at(START), at(END))
+    assert quality.is_still == is_still
+
+
+def test_a_velocity_serves_to_its_greatest_age_and_not_beyond() -> None:
+    """500 ms, counted to the end of a sweep at rest and to the start of one in motion."""
+    last = at(5.0)
+    for late_ms, is_still in ((0, False), (1, True)):
+        end = HostNs(last + (500 + late_ms) * 1_000_000)
+        _, quality = creeping(0.07, 5.0).trajectory(HostNs(end - 230_000_000), end)
+        assert quality.is_still == is_still
+    for late_ms, flags in ((0, ()), (1, (Flag.NO_VELOCITY,))):
+        start = HostNs(last + (500 + late_ms) * 1_000_000)
+        tracker = MotionTracker(MotionConfig())
+        tracker.imu(WALK.imu(0, END))
+        for t in np.arange(4.0, 5.01, 0.1):
+            tracker.velocity(at(t), WALK.velocity(np.array([t]))[0], "odometry")
+        _, quality = tracker.trajectory(start, HostNs(start + 230_000_000))
+        assert quality.flags == flags
+        if not flags:
+            assert quality.velocity_age_ns == 730_000_000
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ T_CLOUD_IMU = np.eye(4)
 T_CLOUD_IMU[:3, 3] = wire.IMU_POSITION_M
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def recording(scene: str, motion: str, seconds: float = 6.0) -> Run:
     return record(scene, motion, 1, seconds)
 
