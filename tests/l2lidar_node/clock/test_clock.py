@@ -468,13 +468,13 @@ def test_system_time_never_goes_back_nor_overlaps() -> None:
 
 
 def test_the_switch_to_system_time_and_back_is_live_and_never_goes_backwards() -> None:
-    config = ClockConfig()
-    clock = DeviceClock(config)
+    configs = [change(ClockConfig(), {"UseSystemTimeTS": value}) for value in (False, True)]
+    clock = DeviceClock(configs[0])
     last = {Stream.IMU: 0, Stream.POINTS: 0}
     modes = []
     events = simulate(Scenario(seconds=6.0, jitter="uniform", jitter_ms=3.0), 1)
     for number, (kind, seq, stamp, arrival, duration, _) in enumerate(events.tolist()):
-        clock.configure(change(config, {"UseSystemTimeTS": 1200 < number < 1600}))
+        clock.configure(configs[1200 < number < 1600])
         answer = clock.observe(STREAMS[kind], seq, stamp, arrival, duration)
         if answer is not None:
             assert answer > last[STREAMS[kind]]

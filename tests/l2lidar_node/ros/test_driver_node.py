@@ -247,9 +247,9 @@ def _change(rig: Rig, label: str) -> bool:
 
 
 def test_the_state_of_the_life_cycle_and_enable_agree(rig: Rig) -> None:
-    rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=False))
+    assert rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=False)).success
     assert _state(rig) == "inactive"
-    rig.insist(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True))
+    assert rig.call(SetBool, "/l2lidar_node/enable", SetBool.Request(data=True)).success
     assert _state(rig) == "active"
     assert _change(rig, "deactivate")
     rig.wait_for(
@@ -260,9 +260,7 @@ def test_the_state_of_the_life_cycle_and_enable_agree(rig: Rig) -> None:
     assert _change(rig, "configure")
     rig.wait_for(lambda: publishers(rig.observer, "/points"), "a publisher of clouds")
     seen = len(rig.observer.clouds.stamps)
-    deadline = time.monotonic() + 60.0
-    while not _change(rig, "activate"):  # a busy machine may not acknowledge in time
-        assert time.monotonic() < deadline
+    assert _change(rig, "activate")
     rig.wait_for(lambda: len(rig.observer.clouds.stamps) > seen + 2, "clouds once it is active")
 
 

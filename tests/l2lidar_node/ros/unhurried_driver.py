@@ -9,7 +9,7 @@ import sys
 
 from l2lidar_node.driver import device
 
-device.REPEAT_NS = 20_000_000_000  # type: ignore[misc]  # before the node takes its timeout from it
+device.REPEAT_NS = 20_000_000_000  # before the node takes its timeout from it
 
 from l2lidar_node.ros import driver_node  # noqa: E402
 
