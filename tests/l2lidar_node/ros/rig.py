@@ -34,8 +34,13 @@ class Rig:
         world = [] if "--world" in arguments else ["--world", "pattern"]
         return self.programs.start("l2lidar_node.emulator", [*ports, *world, *arguments])
 
-    def driver(self, module: str = "l2lidar_node.ros.driver_node", **parameters: Any) -> Program:
+    def driver(self, **parameters: Any) -> Program:
         """Start the driver node for this rig's virtual L2."""
+        return self.programs.start("l2lidar_node.ros.driver_node", self.arguments(**parameters))
+
+    def unhurried_driver(self, **parameters: Any) -> Program:
+        """Start a driver node that waits for acknowledgments however long they take."""
+        module = "tests.l2lidar_node.ros.unhurried_driver"
         return self.programs.start(module, self.arguments(**parameters))
 
     def arguments(self, **parameters: Any) -> list[str]:

@@ -32,7 +32,7 @@ PERIOD_S = 4.639e-3  # of 3D packets
 def rig() -> Iterator[Rig]:
     """A driver that streams."""
     with open_rig() as rig:
-        rig.driver("tests.l2lidar_node.ros.unhurried_driver", aggregateNframes=38)
+        rig.unhurried_driver(aggregateNframes=38)
         rig.emulator("--boot-scale", "0.02")
         rig.wait_for(lambda: len(rig.observer.clouds.stamps) > 3, "clouds")
         yield rig
