@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import TypeVar
@@ -31,7 +31,7 @@ from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import Playback
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher
-from l2lidar_node.ros.managed_node import ManagedNode
+from l2lidar_node.ros.managed_node import ManagedNode, NextTurn
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.transport import session
@@ -331,16 +331,8 @@ class DriverNode(ManagedNode):
         future.add_done_callback(lambda _: executor.wake())
         deadline = time.monotonic() + _ANSWER_TIMEOUT_S
         while not future.done() and time.monotonic() < deadline:
-            await _NextTurn()
+            await NextTurn()
         return future.result() if future.done() and not future.cancelled() else None
-
-
-class _NextTurn:
-    """Awaitable that lets the executor do what else there is to do, once."""
-
-    def __await__(self) -> Generator[None, None, None]:
-        """Yield to the executor."""
-        yield
 
 
 def main(args: list[str] | None = None) -> int:

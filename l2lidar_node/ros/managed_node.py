@@ -7,8 +7,9 @@ ask.
 
 from __future__ import annotations
 
+import inspect
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any, Final
 
 from lifecycle_msgs.msg import State, Transition
@@ -32,6 +33,23 @@ _IDS: Final = {
 }
 
 
+_DESTROYING: Final = frozenset(  # the services that set_up created
+    (
+        Transition.TRANSITION_CLEANUP,
+        Transition.TRANSITION_INACTIVE_SHUTDOWN,
+        Transition.TRANSITION_ACTIVE_SHUTDOWN,
+    )
+)
+
+
+class NextTurn:
+    """Awaitable that lets the executor do what else there is to do, once."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        """Yield to the executor."""
+        yield
+
+
 class ManagedNode(LifecycleNode):
     """Base of the nodes: a subclass says what each transition does.
 
@@ -44,6 +62,7 @@ class ManagedNode(LifecycleNode):
     """
 
     def __init__(self, name: str) -> None:
+        self._answering = 0  # calls of services that are waiting for something
         super().__init__(name)
         self._problem: Exception | None = None
         self._before_set_up: set[Any] = set()
@@ -90,6 +109,27 @@ class ManagedNode(LifecycleNode):
         """
         del transition
         return True
+
+    def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
+        """Create a service whose callback may be a coroutine.
+
+        An answer of a service that is destroyed meanwhile would end the program, so transitions
+        that destroy services wait for it.
+        """
+        is_coroutine = inspect.iscoroutinefunction(callback)
+        return super().create_service(
+            kind, name, self._counted(callback) if is_coroutine else callback, **options
+        )
+
+    def _counted(self, callback: Any) -> Any:
+        async def answer(request: Any, response: Any) -> Any:
+            self._answering += 1
+            try:
+                return await callback(request, response)
+            finally:
+                self._answering -= 1
+
+        return answer
 
     # ---- state
 
@@ -200,6 +240,8 @@ class ManagedNode(LifecycleNode):
         possible = {item[0] for item in self._state_machine.available_transitions}
         if transition in possible and not await self.allows(transition):
             return response
+        while self._answering and transition in _DESTROYING:
+            await NextTurn()
         try:
             return self._answer_change_state(request, response)  # rclpy has no types
         except RCLError as error:

@@ -18,6 +18,7 @@ from l2lidar_proc.slam.se3 import interpolated, inverse
 
 F64 = NDArray[np.float64]
 
+_OTHER_PARENT_S: Final = 3.0  # for which one message makes another parent be believed in
 _AHEAD_S: Final = 1.0  # the transform is carried on so long after the last odometry
 
 
@@ -31,11 +32,12 @@ class MapTransform:
     Attributes
     ----------
     other_parent : str
-        Of the odometry frame, if it has one already: then nothing is published.
+        Of the odometry frame, if it had one a moment ago: then nothing is published.
     """
 
     def __init__(self, node: Node) -> None:
         self.other_parent = ""
+        self._other_parent_s = 0.0
         self._publisher = node.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._stamped = 0
         self._blend = Blend()
@@ -45,7 +47,7 @@ class MapTransform:
         for transform in message.transforms:
             parent = transform.header.frame_id
             if transform.child_frame_id == odom_frame and parent != topics.map_frame:
-                self.other_parent = parent
+                self.other_parent, self._other_parent_s = parent, time.monotonic()
 
     def publish(
         self,
@@ -72,6 +74,8 @@ class MapTransform:
         topics : SlamTopics
         """
         now = time.monotonic_ns()
+        if now * 1e-9 - self._other_parent_s > _OTHER_PARENT_S:
+            self.other_parent = ""
         shown = self._blend.toward(T_map_odom, T_odom_body, now * 1e-9, topics.blend_s)
         if shown is None or not topics.publish_tf or self.other_parent:
             return

@@ -25,8 +25,9 @@ from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, HostNs, is_ros_time
 from l2lidar_proc.ros import odometry_messages as messages
+from l2lidar_proc.ros.inputs import InputMonitor
 from l2lidar_proc.ros.map_transform import MapTransform
 from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
 from l2lidar_proc.slam.atlas import AtlasError
@@ -34,6 +35,8 @@ from l2lidar_proc.slam.config import SlamNodeConfig
 from l2lidar_proc.slam.nodes import Keyframe, Map, OdometrySweep, SlamState, health_of
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 
+_FARTHEST_M: Final = 1e6  # from the origin; no odometry goes so far
+_LATER_NS: Final = 2_000_000_000  # than a pose that the transform is stamped, at most
 _PENDING: Final = 40  # stamps that wait for their other messages
 _SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
 _LEVELS: Final = {
@@ -96,7 +99,7 @@ class SlamNode(ManagedNode):
             raise StartError(str(error)) from None
         self._parts: OrderedDict[HostNs, _Parts] = OrderedDict()
         self._latest: _Latest | None = None
-        self._refused = 0
+        self._refused = self._failures = 0
         self._shown = (-1, -1)
         self._open(config)
 
@@ -104,21 +107,23 @@ class SlamNode(ManagedNode):
         """Listen."""
         topics = self._settings.value.topics
         inputs = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(Odometry, topics.odometry_topic, self._odometry, inputs)
-        self.create_subscription(PointCloud2, topics.cloud_topic, self._cloud, inputs)
-        self.create_subscription(
-            DiagnosticArray, topics.odometry_status_topic, self._status, inputs
-        )
-        self.create_subscription(
-            PoseWithCovarianceStamped, topics.initial_pose_topic, self._initial_pose, 1
-        )
-        self.create_subscription(TFMessage, "/tf", self._transforms, inputs)
-        self.create_timer(1.0 / topics.tf_rate, self._publish_transform)
-        self.create_timer(1.0, self._diagnose)
+        self._inputs = InputMonitor(self, (topics.odometry_topic, topics.cloud_topic))
+        guarded = self._guarded
+
+        def hear(kind: Any, topic: str, callback: Callable[..., None], qos: Any = inputs) -> None:
+            self.create_subscription(kind, topic, guarded(callback), qos)
+
+        hear(Odometry, topics.odometry_topic, self._odometry)
+        hear(PointCloud2, topics.cloud_topic, self._cloud)
+        hear(DiagnosticArray, topics.odometry_status_topic, self._status)
+        hear(PoseWithCovarianceStamped, topics.initial_pose_topic, self._initial_pose, 1)
+        hear(TFMessage, "/tf", self._transforms)
+        self.create_timer(1.0 / topics.tf_rate, guarded(self._publish_transform))
+        self.create_timer(1.0, guarded(self._diagnose))
         if topics.map_period_s > 0.0:
-            self.create_timer(topics.map_period_s, self._show)
+            self.create_timer(topics.map_period_s, guarded(self._show))
         if topics.autosave_s > 0.0:
-            self.create_timer(topics.autosave_s, self._autosave)
+            self.create_timer(topics.autosave_s, guarded(self._autosave))
 
     def pause(self) -> None:
         """Forget messages whose counterparts have not come."""
@@ -129,6 +134,9 @@ class SlamNode(ManagedNode):
         if self._worker is not None:
             self._worker.close()
             self._worker = None
+
+    def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        return self._inputs.guarded(callback, self.pause)
 
     def _open(self, config: SlamNodeConfig) -> None:
         topics = config.topics
@@ -167,9 +175,11 @@ class SlamNode(ManagedNode):
     def _odometry(self, message: Odometry) -> None:
         stamp = from_time(message.header.stamp)
         pose = messages.matrix(message.pose.pose)
-        if np.isfinite(pose).all():
-            frame = message.header.frame_id
-            self._latest = _Latest(stamp, time.monotonic_ns(), frame, pose)
+        problem = _problem(stamp, pose, message)
+        if problem:
+            self._drop(problem)
+            return
+        self._latest = _Latest(stamp, time.monotonic_ns(), message.header.frame_id, pose)
         self._part(stamp).odometry = message
         self._publish_pose(message)
         self._pair(stamp)
@@ -204,8 +214,11 @@ class SlamNode(ManagedNode):
         try:
             self.worker.sweep(_sweep(stamp, parts.odometry, parts.cloud, parts.status))
         except ValueError as error:
-            self._refused += 1
-            self.get_logger().warning(f"sweep dropped: {error}", throttle_duration_sec=5.0)
+            self._drop(str(error))
+
+    def _drop(self, reason: str) -> None:
+        self._refused += 1
+        self.get_logger().warning(f"sweep dropped: {reason}", throttle_duration_sec=5.0)
 
     def _initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         frame = self._settings.value.topics.map_frame
@@ -344,6 +357,11 @@ class SlamNode(ManagedNode):
                 f"'{parent}' is the parent of the odometry frame already: set "
                 "invert_tf of the odometry to false, or publish_tf of slam_node"
             )
+        if self.worker.failures > self._failures:
+            self._failures = self.worker.failures
+            level, text = DiagnosticStatus.ERROR, f"{text}; internal error in the worker, see log"
+        number, text = self._inputs.judge(level[0], text)
+        level = bytes([number])
         values = {**values_of(self.worker), "sweeps refused": self._refused}
         status = DiagnosticStatus(
             level=level,
@@ -361,6 +379,20 @@ class SlamNode(ManagedNode):
         )
 
 
+def _problem(stamp: HostNs, pose: F64, odometry: Odometry) -> str:
+    """Return why the odometry's pose (4, 4) cannot be used, empty if it can."""
+    # the transform is stamped a little later
+    if not (is_ros_time(stamp) and is_ros_time(stamp + _LATER_NS)):
+        return f"its stamp, {stamp / 1e9:.0f} s, is out of range"
+    if not np.isfinite(pose).all():
+        return "the pose is not finite"
+    if np.abs(pose[:3, 3]).max() > _FARTHEST_M:
+        return f"the pose is more than {_FARTHEST_M / 1e3:.0f} km from the origin"
+    if not np.isfinite(odometry.pose.covariance).all():
+        return "the covariance of the pose is not finite"
+    return ""
+
+
 def _sweep(
     stamp: HostNs, odometry: Odometry, cloud: PointCloud2, status: DiagnosticStatus | None
 ) -> OdometrySweep:
@@ -369,7 +401,7 @@ def _sweep(
     Raises
     ------
     ValueError
-        If the cloud or the pose cannot be used.
+        If the cloud cannot be used.
     """
     if cloud.header.frame_id != odometry.child_frame_id:
         raise ValueError(
@@ -381,8 +413,6 @@ def _sweep(
         raise ValueError("the cloud has no x, y, z")
     xyz = np.stack([points[axis].reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
     pose = messages.matrix(odometry.pose.pose)
-    if not np.isfinite(pose).all():
-        raise ValueError("the pose is not finite")
     remarks = status.message.split(",") if status is not None else []
     covariance = np.array(odometry.pose.covariance, np.float64).reshape(6, 6)
     xyz = xyz[np.isfinite(xyz).all(axis=1)]

@@ -15,6 +15,8 @@ pytest.importorskip("gtsam")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402  after importorskip
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from nav_msgs.msg import (  # noqa: E402
     Odometry,
     Path as PathMessage,
@@ -300,6 +302,32 @@ def test_an_error_of_the_worker_is_answered_and_counted(
         bench.close()
 
 
+def test_a_transition_waits_for_the_answers_that_are_under_way(tmp_path: Path) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}")
+    busy = threading.Event()
+    try:
+        bench.node.worker.request(lambda: (busy.wait(60.0), ""), lambda answer: None)
+        reset = bench.peer.create_client(Trigger, "slam_node/reset")
+        change = bench.peer.create_client(ChangeState, "slam_node/change_state")
+        bench.until(lambda: reset.service_is_ready() and change.service_is_ready())
+        asked = reset.call_async(Trigger.Request())
+        bench.until(lambda: bench.node._answering)
+        down = [
+            change.call_async(ChangeState.Request(transition=Transition(id=number)))
+            for number in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+        ]
+        bench.until(down[0].done)
+        busy.set()
+        bench.until(lambda: asked.done() and down[1].done())
+
+        assert asked.result().success
+        assert [item.result().success for item in down] == [True, True]
+        assert not bench.node.is_configured
+    finally:
+        busy.set()
+        bench.close()
+
+
 def test_a_clouds_frame_that_is_not_that_of_the_pose_is_named_and_dropped(
     office: MappingRun,
     tmp_path: Path,
@@ -313,9 +341,17 @@ def test_a_clouds_frame_that_is_not_that_of_the_pose_is_named_and_dropped(
         odometry.header.stamp = to_time(bad.stamp)
         odometry.pose.pose.orientation.w = float("nan")
         bench.odometry_out.publish(odometry)
-        bench.until(lambda: bad.stamp in bench.node._parts)
+        far = Odometry(child_frame_id=FRAME)
+        far.pose.pose.orientation.w = 1.0
+        far.header.stamp.sec = 2**31 - 1
+        bench.odometry_out.publish(far)
+        vague = Odometry(child_frame_id=FRAME)
+        vague.pose.pose.orientation.w = 1.0
+        vague.pose.covariance[3] = float("inf")
+        bench.odometry_out.publish(vague)
+        bench.until(lambda: bench.node._refused == 6)
 
-        assert bench.node._refused == 3
+        assert bench.node._latest.stamp == sweeps_of(office)[2].stamp
         assert bench.node._worker.submaps == 0
     finally:
         bench.close()
