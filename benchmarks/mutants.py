@@ -1,9 +1,14 @@
 """Changes the code in small ways and looks whether a test fails.
 
-``make mutants`` mutates the pure core of the driver (clock, clouds, driver, protocol) and writes
-what lived to ``docs/results/mutants.md``. It samples: ``--sample N`` mutants of each module, the
-same ones for the same seed. No file of the code is changed; a mutant exists in one process only.
-Timeouts count as killed: a test that hangs is seen.
+``make mutants`` mutates the pure core (protocol, clock, clouds, driver, deskew, motion, and the
+odometry's matcher) and writes what it finds to ``docs/results/mutants.md`` (``--write``). It
+samples: ``--mutants N``, spread over the modules by their size, the same ones for the same seed.
+No file of the code is changed; a mutant exists in one process only.
+
+First every test runs once, to see which functions it calls and how long it takes. A mutant then
+meets only the tests that call the function it is in, the module's own and the quickest first, and
+the first that fails ends it. A test that hangs, or takes memory without end, counts as failed.
+Every mutant is kept in ``out/bench/mutants.jsonl`` as soon as it is judged: ``--resume`` goes on.
 """
 
 from __future__ import annotations
@@ -11,21 +16,36 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import hashlib
+import json
 import os
 import random
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from benchmarks.mutants_explained import REASONS
+from benchmarks.results import FOLDER, KeptRows
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "results" / "mutants.md"
-FOLDERS: Final = ("clock", "clouds", "driver", "protocol")
-_TIMEOUT_S: Final = 600.0
-_PASSED, _FAILED = 0, 1  # exit codes of pytest
+CALLS: Final = FOLDER / "mutants-calls.json"
+FOLDERS: Final = (
+    "l2lidar_node/protocol", "l2lidar_node/clock", "l2lidar_node/clouds", "l2lidar_node/driver",
+    "l2lidar_proc/deskew", "l2lidar_proc/motion",
+)  # fmt: skip
+FILES: Final = ("l2lidar_proc/odometry/alignment.py", "l2lidar_proc/odometry/matcher.py")
+TESTS: Final = (
+    *(f"tests/{folder}" for folder in FOLDERS),
+    "tests/l2lidar_proc/odometry", "tests/l2lidar_proc/test_hostile_input.py",
+)  # fmt: skip
+_KEY: Final = ("module", "number", "digest")
+_TARGET: Final = 0.9
+_SLOWEST_S: Final = 30.0  # a test that takes longer is left to the gate
+_TESTS_S: Final = 120.0  # of tests for one mutant
 
 _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
@@ -50,7 +70,7 @@ class Mutant:
         Among the module's mutants.
     line : int
     change : str
-        What stands there, and what instead.
+        The line, what stands there, and what instead.
     """
 
     path: Path
@@ -61,7 +81,12 @@ class Mutant:
     @property
     def module(self) -> str:
         """Name to import."""
-        return ".".join(self.path.with_suffix("").parts)
+        return module_of(self.path)
+
+
+def module_of(path: Path) -> str:
+    """Return the name by which a file below the repository is imported."""
+    return ".".join(path.with_suffix("").parts)
 
 
 def mutations(tree: ast.Module) -> Iterator[tuple[ast.AST, ast.AST]]:
@@ -120,11 +145,13 @@ def _code(node: ast.AST) -> Iterator[ast.AST]:
 
 def mutants_of(path: Path) -> list[Mutant]:
     """Return all mutants of a module, path below the repository."""
-    tree = ast.parse((ROOT / path).read_text())
+    source = (ROOT / path).read_text()
+    lines = source.splitlines()
     found = []
-    for number, (before, after) in enumerate(mutations(tree)):
-        line = getattr(before, "lineno", 0)
-        found.append(Mutant(path, number, line, f"{_text(before)} -> {_text(after)}"))
+    for number, (before, after) in enumerate(mutations(ast.parse(source))):
+        line = getattr(before, "lineno", 1)
+        change = f"{_text(before)} -> {_text(after)}"
+        found.append(Mutant(path, number, line, f"{lines[line - 1].strip()}: {change}"))
     return found
 
 
@@ -149,126 +176,174 @@ def mutated(path: Path, number: int) -> ast.Module:
     return ast.fix_missing_locations(tree)
 
 
-def tests_of(path: Path) -> list[list[str]]:
-    """Return the tests of a module, those of its own first, then its whole folder's."""
-    folder = ROOT / "tests" / path.parent
-    own = [str(file.relative_to(ROOT)) for file in sorted(folder.glob(f"test_{path.stem}*.py"))]
-    rounds = [own] if own else []
-    rounds.append([str(folder.relative_to(ROOT))])
-    return rounds
+@dataclass(frozen=True, slots=True)
+class Called:
+    """What one test calls.
 
-
-def is_killed(mutant: Mutant) -> bool:
-    """Return whether a test fails with a mutant.
-
-    Raises
-    ------
-    RuntimeError
-        If pytest ends in another way than with passed or failed tests.
+    Attributes
+    ----------
+    seconds : float
+        How long it takes.
+    functions : dict
+        By path below the repository: first lines of the functions that it calls.
     """
-    for tests in tests_of(mutant.path):
-        command = [sys.executable, "-m", "benchmarks.mutant_run", mutant.module,
-                   str(mutant.path), str(mutant.number), *tests]  # fmt: skip
-        try:
-            done = subprocess.run(
-                command, cwd=ROOT, capture_output=True, text=True, timeout=_TIMEOUT_S,
-                check=False, env={**os.environ, "CI": "1"},
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            return True
-        if done.returncode != _PASSED:
-            return True  # also where the module cannot even be imported
-    return False
+
+    seconds: float
+    functions: dict[str, list[int]]
 
 
-def check_tests_pass(path: Path) -> None:
-    """Raise RuntimeError if the tests of a module fail without any mutant."""
-    for tests in tests_of(path):
-        command = [sys.executable, "-m", "benchmarks.mutant_run", "-", str(path), "0", *tests]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        if done.returncode != _PASSED:
-            raise RuntimeError(f"{' '.join(tests)} fail without a mutant:\n{done.stdout[-2000:]}")
+def tests_for(mutant: Mutant, calls: dict[str, Called]) -> list[str]:
+    """Return the tests that can notice a mutant, the likeliest first, as many as time allows."""
+    path = str(mutant.path)
+    first = _function_of(mutant)
+    own = f"test_{mutant.path.stem}"
+    found = [
+        (own not in test.partition("::")[0], called.seconds, test)
+        for test, called in calls.items()
+        if path in called.functions and (first is None or first in called.functions[path])
+    ]
+    chosen, total = [], 0.0
+    for _, seconds, test in sorted(found):
+        total += seconds
+        if total > _TESTS_S:
+            break
+        chosen.append(test)
+    return chosen
 
 
-def report(rows: list[tuple[str, int, int]], lived: list[Mutant], options: str) -> str:
-    """Return the page: per module how many were killed, and what lived."""
-    killed, tried = sum(row[1] for row in rows), sum(row[2] for row in rows)
+def _function_of(mutant: Mutant) -> int | None:
+    """Return the first line of the function that a mutant is in, None outside of any."""
+    tree = ast.parse((ROOT / mutant.path).read_text())
+    around = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.body[0].lineno <= mutant.line <= (node.end_lineno or 0)
+    ]
+    if not around:
+        return None
+    inner = max(around, key=lambda node: node.lineno)
+    return min([inner.lineno, *(item.lineno for item in inner.decorator_list)])
+
+
+def sampled(paths: Sequence[Path], count: int, seed: int) -> list[Mutant]:
+    """Return so many mutants of modules, from each according to its size, at least one."""
+    found = {path: mutants_of(path) for path in paths}
+    total = sum(map(len, found.values()))
+    chosen: list[Mutant] = []
+    for path, mutants in found.items():
+        share = max(round(count * len(mutants) / total), 1) if count else len(mutants)
+        rng = random.Random(f"{seed} {path}")
+        some = rng.sample(mutants, min(share, len(mutants)))
+        chosen += sorted(some, key=lambda mutant: mutant.number)
+    return chosen
+
+
+def report(rows: list[dict[str, Any]], options: str) -> str:
+    """Return the page: per module how many were killed, and what lived, with reasons."""
+    lived = [row for row in rows if not row["killed"]]
+    explained = [row for row in lived if (row["path"], row["change"]) in REASONS]
+    killed = len(rows) - len(lived)
     lines = [
         "# Mutants",
         "",
-        f"`make mutants` with `{options}`: {killed} of {tried} killed "
-        f"({100.0 * killed / max(tried, 1):.0f} %).",
+        f'Written by `make mutants BENCH_ARGS="{options} --write"`: {killed} of {len(rows)} '
+        f"killed ({100.0 * killed / max(len(rows), 1):.0f} %); of the {len(lived)} that lived, "
+        f"{len(explained)} are explained.",
+        "",
         "A mutant is one small change of the code: a comparison, an operator, a constant, a "
-        "condition. It is killed when a test fails.",
+        "condition. It is killed when a test fails. The sample is spread over the modules by "
+        "their size. What lived before an assertion was added is counted as killed.",
         "",
         "| Module | Killed | Tried |",
         "|---|---|---|",
-        *(f"| `{name}` | {count} | {total} |" for name, count, total in rows),
-        "",
-        "## Lived",
-        "",
     ]
-    lines += [f"* `{mutant.path}:{mutant.line}`: `{mutant.change}`" for mutant in lived] or [
-        "None."
-    ]
+    for path in dict.fromkeys(row["path"] for row in rows):
+        mine = [row for row in rows if row["path"] == path]
+        lines.append(f"| `{path}` | {sum(row['killed'] for row in mine)} | {len(mine)} |")
+    lines += ["", "## Lived", ""]
+    lines += [
+        f"* `{row['path']}`: `{row['change']}`: "
+        + REASONS.get((row["path"], row["change"]), "not explained")
+        for row in lived
+    ] or ["None."]
     return "\n".join([*lines, ""])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Try the mutants; return 1 if fewer than nine of ten were killed."""
+    from benchmarks.mutant_run import find_calls, is_killed  # imports what the tests import
+
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sample", type=int, default=5, help="mutants of each module; 0: all")
+    parser.add_argument("--mutants", type=int, default=160, help="how many; 0: all")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--folders", nargs="+", choices=FOLDERS, default=list(FOLDERS))
     parser.add_argument("--modules", nargs="+", default=[], help="only these, such as reorder")
-    parser.add_argument("--minutes", type=float, default=60.0, help="begin no mutant after that")
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no mutant after that")
+    parser.add_argument("--resume", action="store_true", help="keep what is judged already")
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
-    options = parser.parse_args(arguments)
-    deadline = time.monotonic() + options.minutes * 60.0
-    rows: list[tuple[str, int, int]] = []
-    lived: list[Mutant] = []
-    for path in _modules(options.folders, options.modules):
-        if time.monotonic() > deadline:
-            break
-        chosen = mutants_of(path)
-        rng = random.Random(f"{options.seed} {path}")
-        if options.sample and len(chosen) > options.sample:
-            chosen = sorted(rng.sample(chosen, options.sample), key=lambda item: item.number)
-        if not chosen:
+    given = parser.parse_args(arguments)
+    until = time.monotonic() + 60.0 * given.minutes
+    kept = KeptRows(FOLDER / "mutants.jsonl", _KEY)
+    if not given.resume:
+        kept.clear()
+        CALLS.unlink(missing_ok=True)
+    if not CALLS.exists():
+        CALLS.parent.mkdir(parents=True, exist_ok=True)
+        find_calls(TESTS, CALLS)
+    calls = {
+        test: Called(item["seconds"], item["functions"])
+        for test, item in json.loads(CALLS.read_text()).items()
+        if item["seconds"] < _SLOWEST_S
+    }
+    judged = {kept.key_of(row): row for row in kept.read()}
+    rows, left = [], 0
+    for mutant in sampled(_modules(given.modules), given.mutants, given.seed):
+        tests = tests_for(mutant, calls)
+        row = {
+            "module": mutant.module, "number": mutant.number, "digest": _digest(mutant, tests),
+            "path": str(mutant.path), "line": mutant.line, "change": mutant.change,
+        }  # fmt: skip
+        before = judged.get(kept.key_of(row))
+        if before is None and time.monotonic() > until:
+            left += 1
             continue
-        check_tests_pass(path)
-        killed = tried = 0
-        for mutant in chosen:
-            if time.monotonic() > deadline:
-                break
-            tried += 1
-            if is_killed(mutant):
-                killed += 1
-            else:
-                lived.append(mutant)
-                print(f"lived: {path}:{mutant.line}: {mutant.change}", flush=True)
-        rows.append((str(path), killed, tried))
-        print(f"{path}: {killed} of {tried} killed", flush=True)
-    words = f"--sample {options.sample} --seed {options.seed}"
-    if options.modules:
-        words += f" --modules {' '.join(options.modules)}"
-    page = report(rows, lived, words)
+        if before is None:
+            expected = sum(calls[test].seconds for test in tests)
+            before = {**row, "tests": len(tests),
+                      "killed": bool(tests) and is_killed(mutant, tests, expected)}  # fmt: skip
+            kept.append(before)
+        rows.append(before)
+    if left:
+        print(f"{left} mutants were left out; go on with --resume", file=sys.stderr)
+        return 1
+    options = f"--mutants {given.mutants} --seed {given.seed}"
+    if given.modules:
+        options += f" --modules {' '.join(given.modules)}"
+    page = report(rows, options)
     print(page)
-    if options.write:
+    if given.write:
         PAGE.parent.mkdir(parents=True, exist_ok=True)
         PAGE.write_text(page)
-    total = sum(row[2] for row in rows)
-    return int(len(lived) > 0.1 * total)
+    return int(sum(row["killed"] for row in rows) < _TARGET * len(rows))
 
 
-def _modules(folders: Sequence[str], names: Sequence[str]) -> list[Path]:
+def _digest(mutant: Mutant, tests: Sequence[str]) -> str:
+    """Return what a verdict holds for: the module and the tests as they are."""
+    paths = [str(mutant.path), *sorted({test.partition("::")[0] for test in tests})]
+    content = b"".join((ROOT / path).read_bytes() for path in paths)
+    return hashlib.sha256(content + mutant.change.encode()).hexdigest()[:16]
+
+
+def _modules(names: Sequence[str]) -> list[Path]:
     paths = [
         file.relative_to(ROOT)
-        for folder in folders
-        for file in sorted((ROOT / "l2lidar_node" / folder).glob("*.py"))
+        for folder in FOLDERS
+        for file in sorted((ROOT / folder).glob("*.py"))
     ]
-    return [path for path in paths if not names or path.stem in names]
+    paths += [Path(name) for name in FILES]
+    return [path for path in paths if mutants_of(path) and (not names or path.stem in names)]
 
 
 if __name__ == "__main__":
+    os.chdir(ROOT)
     sys.exit(main())
