@@ -1,12 +1,15 @@
-"""Lays the stamps of both streams, over the steps of the device's clock, onto one even line.
+"""Maps device stamps to the device line: one continuous time base for both streams.
 
-Between two syncs the device's clock runs evenly; a sync, of this host or another, steps it. Each
-stretch in between is an *epoch*: a constant that, taken from a stamp, gives the *device line*,
-which has no steps. Which epoch a packet was stamped in, and how large the step was, is told by the
-packets themselves: both streams are so regular that the stamp of the next packet is known to
-microseconds from its sequence number, whatever the network does to arrivals. The values this host
-sent tell which sync it was. Arrivals are asked only when regularity cannot answer: after long gaps
-and for stamps that nothing explains.
+The device's clock runs evenly until a time-sync command, of this host or of another, steps it. The
+time between two steps is an *epoch*. Each epoch has an offset, its ``base``; stamp minus base is
+the place on the *device line*, which has no steps.
+
+Two questions have to be answered for each packet: in which epoch was it stamped, and how large
+was the step that began it? The packets themselves answer both. Both streams are so regular that
+:mod:`l2lidar_node.clock.cadence` predicts a stamp to microseconds from its sequence number,
+however late the packet arrives. The values of the syncs that this host sent tell which of them
+took effect. Arrival times decide only where regularity cannot: after long gaps, and for stamps
+that nothing else explains.
 """
 
 from __future__ import annotations
@@ -21,26 +24,27 @@ from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 
 _MS: Final = 1_000_000
-_SLACK_NS: Final = 50_000  # a sync may take effect that much beside its value
-_EARLY_NS: Final = -1 * _MS  # arrivals may seem that early without making a stamp impossible
-_LATE_NS: Final = 500 * _MS  # no path delays packets more than that
-_REACH_NS: Final = 150 * _MS  # sequence numbers are believed while arrivals agree with them so far
-# A sync cannot take effect before it is sent; that much is for the line, under load, and the path.
-_BEFORE_NS: Final = 20 * _MS
-_PAUSE_NS: Final = 50 * _MS  # [device] no standby, in which numbers do not count, is shorter
+_SYNC_ERROR_NS: Final = 50_000  # first stamp after a sync may be this much below its value
+_MOST_EARLY_NS: Final = -1 * _MS  # error of the host line: real packets seem no earlier than that
+_MOST_LATE_NS: Final = 500 * _MS  # no path delays packets longer
+_NUMBERS_HOLD_NS: Final = 150 * _MS  # disagreement with arrivals up to which numbers are believed
+# A sync cannot take effect before it is sent. The margin covers the host line's error under load.
+_BEFORE_SENT_NS: Final = 20 * _MS
+_SHORTEST_STANDBY_NS: Final = 50 * _MS  # [device] the numbers do not count while it lasts
+# Gains of the loops: the IMU's sampler has a constant period, the mirror's motor has not.
 _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
-_SILENT_NS: Final = 1_000 * _MS
-_STALE_NS: Final = 500 * _MS  # [device]
-_BOOT_NS: Final = 600_000 * _MS  # stamps below it can be those of a device that has just started
-_BOOT_SEQ: Final = 16  # so can sequence numbers
-_KEEP: Final = 64  # packets, and epochs, that may still be on their way
+_SILENCE_NS: Final = 1_000 * _MS
+_IMU_OFF_NS: Final = 500 * _MS  # [device] without a sample, until points alone are trusted
+_AFTER_BOOT_NS: Final = 600_000 * _MS  # a device that has just started shows less
+_AFTER_BOOT_SEQ: Final = 16  # and its sequence numbers are below this
+_IN_FLIGHT: Final = 64  # packets, and epochs, that may still arrive late
 _SYNCS: Final = 128
 _IMU: Final = Stream.IMU  # to look up a member of an Enum takes long
 
 
 class Step(Enum):
-    """What this host did not cause: the clock was stepped, or the line had to begin anew."""
+    """A discontinuity that this host did not cause."""
 
     REBOOT = "reboot"
     FOREIGN_SYNC = "foreign sync"
@@ -49,34 +53,34 @@ class Step(Enum):
 
 @dataclass(slots=True, eq=False)
 class _Sync:
-    """A sync of this host; equal only to itself."""
+    """A time-sync command of this host. Compared by identity: two may have equal values."""
 
     value: int
     sent: int
 
 
-_NO_SYNC: Final = _Sync(1 << 80, 0)  # its value is after every stamp
+_NO_SYNC: Final = _Sync(1 << 80, 0)  # its value is above every stamp
 
 
 class _Epoch:
-    """A stretch without a step: ``base`` is what a stamp is ahead of the device line."""
+    """Time without a step of the device's clock: place on the line = stamp - ``base``."""
 
     __slots__ = ("base", "sync")
 
     def __init__(self, base: int, sync: _Sync | None) -> None:
         self.base = base
-        self.sync = sync  # of this host, that began it
+        self.sync = sync  # that began it; None if it was not one of this host
 
 
-class _Track:
-    """Where one stream is."""
+class _StreamState:
+    """The last packet of one stream, and the loop that predicts the next one."""
 
     __slots__ = ("arrival", "cadence", "epoch", "stamp", "suspect", "u")
 
     def __init__(self, gain: float) -> None:
         self.cadence = Cadence(gain)
-        self.epoch: _Epoch | None = None  # None until it has joined the line
-        self.u = -_STALE_NS  # place of the last packet
+        self.epoch: _Epoch | None = None  # None until the stream is on the line
+        self.u = -_IMU_OFF_NS  # place of the last packet on the line
         self.stamp = 0
         self.arrival = 0
         self.suspect: tuple[int, int] | None = None  # number and stamp that nothing explains
@@ -88,7 +92,7 @@ class DeviceClockModel:
     Parameters
     ----------
     ratio : float
-        First guess of host nanoseconds per device nanosecond; to be kept up to date in ``ratio``.
+        First guess of host nanoseconds per device nanosecond.
     lateness : callable
         Returns arrival minus the instant of a place on the line [ns host], None while that is
         unknown.
@@ -96,16 +100,16 @@ class DeviceClockModel:
     Attributes
     ----------
     ratio : float
+        To be kept up to date by the owner.
     steps : deque of (Step, int)
-        What happened and by how much [ns device]; whoever reads it takes it out. A line that began
-        anew says so in ``restarts``.
+        Discontinuities and their sizes [ns device]; the reader removes them.
     restarts : int
-        How often the line began anew, places before and after having nothing in common.
+        How often a new line began; places on different lines cannot be compared.
     epochs : int
         Steps of the clock that were bridged.
     is_firm : bool
-        Whether the latest place was told as well as it can be: false for point packets while the
-        IMU stream, whose word counts, is in another epoch.
+        Whether the latest place is as accurate as it can be. False for a point packet whose epoch
+        the IMU stream, the more regular one, has not reached yet.
     """
 
     def __init__(
@@ -118,257 +122,292 @@ class DeviceClockModel:
         self.is_firm = True
         self._lateness = lateness
         self._syncs: deque[_Sync] = deque(maxlen=_SYNCS)
-        self._epochs: deque[_Epoch] = deque(maxlen=_KEEP)
-        self._newest = _NO_SYNC  # the latest that is known to have taken effect
-        self._imu = _Track(_IMU_GAIN)
-        self._points = _Track(_POINTS_GAIN)
+        self._epochs: deque[_Epoch] = deque(maxlen=_IN_FLIGHT)
+        self._newest_sync = _NO_SYNC  # the latest one that is known to have taken effect
+        self._imu = _StreamState(_IMU_GAIN)
+        self._points = _StreamState(_POINTS_GAIN)
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Take note of a sync that left this host; whether it arrives is not known."""
         self._syncs.append(_Sync(value, sent))
 
     def host_stepped(self, by_ns: int, at: int) -> None:
-        """Take note that the host's clock was set: what was before is told in its new time."""
-        for track in (self._imu, self._points):
-            # The last packets may have come after it was set, but before that was noticed.
-            if track.arrival + by_ns <= at if by_ns > 0 else track.arrival > at:
-                track.arrival += by_ns
+        """Convert earlier arrivals to the new time after the host's clock was set.
+
+        A packet may have arrived after the step and before it was noticed; its arrival is in the
+        new time already.
+        """
+        for stream in (self._imu, self._points):
+            is_old = stream.arrival + by_ns <= at if by_ns > 0 else stream.arrival > at
+            if is_old:
+                stream.arrival += by_ns
         for sync in self._syncs:
             sync.sent += by_ns
 
     def restart(self) -> None:
-        """Forget everything but how sequence numbers wrap."""
+        """Begin a new line; only the modulus of the sequence numbers is kept."""
         self._epochs.clear()
-        self._newest = _NO_SYNC
-        for track in (self._imu, self._points):
-            track.epoch = None
-            track.u = -_STALE_NS
-            track.suspect = None
-            track.cadence.forget()
+        self._newest_sync = _NO_SYNC
+        for stream in (self._imu, self._points):
+            stream.epoch = None
+            stream.u = -_IMU_OFF_NS
+            stream.suspect = None
+            stream.cadence.forget()
         self.restarts += 1
 
     def place(self, stream: Stream, seq: int, stamp: DeviceNs, arrival: HostNs) -> int | None:
-        """Return the place of a stamp on the device line [ns device], None while it is not known.
+        """Return the place of a stamp on the device line [ns device], None if it has none yet.
 
         Never raises, whatever the arguments; see :meth:`DeviceClock.observe`.
         """
-        track = self._imu if stream is _IMU else self._points
-        epoch = track.epoch
+        state = self._imu if stream is _IMU else self._points
+        epoch = state.epoch
         if epoch is None:
-            return self._join(track, seq, stamp, arrival)
+            return self._acquire(state, seq, stamp, arrival)
         u = stamp - epoch.base
-        newest = self._newest
-        behind = stamp >= newest.value and epoch.sync is not newest
-        if not behind and track.cadence.follows(seq, u - track.u):
-            track.u = u
-            track.stamp = stamp
-            track.arrival = arrival
-            self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _STALE_NS
+        newest = self._newest_sync
+        may_be_in_newer_epoch = stamp >= newest.value and epoch.sync is not newest
+        if not may_be_in_newer_epoch and state.cadence.follows(seq, u - state.u):
+            state.u = u
+            state.stamp = stamp
+            state.arrival = arrival
+            self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _IMU_OFF_NS
             return u
-        return self._step(track, epoch, seq, stamp, arrival)
+        return self._place_unpredicted(state, epoch, seq, stamp, arrival)
 
-    def _step(
-        self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int
+    def _place_unpredicted(
+        self, state: _StreamState, epoch: _Epoch, seq: int, stamp: int, arrival: int
     ) -> int | None:
-        """Place a stamp that is not where the cadence wants it."""
-        cadence = track.cadence
-        if self._is_late(track, seq, stamp):
+        """Place a packet that is not where the cadence predicts it.
+
+        The possible reasons, in the order in which they are tested: the packet is old; a standby;
+        a sync of this host; an epoch that another packet has begun; a gap. What is left is a step
+        that somebody else made.
+        """
+        cadence = state.cadence
+        if self._is_old(state, seq, stamp):
             return None
         u = stamp - epoch.base
-        gap = cadence.gap(seq, u - track.u)
+        gap = cadence.gap(seq, u - state.u)
         advance = cadence.advance(gap)
-        expected = track.u + advance
-        counted = gap > 0 and self._agrees(track, seq, advance, arrival)
-        if counted:
-            slip = cadence.slip(gap)
-            is_elsewhere = abs(u - expected) > slip
-            if is_elsewhere and self._has_paused(track, epoch, stamp, expected):
-                return self._unexplained(track, epoch, seq, stamp, arrival, None)
-            begun = self._begun(track, epoch, stamp, expected, cadence.noise(gap))
+        expected = state.u + advance
+        is_gap_known = gap > 0 and self._arrivals_agree(state, seq, advance, arrival)
+        if is_gap_known:
+            is_elsewhere = abs(u - expected) > cadence.slip(gap)
+            if is_elsewhere and self._was_in_standby(state, epoch, stamp, expected):
+                return self._confirm_step(state, epoch, seq, stamp, arrival, None)
+            begun = self._epoch_of_sync(state, epoch, stamp, expected, cadence.noise(gap))
             if begun is not None:
-                return self._accept(track, begun, seq, stamp, arrival)
+                return self._accept(state, begun, seq, stamp, arrival)
             nearest = min(self._epochs, key=lambda item: abs(stamp - item.base - expected))
             off = abs(stamp - nearest.base - expected)
-            if off <= cadence.wander(gap) and stamp - nearest.base > track.u:
-                return self._accept(track, nearest, seq, stamp, arrival)
-        late = (
-            u > expected + _PAUSE_NS if counted else u > track.u and not self._synced_since(track)
+            if off <= cadence.wander(gap) and stamp - nearest.base > state.u:
+                return self._accept(state, nearest, seq, stamp, arrival)
+        if is_gap_known:
+            is_after_gap = u > expected + _SHORTEST_STANDBY_NS
+        else:
+            is_after_gap = u > state.u and not self._synced_since(state)
+        if is_after_gap and self._is_plausible(state, u, arrival):
+            return self._accept(state, epoch, seq, stamp, arrival)
+        return self._confirm_step(
+            state, epoch, seq, stamp, arrival, expected if is_gap_known else None
         )
-        if late and self._possible(track, u, arrival):
-            return self._accept(track, epoch, seq, stamp, arrival)
-        return self._unexplained(track, epoch, seq, stamp, arrival, expected if counted else None)
 
-    def _agrees(self, track: _Track, seq: int, advance: int, arrival: int) -> bool:
-        """Whether arrivals agree with how far a packet should be after the last one.
+    def _arrivals_agree(self, state: _StreamState, seq: int, advance: int, arrival: int) -> bool:
+        """Return whether arrivals agree with the advance that the sequence numbers give.
 
-        It may have waited on its way, but not for so long that numbers can have wrapped meanwhile.
+        A packet may have been delayed, but not so long that the numbers can have wrapped.
         """
-        late = arrival - track.arrival - advance * self.ratio
-        if not track.cadence.ascends(seq):
-            return abs(late) < _REACH_NS
-        lap = track.cadence.lap_ns * self.ratio
-        return -_SILENT_NS < late < max(lap - _SILENT_NS, _SILENT_NS)
+        late = arrival - state.arrival - advance * self.ratio
+        if not state.cadence.ascends(seq):
+            return abs(late) < _NUMBERS_HOLD_NS
+        lap = state.cadence.lap_ns * self.ratio
+        return -_SILENCE_NS < late < max(lap - _SILENCE_NS, _SILENCE_NS)
 
-    def _is_late(self, track: _Track, seq: int, stamp: int) -> bool:
-        """Whether a packet is from before the last one, or is the last one again."""
-        back = track.cadence.back(seq)
-        if not 0 <= back <= _KEEP:
+    def _is_old(self, state: _StreamState, seq: int, stamp: int) -> bool:
+        """Return whether a packet is a duplicate of the last one, or from before it."""
+        back = state.cadence.back(seq)
+        if not 0 <= back <= _IN_FLIGHT:
             return False
-        place = track.u + track.cadence.advance(-back)
-        slip = track.cadence.slip(back)
+        place = state.u + state.cadence.advance(-back)
+        slip = state.cadence.slip(back)
         return any(abs(stamp - epoch.base - place) <= slip for epoch in self._epochs)
 
-    def _has_paused(self, track: _Track, epoch: _Epoch, stamp: int, expected: int) -> bool:
-        """Whether the stream paused in a way that its numbers do not show, as in standby.
+    def _was_in_standby(
+        self, state: _StreamState, epoch: _Epoch, stamp: int, expected: int
+    ) -> bool:
+        """Return whether the stream paused without its numbers showing it, as in standby.
 
-        The place that numbers predict would then have a sync of this host, which the stamp is just
-        after, take effect before it was sent.
+        The predicted place is too early then. If the stamp follows a sync of this host, that sync
+        would have taken effect before it was sent.
         """
         base = stamp - expected
         for sync in reversed(self._syncs):
             if sync is epoch.sync:
                 break
-            if -_SLACK_NS <= stamp - sync.value <= expected - track.u + _MS:
+            if -_SYNC_ERROR_NS <= stamp - sync.value <= expected - state.u + _MS:
                 before = self._lateness(sync.value - base, sync.sent)
-                return before is not None and before > _BEFORE_NS
+                return before is not None and before > _BEFORE_SENT_NS
         return False
 
-    def _begun(
-        self, track: _Track, epoch: _Epoch, stamp: int, expected: int, noise: float
+    def _epoch_of_sync(
+        self, state: _StreamState, epoch: _Epoch, stamp: int, expected: int, noise: float
     ) -> _Epoch | None:
-        """Return the epoch of the sync of this host that a stamp is just after.
+        """Return the epoch of the sync of this host that the stamp follows, None without one.
 
-        The stream that comes first tells where the epoch lies on the line; the IMU stream, more
-        regular, has the last word.
+        The stream that arrives first defines the base of a new epoch. The IMU stream, being more
+        regular, corrects it when it gets there.
         """
         base = stamp - expected
-        off = abs(base - epoch.base)
+        step = abs(base - epoch.base)
         for sync in reversed(self._syncs):
             if sync is epoch.sync:
                 break
-            if not -_SLACK_NS <= stamp - sync.value <= expected - track.u + _MS:
+            if not -_SYNC_ERROR_NS <= stamp - sync.value <= expected - state.u + _MS:
                 continue
             begun = next((item for item in self._epochs if item.sync is sync), None)
             if begun is None:
-                if off <= noise:
+                if step <= noise:
                     continue
                 begun = _Epoch(base, sync)
                 self.epochs += 1
-                self._newest = sync
+                self._newest_sync = sync
                 self._epochs.append(begun)
-            elif not self._is_after(track, epoch, begun, stamp, base, noise):
+            elif not self._is_after_step(state, epoch, begun, stamp, base, noise):
                 continue
-            elif track is self._imu:
+            elif state is self._imu:
                 if self._points.epoch is begun:
                     self._points.u += begun.base - base
                 begun.base = base
             return begun
         return None
 
-    def _is_after(
-        self, track: _Track, epoch: _Epoch, begun: _Epoch, stamp: int, base: int, noise: float
+    def _is_after_step(
+        self,
+        state: _StreamState,
+        epoch: _Epoch,
+        begun: _Epoch,
+        stamp: int,
+        base: int,
+        noise: float,
     ) -> bool:
-        """Whether a stamp past the value of a sync is from after the step.
+        """Return whether a stamp above the value of a sync comes from after the step.
 
-        Clocks faster than the host's pass that value before they are stepped back. The side on
-        which the stamp is nearer to where it is expected counts; where the step is too small for
-        that, the line does, on which the IMU stream has placed the step.
+        It need not: a clock that is ahead of the host's passes the value before the sync steps it
+        back. The epoch in which the stamp is nearer to its prediction is the right one. If the
+        step is too small for that, the device line decides, on which the IMU stream has placed it.
         """
         is_nearer = abs(base - begun.base) <= abs(base - epoch.base)
-        if track is self._imu or begun.sync is None or abs(begun.base - epoch.base) > 2.0 * noise:
+        if state is self._imu or begun.sync is None or abs(begun.base - epoch.base) > 2.0 * noise:
             return is_nearer
         if stamp - epoch.base >= begun.sync.value - begun.base:
             return True
         return begun.base < epoch.base and is_nearer
 
-    def _synced_since(self, track: _Track) -> bool:
-        """Whether a sync may have stepped the clock since the last packet."""
-        return any(sync.sent > track.arrival - _LATE_NS for sync in self._syncs)
+    def _synced_since(self, state: _StreamState) -> bool:
+        """Return whether a sync of this host may have stepped the clock since the last packet."""
+        return any(sync.sent > state.arrival - _MOST_LATE_NS for sync in self._syncs)
 
-    def _accept(self, track: _Track, epoch: _Epoch, seq: int, stamp: int, arrival: int) -> int:
-        track.cadence.resume(seq, stamp - epoch.base - track.u)
-        return self._enter(track, epoch, stamp, arrival)
+    def _accept(
+        self, state: _StreamState, epoch: _Epoch, seq: int, stamp: int, arrival: int
+    ) -> int:
+        """Continue the stream from a packet in an epoch; return its place."""
+        state.cadence.resume(seq, stamp - epoch.base - state.u)
+        return self._enter(state, epoch, stamp, arrival)
 
-    def _enter(self, track: _Track, epoch: _Epoch, stamp: int, arrival: int) -> int:
-        track.epoch = epoch
-        track.u = u = stamp - epoch.base
-        track.stamp = stamp
-        track.arrival = arrival
-        track.suspect = None
-        self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _STALE_NS
+    def _enter(self, state: _StreamState, epoch: _Epoch, stamp: int, arrival: int) -> int:
+        state.epoch = epoch
+        state.u = u = stamp - epoch.base
+        state.stamp = stamp
+        state.arrival = arrival
+        state.suspect = None
+        self.is_firm = epoch is self._imu.epoch or u - self._imu.u > _IMU_OFF_NS
         return u
 
-    def _unexplained(
+    def _confirm_step(
         self,
-        track: _Track,
+        state: _StreamState,
         epoch: _Epoch,
         seq: int,
         stamp: int,
         arrival: int,
         expected: int | None,
     ) -> int | None:
-        """Wait for a second packet that confirms the first; then say what happened and go on."""
-        suspect, track.suspect = track.suspect, (seq, stamp)
-        if suspect is None or not track.cadence.regular(seq - suspect[0], stamp - suspect[1]):
+        """Wait for a second packet that confirms an unexplained one; then bridge or restart.
+
+        ``expected`` is the predicted place on the line, None where the numbers do not give one.
+        """
+        suspect, state.suspect = state.suspect, (seq, stamp)
+        if suspect is None or not state.cadence.regular(seq - suspect[0], stamp - suspect[1]):
             return None
-        begins = expected is None and seq < _BOOT_SEQ and not track.cadence.ascends(seq)
-        if begins or (stamp < track.stamp and stamp < _BOOT_NS):
-            self.steps.append((Step.REBOOT, stamp - track.stamp))
-        elif expected is not None and self._is_prompt(track, expected, arrival):
+        numbers_began = expected is None and seq < _AFTER_BOOT_SEQ
+        numbers_began = numbers_began and not state.cadence.ascends(seq)
+        if numbers_began or (stamp < state.stamp and stamp < _AFTER_BOOT_NS):
+            self.steps.append((Step.REBOOT, stamp - state.stamp))
+        elif expected is not None and self._is_prompt(state, expected, arrival):
             self.steps.append((Step.FOREIGN_SYNC, stamp - epoch.base - expected))
             self.epochs += 1
             self._epochs.append(_Epoch(stamp - expected, None))
-            return self._accept(track, self._epochs[-1], seq, stamp, arrival)
+            return self._accept(state, self._epochs[-1], seq, stamp, arrival)
         else:
-            self.steps.append((Step.LOST, stamp - track.stamp))
+            self.steps.append((Step.LOST, stamp - state.stamp))
         self.restart()
         return None
 
-    def _is_prompt(self, track: _Track, place: int, arrival: int) -> bool:
-        """Whether a packet at a place is not so late that the stream may have paused instead."""
+    def _is_prompt(self, state: _StreamState, place: int, arrival: int) -> bool:
+        """Return whether a packet came soon after its predicted place.
+
+        If it is late, the stream may have paused instead, and the prediction says nothing.
+        """
         late = self._lateness(place, arrival)
         if late is None:
-            late = round(arrival - track.arrival - (place - track.u) * self.ratio)
-        return late < _REACH_NS
+            late = round(arrival - state.arrival - (place - state.u) * self.ratio)
+        return late < _NUMBERS_HOLD_NS
 
-    def _join(self, track: _Track, seq: int, stamp: int, arrival: int) -> int | None:
-        """Let a stream that is new onto the line once its cadence is known."""
-        if not track.cadence.learn(seq, stamp):
+    def _acquire(self, state: _StreamState, seq: int, stamp: int, arrival: int) -> int | None:
+        """Put a new stream on the line as soon as its cadence is known."""
+        if not state.cadence.learn(seq, stamp):
             return None
-        other = self._points if track is self._imu else self._imu
+        other = self._points if state is self._imu else self._imu
         if other.epoch is None:
             self._epochs.append(_Epoch(0, None))
-            return self._enter(track, self._epochs[-1], stamp, arrival)
-        epoch = self._fitting(other, stamp, arrival)
+            return self._enter(state, self._epochs[-1], stamp, arrival)
+        epoch = self._least_late_epoch(other, stamp, arrival)
         if epoch is not None:
-            return self._enter(track, epoch, stamp, arrival)
-        if arrival - other.arrival > _SILENT_NS:
+            return self._enter(state, epoch, stamp, arrival)
+        if arrival - other.arrival > _SILENCE_NS:
             self.steps.append((Step.LOST, stamp - other.stamp))
             self.restart()
         return None
 
-    def _fitting(self, other: _Track, stamp: int, arrival: int) -> _Epoch | None:
-        """Return the epoch in which a stamp is least late, given where the other stream is."""
+    def _least_late_epoch(self, other: _StreamState, stamp: int, arrival: int) -> _Epoch | None:
+        """Return the epoch in which a stamp is least late, given where the other stream is.
+
+        None if it is early, or later than any path could make it, in all of them.
+        """
         best: _Epoch | None = None
-        least = _LATE_NS
-        end: int | None = None  # of an epoch on the line
+        least = _MOST_LATE_NS
+        end: int | None = None  # of the epoch, on the line: where the next one begins
         for epoch in reversed(self._epochs):
             u = stamp - epoch.base
             begin = None if epoch.sync is None else epoch.sync.value - epoch.base
-            inside = (begin is None or u >= begin - _SLACK_NS) and (end is None or u <= end)
+            is_inside = (begin is None or u >= begin - _SYNC_ERROR_NS) and (
+                end is None or u <= end
+            )
             end = begin
-            if not inside:
+            if not is_inside:
                 continue
             late = self._lateness(u, arrival)
             if late is None:
                 late = abs(round(arrival - other.arrival - (u - other.u) * self.ratio))
-            if _EARLY_NS <= late < least:
+            if _MOST_EARLY_NS <= late < least:
                 best, least = epoch, late
         return best
 
-    def _possible(self, track: _Track, u: int, arrival: int) -> bool:
-        """Whether a packet measured at this place could have arrived when it did."""
+    def _is_plausible(self, state: _StreamState, u: int, arrival: int) -> bool:
+        """Return whether a packet measured at a place can have arrived when it did."""
         late = self._lateness(u, arrival)
         if late is None:
-            return abs((u - track.u) * self.ratio - (arrival - track.arrival)) < _REACH_NS
-        return _EARLY_NS <= late <= _LATE_NS
+            elapsed = arrival - state.arrival
+            return abs((u - state.u) * self.ratio - elapsed) < _NUMBERS_HOLD_NS
+        return _MOST_EARLY_NS <= late <= _MOST_LATE_NS
