@@ -478,7 +478,7 @@ def fuzz(seconds: float, seed: int, attacks: int) -> Outcome:
                 campaign.spin(0.1)
             load.begin()
             deadline = time.monotonic() + seconds
-            while time.monotonic() < deadline or campaign.rounds < _CALM_EVERY + 2:
+            while time.monotonic() < deadline or campaign.rounds < _CALM_EVERY:
                 campaign.round(0 if campaign.rounds % _CALM_EVERY == 0 else attacks)
                 now = {name: resident_mb(pid) for name, pid in pids.items()}
                 if campaign.rounds <= _CALM_EVERY + 2:
@@ -553,19 +553,19 @@ def report(outcome: Outcome) -> tuple[list[dict[str, Any]], list[Target]]:
         rows.append({
             "node": name,
             "rounds": len(campaign.back_s[name]),
-            "publishing after [s], median": round(float(np.median(back)), 2),
+            "publishing after (s), median": round(float(np.median(back)), 2),
             "p95": round(float(np.percentile(back, 95)), 2),
             "worst": round(max(back), 2),
-            "calm rounds [s], median": round(float(np.median(calm)), 2),
+            "calm rounds (s), median": round(float(np.median(calm)), 2),
             "calm, worst": round(max(calm), 2),
-            "growth [MB]": round(outcome.growth_mb.get(program, 0.0), 1),
+            "growth (MB)": round(outcome.growth_mb.get(program, 0.0), 1),
         })  # fmt: skip
         if is_idle:
             late, words = max(back), "publishing after good data"
         else:
             late = max(back) - max(calm)
             words = "later than in calm rounds"
-        targets.append(at_most(f"{name}: {words} [s]", late, _TARGET_S))
+        targets.append(at_most(f"{name}: {words} (s)", late, _TARGET_S))
     return rows, targets
 
 
