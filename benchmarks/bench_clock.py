@@ -320,8 +320,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seeded = [(row, 1000 * given.seed + number) for number, row in enumerate(rows())]
     loads = [
         (name, 1000 * given.seed + 500 + 10 * number + more)
-        for number, name in enumerate(SHAPES)
         for more in range(given.loads)
+        for number, name in enumerate(SHAPES)
     ]
     done = {row["seed"] for row in kept.read()} | {row["seed"] for row in kept_loads.read()}
     until = time.monotonic() + 60.0 * given.minutes

@@ -106,6 +106,9 @@ _TO_ACTIVE: Final = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTI
 _TIMEOUT_S: Final = 60.0  # for good data to come through; beyond that a node is stuck
 _ANSWER_S: Final = 10.0
 _TARGET_S: Final = 1.0
+# After hostility: what is under way arrives, and clouds that cannot be told from the sensor's own,
+# being stamped about now, are no longer within the second that sweeps are held together for.
+_QUIET_S: Final = 1.5
 _IDLE: Final = 0.1  # of the machine that others may use while it counts as idle
 _CALM_EVERY: Final = 4
 _RUN_S: Final = 6.0  # of good data; they are repeated
@@ -400,7 +403,7 @@ class Campaign:
         for _ in range(attacks):
             self.fuzzer.attack()
             self.spin(self.fuzzer.rng.choice((0.0, 0.0, 0.01)))
-        self.spin(0.5)  # what is under way arrives
+        self.spin(_QUIET_S)
         if not attacks:
             self._await(self.fuzzer.reset())
         self._await(self.fuzzer.restore())
