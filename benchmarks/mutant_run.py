@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import importlib.abc
 import importlib.machinery
-import json
 import math
 import os
 import resource
@@ -19,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
-from typing import Any, Final
+from typing import Final
 
 import hypothesis.extra.numpy
 import numpy
@@ -30,13 +29,14 @@ import scipy.optimize
 import scipy.spatial
 
 from benchmarks.mutants import FILES, FOLDERS, ROOT, Mutant, module_of, mutated
+from benchmarks.results import KeptRows
 
 PRELOADED: Final = (
     numpy, scipy.interpolate, scipy.linalg, scipy.optimize, scipy.spatial, hypothesis.extra.numpy,
 )  # fmt: skip
 _MAX_BYTES: Final = 6 << 30
 _OPTIONS: Final = ("-q", "--no-header", "-p", "no:cacheprovider", "-m", "not ros")
-_PASSED: Final = 0  # exit code of pytest
+_PASSED, _NONE_LEFT = 0, 5  # exit codes of pytest
 _HANGING: Final = 5.0  # times longer than without a mutant, and
 _HANGING_S: Final = 30.0  # longer [CPU s]
 _WALL: Final = 20.0  # times that by the clock on the wall: other programs run as well
@@ -72,11 +72,19 @@ class _Finder(importlib.abc.MetaPathFinder):
 
 
 class _CallRecorder:
-    """A plugin of pytest that notes which functions each test calls, and how long it takes."""
+    """A plugin of pytest that notes which functions each test calls, and how long it takes.
 
-    def __init__(self) -> None:
-        self.tests: dict[str, dict[str, Any]] = {}
+    Tests that are noted already do not run again.
+    """
+
+    def __init__(self, kept: KeptRows) -> None:
+        self._kept = kept
+        self._known = {row["test"] for row in kept.read()}
         self._paths: dict[str, str | None] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Leave out what is known."""
+        items[:] = [item for item in items if item.nodeid not in self._known]
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
@@ -99,7 +107,8 @@ class _CallRecorder:
             for path, line in sorted(called):
                 functions.setdefault(path, []).append(line)
             seconds = time.process_time() - begun
-            self.tests[item.nodeid] = {"seconds": round(seconds, 3), "functions": functions}
+            row = {"test": item.nodeid, "seconds": round(seconds, 3), "functions": functions}
+            self._kept.append(row)
 
     def _path(self, name: str) -> str | None:
         """Return a file's path below the repository if it may be mutated."""
@@ -110,8 +119,8 @@ class _CallRecorder:
         return self._paths[name]
 
 
-def find_calls(tests: Sequence[str], path: Path) -> None:
-    """Run all tests once and write which functions each calls.
+def find_calls(tests: Sequence[str], kept: KeptRows) -> None:
+    """Run all tests once and keep which functions each calls.
 
     Raises
     ------
@@ -120,13 +129,9 @@ def find_calls(tests: Sequence[str], path: Path) -> None:
     """
 
     def work() -> int:
-        recorder = _CallRecorder()
-        code = int(pytest.main([*_OPTIONS, "-p", "no:xdist", *tests], plugins=[recorder]))
-        path.write_text(json.dumps(recorder.tests))
-        return code
+        return int(pytest.main([*_OPTIONS, *tests], plugins=[_CallRecorder(kept)]))
 
-    if _forked(work, math.inf, quiet=False) != _PASSED:
-        path.unlink(missing_ok=True)
+    if _forked(work, math.inf) not in (_PASSED, _NONE_LEFT):
         raise RuntimeError("tests fail without a mutant")
 
 
@@ -147,7 +152,7 @@ def is_killed(mutant: Mutant, tests: Sequence[str], expected_s: float) -> bool:
         resource.setrlimit(resource.RLIMIT_AS, (_MAX_BYTES, _MAX_BYTES))
         _check_is_fresh(mutant.module)
         sys.meta_path.insert(0, _Finder(_Loader(mutant)))
-        return int(pytest.main(["-x", *_OPTIONS, "-p", "no:randomly", *tests]))
+        return int(pytest.main(["-x", *_OPTIONS, *tests]))
 
     return _forked(work, _HANGING * expected_s + _HANGING_S) != _PASSED
 
@@ -157,16 +162,16 @@ def _check_is_fresh(module: str) -> None:
         raise RuntimeError(f"{module} is imported already, so it cannot be mutated")
 
 
-def _forked(work: Callable[[], int], cpu_s: float, quiet: bool = True) -> int:
+def _forked(work: Callable[[], int], cpu_s: float) -> int:
     """Return the exit code of something that runs in a process of its own, -1 if it was killed."""
     child = os.fork()
     if not child:
         code = 70
         with contextlib.suppress(BaseException):
             os.environ["CI"] = "1"  # hypothesis gives the same answer twice
-            if quiet:
-                sink = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(sink, 1)
+            sink = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(sink, 1)
+            if math.isfinite(cpu_s):
                 os.dup2(sink, 2)
             if math.isfinite(cpu_s):
                 signal.signal(signal.SIGXCPU, signal.SIG_DFL)
