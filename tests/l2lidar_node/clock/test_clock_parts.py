@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from l2lidar_node.clock.cadence import Cadence
-from l2lidar_node.clock.host_clock_model import HostClockModel
+from l2lidar_node.clock.host_clock_model import HostClockModel, HostSlewing
 from l2lidar_node.clock.lower_envelope import supporting_line
 from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
@@ -158,3 +158,39 @@ def test_packets_from_before_a_told_step_do_not_count_in_the_new_time() -> None:
     assert model.at(500 * 2 * MS) == before
     assert not model.steps
     assert model.at(740 * 2 * MS) == pytest.approx(begin + 740 * 4 * MS + 10**9, abs=1000)
+
+
+TOLD = st.lists(
+    st.tuples(st.integers(-(10**18), 10**18), st.integers(-(10**12), 10**12)), min_size=1
+)
+
+
+@given(TOLD, st.integers(-(10**18), 10**18), st.integers(-(10**18), 10**18))
+def test_slewing_takes_whatever_it_is_told(
+    told: list[tuple[int, int]], at: int, step: int
+) -> None:
+    slewing = HostSlewing()
+    assert (slewing.at(at), slewing.rate, slewing.host(at)) == (0, 0.0, at)
+    for instant, by in told:
+        slewing.told(by, instant)
+        assert slewing.at(instant) == by - told[0][1]  # the latest word counts
+        assert abs(slewing.rate) <= 0.1
+    before = slewing.at(at)
+    slewing.stepped(step)
+    assert slewing.at(at + step) == pytest.approx(before, abs=2 + abs(before) * 1e-9)
+
+
+def test_slewing_is_a_polygon_through_what_was_told_and_goes_on_as_it_ended() -> None:
+    slewing = HostSlewing()
+    for instant, by in [(1_000, 500), (2_000, 510), (4_000, 490)]:
+        slewing.told(by, instant)
+
+    assert [slewing.at(at) for at in (0, 1_000, 1_500, 2_000, 3_000, 4_000, 4_200)] == [
+        0, 0, 5, 10, 0, -10, -12,
+    ]  # fmt: skip
+    assert slewing.rate == -0.01
+    assert slewing.host(4_210) == 4_198
+    for number in range(1_000):
+        slewing.told(490, 5_000 + number)
+    assert len(slewing._knots) == 64
+    assert slewing.at(10**9) == -10
