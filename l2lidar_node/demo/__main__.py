@@ -13,8 +13,8 @@ import typer
 from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
-from l2lidar_node.command_line import for_typer
-from l2lidar_node.demo import robot
+from l2lidar_node.command_line import CommandError, UsageError, for_typer
+from l2lidar_node.demo import mapping, robot
 from l2lidar_node.demo.observer import Observer, TopicRecord, TopicRecorder
 from l2lidar_node.demo.processes import (
     ProgramError,
@@ -27,17 +27,30 @@ from l2lidar_node.demo.report import report
 from l2lidar_node.programs import INTERRUPTED, interruptible
 
 _WARM_UP_S = 3.0
+_WATCHING_S = 20.0
+_WORLD = "room"
 _START_TIMEOUT_S = 180.0  # on a slow machine
 _BOOT_SCALE = 0.05  # a real unit takes 25 s
 
 
 def demo(
     duration: Annotated[
-        float, typer.Option(min=3.0, max=3600.0, metavar="S", help="Seconds to watch.")
-    ] = 20.0,
+        float | None,
+        typer.Option(
+            min=3.0,
+            max=3600.0,
+            metavar="S",
+            help=f"Seconds to watch; by default {_WATCHING_S:.0f}, with --slam "
+            f"{mapping.MAPPING_S:.0f}.",
+        ),
+    ] = None,
     world: Annotated[
-        str, typer.Option(help="Scene of the virtual L2, or a mesh file; l2lidar_emulator --help")
-    ] = "room",
+        str | None,
+        typer.Option(
+            help="Scene of the virtual L2, or a mesh file; l2lidar_emulator --help. By default "
+            f"{_WORLD}, with --slam {mapping.WORLD}."
+        ),
+    ] = None,
     motion: Annotated[
         str, typer.Option(help="still, spin, walk, trot, drone, or a TUM file.")
     ] = "walk",
@@ -51,6 +64,13 @@ def demo(
     driver_only: Annotated[
         bool, typer.Option("--driver-only", help="Leave deskew and odometry out.")
     ] = False,
+    slam: Annotated[
+        bool,
+        typer.Option(
+            "--slam",
+            help="Build a map with loops closed, save it, and be found in it again. 3 minutes.",
+        ),
+    ] = False,
     folder: Annotated[Path, typer.Option(help="Where pictures and truth go.")] = Path("out/demo"),
     record: Annotated[
         Path | None, typer.Option(help="Bag to write: FILE.mcap, or a folder for rosbag2.")
@@ -60,7 +80,18 @@ def demo(
 
     The exit code is 1 if a figure is not as it should be.
     """
-    options = _Options(duration, world, motion, forward, driver_only, folder, record)
+    if slam and driver_only:
+        raise UsageError("--slam needs the odometry: leave --driver-only out")
+    options = _Options(
+        duration or (mapping.MAPPING_S if slam else _WATCHING_S),
+        world or (mapping.WORLD if slam else _WORLD),
+        motion,
+        forward,
+        driver_only,
+        slam,
+        folder,
+        record,
+    )
     code = _run(options)
     if code:
         raise typer.Exit(code)
@@ -74,15 +105,21 @@ class _Options(NamedTuple):
     motion: str
     forward: bool
     driver_only: bool
+    slam: bool
     folder: Path
     record: Path | None
 
 
-def main() -> None:
-    """Run the demo by itself, as ``make demo`` does."""
+def main() -> int:
+    """Run the demo by itself, as ``make demo`` does; return the exit code."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(for_typer(demo))
-    app(prog_name="make demo")
+    try:
+        app(prog_name="make demo")
+    except CommandError as error:
+        print(f"make demo: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
 
 
 def _run(options: _Options) -> int:
@@ -90,6 +127,8 @@ def _run(options: _Options) -> int:
     console = Console()
     isolate_ros()
     chain = "driver" if options.driver_only else "driver, deskew and odometry"
+    if options.slam:
+        chain = "driver, deskew, odometry and SLAM"
     console.print(
         f"A virtual L2 in a {options.world} ({options.motion}) streams over UDP to {chain}; "
         f"watching the topics for {options.duration:.0f} s ..."
@@ -104,13 +143,16 @@ def _run(options: _Options) -> int:
             if options.record is not None:
                 recorder = stack.enter_context(TopicRecorder(observer, options.record))
             programs = stack.enter_context(Programs())
+            if options.slam:
+                run = mapping.MappingRun(console, observer, programs, options.folder)
             _start(programs, options)
             _wait_for_data(observer, programs)
-            end = time.monotonic() + options.duration
-            while time.monotonic() < end:
-                observer.watch(min(end, time.monotonic() + 1.0))
-                programs.check()
-                _tell(console, observer)
+            if options.slam:
+                run.watch(options.duration, _tell)
+                run.save()
+                run.start_again()
+            else:
+                _watch(console, observer, programs, options.duration)
     except (ProgramError, OSError) as error:
         console.print(f"[red]{error}")
         return 1
@@ -125,6 +167,8 @@ def _run(options: _Options) -> int:
     troubles = report(
         console, observer, options.folder, with_odometry=not options.driver_only, mount=mount
     )
+    if options.slam:
+        troubles += run.report()
     for trouble in troubles:
         console.print(f"[red]{trouble}")
     return 1 if troubles else 0
@@ -144,7 +188,9 @@ def _start(programs: Programs, options: _Options) -> None:
         "watchdog_action": "wait",  # until the world is there
     }
     programs.start("l2lidar_node.ros.driver_node", assigned(driver))
-    if not options.driver_only:
+    if options.slam:  # one process for both is lighter
+        programs.start("l2lidar_proc.ros.companion_node", [])
+    elif not options.driver_only:
         programs.start("l2lidar_proc.ros.deskew_node", [])
         programs.start("l2lidar_proc.ros.odometry_node", [])
     programs.start(
@@ -152,6 +198,7 @@ def _start(programs: Programs, options: _Options) -> None:
         [
             "--world", options.world,
             "--motion", options.motion,
+            *(["--motion-speed", str(mapping.SPEED)] if options.slam else []),
             "--mount", "forward" if options.forward else "upright",
             "--host-port", str(host_port),
             "--lidar-port", str(lidar_port),
@@ -159,6 +206,14 @@ def _start(programs: Programs, options: _Options) -> None:
             "--truth", str(options.folder / "truth"),
         ],
     )  # fmt: skip
+
+
+def _watch(console: Console, observer: Observer, programs: Programs, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        observer.watch(min(end, time.monotonic() + 1.0))
+        programs.check()
+        _tell(console, observer)
 
 
 def _wait_for_data(observer: Observer, programs: Programs) -> None:

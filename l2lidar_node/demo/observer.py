@@ -81,6 +81,7 @@ class Observer(Node):
         self.deskewed = TopicRecord()
         self.odometry = TopicRecord()
         self.positions: list[tuple[float, float, float]] = []
+        self.follows = True  # the odometry; not once it has begun anew
         self.pairs: dict[int, list[NDArray[np.void] | None]] = {}
         self.points: list[int] = []
         self.cloud: NDArray[np.void] | None = None
@@ -126,6 +127,8 @@ class Observer(Node):
         self._pair(stamp, 1, from_cloud(message))
 
     def _odometry(self, message: Odometry) -> None:
+        if not self.follows:
+            return
         self.odometry.add(from_time(message.header.stamp), message.header.frame_id)
         place = message.pose.pose.position
         self.positions.append((place.x, place.y, place.z))

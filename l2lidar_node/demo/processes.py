@@ -44,6 +44,7 @@ class Program:
 
     def __init__(self, module: str, arguments: list[str]) -> None:
         self.module = module
+        self._ended: tuple[int, str] | None = None
         self._process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             stdout=subprocess.PIPE,
@@ -65,6 +66,8 @@ class Program:
 
     def stop(self) -> tuple[int, str]:
         """Interrupt it as Ctrl-C does; return its exit code and everything it said."""
+        if self._ended is not None:
+            return self._ended
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -72,7 +75,8 @@ class Program:
         except subprocess.TimeoutExpired:
             self._process.kill()
             said, _ = self._process.communicate()
-        return self._process.returncode, said
+        self._ended = self._process.returncode, said
+        return self._ended
 
 
 class Programs:
@@ -102,6 +106,11 @@ class Programs:
             self._running.append(program)
             self._stack.callback(program.stop)
         return program
+
+    def stop(self, program: Program) -> None:
+        """Stop one of them now; the others go on."""
+        self._running.remove(program)
+        program.stop()
 
     def check(self) -> None:
         """Raise :class:`ProgramError` if any of them has ended."""

@@ -32,7 +32,7 @@ from l2lidar_proc.ros.map_transform import MapTransform
 from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
 from l2lidar_proc.slam.atlas import AtlasError
 from l2lidar_proc.slam.config import SlamNodeConfig
-from l2lidar_proc.slam.nodes import Keyframe, Map, OdometrySweep, SlamState, health_of
+from l2lidar_proc.slam.nodes import Health, Keyframe, Map, OdometrySweep, SlamState, health_of
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 
 _FARTHEST_M: Final = 1e6  # from the origin; no odometry goes so far
@@ -416,7 +416,10 @@ def _sweep(
     remarks = status.message.split(",") if status is not None else []
     covariance = np.array(odometry.pose.covariance, np.float64).reshape(6, 6)
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    return OdometrySweep(stamp, pose, xyz, health_of(remarks), covariance)
+    health = health_of(remarks)
+    if (np.diagonal(covariance) >= messages.UNKNOWN_VARIANCE).all():
+        health = Health.CUT  # how odometries without a status say that they are lost
+    return OdometrySweep(stamp, pose, xyz, health, covariance)
 
 
 def _markers(built: Map, loops: list[tuple[int, int]], frame: str) -> MarkerArray:

@@ -98,3 +98,10 @@ def test_a_wrong_option_is_explained() -> None:
     assert "--duration" in result.stderr
     # Words of typer, which change with its version; all name the bound.
     assert re.search(r"\b3(\.0)?\b", result.stderr)
+
+
+def test_a_map_without_odometry_is_refused() -> None:
+    command = [*COMMAND, "--slam", "--driver-only"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 2
+    assert "--slam needs the odometry" in result.stderr

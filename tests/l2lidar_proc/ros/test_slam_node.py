@@ -31,9 +31,9 @@ from l2lidar_node.ros.conversions import from_time, to_cloud, to_time  # noqa: E
 from l2lidar_node.ros.program import StartError  # noqa: E402
 from l2lidar_proc.ros import odometry_messages as messages  # noqa: E402
 from l2lidar_proc.ros.map_transform import Blend  # noqa: E402
-from l2lidar_proc.ros.slam_node import SlamNode  # noqa: E402
+from l2lidar_proc.ros.slam_node import SlamNode, _sweep  # noqa: E402
 from l2lidar_proc.slam import atlas, se3  # noqa: E402
-from l2lidar_proc.slam.nodes import Map, OdometrySweep, SlamState  # noqa: E402
+from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState  # noqa: E402
 from l2lidar_proc.slam.slam import Slam  # noqa: E402
 from tests.l2lidar_proc.conftest import STEP  # noqa: E402
 from tests.l2lidar_proc.ros.bench import FRAME, Bench  # noqa: E402
@@ -355,6 +355,22 @@ def test_a_clouds_frame_that_is_not_that_of_the_pose_is_named_and_dropped(
         assert bench.node._worker.submaps == 0
     finally:
         bench.close()
+
+
+def test_an_odometry_without_a_status_is_lost_where_its_covariance_says_so(
+    office: MappingRun,
+) -> None:
+    sweep = sweeps_of(office)[0]
+    odometry = Odometry(child_frame_id=FRAME)
+    odometry.pose.pose = messages.pose(sweep.T_odom_body)
+    cloud = to_cloud(messages.as_cloud(sweep.points), sweep.stamp, FRAME)
+    for variances, health in (
+        ([1e-4] * 6, Health.GOOD),
+        ([1e-4, 1e-4, 1e6, 1e6, 1e6, 1e-4], Health.GOOD),  # a planar one does not know its height
+        ([9999.0] * 6, Health.CUT),
+    ):
+        odometry.pose.covariance = np.diag(variances).ravel()
+        assert _sweep(sweep.stamp, odometry, cloud, None).health is health
 
 
 def test_another_parent_of_odom_silences_the_transform(
