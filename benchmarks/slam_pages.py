@@ -72,7 +72,7 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         loops = sum(row["loops"] for row in mapping)
         yield at_most(f"wrong loops of {loops}, all scenes", wrong, 0.0)
         yield at_most("cores, largest of any walk", max(r["cores"] for r in mapping), 0.3)
-        yield at_most("longest step, s of processor", max(r["longest_s"] for r in mapping), 10.0)
+        yield at_most("longest step, s of processor", max(r["longest_s"] for r in mapping), 5.0)
         yield at_most("map, MB per km, largest", max(r["mb_per_km"] for r in mapping), 60.0)
     starts = [r for r in rows if r["kind"] == "kidnapped"]
     inside = [r for r in starts if r["scene"] in ("street", "office")]
