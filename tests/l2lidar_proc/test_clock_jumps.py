@@ -112,9 +112,9 @@ IMU = recording("room", "walk").imu
 @example(YEAR_NS, "one sample")
 @example(-int(ROOM[0].start), "both")
 def test_odometry_goes_on_after_any_jump(by: Any, who: Any) -> None:
-    when, pipeline, first, poses = 9, OdometryPipeline(OdometryConfig(), T_CLOUD_IMU), 0, []
+    when, pipeline, first, poses = 6, OdometryPipeline(OdometryConfig(), T_CLOUD_IMU), 0, []
     with memory.at_most(MOST_BYTES):
-        for number, sweep in enumerate(ROOM[:22]):
+        for number, sweep in enumerate(ROOM[:18]):
             last = int(np.searchsorted(IMU["stamp"], sweep.end)) + 1
             cloud_by, imu_by = offsets(who, by, number, when)
             samples = IMU[first:last].copy()
@@ -126,7 +126,7 @@ def test_odometry_goes_on_after_any_jump(by: Any, who: Any) -> None:
             first = last
             pipeline.sweep(moved(sweep, cloud_by), number * 200_000_000)
             poses += [(number, item) for item in pipeline.poll(number * 200_000_000 + 10**9)]
-    assert [number for number, _ in poses][-4:] == [18, 19, 20, 21], (by, who)
+    assert [number for number, _ in poses][-4:] == [14, 15, 16, 17], (by, who)
     for _, item in poses:
         assert np.isfinite(item.T_map_lidar).all()
         assert np.linalg.norm(item.T_map_lidar[:3, 3]) < 20.0, (by, who)

@@ -508,7 +508,7 @@ def test_an_interrupted_convert_leaves_nothing(
     capture: tuple[Path, list[Received]], tmp_path: Path
 ) -> None:
     path = tmp_path / "long.pcap"
-    repeated(capture[1], path, 100)
+    repeated(capture[1], path, 20)
     process = started("convert", str(path), str(tmp_path / "run.mcap"))
     bag = tmp_path / "run.unfinished" / "run" / "run.mcap"
     wait_until(lambda: bag.exists() and bag.stat().st_size > 100_000, process)

@@ -69,6 +69,11 @@ def _learned(period: int, first: int = 0) -> Cadence:
     return cadence
 
 
+@pytest.mark.parametrize(("off", "follows"), [(1_900, True), (2_100, False), (-2_100, False)])
+def test_a_packet_2_us_off_an_even_cadence_is_a_step(off: int, follows: bool) -> None:
+    assert _learned(2 * MS).follows(9, 2 * MS + off) == follows
+
+
 def test_a_cadence_predicts_over_missing_packets() -> None:
     cadence = _learned(2 * MS)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_proc import rotations
+from l2lidar_proc import rotations, tuning
 from l2lidar_proc.motion.imu_buffer import ImuBuffer
 from l2lidar_proc.motion.twist_filter import TwistFilter
 from tests.l2lidar_proc.motion.analytic import EPOCH, T_CLOUD_IMU, G, Motion, at, noisy
@@ -66,6 +66,21 @@ def test_stillness_shows_within_the_first_sweep_but_not_in_motion() -> None:
     assert follow(Motion().imu(0, 0.2)).is_still(noisy(Motion().imu(0, 0.23, BIAS)))
     walk = Motion(turn=0.5, nod=0.1, speed=0.7)
     assert not follow(walk.imu(0, 0.2)).is_still(noisy(walk.imu(0, 0.23, BIAS)))
+
+
+def test_noise_is_a_density_and_more_than_the_usual_where_more_shows() -> None:
+    """White noise of a standard deviation s in samples 4 ms apart has the density 2 s sqrt(ms)."""
+    samples = Motion().imu(0, 40)
+    found = TwistFilter(ImuBuffer(), np.zeros(3), 0.1)
+    quiet = found._noise(samples)
+    assert quiet.gyro == pytest.approx(tuning.TRACKER_GYRO_NOISE * np.sqrt(0.004))
+    assert quiet.accel == pytest.approx(tuning.TRACKER_ACCEL_NOISE * np.sqrt(0.004))
+    rng = np.random.default_rng(0)
+    samples["angular_velocity"] += rng.normal(0.0, 0.3, (len(samples), 3))
+    samples["linear_acceleration"] += rng.normal(0.0, 0.7, (len(samples), 3))
+    loud = found._noise(samples)
+    assert loud.gyro == pytest.approx(0.3 * np.sqrt(0.004), rel=0.05)
+    assert loud.accel == pytest.approx(0.7 * np.sqrt(0.004), rel=0.05)
 
 
 @pytest.mark.parametrize("with_velocity", [True, False])

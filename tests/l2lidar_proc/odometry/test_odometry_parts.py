@@ -15,9 +15,10 @@ from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.kiss import thinned_indices
 from l2lidar_proc.odometry.plain import PlainOdometry
+from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.recording.trajectory import Trajectory, kitti, levelled_start, tum
-from tests.l2lidar_proc.motion.analytic import at
+from tests.l2lidar_proc.motion.analytic import Motion, at
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 
@@ -70,6 +71,22 @@ def test_far_cells_are_forgotten_and_the_rest_stays() -> None:
     assert len(surfaces.match(np.array([[2.12, 0.1, 1.1], [52.12, 0.1, 1.1]])).index) == 1
     surfaces.add(wall(52.12))
     assert len(surfaces) == count
+
+
+def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> None:
+    """White noise of a standard deviation s in samples 4 ms apart has the density 2 s sqrt(ms)."""
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    settings = OdometryConfig().inertial
+    samples = Motion().imu(0, 40)
+    quiet = predictor._noise(samples)
+    assert quiet.gyro == pytest.approx(settings.gyro_noise * np.sqrt(0.004))
+    assert quiet.accel == pytest.approx(settings.accel_noise * np.sqrt(0.004))
+    rng = np.random.default_rng(0)
+    samples["angular_velocity"] += rng.normal(0.0, 0.3, (len(samples), 3))
+    samples["linear_acceleration"] += rng.normal(0.0, 0.7, (len(samples), 3))
+    loud = predictor._noise(samples)
+    assert loud.gyro == pytest.approx(0.3 * np.sqrt(0.004), rel=0.05)
+    assert loud.accel == pytest.approx(0.7 * np.sqrt(0.004), rel=0.05)
 
 
 def test_trajectory_files_keep_nanoseconds() -> None:

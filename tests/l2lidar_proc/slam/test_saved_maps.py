@@ -172,7 +172,7 @@ def test_the_occupancy_map_is_free_along_the_way_and_has_walls_beside_it(mapped:
 
 def test_a_kidnapped_start_is_found_and_kept(mapped: Slam) -> None:
     scene = furnished_office()
-    truth = walk(scene, 0.45, step=STEP, seed=4, backwards=True)
+    truth = walk(scene, 0.3, step=STEP, seed=4, backwards=True)
     run = scan(scene, truth, step=STEP, rays=4000, seed=4)
     localizer = Localizer(SlamConfig(), mapped.map())
     before = len(mapped.map().points())
