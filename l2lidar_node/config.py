@@ -291,9 +291,16 @@ class TopicConfig:
 
     point_cloud_topic_id: str = setting("/points", "topic for point clouds", form=TOPIC)
     imu_topic_id: str = setting("/imu/data", "topic for IMU samples", form=TOPIC)
+    publish_packets: bool = setting(
+        False,
+        "publish the raw packets of the L2, for bags that replay bit for bit",
+    )
+    packet_topic_id: str = setting(
+        "~/packets", "topic for raw packets, with publish_packets", form=TOPIC
+    )
     qos_reliability: str = setting(
         "best_effort",
-        "QoS reliability of both topics; every subscriber can receive reliable",
+        "QoS reliability of clouds and IMU samples; every subscriber can receive reliable",
         choices=("best_effort", "reliable"),
     )
     point_layout: str = setting("native", "fields of a published point", choices=tuple(LAYOUTS))
@@ -333,7 +340,9 @@ class FileConfig:
     """Captures to write and to read, and the calibration of the unit."""
 
     record_file: str = setting("", "capture file to write; a number is added if the file exists")
-    replay_file: str = setting("", "capture file to replay instead of listening to an L2")
+    replay_file: str = setting(
+        "", "capture, or bag with raw packets, to replay instead of listening to an L2"
+    )
     calibration_file: str = setting(
         "",
         "calibration of the unit, written by l2lidar calibrate; used for packets whose reported "
@@ -378,3 +387,11 @@ class DriverConfig:
     watchdog: WatchdogConfig = field(default_factory=WatchdogConfig)
     files: FileConfig = field(default_factory=FileConfig)
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
+
+    def __post_init__(self) -> None:
+        """Check what concerns several groups."""
+        if self.topics.publish_packets and self.files.replay_file:
+            raise SettingError(
+                "parameter 'publish_packets': true cannot be combined with replay_file "
+                f"({self.files.replay_file!r}), which has no device; set only one of them"
+            )

@@ -73,7 +73,9 @@ def generate_launch_description():
     share = FindPackageShare("l2lidar_node")
     return LaunchDescription(
         [
-            DeclareLaunchArgument("file", description="capture (pcap) to play"),
+            DeclareLaunchArgument(
+                "file", description="capture (pcap), or bag of raw packets, to play"
+            ),
             DeclareLaunchArgument(
                 "rate", default_value="1.0", description="speed, 0 for as fast as possible"
             ),

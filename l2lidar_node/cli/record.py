@@ -19,8 +19,9 @@ from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.files import free_name
 from l2lidar_node.recording.bag import BagWriter
+from l2lidar_node.recording.packet_bag import PacketBagWriter, open_packets
 from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Recorder, Recording
+from l2lidar_node.recording.recording import Recorder, Recording, RecordingWriter, written
 from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
 from l2lidar_node.types import StampError, Stream
@@ -130,38 +131,84 @@ def _raise_first(failures: list[str]) -> None:
 
 
 def convert(
-    capture: Annotated[
-        Path, typer.Argument(help="pcap or pcapng file.", exists=True, dir_okay=False)
+    recording: Annotated[
+        Path,
+        typer.Argument(help="pcap or pcapng file, or a bag with raw packets.", exists=True),
     ],
-    bag: Annotated[Path, typer.Argument(help="FILE.mcap or a folder to write.")],
+    result: Annotated[
+        Path, typer.Argument(help="FILE.mcap or a folder for a bag, FILE.pcap for a capture.")
+    ],
     sweep_cut: CutOption = "turn",
     point_layout: LayoutOption = "native",
     l2_ip: Annotated[
-        str, typer.Option(help="Whose packets, if the capture holds those of several units.")
+        str, typer.Option(help="Whose packets, if there are those of several units.")
     ] = "",
+    packets: Annotated[
+        bool,
+        typer.Option("--packets", help="Bag: raw packets, as publish_packets, not clouds."),
+    ] = False,
 ) -> None:
-    """Turn a capture into a ROS 2 bag, with the stamps the driver gives.
+    """Turn raw packets into a ROS 2 bag of clouds, with the stamps the driver gives.
 
-    Interrupted, or stopped by an error, it leaves nothing behind.
+    With --packets, or into FILE.pcap, they stay raw: captures and bags of packets hold the same,
+    to the bit. Interrupted, or stopped by an error, it leaves nothing behind.
     """
-    if _is_capture(bag):
-        raise UsageError(f"'{bag}' is named like a capture; a bag is FILE.mcap, or a folder")
-    if bag.exists():
-        raise UsageError(f"{bag} exists already; choose another name, or remove it")
-    values = {"imu_adjust": False, "sweep_cut": sweep_cut, "point_layout": point_layout}
-    config = build(DriverConfig, values)
+    is_capture = _is_capture(result)
+    if result.exists():
+        raise UsageError(f"{result} exists already; choose another name, or remove it")
     try:
-        with capture.open("rb") as stream:
-            recording = Recording(stream, l2_ip)
-            with BagWriter(bag, config) as writer:
-                for event in events(recording, config):
-                    writer.add(event)
+        with open_packets(recording) as stream:
+            read = Recording(stream, l2_ip)
+            if is_capture:
+                said = _write_capture(read, result)
+            elif packets:
+                said = _write_packets(read, result)
+            else:
+                said = _write_clouds(
+                    read,
+                    result,
+                    {"imu_adjust": False, "sweep_cut": sweep_cut, "point_layout": point_layout},
+                )
     except OSError as error:
-        raise CommandError(f"{error.filename or bag}: {error.strerror}") from None
+        raise CommandError(f"{error.filename or result}: {error.strerror}") from None
     except (CaptureError, StampError) as error:
-        raise CommandError(f"{capture}: {error}") from None
-    cut = "; the capture is cut off at its end" if recording.is_cut_off else ""
-    say(f"{bag}: {writer.clouds} clouds, {writer.samples} IMU samples{cut}")
+        raise CommandError(f"{recording}: {error}") from None
+    cut = "; the capture is cut off at its end" if read.is_cut_off else ""
+    say(f"{result}: {said}{cut}")
+
+
+def _write_clouds(recording: Recording, result: Path, values: dict[str, Any]) -> str:
+    config = build(DriverConfig, values)
+    with BagWriter(result, config) as writer:
+        for event in events(recording, config):
+            writer.add(event)
+    return f"{writer.clouds} clouds, {writer.samples} IMU samples"
+
+
+def _write_capture(recording: Recording, result: Path) -> str:
+    unfinished = result.with_name(f"{result.name}.unfinished")
+    count = 0
+    try:
+        with unfinished.open("xb") as file:
+            writer = RecordingWriter(file, recording.device, recording.host)
+            for entry in recording:
+                kind, arguments = written(entry)
+                getattr(writer, kind)(*arguments)
+                count += 1
+        unfinished.rename(result)
+    except FileExistsError:
+        raise
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+    return f"{count} packets"
+
+
+def _write_packets(recording: Recording, result: Path) -> str:
+    with PacketBagWriter(result, recording.device, recording.host) as writer:
+        for entry in recording:
+            writer.add(entry)
+    return f"{writer.entries} packets in {writer.messages} messages"
 
 
 def _is_capture(file: Path) -> bool:

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from l2lidar_node.cli.console import out, say
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.protocol import wire
+from l2lidar_node.recording.packet_bag import PacketBag, open_packets
 from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Received, Recording
 
@@ -23,7 +24,7 @@ _SHOW_S: Final = 0.1
 
 def replay(
     file: Annotated[
-        Path, typer.Argument(help="pcap or pcapng file.", exists=True, dir_okay=False)
+        Path, typer.Argument(help="pcap or pcapng file, or a bag with raw packets.", exists=True)
     ],
     to: Annotated[
         str, typer.Option(metavar="ADDRESS:PORT", help="Where the driver listens.")
@@ -48,14 +49,14 @@ def replay(
         float | None, typer.Option(min=0.0, help="Seconds to play; to the end if left out.")
     ] = None,
 ) -> None:
-    """Send the datagrams of a capture to a driver, at the pace they were captured.
+    """Send the datagrams of a capture or bag to a driver, at the pace they were captured.
 
     The driver stamps them as they arrive now. For the stamps of the recording, bit for bit, let
     the driver read the file itself: its parameter replay_file.
     """
     destination = _end(to)
     try:
-        stream = file.open("rb")
+        stream = open_packets(file)
         recording = Recording(stream, l2_ip)
     except (OSError, CaptureError) as error:
         raise DeviceError(f"{file}: {error}") from None
@@ -64,7 +65,8 @@ def replay(
         say(
             f"{file}: the L2 at {recording.device}; sending from {address[0]}:{address[1]} to {to}"
         )
-        task = progress.add_task("", total=file.stat().st_size, seconds=0.0, lap=1)
+        size = None if isinstance(stream, PacketBag) else file.stat().st_size
+        task = progress.add_task("", total=size, seconds=0.0, lap=1)
         sent = lap = 0
         try:
             while lap == 0 or loop:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.protocol import wire
@@ -201,6 +201,19 @@ class RecordingWriter:
     def slewed(self, by_ns: int, at: HostNs) -> None:
         """Append that the driver was told how far slewing had moved the host's clock."""
         self._capture.write(UdpDatagram(at, self._host, self._host, SLEWED % by_ns))
+
+
+def written(entry: Entry) -> tuple[str, tuple[Any, ...]]:
+    """Return the method of :class:`RecordingWriter` that appends an entry, and its arguments."""
+    if isinstance(entry, Received):
+        return "received", (entry.data, entry.time)
+    if isinstance(entry, Sent):
+        return "sent", (entry.command.encode(), entry.time)
+    if isinstance(entry, Stepped):
+        return "stepped", (entry.by_ns, entry.time)
+    if isinstance(entry, Slewed):
+        return "slewed", (entry.by_ns, entry.time)
+    return "waited", (entry.time,)
 
 
 def _noted(data: bytes, time: HostNs) -> Waited | Stepped | Slewed | None:

@@ -26,16 +26,18 @@ from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer
 from l2lidar_node.driver.driver import Driver, Event, Silence
 from l2lidar_node.files import free_name
 from l2lidar_node.protocol.packets import Parameters, Version
+from l2lidar_node.recording.packet_bag import open_packets
 from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import Playback
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.managed_node import ManagedNode, NextTurn
+from l2lidar_node.ros.packet_publisher import PacketPublisher
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.transport import session
-from l2lidar_node.transport.session import Loop, Session
+from l2lidar_node.transport.session import Loop, Session, Tap, Taps
 from l2lidar_node.transport.udp import TransportError
 from l2lidar_node.types import HostNs, ImuSample, StampError, Sweep, is_ros_time, split_stamp
 
@@ -54,26 +56,28 @@ def open_loop(node: Node, config: DriverConfig, on_event: Callable[[Event], None
     """
     if config.files.replay_file:
         return _playback(node, config, on_event)
-    recorder = None
+    taps: list[Tap] = []
     if config.files.record_file:
         path = free_name(Path(config.files.record_file).expanduser())
         try:
-            recorder = Recorder(path, config.network, node.get_logger().error)
+            taps.append(Recorder(path, config.network, node.get_logger().error))
         except OSError as error:
             raise StartError(f"cannot record to {path}: {error.strerror}") from None
         node.get_logger().info(f"recording to {path}")
+    if config.topics.publish_packets:
+        taps.append(PacketPublisher(node, config.topics.packet_topic_id, config.network))
     try:
         transport = session.open_transport(config.network)
     except TransportError as error:
         raise StartError(str(error.strerror)) from None
     node.get_logger().info(session.describe_transport(config.network))
-    return Session(Driver(config), transport, on_event, recorder)
+    return Session(Driver(config), transport, on_event, Taps(taps) if taps else None)
 
 
 def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None]) -> Playback:
     path = Path(config.files.replay_file).expanduser()
     try:
-        recording = Recording(path.open("rb"), config.network.l2_ip)
+        recording = Recording(open_packets(path), config.network.l2_ip)
         split_stamp(recording.start)
     except OSError as error:
         raise StartError(f"cannot replay {path}: {error.strerror}") from None

@@ -6,7 +6,7 @@ import contextlib
 import queue
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Final, Protocol, TypeVar
 
@@ -177,6 +177,48 @@ class Tap(Protocol):
 
     def close(self) -> None:
         """Take note that this was all."""
+
+
+class Taps:
+    """Several taps that are told the same.
+
+    Parameters
+    ----------
+    taps : sequence of Tap
+    """
+
+    def __init__(self, taps: Sequence[Tap]) -> None:
+        self._taps = tuple(taps)
+
+    def received(self, data: bytes, arrival: HostNs) -> None:
+        """Pass on bytes that are handed to the driver."""
+        for tap in self._taps:
+            tap.received(data, arrival)
+
+    def sent(self, frame: bytes, at: HostNs) -> None:
+        """Pass on a frame that the driver counts as sent."""
+        for tap in self._taps:
+            tap.sent(frame, at)
+
+    def waited(self, until: HostNs) -> None:
+        """Pass on that the driver waits no longer."""
+        for tap in self._taps:
+            tap.waited(until)
+
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Pass on that the host's clock was set."""
+        for tap in self._taps:
+            tap.stepped(by_ns, at)
+
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        """Pass on how far slewing has moved the host's clock."""
+        for tap in self._taps:
+            tap.slewed(by_ns, at)
+
+    def close(self) -> None:
+        """Close all."""
+        for tap in self._taps:
+            tap.close()
 
 
 class Session(Loop):

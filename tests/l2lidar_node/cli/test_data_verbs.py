@@ -27,6 +27,7 @@ from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.recording.capture import Endpoint
+from l2lidar_node.recording.pcap import is_capture
 from l2lidar_node.recording.recording import (
     Received,
     Recorder,
@@ -529,6 +530,43 @@ def test_times_that_no_stamp_can_hold_are_explained(
     assert not (tmp_path / "late.mcap").exists()
     data, _ = replayed(run, path, "--rate", "0")
     assert data == [entry.data for entry in capture[1]]  # it carries no stamps
+
+
+def test_bags_of_packets_and_captures_hold_the_same(
+    run: Run, capture: tuple[Path, list[Received]], tmp_path: Path
+) -> None:
+    path, received = capture
+    packets, again, clouds = (tmp_path / name for name in ("p.mcap", "again.pcap", "clouds"))
+    outcome = run("convert", str(path), str(packets), "--packets")
+    assert (outcome.code, outcome.err) == (0, "")
+    with AnyReader([packets]) as reader:
+        (connection,) = reader.connections
+        assert (connection.topic, connection.msgtype) == (
+            "/l2lidar_node/packets",
+            "std_msgs/msg/UInt8MultiArray",
+        )
+        first = next(reader.messages())
+        data = reader.deserialize(first[2], connection.msgtype).data.tobytes()  # type: ignore[attr-defined]
+    assert is_capture(data)
+    assert run("convert", str(packets), str(again)).code == 0
+    with path.open("rb") as one, again.open("rb") as other:
+        assert list(Recording(one)) == list(Recording(other))
+    said = [run("convert", str(file), str(tmp_path / f"{clouds}{file.stem}"))
+            for file in (path, packets)]  # fmt: skip
+    assert [outcome.code for outcome in said] == [0, 0]
+    assert said[0].out.partition(": ")[2] == said[1].out.partition(": ")[2]
+    sent, _ = replayed(run, packets, "--rate", "0")
+    rest = iter([entry.data for entry in received])  # a busy machine may drop some
+    assert sent
+    assert all(data in rest for data in sent)
+    outcome = run("replay", str(tmp_path / f"{clouds}run"))
+    assert outcome.code == 1
+    assert "no packets of an L2 in this bag" in outcome.err
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(packets.read_bytes()[: packets.stat().st_size // 2])
+    outcome = run("replay", str(damaged))
+    assert outcome.code == 1
+    assert "damaged.mcap cannot be read as a recording" in outcome.err
 
 
 def test_info_describes_recordings(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import subprocess
 import sys
 import time
@@ -11,12 +12,16 @@ from typing import Any
 
 import pytest
 import rclpy
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, PointCloud2
+from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from l2lidar_node.demo.processes import Program, assigned
+from l2lidar_node.recording.bag import BagFile
+from l2lidar_node.recording.packet_bag import HEADER_SIZE, PACKETS, open_packets
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.ros.conversions import from_time
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
@@ -99,7 +104,15 @@ def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Pat
     path = tmp_path / "run.pcap"
     ear = Ear(rig)
     rig.emulator("--ready", "--loss", "0.01", "--reorder", "0.01")
-    driver = rig.driver(**SETTINGS, record_file=path)
+    packets: list[bytes] = []
+    latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = rig.observer.create_subscription(
+        UInt8MultiArray,
+        "/l2lidar_node/packets",
+        lambda message: packets.append(bytes(message.data)),
+        latched,
+    )
+    driver = rig.driver(**SETTINGS, record_file=path, publish_packets=True)
     rig.wait_for(lambda: len(ear.clouds) > 20, "clouds")
     code, said = driver.stop()
     assert code == 0
@@ -107,8 +120,22 @@ def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Pat
     ear.take_what_waits()
     assert not ear.times
     ear.close()
+    rig.observer.destroy_subscription(subscription)
+    # The topic's messages, one header left of all, are the capture, to the byte; the last ones may
+    # not have come before the driver was gone.
+    recorded_bytes = path.read_bytes()
+    assert len(packets) > 50
+    joined = packets[0] + b"".join(item[HEADER_SIZE:] for item in packets[1:])
+    assert recorded_bytes.startswith(joined)
+    assert len(joined) > 200_000
 
-    again = heard_again(rig, path, **SETTINGS)
+    bag = tmp_path / "run"
+    with BagFile(bag) as file:  # as ros2 bag record makes it
+        file.connect("/l2lidar_node/packets", PACKETS, 100, reliable=True, latched=True)
+        for number, item in enumerate(packets):
+            message = UInt8MultiArray(data=array.array("B", item))
+            file.write("/l2lidar_node/packets", number, serialize_message(message))
+    again = heard_again(rig, bag, **SETTINGS)
     for live, replayed, few in (
         (ear.clouds, again.clouds, 10),
         (ear.samples, again.samples, 100),
@@ -123,7 +150,7 @@ def test_a_replayed_node_publishes_what_the_live_one_did(rig: Rig, tmp_path: Pat
     # The recording's time, never the wall's.
     assert len(again.times) > 50
     assert again.times == sorted(again.times)
-    with path.open("rb") as stream:
+    with open_packets(bag) as stream:
         recorded = [entry.time for entry in Recording(stream)]
     assert min(recorded) <= again.times[0] < again.times[-1] <= max(recorded)
 

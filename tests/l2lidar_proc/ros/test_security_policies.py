@@ -30,7 +30,7 @@ NODES: dict[str, Callable[[], Any]] = {
     "slam_node": SlamNode,
 }
 AT_TIMES = {  # only in a replay, with use_sim_time, and once somebody publishes clouds
-    "l2lidar_node": {"publish /clock", "subscribe /clock"},
+    "l2lidar_node": {"publish /clock", "subscribe /clock", "publish /l2lidar_node/packets"},
     "deskew_node": {"subscribe /clock", "request /l2lidar_node/get_parameters"},
     "odometry_node": {"subscribe /clock"},
     "slam_node": {"subscribe /clock"},
