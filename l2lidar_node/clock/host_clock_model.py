@@ -36,6 +36,7 @@ _REANCHOR_BLOCKS: Final = 20
 _FORWARD_BLOCKS: Final = 10  # late packets may have waited somewhere
 _LOADED_BLOCKS: Final = 3  # where steps are told, late packets that keep coming mean load
 _BACKWARD_BLOCKS: Final = 2  # early ones cannot have
+_MOST_BEFORE_STEP: Final = 10_000  # packets, 20 s of them; more, and the step was told wrongly
 _KNOTS: Final = 64  # of the slewing, told every 100 ms where it is steady
 _SUDDEN: Final = 1e-3  # a rate that changes by more is followed at once
 _FASTEST_SLEW: Final = 0.1  # adjtimex(2) allows a tenth, by the length of the tick
@@ -137,6 +138,7 @@ class HostClockModel:
     """
 
     __slots__ = (
+        "_before_step",
         "_envelope",
         "_from",
         "_host",
@@ -164,6 +166,7 @@ class HostClockModel:
         self.line = Line(0, 0, ratio, 0.0)
         self.advance_ns = 0
         self.is_told = False
+        self._before_step = 0  # packets that were still told in the time before a step
         self._from = 0  # arrivals before may be told in a time before the clock was set
         self.steps: deque[int] = deque(maxlen=64)
         self._slewing = HostSlewing()
@@ -189,6 +192,9 @@ class HostClockModel:
     def add(self, u: int, arrival: int) -> None:
         """Take one packet: its place on the device line, and when it could leave at the latest."""
         if arrival < self._from:
+            self._before_step += 1
+            if self._before_step > _MOST_BEFORE_STEP:
+                self._from = 0
             return
         if not self.ready:
             self._packets.append((u, arrival - self._slewing.at(arrival)))
@@ -209,7 +215,7 @@ class HostClockModel:
         self.is_told = True
         if not by_ns:
             return
-        self._from = at
+        self._from, self._before_step = at, 0
         self._slewing.stepped(by_ns)
         self._suspects.clear()
         self._low = None

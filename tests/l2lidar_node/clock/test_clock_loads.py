@@ -30,8 +30,9 @@ def run(loads: tuple[Load, ...], seed: int = 4, notice_ms: float = 10.0) -> Repl
     end = max(load.stop for load in loads)
     return Replay(
         Scenario(
-            seconds=end + QUIET_S, loads=loads, notice_ms=notice_ms, jitter="uniform",
-            jitter_ms=0.2, drift_ppm=50.0, drift_period=300.0, path_ms=PATH_NS * 1e-6,
+            seconds=end + QUIET_S, loads=loads, notice_ms=notice_ms,
+            are_slews_told=notice_ms >= 0.0, jitter="uniform", jitter_ms=0.2, drift_ppm=50.0,
+            drift_period=300.0, path_ms=PATH_NS * 1e-6,
         ),
         seed,
     )  # fmt: skip

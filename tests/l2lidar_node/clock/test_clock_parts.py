@@ -199,3 +199,14 @@ def test_slewing_is_a_polygon_through_what_was_told_and_goes_on_as_it_ended() ->
         slewing.told(490, 5_000 + number)
     assert len(slewing._knots) == 64
     assert slewing.at(10**9) == -10
+
+
+def test_a_step_that_is_told_for_the_far_future_does_not_end_the_fit() -> None:
+    model = HostClockModel(2.0)
+    model.stepped(10**18, 2 * 10**18)
+    for n in range(10_400):
+        u = n * 2 * MS
+        model.add(u, 10**15 + 2 * u)
+        model.update(u)
+        assert model.ready == (n >= 10_101)  # 0.4 s of data after the last one refused
+    assert model.at(0) == 10**15
