@@ -119,8 +119,8 @@ class _CallRecorder:
         return self._paths[name]
 
 
-def find_calls(tests: Sequence[str], kept: KeptRows) -> None:
-    """Run all tests once and keep which functions each calls.
+def find_calls(tests: str, kept: KeptRows) -> None:
+    """Run the tests of a folder or file once and keep which functions each calls.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def find_calls(tests: Sequence[str], kept: KeptRows) -> None:
     """
 
     def work() -> int:
-        return int(pytest.main([*_OPTIONS, *tests], plugins=[_CallRecorder(kept)]))
+        return int(pytest.main([*_OPTIONS, tests], plugins=[_CallRecorder(kept)]))
 
     if _forked(work, math.inf) not in (_PASSED, _NONE_LEFT):
         raise RuntimeError("tests fail without a mutant")

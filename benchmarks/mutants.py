@@ -17,6 +17,7 @@ import argparse
 import ast
 import copy
 import hashlib
+import multiprocessing
 import os
 import random
 import sys
@@ -279,12 +280,13 @@ def report(rows: list[dict[str, Any]], options: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Try the mutants; return 1 if fewer than nine of ten were killed."""
-    from benchmarks.mutant_run import find_calls, is_killed  # imports what the tests import
+    from benchmarks.mutant_run import find_calls  # imports what the tests import
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mutants", type=int, default=160, help="how many; 0: all")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--modules", nargs="+", default=[], help="only these, such as reorder")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="mutants at a time")
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no mutant after that")
     parser.add_argument("--resume", action="store_true", help="keep what is judged already")
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
@@ -295,33 +297,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given.resume:
         kept.clear()
         kept_calls.clear()
-    find_calls(TESTS, kept_calls)
+    with multiprocessing.get_context("fork").Pool(given.jobs, maxtasksperchild=1) as pool:
+        pool.starmap(find_calls, [(tests, kept_calls) for tests in TESTS], chunksize=1)
     calls = {
         row["test"]: Called(row["seconds"], row["functions"])
         for row in kept_calls.read()
         if row["seconds"] < _SLOWEST_S
     }
-    judged = {kept.key_of(row): row for row in kept.read()}
-    rows, left = [], 0
+    judged = {kept.key_of(row) for row in kept.read()}
+    wanted, todo = [], []
     for mutant in sampled(_modules(given.modules), given.mutants, given.seed):
         tests = tests_for(mutant, calls)
         row = {
             "module": mutant.module, "number": mutant.number, "digest": _digest(mutant, tests),
             "path": str(mutant.path), "line": mutant.line, "change": mutant.change,
+            "tests": len(tests),
         }  # fmt: skip
-        before = judged.get(kept.key_of(row))
-        if before is None and time.monotonic() > until:
-            left += 1
-            continue
-        if before is None:
+        wanted.append(kept.key_of(row))
+        if wanted[-1] not in judged:
             expected = sum(calls[test].seconds for test in tests)
-            before = {**row, "tests": len(tests),
-                      "killed": bool(tests) and is_killed(mutant, tests, expected)}  # fmt: skip
-            kept.append(before)
-        rows.append(before)
+            todo.append((row, mutant, tests, expected, kept, until))
+    with multiprocessing.get_context("fork").Pool(given.jobs) as pool:
+        left = pool.starmap(_judge, todo, chunksize=1).count(False)
     if left:
         print(f"{left} mutants were left out; go on with --resume", file=sys.stderr)
         return 1
+    found = {kept.key_of(row): row for row in kept.read()}
+    rows = [found[key] for key in wanted]
     options = f"--mutants {given.mutants} --seed {given.seed}"
     if given.modules:
         options += f" --modules {' '.join(given.modules)}"
@@ -331,6 +333,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         PAGE.parent.mkdir(parents=True, exist_ok=True)
         PAGE.write_text(page)
     return int(sum(row["killed"] for row in rows) < _TARGET * len(rows))
+
+
+def _judge(
+    row: dict[str, Any],
+    mutant: Mutant,
+    tests: list[str],
+    expected_s: float,
+    kept: KeptRows,
+    until: float,
+) -> bool:
+    """Try a mutant and keep what was found; return False if it is too late to begin."""
+    from benchmarks.mutant_run import is_killed
+
+    if time.monotonic() > until:
+        return False
+    kept.append({**row, "killed": bool(tests) and is_killed(mutant, tests, expected_s)})
+    return True
 
 
 def _digest(mutant: Mutant, tests: Sequence[str]) -> str:
