@@ -40,7 +40,7 @@ class Watchdog:
 
     def __init__(self, config: WatchdogConfig) -> None:
         self._timeout_ns = config.timeout_ms * 1_000_000
-        self._patient = config.standby_on_powerup_enabled
+        self._waits_for_start = config.standby_on_powerup_enabled
         self._last: dict[Stream, HostNs] = {}
         self._watching_since: HostNs | None = None
         self._imu_since: HostNs | None = None
@@ -93,7 +93,7 @@ class Watchdog:
 
     def silence_ns(self, now: HostNs) -> int:
         """Return how long nothing has been measured, 0 while that is as it should be."""
-        if self._standby_since is not None or (self._patient and not self._last):
+        if self._standby_since is not None or (self._waits_for_start and not self._last):
             return 0
         if self._watching_since is None:
             self._watching_since = now

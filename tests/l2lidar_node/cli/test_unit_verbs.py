@@ -35,7 +35,7 @@ def is_measuring(unit: Unit) -> bool:
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make nobody wait long for what does not come."""
     wait_for = Device.wait_for
     monkeypatch.setattr(
@@ -77,13 +77,13 @@ def test_info_of_a_unit_in_standby_says_what_is_not_known(run: Run, make_unit: A
     ],
     ids=" ".join,
 )
-def test_nobody_there_is_exit_code_1(run: Run, impatient: None, verb: list[str]) -> None:
+def test_nobody_there_is_exit_code_1(run: Run, short_waits: None, verb: list[str]) -> None:
     outcome = run(*verb, *SILENT, str(free_port()))
     assert outcome.code == 1
     assert outcome.err.startswith("l2lidar: ")
 
 
-def test_silence_is_explained(run: Run, impatient: None) -> None:
+def test_silence_is_explained(run: Run, short_waits: None) -> None:
     outcome = run("info", *SILENT, str(free_port()))
     assert "is it at 127.0.0.1" in outcome.err
     assert "this machine's addresses" in outcome.err

@@ -125,7 +125,7 @@ def test_the_watchdog_ends_a_driver_without_device() -> None:
     assert "Traceback" not in result.stderr
 
 
-def test_a_patient_driver_waits_and_takes_up_a_device_that_comes_late(rig: Rig) -> None:
+def test_a_driver_told_to_wait_takes_up_a_device_that_comes_late(rig: Rig) -> None:
     rig.driver(watchdog_timeout_ms=300, watchdog_action="wait")
     rig.wait_for(
         lambda: (

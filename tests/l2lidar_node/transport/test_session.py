@@ -24,7 +24,7 @@ from l2lidar_node.types import Datagram, HostNs, ImuSample, Sweep
 from tests.support import build
 
 DEVICE, HOST = "127.0.0.1", "127.0.0.3"
-PATIENCE_S = 60.0  # generous: only a failure waits that long
+LIMIT_S = 60.0  # generous: only a failure waits that long
 VALUES = {
     "l2_ip": DEVICE, "host_ip": HOST, "UseSystemTimeTS": True, "enable_l2_host_sync": False,
     "imu_adjust": False, "aggregateNframes": 20,
@@ -52,7 +52,7 @@ class Running:
         """Return the next events of a kind; others are dropped."""
         found: list[Any] = []
         while len(found) < count:
-            event = self.events.get(timeout=PATIENCE_S)
+            event = self.events.get(timeout=LIMIT_S)
             found += [event] if isinstance(event, kind) else []
         return found
 
@@ -71,7 +71,7 @@ class Running:
 
 
 @pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the driver wait for an answer however long this test takes to give it."""
     monkeypatch.setattr(device_module, "REPEAT_NS", 10**12)
 
@@ -80,7 +80,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def device() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind((DEVICE, 0))
-        end.settimeout(PATIENCE_S)
+        end.settimeout(LIMIT_S)
         yield end
 
 
@@ -96,7 +96,7 @@ def test_datagrams_become_sweeps_and_samples_and_stop_hands_out_the_rest(running
     running.send(*(data for _, data in build.capture(0.5)))
     events: list[Event] = []
     while sum(isinstance(event, ImuSample) for event in events) < 125:
-        events.append(running.events.get(timeout=PATIENCE_S))
+        events.append(running.events.get(timeout=LIMIT_S))
     running.session.stop()
     events += running.rest()
     stamps = [event.stamp for event in events if isinstance(event, ImuSample)]
@@ -122,13 +122,13 @@ def test_calls_run_in_the_loops_thread_and_return_or_raise(running: Running) -> 
     def who(driver: Driver, now: HostNs) -> tuple[bool, str]:
         return now > build.EPOCH_NS, threading.current_thread().name
 
-    assert running.session.call(who).result(PATIENCE_S) == (True, "l2lidar-receive")
+    assert running.session.call(who).result(LIMIT_S) == (True, "l2lidar-receive")
 
     def fail(driver: Driver, now: HostNs) -> None:
         raise KeyError("no such thing")
 
     with pytest.raises(KeyError, match="no such thing"):
-        running.session.call(fail).result(PATIENCE_S)
+        running.session.call(fail).result(LIMIT_S)
     assert running.session.failure is None
 
 
@@ -137,29 +137,27 @@ def test_a_call_that_nobody_wants_any_more_harms_nothing(running: Running) -> No
 
     def held(*_: object) -> None:
         reached.set()
-        go_on.wait(PATIENCE_S)
+        go_on.wait(LIMIT_S)
 
     running.session.call(held)
-    assert reached.wait(PATIENCE_S)
+    assert reached.wait(LIMIT_S)
     unwanted: Future[int] = running.session.call(lambda *_: 1)
     assert unwanted.cancel()
     wanted = running.session.call(lambda *_: 2)
     go_on.set()
-    assert wanted.result(PATIENCE_S) == 2
+    assert wanted.result(LIMIT_S) == 2
 
 
 def test_a_command_reaches_the_device_and_its_ack_comes_back(
-    patient: None, running: Running
+    unhurried: None, running: Running
 ) -> None:
-    ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(
-        PATIENCE_S
-    )
+    ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(LIMIT_S)
     packet_type = running.received(commands.start())
     running.send(build.frame(wire.PacketType.ACK, build.ack(packet_type, 2, 0)))
     (answer,) = running.wait_for(Answer)
     assert (answer.ticket, answer.ok) == (ticket, True)
     assert answer.round_trip_ns is not None
-    assert 0 < answer.round_trip_ns < PATIENCE_S * 1e9
+    assert 0 < answer.round_trip_ns < LIMIT_S * 1e9
 
 
 def test_a_device_that_answers_nothing_is_asked_again_and_given_up(running: Running) -> None:
@@ -171,11 +169,9 @@ def test_a_device_that_answers_nothing_is_asked_again_and_given_up(running: Runn
     assert answer.text == "start rotation: the device did not acknowledge it"
 
 
-def test_others_cannot_inject_samples_points_or_answers(patient: None, running: Running) -> None:
+def test_others_cannot_inject_samples_points_or_answers(unhurried: None, running: Running) -> None:
     """Everything is right about their packets but where they come from."""
-    ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(
-        PATIENCE_S
-    )
+    ticket = running.session.call(lambda driver, now: driver.start_rotation(now)).result(LIMIT_S)
     packet_type = running.received(commands.start())
     fakes = [
         build.frame(wire.PacketType.IMU, build.imu(500)),
@@ -201,14 +197,14 @@ def test_others_cannot_inject_samples_points_or_answers(patient: None, running: 
 def test_silence_comes_by_itself(device: socket.socket) -> None:
     running = Running(device, watchdog_timeout_ms=100)
     running.session.start()
-    assert running.events.get(timeout=PATIENCE_S).duration_ns > 100_000_000
+    assert running.events.get(timeout=LIMIT_S).duration_ns > 100_000_000
     running.session.stop()
 
 
 def test_calls_after_the_end_are_cancelled(running: Running) -> None:
     running.session.stop()
     with pytest.raises(CancelledError):
-        running.session.call(lambda *_: 1).result(PATIENCE_S)
+        running.session.call(lambda *_: 1).result(LIMIT_S)
 
 
 def test_stopping_twice_and_without_a_start(device: socket.socket) -> None:
@@ -230,8 +226,8 @@ def test_a_receiver_may_stop_the_session(device: socket.socket) -> None:
     running.session = session
     session.start()
     running.send(build.frame(wire.PacketType.IMU, build.imu()))
-    assert seen.wait(PATIENCE_S)
-    session._thread.join(PATIENCE_S)
+    assert seen.wait(LIMIT_S)
+    session._thread.join(LIMIT_S)
     assert not session._thread.is_alive()
     assert running.is_closed()
 
@@ -246,13 +242,13 @@ def test_a_receiver_that_fails_ends_the_session_and_says_why(device: socket.sock
     session = Session(running.session.driver, running.transport, fail)
     session.start()
     waiting = session.call(lambda *_: threading.current_thread().name)
-    assert waiting.result(PATIENCE_S) == "l2lidar-receive"
+    assert waiting.result(LIMIT_S) == "l2lidar-receive"
     running.send(build.frame(wire.PacketType.IMU, build.imu()))
-    session._thread.join(PATIENCE_S)
+    session._thread.join(LIMIT_S)
     assert str(session.failure) == "publisher gone"
     assert running.is_closed()
     with pytest.raises(CancelledError):
-        session.call(lambda *_: 1).result(PATIENCE_S)
+        session.call(lambda *_: 1).result(LIMIT_S)
     session.stop()
 
 
@@ -317,7 +313,7 @@ def test_a_tap_hears_everything_in_both_directions() -> None:
     session = Session(driver, transport, events.append, notes)
     session.call(lambda driver, now: driver.start_rotation(now))
     session.start()
-    assert transport.is_empty.wait(PATIENCE_S)
+    assert transport.is_empty.wait(LIMIT_S)
     session.stop()
     assert notes.received_data == [item.data for item in datagrams]
     assert notes.sent_frames == transport.sent

@@ -19,14 +19,14 @@ from l2lidar_node.transport.udp import TransportError, UdpTransport
 from l2lidar_node.types import Datagram
 
 DEVICE, FOREIGNER, HOST = "127.0.0.1", "127.0.0.2", "127.0.0.3"
-PATIENCE_S = 60.0  # generous: only a failure waits that long
+LIMIT_S = 60.0  # generous: only a failure waits that long
 
 
 @pytest.fixture
 def device() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind((DEVICE, 0))
-        end.settimeout(PATIENCE_S)
+        end.settimeout(LIMIT_S)
         yield end
 
 
@@ -44,8 +44,8 @@ def opened(device: socket.socket, **config: Any) -> Iterator[UdpTransport]:
 
 
 def receive(link: UdpTransport, count: int) -> list[Datagram]:
-    """Return so many datagrams, or as many as come before patience ends."""
-    deadline = time.monotonic() + PATIENCE_S
+    """Return so many datagrams, or as many as come in time."""
+    deadline = time.monotonic() + LIMIT_S
     got: list[Datagram] = []
     while len(got) < count and time.monotonic() < deadline:
         got += link.receive(0.1)
