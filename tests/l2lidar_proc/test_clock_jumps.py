@@ -19,7 +19,7 @@ from tests.support import memory
 from tests.support.odometry_runs import sweeps
 
 YEAR_NS = 365 * 86_400 * 1_000_000_000
-MOST_BYTES = 200_000_000
+MOST_BYTES = 400_000_000
 WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
 
 jumps = st.one_of(
