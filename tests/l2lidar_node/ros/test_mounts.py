@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,7 +21,7 @@ from l2lidar_node.config import FrameConfig  # noqa: E402
 from l2lidar_node.demo.robot import as_message, floor_and_ceiling, mount, moved  # noqa: E402
 from l2lidar_node.ros.mount import MAX_TILT_DEG, MountMonitor  # noqa: E402
 from l2lidar_node.types import Level  # noqa: E402
-from tests.l2lidar_node.ros.rig import open_rig  # noqa: E402
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, open_rig  # noqa: E402
 from tests.support.odometry_runs import record, sweeps  # noqa: E402
 
 pytestmark = pytest.mark.ros
@@ -79,11 +80,10 @@ def publish(node: Any, monitor: Any, message: Any, frame: Any) -> None:
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(TFMessage, "/tf_static", latched)
     publisher.publish(message)
-    for _ in range(200):
-        if monitor.tilt_deg()[0] == frame:
-            return
+    deadline = time.monotonic() + TIMEOUT_S
+    while monitor.tilt_deg()[0] != frame:
+        assert time.monotonic() < deadline, f"nothing above is known but {monitor.tilt_deg()}"
         rclpy.spin_once(node, timeout_sec=0.05)
-    raise AssertionError(f"nothing above is known but {monitor.tilt_deg()}")
 
 
 @pytest.mark.parametrize(
