@@ -143,6 +143,7 @@ def test_evo_reads_odometry_out_of_a_bag(name: str, tmp_path: Path) -> None:
     assert float(re.findall(r"rmse\s+([\d.]+)", said)[0]) < 1e-6
 
 
+@pytest.mark.parametrize("bag", ["run.mcap"], indirect=True)  # the other is read above
 def test_evo_judges_the_trajectory_of_a_bag(bag: Any, tmp_path: Path) -> None:
     run("l2lidar", "odometry", bag, "out/run", cwd=tmp_path)
     world = recording("room", "walk")
