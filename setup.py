@@ -52,6 +52,7 @@ setup(
         "dpkt>=1.9.8",
         "rosbags>=0.10.6",
         "PyYAML>=6.0.1",
+        "zstandard>=0.22",
         "typer>=0.9",
         "rich>=13.7",
         "matplotlib>=3.6.3",

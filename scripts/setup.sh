@@ -168,9 +168,9 @@ make_venv() {
 
 install_ros() {
     say "installing ROS 2 as wheels"
-    pip_install -r requirements/ros-jazzy.txt -r requirements/tf2-msgs-build.txt
-    say "building tf2_msgs"
-    scripts/tf2_msgs.sh "$venv" || die "tf2_msgs could not be built; the builder's own words are above."
+    pip_install -r requirements/ros-jazzy.txt -r requirements/interfaces-build.txt
+    say "building tf2_msgs and point_cloud_interfaces"
+    scripts/interfaces.sh "$venv" || die "The messages could not be built; the builder's own words are above."
 }
 
 # Whether what was installed is still there; a stamp cannot tell.
@@ -189,7 +189,8 @@ main() {
     chosen=$(chosen_python)
     files=()
     made=$(digest "$root" "$ros" "$chosen")
-    files=(requirements/{build,ros-jazzy,tf2-msgs-build}.txt ${constraints:+"$constraints"} scripts/tf2_msgs.sh scripts/tf2_msgs/*.* scripts/tf2_msgs/msg/*)
+    files=(requirements/{build,ros-jazzy,interfaces-build}.txt ${constraints:+"$constraints"} scripts/interfaces.sh
+        scripts/interfaces/*/*.* scripts/interfaces/*/msg/*)
     ros_made=$(digest "$made")
     files=(setup.py setup.cfg package.xml)
     installed=$(digest "$ros_made")

@@ -121,14 +121,23 @@ class CloudTemplate:
         size = points.nbytes
         return b"".join(
             (
+                self.head(len(points), size, stamp),
+                struct.pack("<I", size),
+                np.ascontiguousarray(points).view(np.uint8).data,  # copied once, here
+                b"\x01",  # is_dense
+            )
+        )
+
+    def head(self, count: int, row_step: int, stamp: HostNs) -> bytes:
+        """Return a message up to and with ``row_step``."""
+        return b"".join(
+            (
                 self._encapsulation,
                 _STAMP.pack(*split_stamp(stamp)),
                 self._before,
-                struct.pack("<I", len(points)),
+                struct.pack("<I", count),
                 self._between,
-                struct.pack("<II", size, size),
-                np.ascontiguousarray(points).view(np.uint8).data,  # copied once, here
-                b"\x01",  # is_dense
+                struct.pack("<I", row_step),
             )
         )
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import rclpy
 from lifecycle_msgs.msg import Transition
@@ -188,6 +188,9 @@ class DriverNode(ManagedNode):
             topics.point_cloud_topic_id,
             QoSProfile(depth=_CLOUD_DEPTH, reliability=reliability),
         )
+        self._compressed: Any = None
+        if topics.compressed_clouds != "off":
+            self._open_compressed(config, reliability)
         self._imu_publisher = None
         if config.imu.enable_publishing:
             self._imu_template = ImuTemplate(config.frames.imu, config.imu)
@@ -199,6 +202,28 @@ class DriverNode(ManagedNode):
             self._tf_publisher = self.create_publisher(TFMessage, "/tf_static", latched)
             now = HostNs(self.get_clock().now().nanoseconds)
             self._tf_publisher.publish(TFMessage(transforms=[imu_transform(config.frames, now)]))
+
+    def _open_compressed(self, config: DriverConfig, reliability: ReliabilityPolicy) -> None:
+        try:
+            from point_cloud_interfaces.msg import CompressedPointCloud2
+
+            from l2lidar_node.ros.compressed_cloud import CompressedCloudTemplate
+        except ImportError as error:
+            raise StartError(
+                f"parameter 'compressed_clouds': needs '{error.name}', which is not installed; "
+                "sudo apt install ros-jazzy-point-cloud-interfaces python3-zstandard, or set it "
+                "to off"
+            ) from None
+        topics = config.topics
+        is_lossy = topics.compressed_clouds == "millimeter"
+        self._compressed_template = CompressedCloudTemplate(
+            self._layout.dtype, config.frames.cloud, topics.zstd_level, is_lossy
+        )
+        self._compressed = self.create_lifecycle_publisher(
+            CompressedPointCloud2,
+            f"{topics.point_cloud_topic_id}/zstd",
+            QoSProfile(depth=_CLOUD_DEPTH, reliability=reliability),
+        )
 
     def _configure(self, config: DriverConfig) -> None:
         if self._session is not None:
@@ -214,6 +239,10 @@ class DriverNode(ManagedNode):
                     return
                 points = self._layout.convert(event.points, event.start)
                 self._cloud_publisher.publish(self._cloud_template.serialize(points, event.start))
+                if self._compressed is not None and self._compressed.get_subscription_count():
+                    self._compressed.publish(
+                        self._compressed_template.serialize(points, event.start)
+                    )
             else:
                 self._report(event)
         except StampError as error:

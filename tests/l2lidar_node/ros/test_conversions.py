@@ -7,15 +7,16 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from rclpy.serialization import deserialize_message  # noqa: E402  after importorskip
-from sensor_msgs.msg import Imu  # noqa: E402
+from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402  after importorskip
+from sensor_msgs.msg import Imu, PointCloud2  # noqa: E402
 
 from l2lidar_node.config import ImuConfig  # noqa: E402
-from l2lidar_node.ros.conversions import ImuTemplate, from_time, to_time  # noqa: E402
+from l2lidar_node.ros.conversions import ImuTemplate, from_cloud, from_time, to_time  # noqa: E402
 from l2lidar_node.settings import build  # noqa: E402
 from l2lidar_node.types import (  # noqa: E402
     FIRST_STAMP,
     LAST_STAMP,
+    POINT,
     HostNs,
     ImuSample,
     StampError,
@@ -59,3 +60,51 @@ def test_every_time_that_fits_goes_there_and_back(stamp: HostNs) -> None:
 def test_a_time_that_does_not_fit_is_named(stamp: int) -> None:
     with pytest.raises(StampError, match="s after 1970 is out of range"):
         to_time(HostNs(stamp))
+
+
+@pytest.mark.parametrize("is_lossy", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 7000])
+def test_a_compressed_cloud_is_read_as_the_zstd_plugin_reads_it(
+    count: int, is_lossy: bool
+) -> None:
+    pytest.importorskip("point_cloud_interfaces")
+    import zstandard
+    from point_cloud_interfaces.msg import CompressedPointCloud2
+
+    from l2lidar_node.ros.compressed_cloud import GRID_M, CompressedCloudTemplate
+
+    rng = np.random.default_rng(count)
+    points = np.zeros(count, POINT)
+    for name in POINT.names or ():
+        points[name] = rng.uniform(-30.0, 30.0, count)
+    stamp = HostNs(1_700_000_000_000_000_005)
+    template = CompressedCloudTemplate(POINT, "l2lidar_link", 1, is_lossy)
+    data = template.serialize(points, stamp)
+    message = deserialize_message(data, CompressedPointCloud2)
+    assert len(serialize_message(message)) == len(data)  # its padding is not all zero
+    assert message.format == "zstd"
+    compressed = bytes(message.compressed_data)
+    # one frame that says how large its content is, or the plugin refuses it
+    size = zstandard.frame_content_size(compressed)
+    assert size == message.row_step == message.point_step * message.width
+    cloud = PointCloud2(
+        header=message.header,
+        height=message.height,
+        width=message.width,
+        fields=message.fields,
+        is_bigendian=message.is_bigendian,
+        point_step=message.point_step,
+        row_step=message.row_step,
+        data=zstandard.ZstdDecompressor().decompress(compressed),
+        is_dense=message.is_dense,
+    )
+    assert (from_time(cloud.header.stamp), cloud.header.frame_id) == (stamp, "l2lidar_link")
+    found = from_cloud(cloud)
+    assert len(found) == count
+    if not is_lossy:
+        assert found.tobytes() == points.tobytes()
+        return
+    assert found.dtype.names == ("x", "y", "z", "intensity")
+    assert (found["intensity"] == points["intensity"]).all()
+    for axis in "xyz":
+        assert np.abs(found[axis] - points[axis]).max(initial=0.0) <= GRID_M / 2 * 1.001

@@ -93,6 +93,7 @@ def test_a_policy_allows_what_its_node_does_and_nothing_else(name: str) -> None:
         "l2_port": lidar,
         "host_port": host,
         "enable_IMU_publishing": True,
+        "compressed_clouds": "lossless",
     }
     rclpy.init(args=["test", *(assigned(values) if name == "l2lidar_node" else [])])
     may = allowed(FOLDER / f"{name}.xml")

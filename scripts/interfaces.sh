@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Builds the interface package tf2_msgs against the ROS 2 wheels of a virtual environment, into it.
-# Usage: tf2_msgs.sh VENV
+# Builds the interface packages that are not among the ROS 2 wheels of a virtual environment, into it.
+# Usage: interfaces.sh VENV
 set -euo pipefail
 
 venv=$(cd "$1" && pwd)
@@ -21,7 +21,7 @@ trap 'rm -rf "$build"' EXIT
 if ! env -i HOME="$HOME" PATH="$venv/bin:/usr/local/bin:/usr/bin:/bin" ${LANG:+LANG="$LANG"} \
     AMENT_PREFIX_PATH="$venv" CMAKE_PREFIX_PATH="$venv" \
     "$venv/bin/colcon" --log-base "$build/log" build \
-    --base-paths "$here/tf2_msgs" --build-base "$build/build" \
+    --base-paths "$here/interfaces" --build-base "$build/build" \
     --install-base "$venv" --merge-install \
     --cmake-args -DBUILD_TESTING=OFF -DCMAKE_BUILD_TYPE=Release \
     -DPython3_EXECUTABLE="$venv/bin/python" -DPython3_ROOT_DIR="$venv" >"$build/output" 2>&1; then
@@ -34,4 +34,9 @@ if [ "$found" != "$expected" ]; then
     echo "tf2_msgs/TFMessage has type hash ${found:-none}, ROS 2 has $expected" >&2
     exit 1
 fi
-"$venv/bin/python" -c 'from tf2_msgs.msg import TFMessage; TFMessage.__class__.__import_type_support__()'
+"$venv/bin/python" -c '
+from point_cloud_interfaces.msg import CompressedPointCloud2
+from tf2_msgs.msg import TFMessage
+
+TFMessage.__class__.__import_type_support__()
+CompressedPointCloud2.__class__.__import_type_support__()'
