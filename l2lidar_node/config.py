@@ -40,6 +40,14 @@ class NetworkConfig:
         lo=4096,
         hi=1 << 30,
     )
+    receive_interval_ms: int = setting(
+        4,
+        "pause between looks at the socket; the kernel stamps arrivals, so that it costs latency "
+        "only; 0 reads each datagram as it comes",
+        unit="ms",
+        lo=0,
+        hi=100,
+    )
 
     def __post_init__(self) -> None:
         """Check the addresses."""
@@ -234,6 +242,15 @@ class ImuConfig:
     """The IMU topic and what the onboard orientation is used for."""
 
     enable_publishing: bool = setting(False, "publish IMU data", name="enable_IMU_publishing")
+    publish_every: int = setting(
+        1,
+        "publish every n-th IMU sample only, for consumers that cannot take 250 a second; deskew "
+        "and odometry need all",
+        name="imu_publish_every",
+        lo=1,
+        hi=250,
+        live=True,
+    )
     adjust: bool = setting(
         True,
         "rotate points into a level frame with the onboard orientation",

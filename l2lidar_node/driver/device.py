@@ -85,6 +85,12 @@ class Watchdog:
             return DeviceState.SPINNING_UP
         return DeviceState.STALLED if self._last else DeviceState.WAITING
 
+    def is_there(self, now: HostNs) -> bool:
+        """Tell whether the device was heard in the last seconds, or is silent as told."""
+        if self._standby_since is not None:
+            return bool(self._last)
+        return any(now - last <= RUN_OUT_NS for last in self._last.values())
+
     def spin_up_left_s(self, now: HostNs) -> float:
         """Return the seconds until points can be expected; 0 when they are overdue."""
         if self._imu_since is None:

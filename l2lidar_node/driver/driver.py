@@ -242,6 +242,10 @@ class Driver:
         """Return what the device is doing."""
         return self._watchdog.state(now)
 
+    def is_there(self, now: HostNs) -> bool:
+        """Tell whether the device was heard in the last seconds, or is silent as told."""
+        return self._watchdog.is_there(now)
+
     def spin_up_left_s(self, now: HostNs) -> float:
         """Return the seconds until points can be expected."""
         return self._watchdog.spin_up_left_s(now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,9 @@ class Metadata:
     work_mode_names : list of str
     calibration : dict
         What the unit reports; names and units as in :data:`wire.CALIBRATION`.
+    calibration_crc : str
+        CRC-32 of the block that the unit reports, eight hexadecimal digits: no two units have the
+        same.
     calibration_used : dict
         What its points are made with.
     calibration_source : dict
@@ -52,6 +56,7 @@ class Metadata:
     work_mode: int | None
     work_mode_names: list[str]
     calibration: dict[str, float]
+    calibration_crc: str
     calibration_used: dict[str, float]
     calibration_source: dict[str, str]
     calibration_file: str
@@ -95,6 +100,7 @@ def metadata(driver: Driver) -> Metadata:
         calibration={}
         if packet is None
         else {name: float(packet["calibration"][name]) for name in wire.CALIBRATION.names or ()},
+        calibration_crc="" if block is None else f"{zlib.crc32(block):08x}",
         calibration_used={} if block is None else driver.blocks.values(block),
         calibration_source={} if block is None else driver.blocks.sources(block),
         calibration_file=driver.config.files.calibration_file,

@@ -66,6 +66,7 @@ class HealthPublisher:
         self._before: health.Period | None = None
         self._driver: Driver | None = None
         self._metadata = ""
+        self._block = ""
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._about = node.create_publisher(String, "~/metadata", latched)
@@ -99,6 +100,7 @@ class HealthPublisher:
         except CancelledError:
             self._ended()
             return
+        self._block = about["calibration_crc"]
         if checks:
             mount = self._mount.judge(self._session.driver.config.imu.adjust)
             checks += [mount] if mount is not None else []
@@ -110,9 +112,14 @@ class HealthPublisher:
 
     def _send(self, checks: list[health.Check], now: HostNs) -> None:
         name = self._node.get_fully_qualified_name().lstrip("/")
-        address = self._session.driver.config.network.l2_ip
         stamp = HostNs(min(max(now, FIRST_STAMP), LAST_STAMP))
-        self._diagnostics.publish(diagnostic_array(checks, name, address, stamp))
+        self._diagnostics.publish(diagnostic_array(checks, name, self._hardware_id(), stamp))
+
+    def _hardware_id(self) -> str:
+        """Name the unit: its line or address, and its calibration block, which no other has."""
+        network = self._session.driver.config.network
+        where = network.serial_port or network.l2_ip
+        return f"L2 at {where}" + (f", calibration block {self._block}" if self._block else "")
 
     def _ended(self) -> None:
         """End the program if the session failed: nothing would ever come again."""

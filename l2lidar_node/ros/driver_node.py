@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from collections.abc import Callable
@@ -140,6 +141,7 @@ class DriverNode(ManagedNode):
         super().__init__("l2lidar_node")
         self.exit_code = 0
         self._answers: dict[int, Future[Answer]] = {}  # touched by the session's thread only
+        self._samples = itertools.count()
         self._session: Loop | None = None
         self._settings = ParameterSet(self, DriverConfig, self._configure)
         self.create_service(SetBool, "~/enable", self._enable)
@@ -232,7 +234,11 @@ class DriverNode(ManagedNode):
     def _handle(self, event: Event) -> None:
         try:
             if isinstance(event, ImuSample):
-                if self._imu_publisher is not None and self._imu_publisher.is_activated:
+                if (
+                    self._imu_publisher is not None
+                    and self._imu_publisher.is_activated
+                    and next(self._samples) % self._settings.value.imu.publish_every == 0
+                ):
                     self._imu_publisher.publish(self._imu_template.serialize(event))
             elif isinstance(event, Sweep):
                 if not self._cloud_publisher.is_activated:
@@ -341,18 +347,20 @@ class DriverNode(ManagedNode):
         if response.message:
             return response
 
-        def command(driver: Driver, now: HostNs) -> bool:
+        def command(driver: Driver, now: HostNs) -> tuple[bool, str]:
+            is_there = driver.is_there(now)
             for event in driver.reset_device(now):
                 self._handle(event)
-            return True
+            if not is_there:
+                address = driver.config.network.serial_port or driver.config.network.l2_ip
+                return False, (
+                    f"nothing has been heard of a device at {address} lately; the reset was sent "
+                    "all the same, but is never acknowledged"
+                )
+            return True, "reset sent; the device does not acknowledge it and is back in about 25 s"
 
-        if await self._completed(self.session.call(command)):
-            response.success = True
-            response.message = (
-                "reset sent; the device does not acknowledge it and is back in about 25 s"
-            )
-        else:
-            response.success, response.message = False, _NOT_IN_TIME
+        done = await self._completed(self.session.call(command))
+        response.success, response.message = done or (False, _NOT_IN_TIME)
         return response
 
     async def _completed(self, future: Future[T]) -> T | None:

@@ -63,7 +63,7 @@ class ParameterSet(Generic[G]):
                 node.set_parameters([Parameter(item.name, value=[])])
                 values[item.name] = ()
         self.value: G = build(group, values)
-        _warn_of_unknown(node, set(self._settings))
+        _refuse_unknown(node, set(self._settings))
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
@@ -123,10 +123,21 @@ def _declaration(item: Setting) -> tuple[str, Any, ParameterDescriptor]:
     return item.name, default, descriptor
 
 
-def _warn_of_unknown(node: Node, known: set[str]) -> None:
+def _refuse_unknown(node: Node, known: set[str]) -> None:
+    """Warn of parameters that are not known; refuse those that would not act as they say.
+
+    Raises
+    ------
+    SettingError
+    """
     for name in node._parameter_overrides:
-        if name in known or node.has_parameter(name) or name.startswith("qos_overrides."):
+        if name in known or node.has_parameter(name):
             continue
+        if name.startswith("qos_overrides."):
+            raise SettingError(
+                f"parameter '{name}': QoS overrides are not taken; set qos_reliability, and leave "
+                "the depths, which suit the rates of this sensor"
+            )
         if name in _LEGACY:
             hint = f"it was replaced by {_LEGACY[name]}"
         else:

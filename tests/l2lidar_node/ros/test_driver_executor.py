@@ -51,6 +51,7 @@ class Rig:
         self.node = DriverNode()
         self.peer = rclpy.create_node("peer")
         self.said: list[str] = []
+        self.units: set[str] = set()
         self.clouds: list[PointCloud2] = []
         self.peer.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
         self.peer.create_subscription(
@@ -68,6 +69,7 @@ class Rig:
 
     def _hear(self, message: DiagnosticArray) -> None:
         self.said.extend(status.message for status in message.status)
+        self.units.update(status.hardware_id for status in message.status)
 
     def until(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + TIMEOUT_S
@@ -108,6 +110,12 @@ def test_while_a_device_does_not_acknowledge_everything_else_goes_on(rig: Rig) -
         rig.until(future.done)
         assert not future.result().success
         assert "did not acknowledge" in future.result().message
+    resetting = rig.reset.call_async(Trigger.Request())
+    rig.until(resetting.done)
+    assert not resetting.result().success
+    assert "nothing has been heard of a device at 127.0.0.1" in resetting.result().message
+    rig.until(lambda: rig.units)
+    assert rig.units == {"L2 at 127.0.0.1"}
 
 
 def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(

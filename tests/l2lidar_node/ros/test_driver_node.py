@@ -123,6 +123,7 @@ def test_diagnostics_and_metadata_tell_what_the_device_is_and_does(rig: Rig) -> 
     rig.wait_for(lambda: about, "metadata")
     rig.observer.destroy_subscription(subscription)
     facts = json.loads(about[-1].data)
+    assert len(facts["calibration_crc"]) == 8
     assert facts["firmware"] == "2.8.11.1"
     assert facts["work_mode"] == 0
     assert facts["calibration"]["range_scale"] == pytest.approx(0.000978)
@@ -188,6 +189,12 @@ def test_live_parameters_act_on_the_stream(rig: Rig) -> None:
         lambda: rig.observer.cloud is not None and rig.observer.cloud["time"][-1] < 0.05,
         "short clouds",
     )
+    assert _set(rig, "imu_publish_every", 5) == (True, "")
+    rig.wait_for(
+        lambda: np.median(rig.observer.imu.intervals_ms[-20:]) == pytest.approx(20.0, abs=0.1),
+        "every fifth IMU sample",
+    )
+    assert _set(rig, "imu_publish_every", 1)[0]
     assert _set(rig, "EnableCalRangeOVR", True)[0]
     assert _set(rig, "calRangeScale", 0.0005)[0]
     # The pattern is within 3 to 6 m by the unit's own scale of 0.000978 m.

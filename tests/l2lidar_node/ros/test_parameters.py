@@ -1,5 +1,6 @@
 """Settings as ROS parameters, from files as ROS reads them."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from l2lidar_node.ros.parameters import ParameterSet
-from l2lidar_node.settings import setting
+from l2lidar_node.settings import SettingError, setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,3 +58,12 @@ def test_empty_list_can_be_filled_live(started: Any) -> None:
     assert result.successful, result.reason
     assert parameters.value.names == ("c",)
     assert changes == [parameters.value]
+
+
+def test_qos_overrides_are_refused_rather_than_ignored(started: Any) -> None:
+    words = "qos_overrides./points.publisher.reliability': QoS overrides are not taken"
+    with pytest.raises(SettingError, match=re.escape(words)):
+        started(
+            "lists: {ros__parameters: {qos_overrides: {/points: {publisher: {reliability: "
+            "reliable}}}}}"
+        )

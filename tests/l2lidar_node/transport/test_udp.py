@@ -237,3 +237,18 @@ def test_closing_twice_and_listening_again(device: socket.socket) -> None:
         link.close()
     with opened(device, host_port=port) as again:
         assert again.port == port
+
+
+def test_a_pause_between_looks_costs_no_accuracy(device: socket.socket) -> None:
+    """What came meanwhile is read at once, each with the instant at which it came."""
+    with opened(device, receive_interval_ms=100) as link:
+        link.receive(0.001)
+        sent = []
+        for number in range(5):
+            sent.append(time.time_ns())
+            device.sendto(bytes([number]), (HOST, link.port))
+        got = receive(link, 5)
+        read = time.time_ns()
+    assert [item.data for item in got] == [bytes([number]) for number in range(5)]
+    assert all(begin <= item.arrival for begin, item in zip(sent, got, strict=True))
+    assert got[-1].arrival < read

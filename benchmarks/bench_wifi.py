@@ -1,0 +1,258 @@
+"""Measures what a slow network needs: sizes of clouds, and what arrives over a bad link.
+
+``make bench-wifi``. The sizes are of a virtual L2's turns. For the link, driver and listener are
+in two network namespaces with ``tc netem`` between them, which takes root and iproute2; without
+them this part is left out, and says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from l2lidar_node.demo.processes import assigned
+from l2lidar_node.ros.compressed_cloud import on_grid
+from l2lidar_node.types import POINT, Sweep
+from tests.support.odometry_runs import record, sweeps
+
+PAGE: Final = Path("docs") / "results" / "wifi.md"
+_NAMES: Final = ("l2lidar_robot", "l2lidar_desk")
+_ADDRESSES: Final = ("10.217.3.1", "10.217.3.2")
+_TOPICS: Final = {
+    "cloud": "/points",
+    "zstd": "/points/zstd",
+    "packets": "/l2lidar_node/packets",
+}
+_CASES: Final = (
+    ("cloud", "off", "best_effort"),
+    ("cloud", "off", "reliable"),
+    ("zstd", "lossless", "best_effort"),
+    ("zstd", "lossless", "reliable"),
+    ("zstd", "millimeter", "best_effort"),
+    ("zstd", "millimeter", "reliable"),
+    ("packets", "off", "reliable"),
+)
+_RATE: Final = "20mbit"
+_LOSS: Final = "2%"
+_DELAY: Final = "30ms"
+_TURNS_S: Final = 6.0
+_BATCHES_PER_S: Final = 20.0  # of packets
+
+
+def sizes(turns: list[Sweep]) -> list[tuple[str, float, float]]:
+    """Return what is sent, its bytes per turn, and the time to make it [ms], medians."""
+    ways: tuple[tuple[str, Callable[[NDArray[np.void]], bytes]], ...] = (
+        ("cloud as it is", lambda points: points.tobytes()),
+        ("zstd, lossless", lambda points: _zstd(points.tobytes())),
+        ("zstd, millimeter", lambda points: _zstd(on_grid(points).tobytes())),
+        ("int16 mm, deltas, zstd (no plugin reads it)", _deltas),
+    )
+    found = []
+    for name, way in ways:
+        lengths, times = [], []
+        for turn in turns:
+            begin = time.perf_counter()
+            lengths.append(len(way(turn.points)))
+            times.append(1e3 * (time.perf_counter() - begin))
+        found.append((name, float(np.median(lengths)), float(np.median(times))))
+    packets = float(np.median([turn.packets for turn in turns])) * 1044.0
+    found.append(("raw packets of the sensor", packets, 0.0))
+    return found
+
+
+def _zstd(data: bytes) -> bytes:
+    return bytes(zstandard.ZstdCompressor(level=1).compress(data))
+
+
+def _deltas(points: NDArray[np.void]) -> bytes:
+    """Return the smallest that a format of one's own could send: columns of differences."""
+    columns = BytesIO()
+    for axis in "xyz":
+        whole = np.round(points[axis] * 1000.0).astype(np.int32)
+        columns.write(np.diff(whole, prepend=0).astype("<i2").tobytes())
+    columns.write(points["intensity"].astype(np.uint8).tobytes())
+    return _zstd(columns.getvalue())
+
+
+def _run(*words: str) -> None:
+    subprocess.run(words, check=True, capture_output=True)
+
+
+@contextmanager
+def bad_link() -> Iterator[None]:
+    """Make two network namespaces and a link that loses and delays between them.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made; the message says what is missing.
+    """
+    if os.geteuid() != 0 or not shutil.which("ip") or not shutil.which("tc"):
+        raise OSError("the link takes root, ip and tc (iproute2); run as root")
+    robot, desk = _NAMES
+    with ExitStack() as undo:
+        try:
+            for name in _NAMES:
+                _run("ip", "netns", "add", name)
+                undo.callback(subprocess.run, ("ip", "netns", "del", name), check=False)
+            _run("ip", "link", "add", "l2a", "netns", robot, "type", "veth",
+                 "peer", "name", "l2b", "netns", desk)  # fmt: skip
+            for name, end, address in zip(_NAMES, ("l2a", "l2b"), _ADDRESSES, strict=True):
+                inside = ("ip", "netns", "exec", name)
+                _run(*inside, "ip", "link", "set", "lo", "up")
+                _run(*inside, "ip", "address", "add", f"{address}/24", "dev", end)
+                _run(*inside, "ip", "link", "set", end, "up", "multicast", "on")
+                _run(*inside, "ip", "route", "add", "224.0.0.0/4", "dev", end)
+                _run(*inside, "tc", "qdisc", "add", "dev", end, "root", "netem",
+                     "rate", _RATE, "loss", _LOSS, "delay", _DELAY, "limit", "2000")  # fmt: skip
+        except subprocess.CalledProcessError as error:
+            words = " ".join(error.cmd)
+            said = error.stderr.decode().strip()
+            raise OSError(f"the link cannot be made: {words}: {said}") from None
+        yield
+
+
+def arrived(kind: str, compressed: str, reliability: str, seconds: float) -> dict[str, Any]:
+    """Return what comes to the desk of one topic; see :mod:`benchmarks.wifi_watch`."""
+    inside = ("ip", "netns", "exec")
+    environment = {**os.environ, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", "ROS_DOMAIN_ID": "71"}
+    values = {
+        "l2_ip": "127.0.0.1",
+        "host_ip": "127.0.0.1",
+        "imu_adjust": False,
+        "sweep_cut": "turn",
+        "compressed_clouds": compressed,
+        "qos_reliability": reliability,
+        "publish_packets": kind == "packets",
+    }
+    robot = [
+        [*inside, _NAMES[0], sys.executable, "-m", module, *arguments]
+        for module, arguments in (
+            ("l2lidar_node.emulator", ["--ready", "--world", "room"]),
+            ("l2lidar_node.ros.driver_node", assigned(values)),
+        )
+    ]
+    watch = [*inside, _NAMES[1], sys.executable, "-m", "benchmarks.wifi_watch"]
+    running = [
+        subprocess.Popen(
+            words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        for words in robot
+    ]
+    try:
+        found = subprocess.run(
+            [*watch, _TOPICS[kind], kind, reliability, str(seconds)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=seconds + 180.0,
+            check=True,
+        )
+    finally:
+        for process in running:
+            process.terminate()
+        for process in running:
+            process.wait(30)
+    measured: dict[str, Any] = json.loads(found.stdout.splitlines()[-1])
+    return measured
+
+
+def link_rows(seconds: float, turn_s: float) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each case: topic, setting, reliability, arrived, age, megabits."""
+    for kind, compressed, reliability in _CASES:
+        found = arrived(kind, compressed, reliability, seconds)
+        expected = found["seconds"] * (_BATCHES_PER_S if kind == "packets" else 1.0 / turn_s)
+        share = min(found["messages"] / expected, 1.0)
+        # the stamp of a cloud is its first point's
+        late = np.array(found["ages_s"]) - turn_s
+        age = f"{np.median(late):.2f} / {np.percentile(late, 95):.2f}" if len(late) else ""
+        yield (
+            _TOPICS[kind],
+            compressed if kind == "zstd" else "",
+            reliability,
+            f"{100.0 * share:.0f} %",
+            age if kind != "packets" else "",
+            f"{8e-6 * found['bytes'] / found['seconds']:.1f}",
+        )
+
+
+def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, tuple("---" for _ in head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def main() -> int:
+    """Measure, print, and write the page if asked to; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="for each case")
+    parser.add_argument("--page", action="store_true", help=f"write {PAGE}")
+    given = parser.parse_args()
+    turns = list(sweeps(record("furnished_office", "walk", 1, _TURNS_S), "turn"))
+    turns = [turn for turn in turns if turn.points.dtype == POINT][1:-1]
+    measured = sizes(turns)
+    whole = measured[0][1]
+    text = table(
+        ("A full turn as", "kB", "of the cloud", "ms to make"),
+        [
+            (name, f"{size / 1e3:.0f}", f"{100 * size / whole:.0f} %", f"{ms:.1f}" if ms else "")
+            for name, size, ms in measured
+        ],
+    )
+    print(text)
+    turn_s = float(np.median(np.diff([turn.start for turn in turns]))) * 1e-9
+    try:
+        with bad_link():
+            rows = list(link_rows(given.seconds, turn_s))
+    except OSError as error:
+        print(f"what arrives over a bad link was not measured: {error}")
+        return 0
+    link = table(
+        ("topic", "compressed_clouds", "reliability", "arrived", "late, median / p95 [s]",
+         "Mbit/s"),
+        rows,
+    )  # fmt: skip
+    print(link)
+    if given.page:
+        PAGE.write_text(_PAGE.format(sizes=text, link=link, seconds=given.seconds))
+        print(PAGE)
+    return 0
+
+
+_PAGE: Final = """# Over a slow network
+
+Written by `make bench-wifi BENCH_ARGS=--page` (as root). [On a robot](../robot.md) says what to
+make of it.
+
+## Sizes
+
+Medians over full turns of a virtual L2 carried through a furnished office; zstd at level 1, on
+one core of a PC.
+
+{sizes}
+
+## What arrives
+
+Driver and listener under Fast DDS in two network namespaces, 20 Mbit/s, 2 % loss and 30 ms each
+way (`tc netem`), {seconds:.0f} s for each line after 4 s of settling. *Late* counts from the last
+point of a cloud.
+
+{link}
+"""
+
+if __name__ == "__main__":
+    sys.exit(main())
