@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from functools import cache
+from importlib import import_module
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from filterpy.kalman import predict as kalman_predict, update as kalman_update
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
@@ -32,6 +33,15 @@ ACCEL_BIAS: Final = slice(12, 15)
 GRAVITY: Final = slice(15, 18)
 POSE: Final = slice(ROTATION.start, POSITION.stop)
 ERRORS: Final = 18
+
+
+@cache
+def kalman() -> Any:
+    """Return ``filterpy.kalman``, imported when it is first asked for.
+
+    It brings ``scipy.stats`` along, which takes longer than all else that a node imports.
+    """
+    return import_module("filterpy.kalman")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +201,7 @@ def predict(
         gained = preintegrated.velocities[last] - preintegrated.velocities[first]
         f = transition(at.rotation, turn[0].T @ turn[1], turn[0].T @ gained / dt, dt)
         q = process_noise(gyro2, accel2, noise, dt)
-        _, covariance = kalman_predict(np.zeros(ERRORS), covariance, f, q)
+        _, covariance = kalman().predict(np.zeros(ERRORS), covariance, f, q)
     return state.at(preintegrated, knot), covariance
 
 
@@ -269,7 +279,7 @@ def update(
     """
     spread = jacobian @ covariance @ jacobian.T + noise
     nis = float(innovation @ np.linalg.solve(spread, innovation))
-    error, posterior = kalman_update(np.zeros(ERRORS), covariance, innovation, noise, jacobian)
+    error, posterior = kalman().update(np.zeros(ERRORS), covariance, innovation, noise, jacobian)
     symmetric = 0.5 * (posterior + posterior.T)
     return Update(state.boxplus(np.asarray(error)), symmetric, nis)
 
@@ -298,7 +308,7 @@ def update_with_information(
     root = np.sqrt(strength[observed])
     h = root[:, None] * directions[:, observed].T
     z = (directions[:, observed].T @ gradient) / root
-    error, posterior = kalman_update(-at.boxminus(prior), covariance, z, np.eye(len(z)), h)
+    error, posterior = kalman().update(-at.boxminus(prior), covariance, z, np.eye(len(z)), h)
     return at.boxplus(np.asarray(error)), 0.5 * (posterior + posterior.T)
 
 

@@ -1,21 +1,21 @@
 """KISS-ICP's parts for the odometry, and KISS-ICP as it is; the only importer of kiss_icp.
 
+It is imported where it is first used: its configuration takes longer than a node may to start.
 kiss_icp ends the whole process, without an exception, on constant times and on clouds of one
 point: nothing of that kind gets past this module.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from kiss_icp.config import KISSConfig
-from kiss_icp.kiss_icp import KissICP
-from kiss_icp.mapping import get_voxel_hash_map
-from kiss_icp.registration import get_registration
-from kiss_icp.threshold import get_threshold_estimator
-from kiss_icp.voxelization import voxel_down_sample
 from numpy.typing import NDArray
 
 from l2lidar_proc.config import OdometryConfig
+
+if TYPE_CHECKING:
+    from kiss_icp.config import KISSConfig
 
 F64 = NDArray[np.float64]
 
@@ -28,6 +28,8 @@ LEAST_POINTS = 10  # kiss_icp aborts below 2; below this there is nothing to reg
 
 def kiss_config(config: OdometryConfig) -> KISSConfig:
     """Return KISS-ICP's configuration, the voxel size included (it stays unset by itself)."""
+    from kiss_icp.config import KISSConfig
+
     kiss = config.kiss
     out = KISSConfig()
     out.data.max_range, out.data.min_range = config.max_range, config.min_range
@@ -55,6 +57,10 @@ class KissMatcher:
 
     def clear(self) -> None:
         """Forget the map and what was learnt about the predictions."""
+        from kiss_icp.mapping import get_voxel_hash_map
+        from kiss_icp.registration import get_registration
+        from kiss_icp.threshold import get_threshold_estimator
+
         self._map = get_voxel_hash_map(self._config)
         self._registration = get_registration(self._config)
         self._threshold = get_threshold_estimator(self._config)
@@ -78,7 +84,7 @@ class KissMatcher:
         if self._map.empty() or len(points) < LEAST_POINTS:
             return None
         sigma = min(self.threshold, most)
-        source = voxel_down_sample(points, 1.5 * self._config.mapping.voxel_size)
+        source = _thinned(points, 1.5 * self._config.mapping.voxel_size)
         pose = self._registration.align_points_to_map(
             points=source,
             voxel_map=self._map,
@@ -93,7 +99,7 @@ class KissMatcher:
         if len(points) < LEAST_POINTS:
             return
         self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
-        self._map.update(voxel_down_sample(points, 0.5 * self._config.mapping.voxel_size), pose)
+        self._map.update(_thinned(points, 0.5 * self._config.mapping.voxel_size), pose)
 
     def points(self) -> F64:
         """Return the map's points [m], shape (N, 3)."""
@@ -114,6 +120,8 @@ class PlainKiss:
 
     def clear(self) -> None:
         """Start again."""
+        from kiss_icp.kiss_icp import KissICP
+
         self._kiss = KissICP(self._config)
 
     @property
@@ -147,10 +155,17 @@ def thinned_indices(points: F64, size: float) -> NDArray[np.intp]:
     """
     if len(points) < LEAST_POINTS:
         return np.arange(len(points))
-    every, kept = _hashes(points), _hashes(np.asarray(voxel_down_sample(points, size)))
+    every, kept = _hashes(points), _hashes(_thinned(points, size))
     order = np.argsort(every, kind="stable")
     place = np.searchsorted(every, kept, sorter=order)
     return np.unique(order[np.minimum(place, len(points) - 1)])
+
+
+def _thinned(points: F64, size: float) -> F64:
+    """Return one of the points (N, 3) in each voxel of a size [m]."""
+    from kiss_icp.voxelization import voxel_down_sample
+
+    return np.asarray(voxel_down_sample(points, size))
 
 
 def _hashes(points: F64) -> NDArray[np.uint64]:

@@ -29,7 +29,7 @@ from l2lidar_proc.deskew import report
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, carried_over
-from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
+from l2lidar_proc.ros.inputs import InputMonitor, load_libraries, steady_timer
 from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
 from l2lidar_proc.ros.scan_publisher import ScanPublisher
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
@@ -103,6 +103,7 @@ class DeskewNode(ManagedNode):
             self, topics.cloud_topic, on_leveling=self._warn_of_leveling
         )
         steady_timer(self, 1.0, guarded(self._diagnose))
+        load_libraries("filterpy.kalman")
 
     def pause(self) -> None:
         """Listen no more; publish what still waits, and forget how the sensor moved."""

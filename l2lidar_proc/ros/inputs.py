@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import threading
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
 from functools import wraps
+from importlib import import_module
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -194,6 +197,20 @@ class InputMonitor:
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
     """Return a timer that runs on whatever the host's clock, /clock or a replay do."""
     return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def load_libraries(*names: str) -> None:
+    """Import, in a thread, what the first sweep will need; who needs it earlier waits.
+
+    Meanwhile the node is there and answers, and what comes waits in its queues.
+    """
+
+    def load() -> None:
+        for name in names:
+            import_module(name)
+        gc.freeze()  # or every full collection walks all of it
+
+    threading.Thread(target=load, name="import", daemon=True).start()
 
 
 def answer_or_error(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -15,7 +15,9 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseMotion
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
-from l2lidar_proc.slam.nodes import Keyframe
+
+if TYPE_CHECKING:
+    from l2lidar_proc.slam.nodes import Keyframe  # brings half of scipy along
 
 UNKNOWN_VARIANCE: Final = 9999.0
 """What rtabmap takes for a pose or velocity that is not known."""

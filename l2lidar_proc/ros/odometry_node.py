@@ -42,6 +42,7 @@ from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import (
     InputMonitor,
     answer_or_error,
+    load_libraries,
     steady_timer,
 )
 from l2lidar_proc.ros.intake import SLOW_LOOK_S, OneCloud, SensorIntake
@@ -103,6 +104,7 @@ class OdometryNode(ManagedNode):
         map_period_s = self._settings.value.topics.map_period_s
         if map_period_s > 0.0:
             steady_timer(self, map_period_s, guarded(self._show_map))
+        load_libraries("filterpy.kalman", "kiss_icp.voxelization", "scipy.spatial.transform")
 
     def pause(self) -> None:
         """Listen no more."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
@@ -52,3 +54,17 @@ def test_what_waits_is_taken_in_order_and_the_executor_goes_on(node: Node) -> No
     assert heard == list(range(8, 20))
     assert list(waiting(subscription, 5)) == []
     executor.shutdown()
+
+
+def test_a_node_starts_before_what_only_its_first_sweep_needs() -> None:
+    """What takes most of the start is imported in a thread meanwhile."""
+    heavy = ("scipy.stats", "scipy.sparse", "kiss_icp.config", "open3d", "matplotlib", "gtsam")
+    code = (
+        "import sys\n"
+        "import l2lidar_node.ros.driver_node, l2lidar_proc.ros.companion_node\n"
+        f"print([name for name in {heavy} if name in sys.modules])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert found.stdout.strip() == "[]"
