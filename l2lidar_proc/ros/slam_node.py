@@ -27,7 +27,7 @@ from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.types import F64, HostNs, is_ros_time
 from l2lidar_proc.ros import odometry_messages as messages
-from l2lidar_proc.ros.inputs import InputMonitor
+from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.map_transform import MapTransform
 from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
 from l2lidar_proc.slam.atlas import AtlasError
@@ -119,7 +119,7 @@ class SlamNode(ManagedNode):
         hear(PoseWithCovarianceStamped, topics.initial_pose_topic, self._initial_pose, 1)
         hear(TFMessage, "/tf", self._transforms)
         self.create_timer(1.0 / topics.tf_rate, guarded(self._publish_transform))
-        self.create_timer(1.0, guarded(self._diagnose))
+        steady_timer(self, 1.0, guarded(self._diagnose))
         if topics.map_period_s > 0.0:
             self.create_timer(topics.map_period_s, guarded(self._show))
         if topics.autosave_s > 0.0:
