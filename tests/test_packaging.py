@@ -27,7 +27,7 @@ EXECUTABLES = {
 
 # Of ROS 2, by import name, where it is not the package's own.
 ROS_MODULES = re.compile(
-    r"(rclpy|ament_index_python|launch|launch_ros|rcl_interfaces|builtin_interfaces|\w+_msgs|\w+_srvs)$"
+    r"(rclpy|ament_index_python|launch|launch_ros|\w+_interfaces|\w+_msgs|\w+_srvs)$"
 )
 # By import name, where PyPI has another.
 DISTRIBUTIONS = {

@@ -93,6 +93,7 @@ class UdpTransport:
         self._timeout_s = -1.0
         self._interval_s = config.receive_interval_ms / 1e3
         self._looked_s = 0.0
+        self._is_behind = False  # more waited than one batch holds
 
     @property
     def port(self) -> int:
@@ -126,7 +127,7 @@ class UdpTransport:
         likely to be more. The kernel has noted when each came: reading them some at a time saves
         most of the wake-ups and costs no accuracy.
         """
-        if self._interval_s:
+        if self._interval_s and not self._is_behind:
             pause = self._looked_s + self._interval_s - time.monotonic()
             if pause > 0.0:
                 time.sleep(min(pause, timeout_s))
@@ -134,7 +135,8 @@ class UdpTransport:
             self._set_timeout(timeout_s)
         batch: list[Datagram] = []
         flags = 0
-        for _ in range(_BATCH):
+        self._is_behind = False
+        for number in range(_BATCH):
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(
                     _MAX_DATAGRAM, _ANCILLARY_SIZE, flags
@@ -151,6 +153,7 @@ class UdpTransport:
             if not flags and 0 <= time.time_ns() - arrival < _FRESH_NS:
                 break
             flags = socket.MSG_DONTWAIT
+            self._is_behind = number == _BATCH - 1
         if self._filters:
             self._watch_flood()
         self._looked_s = time.monotonic()

@@ -1,0 +1,121 @@
+"""A bad link between two network namespaces: limits the rate, delays, and loses, both ways.
+
+What ``tc netem`` does in kernels that have it, for those that have not: a process that holds a TUN
+device in each namespace and passes packets on in its own time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import heapq
+import os
+import random
+import selectors
+import struct
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+_TUNSETIFF: Final = 0x400454CA
+_IFF_TUN: Final = 0x0001
+_IFF_NO_PI: Final = 0x1000
+_CLONE_NEWNET: Final = 0x40000000
+_LARGEST: Final = 65_536
+_QUEUE_S: Final = 1.0  # of packets that wait for their turn; more are lost, as in a router
+
+
+def open_tun(namespace: str, name: str) -> int:
+    """Return the descriptor of a new TUN device in a namespace; this process is in it after.
+
+    Raises
+    ------
+    OSError
+        Without the right or the device.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    with Path("/run/netns", namespace).open("rb") as place:
+        if libc.setns(place.fileno(), _CLONE_NEWNET) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), namespace)
+    descriptor = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
+    fcntl.ioctl(
+        descriptor, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TUN | _IFF_NO_PI)
+    )
+    return descriptor
+
+
+class Direction:
+    """Packets from one end to the other.
+
+    Parameters
+    ----------
+    source, target : int
+        Descriptors.
+    rate : float
+        [bit/s]
+    loss : float
+        Share of the packets that do not arrive.
+    delay_s : float
+    seed : int
+    """
+
+    def __init__(
+        self, source: int, target: int, rate: float, loss: float, delay_s: float, seed: int
+    ) -> None:
+        self.source = source
+        self._target = target
+        self._rate, self._loss, self._delay_s = rate, loss, delay_s
+        self._random = random.Random(seed)
+        self._free_s = 0.0
+        self._waiting: list[tuple[float, int, bytes]] = []
+        self._count = 0
+
+    def take(self, now: float) -> None:
+        """Read what has come."""
+        while True:
+            try:
+                packet = os.read(self.source, _LARGEST)
+            except BlockingIOError:
+                return
+            begin = max(now, self._free_s)
+            if begin - now > _QUEUE_S:
+                continue
+            self._free_s = begin + 8.0 * len(packet) / self._rate
+            if self._random.random() < self._loss:
+                continue
+            self._count += 1
+            heapq.heappush(self._waiting, (self._free_s + self._delay_s, self._count, packet))
+
+    def give(self, now: float) -> float:
+        """Pass on what is due; return the time to the next [s]."""
+        while self._waiting and self._waiting[0][0] <= now:
+            try:
+                os.write(self._target, heapq.heappop(self._waiting)[2])
+            except OSError:  # a full device: one packet more that is lost
+                continue
+        return self._waiting[0][0] - now if self._waiting else 1.0
+
+
+def main() -> int:
+    """Run until killed: RATE LOSS DELAY_S NAMESPACE DEVICE NAMESPACE DEVICE."""
+    rate, loss, delay_s = map(float, sys.argv[1:4])
+    ends = [open_tun(*sys.argv[at : at + 2]) for at in (4, 6)]
+    ways = [
+        Direction(ends[0], ends[1], rate, loss, delay_s, 1),
+        Direction(ends[1], ends[0], rate, loss, delay_s, 2),
+    ]
+    print("ready", flush=True)
+    with selectors.DefaultSelector() as selector:
+        for way in ways:
+            selector.register(way.source, selectors.EVENT_READ, way)
+        while True:
+            now = time.monotonic()
+            pause = min(way.give(now) for way in ways)
+            for key, _ in selector.select(max(pause, 0.0)):
+                key.data.take(time.monotonic())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
