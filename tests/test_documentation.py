@@ -40,7 +40,7 @@ RUN_BY = {
 """Commands that a test runs, itself or the file behind them, by the test."""
 
 NOT_RUN = {
-    r"ros2 (topic|service|param|run|bag|security) .*": ROS,
+    r"ros2 (topic|service|param|run|bag|security|lifecycle) .*": ROS,
     r"source .*": ROS,
     r"export ROS_SECURITY_.*": ROS,
     r"rosdep .*": ROS,
