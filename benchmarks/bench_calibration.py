@@ -1,35 +1,39 @@
-"""Measures how well still places calibrate a unit, and what that is worth to the odometry.
+"""Measures how well a unit calibrates, and what that is worth to the odometry.
 
-``make bench-calibration`` prints the table and writes ``out/bench/calibration.json``;
-``BENCH_ARGS="--seeds 3"`` is a short run, ``--capture FILE`` adds a capture of a real unit (pcap,
-or a cloud ``.npy`` with its table of packets), ``--docs`` draws the pictures of
-``docs/calibration.md``.
+``make bench-calibration`` prints the table, writes ``out/bench/calibration.json`` and, with
+``BENCH_ARGS="--page"``, ``docs/results/calibration.md``. ``--seeds 3`` is a short run,
+``--capture FILE`` adds a capture of a real unit (pcap, or a cloud ``.npy`` with its table of
+packets), ``--docs`` draws the pictures of ``docs/calibration.md``. Every case is kept in
+``out/bench/calibration.jsonl`` as soon as it is there: ``--minutes 7 --resume`` goes on where a
+run was cut.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from dataclasses import replace
+import json
+import multiprocessing
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks import odometry_methods, real_l2
-from benchmarks.bench_odometry import score
-from benchmarks.results import Target, at_least, at_most, keep, publish
+from benchmarks import calibration_pages, real_l2
+from benchmarks.results import FOLDER, Target, at_least, at_most, publish
 from l2lidar_node.calibration import picture, report
-from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
 from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate
-from l2lidar_node.cli.calibrate import capture_place
+from l2lidar_node.cli.calibrate_files import capture_place
 from l2lidar_node.cli.virtual_places import still_places
 from l2lidar_node.emulator.unit.errors import UnitErrors, drawn
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.units import UNITS, Unit
-from tests.support import odometry_runs
 
 Row = dict[str, Any]
 
@@ -37,97 +41,197 @@ INJECTED: Final = UnitErrors(xi=0.4 * DEG, beta=-0.3 * DEG, alpha=0.3 * DEG, ran
 BOUNDS: Final = {"xi": 0.02 * DEG, "beta": 0.02 * DEG, "alpha": 0.01 * DEG, "b": 0.5e-3,
                  "bias": 8e-3}  # fmt: skip
 SECONDS: Final = 4.0
-RUNS: Final = (("room", "walk"), ("corridor", "walk"), ("yard", "walk"))
-_RUN_S: Final = 40.0
 _FACTORS: Final = {name: factor for name, (_, factor) in report.UNITS.items()}
 
 
-def main() -> None:
-    """Measure everything that is asked for and write it down."""
+class Case(NamedTuple):
+    """One thing to measure, by name and seed, in a process of its own.
+
+    Attributes
+    ----------
+    name : str
+    seed : int
+    """
+
+    name: str
+    seed: int = 0
+
+
+class Kept:
+    """What has been measured so far, one case a line; several processes may append.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path = FOLDER / "calibration.jsonl") -> None:
+        self._path = path
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._path.unlink(missing_ok=True)
+
+    def append(self, case: Case, found: list[Row | Target]) -> None:
+        """Keep what a case has found."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        rows = [item for item in found if not isinstance(item, Target)]
+        targets = [asdict(item) for item in found if isinstance(item, Target)]
+        entry = {"case": list(case), "rows": rows, "targets": targets}
+        with self._path.open("a", encoding="utf-8") as file:
+            # the line before may have been cut off
+            file.write("\n" + json.dumps(entry, default=float) + "\n")
+
+    def read(self) -> dict[Case, list[Row | Target]]:
+        """Return what is there; a line that was cut off does not count."""
+        found: dict[Case, list[Row | Target]] = {}
+        if not self._path.exists():
+            return found
+        for line in self._path.read_text(encoding="utf-8").splitlines():
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                continue
+            targets = [Target(**item) for item in entry["targets"]]
+            found[Case(*entry["case"])] = [*entry["rows"], *targets]
+        return found
+
+
+def main() -> int:
+    """Measure what is asked for and write it down; return 0 when all targets are met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20, help="units of each population")
     parser.add_argument("--capture", type=Path, action="append", default=[], metavar="FILE")
-    parser.add_argument("--no-odometry", action="store_true", help="leave the odometry out")
+    parser.add_argument("--only", nargs="+", choices=tuple(CASES), help="leave the others out")
     parser.add_argument("--docs", action="store_true", help="draw docs/calibration_*.png")
-    arguments = parser.parse_args()
-    rows: list[Row] = []
-    targets: list[Target] = []
-    for part in (
-        real(arguments.capture, arguments.docs),
-        injected(arguments.docs),
-        refused(),
-        () if arguments.no_odometry else odometry(),
-        perfect(arguments.seeds),
-        population(arguments.seeds),
-    ):
-        for item in part:
-            if isinstance(item, Target):
-                targets.append(item)
-            else:
-                rows.append(item)
-                keep("calibration", rows, targets)  # what is there counts if it is interrupted
-                print({name: value for name, value in item.items() if value != ""}, flush=True)
-    publish("calibration", "Calibration from still places: deg, mm", rows, targets)
+    parser.add_argument("--page", action="store_true", help="write docs/results/calibration.md")
+    parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no case after that")
+    parser.add_argument("--resume", action="store_true", help="keep the cases that there are")
+    given = parser.parse_args()
+    kept = Kept()
+    if not given.resume:
+        kept.clear()
+    cases = [
+        Case(name, seed)
+        for name in given.only or CASES
+        for seed in range(given.seeds if name in POPULATIONS else 1)
+    ]
+    until = time.monotonic() + 60.0 * given.minutes
+    orders = [(case, kept, until) for case in cases if case not in kept.read()]
+    if given.jobs > 1:
+        with multiprocessing.get_context("fork").Pool(given.jobs, maxtasksperchild=4) as pool:
+            left = sum(pool.imap(_work, orders))
+    else:
+        left = sum(map(_work, orders))
+    if left:
+        print(f"{left} cases were left out, for want of time", file=sys.stderr)
+    done = kept.read()
+    found = [item for case in cases for item in done.get(case, [])]
+    for path in given.capture:
+        place = real_l2.place(path, 0) if path.suffix == ".npy" else capture_place(path)[0]
+        found.append(_row(path.name, 0, calibrate([place]), None))
+    rows = [item for item in found if not isinstance(item, Target)]
+    targets = [item for item in found if isinstance(item, Target)]
+    targets += [*perfect_targets(rows), *population_targets(rows)]
+    publish("calibration", "Calibration of units: what is left, and its deviation", rows, targets)
+    if given.docs:
+        draw()
+    if given.page:
+        calibration_pages.write(rows, targets)
+    return 0 if all(target.met for target in targets) and not left else 1
 
 
-def perfect(seeds: int) -> Iterator[Row | Target]:
-    """Yield what is found on units that report the truth: nothing must be corrected."""
-    worst = dict.fromkeys(BOUNDS, 0.0)
-    stored = 0
-    for seed in range(seeds):
-        result = calibrate(still_places("perfect", seconds=SECONDS, seed=seed), keep_alpha=True)
-        yield _row("perfect", seed, result, UnitErrors())
-        stored += bool(result.stored)
-        for name in worst:
-            worst[name] = max(worst[name], abs(result.estimates[name].value))
-    yield at_most("perfect units that get a correction", stored, 0)
-    for name, value in worst.items():
-        yield at_most(
-            f"perfect units, worst |{name}|, {report.UNITS[name][0]}",
-            value * _FACTORS[name],
-            BOUNDS[name] * _FACTORS[name],
-        )
+def _work(given: tuple[Case, Kept, float]) -> int:
+    """Measure a case; return 1 if there was no time for it."""
+    case, kept, until = given
+    if time.monotonic() > until:
+        return 1
+    begun = time.monotonic()
+    try:
+        found = list(CASES[case.name](case.seed))
+    except Exception:  # one case must not end the measurement
+        traceback.print_exc()
+        found = [_failed(case)]
+    kept.append(case, found)
+    missed = [item.name for item in found if isinstance(item, Target) and not item.met]
+    print(
+        f"{case.name} {case.seed}: {time.monotonic() - begun:.0f} s"
+        + "".join(f"; NOT MET: {name}" for name in missed),
+        file=sys.stderr,
+        flush=True,
+    )
+    return 0
 
 
-def injected(docs: bool) -> Iterator[Row | Target]:
+def _failed(case: Case) -> Target:
+    return at_most(f"{case.name} {case.seed} failed", 1, 0)
+
+
+def perfect(seed: int) -> Iterator[Row | Target]:
+    """Yield what is found on a unit that reports the truth: nothing must be corrected."""
+    result = calibrate(still_places("perfect", seconds=SECONDS, seed=seed), keep_alpha=True)
+    yield _row("perfect", seed, result, UnitErrors())
+
+
+def perfect_targets(rows: list[Row]) -> Iterator[Target]:
+    """Yield what all perfect units together say."""
+    mine = [row for row in rows if row["case"] == "perfect"]
+    if not mine:
+        return
+    corrected = sum(row["corrected"] != "" for row in mine)
+    yield at_most(f"of {len(mine)} perfect units get a correction", corrected, 0)
+    for name, bound in BOUNDS.items():
+        known = [abs(row[name]) for row in mine if row[name] != ""]
+        unit, factor = report.UNITS[name]
+        yield at_most(f"perfect units, worst |{name}|, {unit}", max(known), bound * factor)
+
+
+def injected(seed: int) -> Iterator[Row | Target]:
     """Yield what is recovered of large errors."""
-    result = calibrate(still_places(_unit(INJECTED), seconds=SECONDS), keep_alpha=True)
-    yield _row("injected", 0, result, INJECTED)
+    result = calibrate(still_places(_unit(INJECTED), seconds=SECONDS, seed=seed), keep_alpha=True)
+    yield _row("injected", seed, result, INJECTED)
     for name, bound in BOUNDS.items():
         truth = getattr(INJECTED, "range_bias" if name == "bias" else name)
         off = abs(result.estimates[name].value - truth)
         unit, factor = report.UNITS[name]
         yield at_most(f"injected errors, {name} off by, {unit}", off * factor, bound * factor)
     yield at_most("injected errors, halves apart afterwards, mm", 1e3 * result.after.gap, 2.0)
-    if docs:
-        picture.save(result, Path("docs") / "calibration_room.png")
 
 
-def population(seeds: int) -> Iterator[Row | Target]:
-    """Yield what is found on a population of units with all their errors."""
-    covered = dict.fromkeys(("xi", "beta", "alpha"), 0)
-    refusals = 0
-    gains = []
-    for seed in range(1, seeds + 1):
-        errors = drawn(seed).powered_up(seed, 0)
-        result = calibrate(
-            still_places(_unit(errors), seconds=SECONDS, seed=seed), keep_alpha=True
-        )
-        yield _row("population", seed, result, errors)
-        refusals += bool(result.refusals)
-        gains.append(result.after.thickness / result.before.thickness)
-        for name in covered:
-            item = result.estimates[name]
-            covered[name] += abs(item.value - getattr(errors, name)) <= 3.0 * item.sd
-    for name, count in covered.items():
-        yield at_least(f"units whose {name} is within 3 stated deviations", count, seeds)
+def population(seed: int) -> Iterator[Row | Target]:
+    """Yield what is found on a unit of a population with all its errors."""
+    errors = drawn(seed + 1).powered_up(seed + 1, 0)
+    places = still_places(_unit(errors), seconds=SECONDS, seed=seed + 1)
+    yield _row("population", seed + 1, calibrate(places, keep_alpha=True), errors)
+
+
+def population_targets(rows: list[Row]) -> Iterator[Target]:
+    """Yield what all units of the population together say."""
+    mine = [row for row in rows if row["case"] == "population"]
+    if not mine:
+        return
+    for name in ("xi", "beta", "alpha"):
+        covered = sum(abs(row[name]) <= 3.0 * row[f"{name} sd"] for row in mine)
+        yield at_least(f"units whose {name} is within 3 stated deviations", covered, len(mine))
+    refusals = sum(row["refused"] != "" for row in mine)
     yield at_most("units of the population that are refused", refusals, 0)
+    gains = [row["thick after"] / row["thick before"] for row in mine]
     yield at_most("thickness after over before, median", float(np.median(gains)), 0.95)
 
 
-def refused() -> Iterator[Row | Target]:
+def draw() -> None:
+    """Draw the pictures of ``docs/calibration.md``."""
+    for result, name in (
+        (calibrate(still_places(_unit(INJECTED), seconds=SECONDS)), "calibration_room"),
+        *((calibrate([place]), f"{place.name}_calibrated") for place in _real_places()),
+    ):
+        picture.save(result, Path("docs") / f"{name}.png")
+
+
+def refused(seed: int) -> Iterator[Row | Target]:
     """Yield what must not be believed."""
-    yield from _refusal("one turn of the head", still_places("perfect", seconds=0.24))
+    yield from _refusal("one turn of the head", still_places("perfect", seconds=0.24, seed=seed))
     yield from _refusal("sensor that moved", _moved())
     strong = _unit(replace(INJECTED, whirl=(0.6 * DEG, 0.0)))
     yield from _refusal(
@@ -136,15 +240,25 @@ def refused() -> Iterator[Row | Target]:
     noisy = ImuNoise(gyro_line=0.2)
     places = still_places("perfect", seconds=SECONDS, poses=("tilted",), imu=noisy)
     yield from _refusal("gyro line that is no motion", places)
+
+
+def poor_places(seed: int) -> Iterator[Row | Target]:
+    """Yield what is found where there is little to see."""
     for world in ("yard", "corridor"):
-        one = still_places(_unit(INJECTED), seconds=SECONDS, world=world, poses=("upright",))
+        one = still_places(
+            _unit(INJECTED), seconds=SECONDS, world=world, poses=("upright",), seed=seed
+        )
         result = calibrate(one)
-        yield _row(f"{world}, one place", 0, result, INJECTED)
+        yield _row(f"{world}, one place", seed, result, INJECTED)
         is_unknown = result.estimates["bias"].verdict is Verdict.UNKNOWN
         yield at_least(f"{world}: range bias is refused", int(is_unknown), 1)
-    rocking = UnitErrors(whirl=(0.3 * DEG, -0.1 * DEG), whirl_back=(0.05 * DEG, 0.0))
-    result = calibrate(still_places(_unit(rocking), seconds=SECONDS), keep_alpha=True)
-    yield _row("rocking 0.3 deg", 0, result, rocking)
+
+
+def rocking(seed: int) -> Iterator[Row | Target]:
+    """Yield what a mount that rocks by 0.3 degrees leaves in alpha and beta."""
+    errors = UnitErrors(whirl=(0.3 * DEG, -0.1 * DEG), whirl_back=(0.05 * DEG, 0.0))
+    result = calibrate(still_places(_unit(errors), seconds=SECONDS, seed=seed), keep_alpha=True)
+    yield _row("rocking 0.3 deg", seed, result, UnitErrors())
     off = max(abs(result.estimates[name].value) for name in ("alpha", "beta")) / DEG
     yield at_most("rocking of 0.3 deg left in alpha or beta, deg", off, 0.03)
 
@@ -156,7 +270,7 @@ def _refusal(name: str, places: list[Place]) -> Iterator[Row | Target]:
         yield _row(f"refuse: {name}", 0, result, None)
         is_refused = bool(result.refusals)
     except CalibrationError as error:
-        yield {**_empty(f"refuse: {name}", 0), "words": str(error)}
+        yield {**_empty(f"refuse: {name}", 0), "refused": str(error)}
         is_refused = True
     yield at_least(f"refused: {name}", int(is_refused), 1)
 
@@ -169,17 +283,12 @@ def _moved() -> list[Place]:
     return [replace(made, returns=returns)]
 
 
-def real(captures: list[Path], docs: bool) -> Iterator[Row | Target]:
-    """Yield what is found in captures of real units."""
-    places: list[Place] = []
-    if real_l2.FOLDER.exists():
-        places = [
-            real_l2.place(real_l2.FOLDER / f"{name}.npy", number)
-            for number, name in enumerate(real_l2.CAPTURES)
-        ]
+def real(seed: int) -> Iterator[Row | Target]:
+    """Yield what is found in captures of a real unit."""
+    places = _real_places()
     for place, most in zip(places, (21.0, 18.0), strict=False):
         result = calibrate([place])
-        yield _row(place.name, 0, result, None)
+        yield _row(place.name, seed, result, None)
         yield at_least(f"{place.name}: xi - 0.7 beta, deg", result.side / DEG, 0.34)
         yield at_most(f"{place.name}: xi - 0.7 beta, deg", result.side / DEG, 0.42)
         yield at_most(
@@ -187,49 +296,49 @@ def real(captures: list[Path], docs: bool) -> Iterator[Row | Target]:
         )
         bias = result.estimates["bias"].verdict is Verdict.UNKNOWN
         yield at_least(f"{place.name}: range bias is refused", int(bias), 1)
-        if docs:
-            picture.save(result, Path("docs") / f"{place.name}_calibrated.png")
+        for half in (0, 1):
+            part = _half(place, half)
+            yield _row(part.name, seed, calibrate([part]), None)
     if len(places) > 1:
         result = calibrate(places)
-        yield _row("both captures", 0, result, None)
+        yield _row("both captures", seed, result, None)
         for name in ("xi", "beta"):
             values = [getattr(item, name) / DEG for item in result.places]
             yield at_most(f"captures: {name} differs by, deg", abs(values[0] - values[1]), 0.06)
         is_shown = result.estimates["alpha"].verdict is Verdict.SHOWN
         yield at_least("captures: alpha is reported as not repeatable", int(is_shown), 1)
-    for path in captures:
-        place = real_l2.place(path, 0) if path.suffix == ".npy" else capture_place(path)[0]
-        result = calibrate([place])
-        yield _row(path.name, 0, result, None)
 
 
-def odometry() -> Iterator[Row | Target]:
-    """Yield what the odometry is off on a typical unit, before and after its calibration."""
-    made = _calibrated("typical")
-    ratios = []
-    for scene, motion in RUNS:
-        runs = {
-            "perfect": ("perfect", None),
-            "typical": ("typical", None),
-            "calibrated": ("typical", made),
-        }
-        ates = {}
-        for name, (unit, calibration) in runs.items():
-            run = odometry_runs.record(
-                scene, motion, 0, _RUN_S, unit=unit, calibration=calibration
-            )
-            found = odometry_methods.run_method(odometry_methods.OURS, run, "turn")
-            assert found is not None
-            ates[name] = 1e3 * score(run, found)[0]
-        words = ", ".join(f"{name} {value:.1f}" for name, value in ates.items())
-        yield {**_empty(f"odometry: {scene} {motion}", 0), "words": f"ATE, mm: {words}"}
-        ratios.append(ates["calibrated"] / ates["perfect"])
-    yield at_most("odometry: ATE calibrated over perfect, median", float(np.median(ratios)), 1.5)
+def _real_places() -> list[Place]:
+    """Return the captures that are at hand; none where there are none."""
+    if not real_l2.FOLDER.exists():
+        return []
+    return [
+        real_l2.place(real_l2.FOLDER / f"{name}.npy", number)
+        for number, name in enumerate(real_l2.CAPTURES)
+    ]
 
 
-def _calibrated(unit: str) -> CalibrationFile:
-    places = still_places(unit, seconds=SECONDS)
-    return report.calibration_of(calibrate(places, keep_alpha=True), places, "")
+def _half(place: Place, half: int) -> Place:
+    """Return the first or second half of a place: what a shorter recording would say."""
+    middle = int(np.median(place.returns["packet"]))
+    late = place.returns["packet"] > middle
+    returns = place.returns[late if half else ~late].copy()
+    returns["packet"] -= returns["packet"].min()
+    name = f"{place.name}, {'second' if half else 'first'} half"
+    return replace(place, name=name, returns=returns, turns=place.turns / 2, gyro=place.gyro[:0])
+
+
+CASES: Final[dict[str, Callable[[int], Iterator[Row | Target]]]] = {
+    "real": real,
+    "injected": injected,
+    "refused": refused,
+    "poor_places": poor_places,
+    "rocking": rocking,
+    "perfect": perfect,
+    "population": population,
+}
+POPULATIONS: Final = ("perfect", "population")
 
 
 def _unit(errors: UnitErrors) -> Unit:
@@ -246,19 +355,25 @@ def _row(name: str, seed: int, result: StillResult, truth: UnitErrors | None) ->
             true = getattr(truth, "range_bias" if key == "bias" else key)
         row[key] = round((item.value - true) * _FACTORS[key], 4)
         row[f"{key} sd"] = round(item.sd * _FACTORS[key], 4)
-    row["side"] = round(result.side / DEG, 4)
     before, after = report.quality_mm(result.before), report.quality_mm(result.after)
-    row["thickness"] = f"{before['thickness_median']} to {after['thickness_median']}"
-    row["gap"] = f"{before['gap_median']} to {after['gap_median']}"
-    row["words"] = result.refusals[0].reason if result.refusals else ""
+    row |= {
+        "side": round(result.side / DEG, 4),
+        "thick before": before["thickness_median"],
+        "thick after": after["thickness_median"],
+        "gap before": before["gap_median"],
+        "gap after": after["gap_median"],
+        "corrected": " ".join(result.stored),
+        "refused": result.refusals[0].reason if result.refusals else "",
+    }
     return row
 
 
 def _empty(name: str, seed: int) -> Row:
-    columns = [part for key in _FACTORS for part in (key, f"{key} sd")]
-    return {"case": name, "seed": seed, **dict.fromkeys([*columns, "side", "thickness", "gap",
-                                                         "words"], "")}  # fmt: skip
+    parts = [part for key in _FACTORS for part in (key, f"{key} sd")]
+    others = ("side", "thick before", "thick after", "gap before", "gap after", "corrected",
+              "refused")  # fmt: skip
+    return {"case": name, "seed": seed, **dict.fromkeys([*parts, *others], "")}
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

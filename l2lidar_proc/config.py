@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
@@ -34,8 +33,8 @@ FILTERS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MotionConfig:
-    """What is known about the sensor's motion and how far it is trusted."""
+class ImuConfig:
+    """Where the IMU is, and what is known of it."""
 
     imu_xyz: tuple[float, ...] = setting(
         (-0.007698, -0.014655, 0.00667), "position of the IMU in the cloud frame", unit="m"
@@ -50,6 +49,34 @@ class MotionConfig:
         lo=-100.0,
         hi=100.0,
     )
+    calibration_file: str = setting(
+        "",
+        "file of l2lidar calibrate imu for this unit: rotation of the IMU (in place of that in "
+        "/tf_static), time offset, gyro scale; imu_rpy and imu_time_offset_ms count more if set",
+    )
+
+    def __post_init__(self) -> None:
+        """Check what a single setting cannot."""
+        for name in ("imu_xyz", "imu_rpy"):
+            value = getattr(self, name)
+            if len(value) != 3:
+                raise SettingError(
+                    f"parameter '{name}': {value!r} is not valid; expected three numbers"
+                )
+
+    @property
+    def T_cloud_imu(self) -> F64:
+        """IMU coordinates to cloud coordinates where nothing else says it, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotations.from_rpy(np.deg2rad(self.imu_rpy))
+        pose[:3, 3] = self.imu_xyz
+        return pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionConfig(ImuConfig):
+    """What is known about the sensor's motion and how far it is trusted."""
+
     max_gyro_bias: float = setting(
         0.1,
         "largest mean angular rate at rest that is accepted as gyro bias",
@@ -87,24 +114,6 @@ class MotionConfig:
         hi=1000,
         live=True,
     )
-
-    def __post_init__(self) -> None:
-        """Check what a single setting cannot."""
-        for name in ("imu_xyz", "imu_rpy"):
-            value = getattr(self, name)
-            if len(value) != 3:
-                raise SettingError(
-                    f"parameter '{name}': {value!r} is not valid; expected three numbers"
-                )
-
-    @property
-    def T_cloud_imu(self) -> F64:
-        """IMU coordinates to cloud coordinates, shape (4, 4)."""
-        roll, pitch, yaw = np.deg2rad(self.imu_rpy)
-        q = rotations.exp((0.0, 0.0, yaw))
-        for turn in ((0.0, pitch, 0.0), (roll, 0.0, 0.0)):
-            q = rotations.multiply(q, rotations.exp(turn))
-        return rotations.transform(q, self.imu_xyz)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -542,13 +551,6 @@ class OdometryConfig:
     reference: str = setting(
         "middle", "instant of a sweep whose pose is estimated", choices=("start", "middle", "end")
     )
-    imu_time_offset_ms: float = setting(
-        0.0,
-        "lateness of the stamps of IMU samples; subtracted before they are used, never on a topic",
-        unit="ms",
-        lo=-100.0,
-        hi=100.0,
-    )
     min_range: float = setting(
         0.4,
         "nearer points are dropped, such as the carrier's own body",
@@ -581,7 +583,7 @@ class OdometryConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryTopics:
+class OdometryTopics(ImuConfig):
     """Where an odometry node listens and speaks, and which frames it names."""
 
     cloud_topic: str = setting(
@@ -624,10 +626,7 @@ class OdometryTopics:
     invert_tf: bool = setting(
         False, "publish base_frame as the parent of odom_frame, for a base_frame that has a parent"
     )
-    use_tf: bool = setting(True, "take mounts from /tf_static; fall back to imu_xyz")
-    imu_xyz: tuple[float, ...] = setting(
-        (-0.007698, -0.014655, 0.00667), "position of the IMU in the cloud frame", unit="m"
-    )
+    use_tf: bool = setting(True, "take mounts from /tf_static; fall back to imu_xyz and imu_rpy")
     imu_wait_ms: int = setting(
         50, "longest wait for IMU samples that cover the end of a sweep", unit="ms", lo=0, hi=1000
     )
@@ -651,22 +650,12 @@ class OdometryTopics:
 
     def __post_init__(self) -> None:
         """Check what a single setting cannot."""
-        if len(self.imu_xyz) != 3:
-            raise SettingError(
-                f"parameter 'imu_xyz': {self.imu_xyz!r} is not valid; expected three numbers"
-            )
+        ImuConfig.__post_init__(self)  # slots leave no place for super()
         if self.odom_frame in ("", self.base_frame):
             raise SettingError(
                 f"parameter 'odom_frame': {self.odom_frame!r} is not valid; expected a frame name "
                 "other than base_frame's"
             )
-
-    @property
-    def T_cloud_imu(self) -> NDArray[np.float64]:
-        """IMU coordinates to cloud coordinates where TF does not say, shape (4, 4)."""
-        pose = np.eye(4)
-        pose[:3, 3] = self.imu_xyz
-        return pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -112,6 +112,20 @@ def from_matrix(matrix: ArrayLike) -> F64:
     return -q if q[0] < 0.0 else q
 
 
+def from_rpy(rpy: ArrayLike) -> F64:
+    """Return the matrix of roll, pitch, yaw [rad] about fixed x, y, z, in this order, (3, 3)."""
+    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
+    turns = exp([(0.0, 0.0, yaw), (0.0, pitch, 0.0), (roll, 0.0, 0.0)])
+    return matrices(multiply(multiply(turns[0], turns[1]), turns[2]))
+
+
+def to_rpy(matrix: ArrayLike) -> F64:
+    """Return roll, pitch, yaw [rad] of one rotation matrix, shape (3,); see :func:`from_rpy`."""
+    m = np.asarray(matrix, dtype=np.float64)
+    pitch = np.arctan2(-m[2, 0], np.hypot(m[0, 0], m[1, 0]))
+    return np.array([np.arctan2(m[2, 1], m[2, 2]), pitch, np.arctan2(m[1, 0], m[0, 0])])
+
+
 def cumulative(q_wxyz: ArrayLike) -> F64:
     """Return the running products ``q[0] q[1] ... q[k]``, shape (K, 4).
 

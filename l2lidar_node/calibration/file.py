@@ -30,6 +30,7 @@ _IMU_LIMITS: Final = {
     "rotation_rpy": math.radians(15.0),
     "gyro_bias": 0.2,
     "gyro_scale": 0.1,
+    "gyro_skew": 0.05,
 }
 _LATEST_S: Final = 0.1
 
@@ -52,6 +53,8 @@ class ImuCalibration:
         [rad/s]
     gyro_scale : tuple of float
         Measured over true rate of each axis, minus one.
+    gyro_skew : tuple of float
+        Symmetric misalignment of x and y, x and z, y and z [rad].
     sd : dict
         Standard deviations by the names above.
     """
@@ -60,6 +63,7 @@ class ImuCalibration:
     time_offset: float
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gyro_scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_skew: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sd: dict[str, float] = field(default_factory=dict)
 
 
@@ -133,12 +137,14 @@ class CalibrationFile:
                 "time_offset": _short(self.imu.time_offset),
                 "gyro_bias": [_short(value) for value in self.imu.gyro_bias],
                 "gyro_scale": [_short(value) for value in self.imu.gyro_scale],
+                "gyro_skew": [_short(value) for value in self.imu.gyro_skew],
                 "sd": {name: _short(value) for name, value in self.imu.sd.items()},
             }
         content["about"] = self.about
         head = (
             "# Calibration of one L2, written by `l2lidar calibrate`; give it to the driver as\n"
-            "# calibration_file. SI units; range_bias in meters, range_scale relative.\n"
+            "# calibration_file, and to deskew and odometry too where it has a part `imu`.\n"
+            "# SI units; range_bias in meters, range_scale relative.\n"
             "# Used for packets whose calibration block equals `block` to the bit.\n"
         )
         return head + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
@@ -211,6 +217,7 @@ def _imu(given: dict[Any, Any]) -> ImuCalibration:
         _number(given.get("time_offset", 0.0), "imu.time_offset", _LATEST_S),
         vectors["gyro_bias"],
         vectors["gyro_scale"],
+        vectors["gyro_skew"],
         _deviations(given.get("sd"), "imu.sd"),
     )
 

@@ -1,4 +1,4 @@
-"""Picture of a calibration: a wall from its edge and a place from above, before and after."""
+"""Pictures of a calibration: walls before and after, turns of gyro and clouds."""
 
 from __future__ import annotations
 
@@ -51,6 +51,43 @@ def save(result: StillResult, path: Path) -> None:
         _draw_plan(axes[1, column], cloud, scene.is_far_half, scene.group == group)
     name = result.places[group].name
     figure.suptitle(f"a wall seen from its edge, and a slice of '{name}' from above")
+    with whole(path) as part:
+        figure.savefig(part)
+
+
+def save_turns(before: tuple[F64, F64], after: tuple[F64, F64], path: Path) -> None:
+    """Write a picture of how far a gyro turns otherwise than the clouds.
+
+    Parameters
+    ----------
+    before, after : tuple of ndarray
+        Instants (N,) [s] and rotation vectors (N, 3) from sweep to sweep [rad], under the drawing
+        and calibrated.
+    path : Path
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6), dpi=80, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: Any = figure.subplots(3, 2, sharex=True, sharey=True)
+    for column, (title, (seconds, turns)) in enumerate(
+        (("as drawn", before), ("calibrated", after))
+    ):
+        degrees = np.rad2deg(turns)
+        rms = float(np.sqrt(np.mean(np.sum(degrees**2, axis=1))))
+        axes[0, column].set_title(f"{title}: {rms:.2f} degrees from sweep to sweep (rms)")
+        for row, name in enumerate("xyz"):
+            axes[row, column].plot(seconds, degrees[:, row], ".", ms=4)
+            axes[row, column].grid(visible=True, alpha=0.3)
+            axes[row, 0].set_ylabel(f"about {name} [deg]")
+        axes[2, column].set_xlabel("time [s]")
+    figure.suptitle("turns of the gyro against those of the clouds")
     with whole(path) as part:
         figure.savefig(part)
 

@@ -75,7 +75,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     CalibrationError
         If there is nothing to estimate from.
     """
-    refusals = [refusal for place in places for refusal in _problems(place)]
+    refusals = [refusal for place in places for refusal in problems(place)]
     refusals += _between(places)
     whirls = [demodulated(place) for place in places]
     scene = _scene(places, [None] * len(places))
@@ -144,7 +144,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     )
 
 
-def _problems(place: Place) -> list[Refusal]:
+def problems(place: Place) -> list[Refusal]:
     """Return what is wrong with a place before anything is estimated."""
     found = []
     if place.turns < _FEWEST_TURNS:
@@ -166,7 +166,8 @@ def _problems(place: Place) -> list[Refusal]:
         found.append(
             Refusal(
                 f"{place.name}: wide field of view, which has a block of its own",
-                "set the standard field of view (l2lidar set fov standard) and record again",
+                "set the standard field of view (l2lidar set work-mode -- -wide_fov) and record "
+                "again",
             )
         )
     if place.dirt > _DIRTIEST:

@@ -7,8 +7,9 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -16,21 +17,19 @@ from rich.table import Table
 
 from l2lidar_node import __version__
 from l2lidar_node.calibration import picture, report
-from l2lidar_node.calibration.file import CalibrationFile, CalibrationFileError, load
-from l2lidar_node.calibration.observation import Gathering, Place
+from l2lidar_node.calibration.file import CalibrationFile
+from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
 from l2lidar_node.calibration.scale import by_tape
-from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate
+from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate, problems
+from l2lidar_node.cli import calibrate_files as files
+from l2lidar_node.cli.calibrate_files import EmulatorOption, OutputOption, PictureOption
+from l2lidar_node.cli.calibrate_imu import imu
 from l2lidar_node.cli.console import JsonOption, YesOption, out, print_json, say, with_network
 from l2lidar_node.cli.device import Device
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver.driver import Driver
-from l2lidar_node.protocol.framing import Frame, Framer
-from l2lidar_node.protocol.packets import DecodeError, ImuPacket, PointPacket, Version, decode
-from l2lidar_node.protocol.wire import PacketType
-from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Received, Recorder, Recording
+from l2lidar_node.recording.recording import Recorder
 
 _POSES: Final = (
     "upright, in the middle of the room",
@@ -44,27 +43,13 @@ _BEFORE: Final = """\
   - a furnished room of 4 to 10 m with a flat ceiling and free walls; not a corridor, not outdoors
   - screw or clamp the sensor to something heavy: not foam, not a tripod, not your hand
   - clean the cover; nobody walks about"""
-_SPIN_UP_S: Final = 60.0
-_LOOK_S: Final = 0.1
+_RIGHT: Final = "the block that the unit reports is right: nothing to correct"
 
 app = typer.Typer(
     help="Estimate what the unit is off by, and write its calibration file.",
     no_args_is_help=True,
 )
-
-OutputOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--output", "-o", metavar="FILE.yaml", help="Calibration file to write or to add to."
-    ),
-]
-EmulatorOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="UNIT",
-        help="Calibrate a virtual unit instead: perfect, typical, poor or a number.",
-    ),
-]
+app.command()(imu)
 
 
 @app.command()
@@ -106,12 +91,7 @@ def still(
         ),
     ] = False,
     output: OutputOption = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(
-            "--picture", metavar="FILE.png", help="Picture of before and after to write."
-        ),
-    ] = None,
+    figure: PictureOption = None,
     yes: YesOption = False,
     json_: JsonOption = False,
 ) -> None:
@@ -132,11 +112,11 @@ def still(
         raise UsageError("--emulator measures by itself; leave the captures out")
     firmware = ""
     if emulator is not None:
-        gathered = _virtual(emulator, seconds, min(places, 4))
+        gathered = _virtual(emulator, seconds, min(places, 4), quiet=json_)
     elif captures:
         gathered, firmware = _captured(captures, again or [])
     else:
-        gathered, firmware = _live(network, places, seconds, keep, yes or json_)
+        gathered, firmware = _live(network, places, seconds, keep, _Guide(yes or json_, json_))
     say("estimating ...") if not json_ else None
     try:
         result = calibrate(gathered, keep_alpha)
@@ -153,7 +133,13 @@ def still(
             say(f"picture in {figure}")
     if result.refusals:
         raise CommandError("nothing is written: " + result.refusals[0].reason)
-    _write(made, output, bool(result.stored), quiet=json_)
+    files.write(
+        made,
+        output,
+        "" if result.stored else _RIGHT,
+        "give it to the driver as calibration_file",
+        quiet=json_,
+    )
 
 
 @app.command()
@@ -212,9 +198,13 @@ def scale(
         gathered = []
         with ExitStack() as stack:
             folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            guide = _Guide(yes or json_, json_)
             for name in ("start", "end"):
-                _ask(f"\nThe {name} of the tape; the sensor looks along it", yes or json_)
-                place, firmware = _recorded(network, folder / f"{name}.pcap", seconds, 0)
+                files.unused(folder / f"{name}.pcap")
+            files.require_unit(network, quiet=json_)
+            for name in ("start", "end"):
+                text = f"\nThe {name} of the tape; the sensor looks along it"
+                place, firmware = _measured(network, folder / name, seconds, 0, text, guide)
                 gathered.append(place)
     try:
         found = by_tape(gathered[0], gathered[1], length, tape_mm / 1e3)
@@ -244,87 +234,28 @@ def scale(
         None,
         {"scale": about},
     )
-    _write(made, output, is_significant, quiet=json_)
-
-
-def _write(made: CalibrationFile, output: Path | None, is_new: bool, quiet: bool) -> None:
-    """Write a calibration file, or say why there is none to write."""
-    words = ""
-    if not is_new:
-        words = "the block that the unit reports is right: nothing to correct"
-    elif output is None:
-        words = "nothing is written without --output FILE.yaml"
-    else:
-        old = None
-        if output.exists():
-            try:
-                old = load(output)
-            except CalibrationFileError as error:
-                raise CommandError(f"{error}; give --output another name") from None
-            if not old.matches(made.block):
-                raise CommandError(f"{output} is of another unit; give --output another name")
-        output.parent.mkdir(parents=True, exist_ok=True)
-        report.joined(made, old).save(output)
-        words = f"{output}: give it to the driver as calibration_file"
-    if not quiet:
-        say(words)
-
-
-def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
-    """Return what a capture holds of a still place, and the unit's firmware if it says so.
-
-    Raises
-    ------
-    CommandError
-        If it cannot be read or holds no 3D packets.
-    """
-    gathering = Gathering(path.stem, power_up)
-    framer = Framer()
-    firmware = ""
-    try:
-        with path.open("rb") as stream:
-            for entry in Recording(stream):
-                if not isinstance(entry, Received):
-                    continue
-                for item in framer.feed(entry.data):
-                    if isinstance(item, Frame):
-                        firmware = _gathered(gathering, item) or firmware
-        return gathering.place(), firmware
-    except OSError as error:
-        raise CommandError(f"{path}: {error.strerror}") from None
-    except (CaptureError, ValueError) as error:
-        raise CommandError(f"{path}: {error}") from None
-
-
-def _gathered(gathering: Gathering, frame: Frame) -> str:
-    """Add a frame to a place; return the firmware if it says so."""
-    packet = decode(frame)
-    if isinstance(packet, PointPacket):
-        if packet.packet_type == PacketType.POINTS_3D:
-            gathering.points(packet.stamp / 1e9, packet.payload)
-        else:
-            gathering.flat()
-    elif isinstance(packet, ImuPacket):
-        gathering.imu(packet.stamp / 1e9, frame.payload)
-    elif isinstance(packet, DecodeError):
-        gathering.rejected()
-    elif isinstance(packet, Version):
-        return packet.firmware
-    return ""
+    files.write(
+        made,
+        output,
+        "" if is_significant else _RIGHT,
+        "give it to the driver as calibration_file",
+        quiet=json_,
+    )
 
 
 def _captured(first: Sequence[Path], again: Sequence[Path]) -> tuple[list[Place], str]:
-    found = [capture_place(path, 0) for path in first]
-    found += [capture_place(path, 1) for path in again]
+    found = [files.capture_place(path, 0) for path in first]
+    found += [files.capture_place(path, 1) for path in again]
     firmware = next((text for _, text in found if text), "")
     return [place for place, _ in found], firmware
 
 
-def _virtual(name: str, seconds: float, places: int) -> list[Place]:
+def _virtual(name: str, seconds: float, places: int, *, quiet: bool) -> list[Place]:
     from l2lidar_node.cli.virtual_places import POSES_DEG, still_places
 
     poses = tuple(POSES_DEG)[:places]
-    say(f"a virtual unit, '{name}', at {len(poses)} places, twice switched on")
+    if not quiet:
+        say(f"a virtual unit, '{name}', at {len(poses)} places, twice switched on")
     try:
         first = still_places(name, seconds=seconds, poses=poses)
         second = still_places(name, seconds=seconds, poses=poses[:1], power_up=1)
@@ -334,41 +265,87 @@ def _virtual(name: str, seconds: float, places: int) -> list[Place]:
 
 
 def _live(
-    network: NetworkConfig, places: int, seconds: float, keep: Path | None, unattended: bool
+    network: NetworkConfig, places: int, seconds: float, keep: Path | None, guide: _Guide
 ) -> tuple[list[Place], str]:
     """Guide through the places and return what was measured."""
     found: list[Place] = []
     firmware = ""
-    if not unattended:
-        say(_BEFORE)
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        for number in range(places):
+        names = [f"place_{number + 1}" for number in range(places)]
+        for name in (*names, "again"):
+            files.unused(folder / f"{name}.pcap")
+        files.require_unit(network, quiet=guide.is_quiet)
+        if not guide.is_unattended:
+            say(_BEFORE)
+        for number, name in enumerate(names):
             pose = _POSES[min(number, len(_POSES) - 1)]
-            _ask(f"\nPlace {number + 1} of {places}: {pose}", unattended)
-            place, text = _recorded(network, folder / f"place_{number + 1}.pcap", seconds, 0)
+            text = f"\nPlace {number + 1} of {places}: {pose}"
+            place, told = _measured(network, folder / name, seconds, 0, text, guide)
             found.append(place)
-            firmware = text or firmware
-        if not unattended:
+            firmware = told or firmware
+        if not guide.is_unattended:
             say(
                 "\nSwitch the unit off and on and wait until its head turns; alpha is stored only "
                 "if it is the same then."
             )
-            if typer.confirm("Measure once more?", default=True):
-                place, _ = _recorded(network, folder / "again.pcap", seconds, 1)
+            if files.confirmed("Measure once more?"):
+                place, _ = _measured(network, folder / "again", seconds, 1, "", guide)
                 found.append(place)
     return found, firmware
 
 
-def _ask(text: str, unattended: bool) -> None:
-    if unattended:
-        return
-    say(text)
-    typer.prompt("Press Enter when it stands still", default="", show_default=False)
+class _Guide(NamedTuple):
+    """How much is said and asked: nobody is there to answer, nothing but JSON is printed."""
+
+    is_unattended: bool
+    is_quiet: bool
+
+
+def _measured(
+    network: NetworkConfig, path: Path, seconds: float, power_up: int, text: str, guide: _Guide
+) -> tuple[Place, str]:
+    """Return a place; one that cannot be used is told at once, and may be measured again.
+
+    Parameters
+    ----------
+    network : NetworkConfig
+    path : Path
+        Without its ending: a second attempt has a number behind its name.
+    seconds : float
+    power_up : int
+    text : str
+        What to do before; empty if it was said.
+    guide : _Guide
+    """
+    for attempt in count(1):
+        if text:
+            files.ask(text, unattended=guide.is_unattended)
+        name = path.name if attempt == 1 else f"{path.name}_{attempt}"
+        troubles: list[str] = []
+        try:
+            place, firmware = _recorded(
+                network, path.with_name(f"{name}.pcap"), seconds, power_up, quiet=guide.is_quiet
+            )
+        except CommandError as error:
+            if guide.is_unattended:
+                raise
+            troubles = [str(error)]
+        else:
+            troubles = [f"{item.reason}: {item.advice}" for item in problems(place)]
+            if guide.is_unattended or not troubles:
+                if not guide.is_quiet:
+                    say(f"{place.turns:.0f} turns of the head, {len(place.returns)} returns")
+                return place, firmware
+        for trouble in troubles:
+            say(f"[yellow]{trouble}[/]")
+        if not files.confirmed("Measure this place again?"):
+            raise CommandError(f"nothing is written: {troubles[0]}")
+    raise AssertionError("count never ends")
 
 
 def _recorded(
-    network: NetworkConfig, path: Path, seconds: float, power_up: int
+    network: NetworkConfig, path: Path, seconds: float, power_up: int, *, quiet: bool
 ) -> tuple[Place, str]:
     """Record a place with a bar, and return it."""
     failures: list[str] = []
@@ -378,25 +355,18 @@ def _recorded(
         raise CommandError(f"cannot write {path}: {error.strerror}") from None
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     try:
-        with Device(network, tap=recorder) as device, Progress(*columns, console=out) as progress:
-            if device.wait_for(_sends_points, _SPIN_UP_S) is None:
-                raise CommandError(f"no points from the L2; {device.advice()}")
-            task = progress.add_task("recording", total=seconds)
-            begun = time.monotonic()
-            while (passed := time.monotonic() - begun) < seconds and not failures:
-                progress.update(task, completed=passed)
-                time.sleep(_LOOK_S)
-            progress.update(task, completed=seconds)
+        with Device(network, tap=recorder) as device:
+            files.wait_for_points(device, quiet=quiet)
+            with Progress(*columns, console=out, disable=quiet) as progress:
+                task = progress.add_task("recording", total=seconds)
+                files.pass_time(
+                    seconds, failures, lambda passed: progress.update(task, completed=passed)
+                )
     finally:
         recorder.close()
     if failures:
         raise CommandError(failures[0])
-    place, firmware = capture_place(path, power_up)
-    return place, firmware
-
-
-def _sends_points(driver: Driver) -> bool:
-    return driver.counters.frames[PacketType.POINTS_3D] > 0
+    return files.capture_place(path, power_up)
 
 
 def _show(result: StillResult) -> None:

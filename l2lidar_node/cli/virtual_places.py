@@ -1,18 +1,26 @@
-"""Still places measured by a virtual L2: what `l2lidar calibrate still --emulator` works on."""
+"""What `l2lidar calibrate --emulator` works on: places and motions measured by a virtual L2."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from l2lidar_node.calibration.observation import Gathering, Place
+from l2lidar_node.emulator.config import DeviceConfig, PowerConfig
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.motion.spline import PoseSpline
 from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
+from l2lidar_node.emulator.unit.device import VirtualL2
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.scanner import Scanner
 from l2lidar_node.emulator.unit.units import Unit, unit
+from l2lidar_node.protocol import wire
+from l2lidar_node.recording.capture import Endpoint
+from l2lidar_node.recording.recording import RecordingWriter
+from l2lidar_node.types import HostNs
 
 POSES_DEG: Final = {
     "upright": (0.0, 0.0, 0.0),
@@ -23,6 +31,8 @@ POSES_DEG: Final = {
 """Roll, pitch, yaw of the places that the guide asks for."""
 
 _RATIO: Final = 1.99866  # true seconds per second of the unit's clock
+_POWER_ON_NS: Final = 1_700_000_000_000_000_000
+_STEP_S: Final = 0.2
 _SKIP_S: Final = 2.0  # the motion begins with a rest, and so does a recording
 
 
@@ -104,6 +114,46 @@ def slide(own: str | Unit, length: float, *, seconds: float = 10.0, seed: int = 
         )
         found.append(_measured(moved, seconds, name, 0))
     return found
+
+
+def capture(
+    path: Path,
+    own: str | Unit,
+    seconds: float,
+    *,
+    motion: str = "shake",
+    world: str = "room",
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> None:
+    """Write a capture of a virtual unit in motion, after a rest of two seconds.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced if it exists.
+    own : str or Unit
+    seconds : float
+        Of the capture.
+    motion, world : str
+        See :class:`emulator.physics.PhysicsConfig`.
+    seed : int
+    progress : callable
+        Told how far it is, 0 to 1.
+    """
+    made = unit(own) if isinstance(own, str) else own
+    physics = assemble(PhysicsConfig(world=world, motion=motion, seed=seed), made)
+    config = DeviceConfig(power=PowerConfig(boot_scale=0.0), seed=seed)
+    device = VirtualL2(config, physics.scanner, physics.inertial, power_on_ns=_POWER_ON_NS)
+    ends = Endpoint(wire.LIDAR_IP, wire.LIDAR_PORT), Endpoint(wire.HOST_IP, wire.HOST_PORT)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, *ends)
+        for step in range(1, round(seconds / _STEP_S) + 1):
+            now = _POWER_ON_NS + round(step * _STEP_S * 1e9)
+            for at, data in device.advance(now):
+                writer.received(data, HostNs(at))
+            progress(step * _STEP_S / seconds)
 
 
 def _place(config: PhysicsConfig, own: Unit, seconds: float, name: str, power_up: int) -> Place:

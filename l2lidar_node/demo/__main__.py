@@ -52,7 +52,7 @@ def demo(
         ),
     ] = None,
     motion: Annotated[
-        str, typer.Option(help="still, spin, walk, trot, drone, or a TUM file.")
+        str, typer.Option(help="still, spin, shake, walk, trot, drone, or a TUM file.")
     ] = "walk",
     forward: Annotated[
         bool,

@@ -31,11 +31,11 @@ class PhysicsConfig:
     )
     motion: str = setting(
         "walk",
-        "built-in motion (still, spin, walk, trot, drone) or path of a TUM file",
+        "built-in motion (still, spin, shake, walk, trot, drone) or path of a TUM file",
     )
     speed: float = setting(
         0.0,
-        "speed of a built-in motion in m/s, of spin in rad/s, 0 = its own",
+        "speed of a built-in motion in m/s, of spin and shake in rad/s, 0 = its own",
         name="motion_speed",
         lo=0.0,
         hi=50.0,

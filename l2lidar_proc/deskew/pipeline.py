@@ -19,7 +19,8 @@ from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.filters import FilterError
 from l2lidar_proc.deskew.organise import organise
-from l2lidar_proc.motion.imu_buffer import Samples, earlier
+from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, Quality
@@ -88,6 +89,10 @@ class Pipeline:
     Attributes
     ----------
     tracker : MotionTracker
+    extrinsics : ImuExtrinsics
+        What is known of the IMU beside its place.
+    T_cloud_imu : ndarray, shape (4, 4)
+        The mount that is used.
     odometry_motion : callable or None
         Returns the motion that an odometry in the same process has estimated for a sweep.
     counts : PipelineCounts
@@ -96,12 +101,24 @@ class Pipeline:
     """
 
     def __init__(self, config: ProcConfig, T_cloud_imu: F64 | None = None) -> None:
-        self.tracker = MotionTracker(config.motion, T_cloud_imu)
+        self.extrinsics = ImuExtrinsics.of(config.motion)
+        self.T_cloud_imu = self.extrinsics.mounted(
+            config.motion.T_cloud_imu if T_cloud_imu is None else T_cloud_imu
+        )
+        self.tracker = MotionTracker(config.motion, self.T_cloud_imu)
         self._sequencer = Sequencer(config.deskew.imu_wait_ms * _MS)
         self.counts = PipelineCounts()
         self.problems = ""
         self.odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
         self.configure(config)
+
+    def mount(self, T_cloud_imu: F64) -> bool:
+        """Take another mount of the IMU (4, 4); return whether it is another one.
+
+        A rotation that is known better than by mounts takes the place of its own.
+        """
+        self.T_cloud_imu = self.extrinsics.mounted(T_cloud_imu)
+        return self.tracker.mount(self.T_cloud_imu)
 
     def configure(self, config: ProcConfig) -> None:
         """Take new live settings."""
@@ -121,7 +138,7 @@ class Pipeline:
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples, shape (N,), in any order and state."""
-        samples = earlier(samples, self._config.motion.imu_time_offset_ms)
+        samples = self.extrinsics.corrected(samples)
         if self.tracker.imu(samples):
             self._jumped()
             self._sequencer.jump()

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck
 
 OK: Final = 0
 WARN: Final = 1
@@ -23,6 +24,7 @@ def judged(
     counts: Counter[Status],
     refused: Counter[str],
     untied: str = "",
+    check: ExtrinsicCheck | None = None,
 ) -> tuple[int, str, dict[str, str]]:
     """Return level, message and figures for a diagnostic status.
 
@@ -40,6 +42,8 @@ def judged(
         Clouds that could not be used, by reason.
     untied : str
         Why the poses are not those of the base frame; empty if they are.
+    check : ExtrinsicCheck, optional
+        Whether the gyro turns as the clouds do.
     """
     values = {"sweeps": str(sweeps)}
     values |= {f"{status.name.lower()} [sweeps]": str(count) for status, count in counts.items()}
@@ -62,8 +66,13 @@ def judged(
         "gyro bias [rad/s]": " ".join(f"{axis:.4f}" for axis in last.gyro_bias),
         "accelerometer bias [m/s^2]": " ".join(f"{axis:.3f}" for axis in last.accel_bias),
     }
+    finding = ""
+    if check is not None:
+        values |= check.values
+        finding = check.finding
     if not since:
         return WARN, "no clouds", values
-    level = ERROR if untied or _SERIOUS & set(last.status) else WARN if last.status else OK
-    text = "; ".join(status.value for status in last.status) or "aligned"
-    return level, f"{text}; {untied}" if untied else text, values
+    is_warned = bool(last.status or finding)
+    level = ERROR if untied or _SERIOUS & set(last.status) else WARN if is_warned else OK
+    words = [status.value for status in last.status] or ["aligned"]
+    return level, "; ".join([*words, *filter(None, (finding, untied))]), values

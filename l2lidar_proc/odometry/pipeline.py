@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig
-from l2lidar_proc.motion.imu_buffer import Samples, earlier
+from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_convention import ImuConvention
+from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.motion.sweep_trajectory import still_trajectory
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.plain import PlainOdometry
 from l2lidar_proc.recording.trajectory import Trajectory
@@ -35,6 +37,8 @@ class OdometryPipeline:
         IMU coordinates to cloud coordinates.
     imu_wait_ms : int
         Longest wait for IMU samples up to the end of a sweep; plain KISS-ICP does not wait.
+    extrinsics : ImuExtrinsics, optional
+        What is known of the IMU beside its place.
     accelerometer : bool
         False: the accelerometer is watched, for its sign, but not used.
 
@@ -50,6 +54,8 @@ class OdometryPipeline:
     last : OdometryEstimate or None
     convention : ImuConvention
         In which unit and with which sign the accelerometer measures.
+    check : ExtrinsicCheck
+        Whether the gyro turns as the clouds do.
     """
 
     def __init__(
@@ -57,6 +63,7 @@ class OdometryPipeline:
         config: OdometryConfig,
         T_cloud_imu: NDArray[np.float64],
         imu_wait_ms: int = 50,
+        extrinsics: ImuExtrinsics | None = None,
         *,
         accelerometer: bool = True,
     ) -> None:
@@ -64,17 +71,28 @@ class OdometryPipeline:
         self._uses_accelerometer = accelerometer
         self._wait_ns = imu_wait_ms * _MS if config.mode == "inertial" else 0
         self._newest_imu: HostNs | None = None
+        self._extrinsics = extrinsics or ImuExtrinsics()
         self.convention = ImuConvention()
         self.mount(T_cloud_imu)
 
     def mount(self, T_cloud_imu: NDArray[np.float64]) -> None:
-        """Take another place of the IMU (4, 4); everything begins again."""
+        """Take another mount of the IMU (4, 4); everything begins again.
+
+        A rotation that is known better than by mounts takes the place of its own.
+        """
         self.odometry: Odometry | PlainOdometry = (
             PlainOdometry(self._config)
             if self._config.mode == "plain"
-            else Odometry(self._config, T_cloud_imu)
+            else Odometry(self._config, self._extrinsics.mounted(T_cloud_imu))
         )
         self._begin()
+
+    def is_mounted(self, T_cloud_imu: NDArray[np.float64]) -> bool:
+        """Return whether a mount (4, 4) is the one that is used, or none is."""
+        odometry = self.odometry
+        return not isinstance(odometry, Odometry) or np.allclose(
+            self._extrinsics.mounted(T_cloud_imu), odometry.T_cloud_imu, atol=1e-6
+        )
 
     def configure(self, config: OdometryConfig) -> None:
         """Take new live settings."""
@@ -93,6 +111,9 @@ class OdometryPipeline:
         self._motions: dict[tuple[HostNs, HostNs], KnownMotion] = {}
         self.sweeps = 0
         self.counts: Counter[Status] = Counter()
+        odometry = self.odometry
+        mount = odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
+        self.check = ExtrinsicCheck(mount[:3, :3])
         self.last: OdometryEstimate | None = None
 
     def motion_of(self, sweep: Sweep) -> KnownMotion | None:
@@ -127,11 +148,12 @@ class OdometryPipeline:
 
     def imu(self, samples: Samples) -> Samples:
         """Take IMU samples (N,) in any order and state; return them as they are used."""
-        samples = self.convention.corrected(earlier(samples, self._config.imu_time_offset_ms))
+        samples = self.convention.corrected(self._extrinsics.corrected(samples))
         if not self._uses_accelerometer:
             samples = samples.copy()
             samples["linear_acceleration"] = 0.0
         self.odometry.imu(samples)
+        self.check.imu(samples)
         if len(samples):
             self._newest_imu = HostNs(int(samples["stamp"][-1]))
         return samples
@@ -158,9 +180,12 @@ class OdometryPipeline:
         return estimates
 
     def _watch(self, estimate: OdometryEstimate) -> None:
-        """Begin again where the accelerometer turns out to point the other way."""
+        """Check the IMU against a pose; begin again where its accelerometer points backwards."""
         odometry = self.odometry
-        if isinstance(odometry, PlainOdometry) or not estimate.is_aligned:
+        if isinstance(odometry, PlainOdometry):
+            return
+        self.check.pose(estimate)
+        if not estimate.is_aligned:
             return
         T_map_imu = estimate.T_map_lidar @ odometry.T_cloud_imu
         if self.convention.watch(estimate.stamp, T_map_imu[:3, :3], T_map_imu[:3, 3]):

@@ -156,7 +156,7 @@ class DeskewNode(ManagedNode):
             self._mounted = asked
             T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
             if T_cloud_imu is not None and self._cloud_frame != imu_frame:
-                self.pipeline.tracker.mount(T_cloud_imu)
+                self.pipeline.mount(T_cloud_imu)
 
     def take_cloud(self, item: OneCloud) -> None:
         """Take a cloud; one without usable times is passed on as it came."""

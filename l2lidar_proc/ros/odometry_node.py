@@ -30,6 +30,7 @@ from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.config import DeskewTopics, OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
@@ -78,7 +79,9 @@ class OdometryNode(ManagedNode):
         """Open publishers and services, and begin without a map."""
         config = self._settings.value
         topics = config.topics
-        self._pipeline = OdometryPipeline(config.odometry, topics.T_cloud_imu, topics.imu_wait_ms)
+        self._pipeline = OdometryPipeline(
+            config.odometry, topics.T_cloud_imu, topics.imu_wait_ms, ImuExtrinsics.of(topics)
+        )
         self._folder = DataFolder(config.files.data_dir, config.files.overwrite)
         self._frames = StaticFrames(self) if topics.use_tf else None
         self._base = BaseFrame(np.eye(4))
@@ -89,7 +92,7 @@ class OdometryNode(ManagedNode):
         self._looked_at = 0
         self._path: deque[PoseStamped] = deque(maxlen=topics.path_length)
         self._path_end = np.full((4, 4), np.inf)
-        self._reckoning = DeadReckoning(topics.T_cloud_imu)
+        self._reckoning = self._dead_reckoning()
         self._samples: list[Samples] = []  # since the latest step of dead reckoning
         self._reckoned_ns = self._transform_ns = 0
         self._open(config)
@@ -244,19 +247,19 @@ class OdometryNode(ManagedNode):
         self._mounted = asked
         if imu_frame and imu_frame != self._cloud_frame:
             T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
-            odometry = self.pipeline.odometry
-            if (
-                T_cloud_imu is not None
-                and isinstance(odometry, Odometry)
-                and not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6)
-            ):
+            if T_cloud_imu is not None and not self.pipeline.is_mounted(T_cloud_imu):
                 self.pipeline.mount(T_cloud_imu)
-                self._reckoning = DeadReckoning(T_cloud_imu)
+                self._reckoning = self._dead_reckoning()
         base = self._settings.value.topics.base_frame
         if base and base != self._cloud_frame:
             T_cloud_base = self._frames.find(self._cloud_frame, base)
             if T_cloud_base is not None and not np.allclose(T_cloud_base, self._base.T_lidar_base):
                 self._base = BaseFrame(T_cloud_base)
+
+    def _dead_reckoning(self) -> DeadReckoning:
+        """Return dead reckoning with the IMU where the odometry has it."""
+        odometry = self.pipeline.odometry
+        return DeadReckoning(odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4))
 
     def _say(self, note: str) -> None:
         """Warn of something once."""
@@ -266,15 +269,15 @@ class OdometryNode(ManagedNode):
 
     def _share_frame(self, imu_frame: str) -> None:
         """Put the IMU where the clouds' frame is, if it says that it is measured in that one."""
-        odometry, topics = self.pipeline.odometry, self._settings.value.topics
+        topics = self._settings.value.topics
         if (
             imu_frame
             and imu_frame == self._cloud_frame
             and topics.imu_xyz == OdometryTopics().imu_xyz  # a place set by hand counts more
-            and isinstance(odometry, Odometry)
-            and not np.allclose(odometry.T_cloud_imu, np.eye(4), atol=1e-6)
+            and not self.pipeline.is_mounted(np.eye(4))
         ):
             self.pipeline.mount(np.eye(4))
+            self._reckoning = self._dead_reckoning()
             self._say(
                 f"IMU and clouds have the same frame '{imu_frame}': the IMU is taken to be "
                 "at its origin"
@@ -458,6 +461,7 @@ class OdometryNode(ManagedNode):
             self.pipeline.counts,
             self._inputs.refused,
             self._untied(),
+            self.pipeline.check,
         )
         level, text = self._inputs.judge(level, text)
         if self._frames is not None and self._frames.refused:

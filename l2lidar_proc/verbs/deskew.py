@@ -16,7 +16,6 @@ from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_t
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.frames import FrameTree
-from l2lidar_proc.motion.imu_buffer import earlier
 from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.recording import bag
@@ -48,7 +47,6 @@ class _Deskewer:
         self.pipeline = Pipeline(config.proc)
         self.refused: dict[str, int] = {}
         self._unit = config.proc.deskew.time_unit
-        self._imu_time_offset_ms = config.proc.motion.imu_time_offset_ms
         self._uses_tf = config.topics.use_tf
         # A bag names topics in full; relative to the node they are below the root here.
         self._output = "/" + config.topics.output_topic.lstrip("/")
@@ -56,7 +54,7 @@ class _Deskewer:
         self._writer = writer
         self._odometry: Odometry | None = None
         if not topics.velocity and config.topics.velocity_type == "odometry":
-            self._odometry = Odometry(OdometryConfig(), config.proc.motion.T_cloud_imu)
+            self._odometry = Odometry(OdometryConfig(), self.pipeline.T_cloud_imu)
         self._frames = FrameTree()
         self._cloud_frame = ""
 
@@ -69,7 +67,7 @@ class _Deskewer:
             sample = bag.sample_of(message)
             self.pipeline.imu(sample)
             if self._odometry is not None:
-                self._odometry.imu(earlier(sample, self._imu_time_offset_ms))
+                self._odometry.imu(self.pipeline.extrinsics.corrected(sample))
         elif topic == self._topics.velocity:
             self._velocity(message)
         elif kind == bag.TRANSFORMS and topic.endswith("tf_static") and self._uses_tf:
@@ -81,8 +79,8 @@ class _Deskewer:
         T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
         if T_cloud_imu is None or self._cloud_frame == imu_frame:
             return
-        if self.pipeline.tracker.mount(T_cloud_imu) and self._odometry is not None:
-            self._odometry = Odometry(OdometryConfig(), T_cloud_imu)
+        if self.pipeline.mount(T_cloud_imu) and self._odometry is not None:
+            self._odometry = Odometry(OdometryConfig(), self.pipeline.T_cloud_imu)
 
     def finish(self, now: int) -> None:
         """Write what is finished by ``now`` [ns]."""

@@ -27,6 +27,7 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.motion.frames import FrameTree
+from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
@@ -127,6 +128,7 @@ class OdometryRunner:
             config.odometry,
             topics.T_cloud_imu,
             topics.imu_wait_ms,
+            ImuExtrinsics.of(topics),
             accelerometer=accelerometer,
         )
         self.pipeline.convention.reversed = opposite
@@ -163,8 +165,13 @@ class OdometryRunner:
             self.pipeline.sweeps,
             self.pipeline.counts,
             self.refused,
-            (*self.notes, *self.pipeline.convention.notes),
+            (*self.notes, *self.pipeline.convention.notes, *self._finding()),
         )
+
+    def _finding(self) -> list[str]:
+        """Return what looks wrong with the IMU, and what to do."""
+        finding = self.pipeline.check.finding
+        return [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
 
 
 def run_events(
@@ -455,7 +462,7 @@ class _Listener:
         if T_cloud_imu is None:
             return
         self._is_mounted = True
-        if not np.allclose(T_cloud_imu, odometry.T_cloud_imu, atol=1e-6):
+        if not self.runner.pipeline.is_mounted(T_cloud_imu):
             self.runner.pipeline.mount(T_cloud_imu)
 
 

@@ -1,4 +1,4 @@
-"""Makes the motions that come with the emulator: still, spin, walk, trot, drone."""
+"""Makes the motions that come with the emulator: still, spin, shake, walk, trot, drone."""
 
 from __future__ import annotations
 
@@ -13,13 +13,28 @@ from l2lidar_node.emulator.motion.spline import PoseSpline
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.world.scene import Scene
 
-MOTIONS: Final = ("still", "spin", "walk", "trot", "drone")
+MOTIONS: Final = ("still", "spin", "shake", "walk", "trot", "drone")
 """Names for :func:`make`."""
 
-DEFAULT_SPEEDS: Final = {"still": 0.0, "spin": 1.0, "walk": 0.7, "trot": 0.8, "drone": 1.0}
-"""Speed by motion [m/s], for spin the rate [rad/s]."""
+DEFAULT_SPEEDS: Final = {
+    "still": 0.0,
+    "spin": 1.0,
+    "shake": 1.8,
+    "walk": 0.7,
+    "trot": 0.8,
+    "drone": 1.0,
+}
+"""Speed by motion [m/s], for spin the rate and for shake the peak rate of each axis [rad/s]."""
 
-_KNOTS_PER_S: Final = {"still": 4.0, "spin": 50.0, "walk": 100.0, "trot": 250.0, "drone": 250.0}
+_KNOTS_PER_S: Final = {
+    "still": 4.0,
+    "spin": 50.0,
+    "shake": 50.0,
+    "walk": 100.0,
+    "trot": 250.0,
+    "drone": 250.0,
+}
+_SHAKE_S: Final = 20.0  # one lap
 
 
 def make(
@@ -38,9 +53,9 @@ def make(
     name : str
         One of :data:`MOTIONS`.
     scene : Scene
-        Gives the route (walk, trot, drone) or the spot (still, spin).
+        Gives the route (walk, trot, drone) or the spot (still, spin, shake).
     speed : float
-        [m/s], for spin the rate [rad/s]; 0 = the motion's own.
+        [m/s], for spin and shake the rate [rad/s]; 0 = the motion's own.
     rest_s : float
         Rest at the beginning [s], see :class:`Motion`.
     mount : str or tuple of float
@@ -59,7 +74,7 @@ def make(
         raise ValueError(f"speed {speed!r} is out of range, expected 0 to 100")
     speed = speed or DEFAULT_SPEEDS[name]
     route = _Route(scene.route)
-    lap_s = {"still": 2.0, "spin": 2.0 * np.pi / (speed or 1.0)}.get(
+    lap_s = {"still": 2.0, "spin": 2.0 * np.pi / (speed or 1.0), "shake": _SHAKE_S}.get(
         name, route.length / (speed or 1.0)
     )
     lap = _Lap(lap_s, _KNOTS_PER_S[name], speed, scene, route, generator(seed, Stream.MOTION, 0))
@@ -163,6 +178,14 @@ def _spin(lap: _Lap) -> _Poses:
     return position, np.column_stack([zero, zero, yaw])
 
 
+def _shake(lap: _Lap) -> _Poses:
+    """Turn and shake in the hand about all three axes, as for calibrating an IMU."""
+    frequencies = (0.45, 0.55, 0.35)  # so that no axis keeps step with another
+    turns = [lap.speed / (2.0 * np.pi * f) * lap.wave(f) for f in frequencies]
+    sways = [a * lap.wave(f) for a, f in ((0.06, 0.9), (0.06, 1.05), (0.05, 1.2))]
+    return _spot(lap, 1.0) + np.column_stack(sways), np.column_stack(turns)
+
+
 def _walk(lap: _Lap) -> _Poses:
     """Walk with the sensor in the hand: a bob per step, a sway per stride, a wandering look."""
     step, vigour = 1.8 * np.sqrt(lap.speed / 1.2), min(lap.speed / 1.2, 1.5)
@@ -207,6 +230,7 @@ def _drone(lap: _Lap) -> _Poses:
 _GAITS: Final[dict[str, Callable[[_Lap], _Poses]]] = {
     "still": _still,
     "spin": _spin,
+    "shake": _shake,
     "walk": _walk,
     "trot": _trot,
     "drone": _drone,

@@ -26,7 +26,7 @@ FILE = CalibrationFile(
     {"xi_angle": 0.0033, "beta_angle": -0.0049, "range_bias": 0.015, "range_scale": 0.001},
     {"xi_angle": 3e-4},
     ImuCalibration(
-        (0.01, -0.02, 0.0), 0.0015, (1e-3, 0.0, 0.0), (0.002, 0.0, 0.0), {"time": 1e-4}
+        (0.01, -0.02, 0.0), 0.0015, (1e-3, 0.0, 0.0), (0.002, 0.0, 0.0), sd={"time": 1e-4}
     ),
     {"weakest": "xi and beta together", "captures": ["a.pcap"]},
 )

@@ -146,7 +146,7 @@ def test_a_gyro_line_that_is_not_a_motion_is_refused() -> None:
 def test_packets_of_a_wide_view_and_of_two_blocks_are_named() -> None:
     (place,) = places(poses=("upright",), seconds=2.0)
     other = replace(place, is_wide=True, blocks=2, dirt=9.0)
-    reasons = " ".join(item.reason for item in still._problems(other))
+    reasons = " ".join(item.reason for item in still.problems(other))
     for word in ("wide", "2 different calibration blocks", "dirt"):
         assert word in reasons
 

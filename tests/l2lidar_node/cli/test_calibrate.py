@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2lidar_node.calibration.file import load
+from l2lidar_node.calibration.file import CalibrationFile, load
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
@@ -16,6 +16,7 @@ from l2lidar_node.recording.capture import Endpoint
 from l2lidar_node.recording.recording import RecordingWriter
 from l2lidar_node.types import HostNs
 from tests.l2lidar_node.cli.conftest import Run, Unit
+from tests.support.terminal import Terminal
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -127,3 +128,71 @@ def test_live_places_are_recorded_and_kept(run: Run, unit: Unit, tmp_path: Path)
     assert done.code == 1
     assert "flat surfaces" in done.err or "nothing is written" in done.err
     assert (tmp_path / "place_1.pcap").stat().st_size > 100_000
+
+
+def test_the_guide_is_led_through_at_a_terminal(unit: Unit, tmp_path: Path) -> None:
+    """A place that cannot be used is told at once, wrong answers are asked again."""
+    with Terminal(
+        "l2lidar_node.cli.main", "calibrate", "still", "--places", "1", "--seconds", "1",
+        "--keep", str(tmp_path), *unit.options,
+    ) as terminal:  # fmt: skip
+        terminal.wait_for("looking for the L2")
+        terminal.wait_for("Before you begin")
+        terminal.wait_for("Place 1 of 1: upright")
+        terminal.wait_for("Press Enter")
+        terminal.type("\n")
+        terminal.wait_for("turns of the head, at least 8 are needed: record 10 s")
+        terminal.wait_for("Measure this place again?")
+        terminal.type("perhaps\n")
+        terminal.wait_for("'perhaps' is neither yes nor no")
+        terminal.wait_for("[Y/n]")
+        terminal.type("\n")
+        terminal.wait_for("Press Enter")
+        terminal.interrupt()
+        assert terminal.exit_code() == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["place_1.pcap"]
+
+
+def test_turning_is_shown_in_bars_and_can_be_given_up(unit: Unit, tmp_path: Path) -> None:
+    output = tmp_path / "unit.yaml"
+    with Terminal(
+        "l2lidar_node.cli.main", "calibrate", "imu", "-o", str(output), *unit.options
+    ) as terminal:
+        terminal.wait_for("calibrate the beams first")
+        terminal.wait_for("Press Enter")
+        terminal.type("\n")
+        for text in ("still", "roll about x", "nod about y", "turn about z", "time"):
+            terminal.wait_for(text)
+        terminal.interrupt()
+        assert terminal.exit_code() == 130
+        assert "Traceback" not in terminal.said
+    assert not output.exists()
+
+
+def test_nobody_at_the_terminal_is_said(run: Run, unit: Unit, tmp_path: Path) -> None:
+    done = run("calibrate", "scale", "--length", "3", *unit.options)
+    assert done.code == 1
+    assert "nobody answers" in done.err
+    (tmp_path / "place_1.pcap").write_bytes(b"precious")
+    done = run("calibrate", "still", "--keep", str(tmp_path), *unit.options)
+    assert done.code == 2
+    assert "place_1.pcap is there already" in done.err
+
+
+def test_the_imu_verb_refuses_what_it_cannot_use(
+    run: Run, captures: list[Path], tmp_path: Path
+) -> None:
+    done = run("calibrate", "imu", str(captures[0]), "--emulator", "typical")
+    assert done.code == 2
+    assert "leave the capture out" in done.err
+    done = run("calibrate", "imu", "--emulator", "good")
+    assert done.code == 2
+    assert "expected perfect, typical, poor" in done.err
+    output = tmp_path / "other.yaml"
+    CalibrationFile(bytes(32), {"xi_angle": 0.001}).save(output)
+    done = run("calibrate", "imu", str(captures[0]), "-o", str(output))
+    assert done.code == 1
+    assert "is of another unit" in done.err
+    done = run("calibrate", "imu", str(captures[0]))
+    assert done.code == 1
+    assert "record for 30 s" in done.err

@@ -1,0 +1,80 @@
+"""Writes what the calibration benchmark finds into a page of results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.results import Target, machine
+
+PAGE: Final = Path("docs") / "results" / "calibration.md"
+_HEAD: Final = """# Calibration of units
+
+Written by `make bench-calibration BENCH_ARGS="--page"`; [calibration](../calibration.md) says what
+the parameters are. Of virtual units the tables hold what is left of an error, estimate minus
+truth; of real ones what was found. The figure after +- is the stated deviation. Thickness is the
+median over flat patches, gap the distance of the two halves of a turn on them.
+"""
+
+Row = dict[str, Any]
+
+
+def write(rows: list[Row], targets: list[Target]) -> Path:
+    """Write the page; return its path."""
+    facts = machine()
+    parts = [
+        _HEAD,
+        _targets(targets),
+        "## What was found",
+        _table(rows),
+        f"Measured with Python {facts['python']} on {facts['system']}.",
+    ]
+    PAGE.parent.mkdir(parents=True, exist_ok=True)
+    PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
+    return PAGE
+
+
+def _targets(targets: list[Target]) -> str:
+    lines = ["## Targets", "", "| Target | Measured | Bound | |", "|---|---|---|---|"]
+    lines += [
+        f"| {item.name.replace('|', chr(92) + '|')} | {item.value:.3g} | {item.bound:.3g} | "
+        f"{'met' if item.met else '**not met**'} |"
+        for item in targets
+    ]
+    return "\n".join(lines)
+
+
+def _table(rows: Iterable[Row]) -> str:
+    lines = [
+        "| Case | Seed | xi [deg] | beta [deg] | alpha [deg] | b [mm] | bias [mm] | "
+        "Thickness [mm] | Gap [mm] | Corrected, or why not |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        if "xi" not in row:
+            continue
+        figures = [_figure(row, name) for name in ("xi", "beta", "alpha", "b", "bias")]
+        cells = [
+            row["case"],
+            str(row["seed"]),
+            *figures,
+            _pair(row, "thick"),
+            _pair(row, "gap"),
+            f"refused: {row['refused']}" if row["refused"] else row["corrected"] or "nothing",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _figure(row: Row, name: str) -> str:
+    if row[name] == "":
+        return "not known"
+    digits = 3 if name in ("xi", "beta", "alpha") else 2 if name == "b" else 1
+    return f"{row[name]:+.{digits}f} +- {row[f'{name} sd']:.{digits}f}"
+
+
+def _pair(row: Row, name: str) -> str:
+    if row[f"{name} before"] == "":
+        return ""
+    return f"{row[f'{name} before']:.1f} to {row[f'{name} after']:.1f}"

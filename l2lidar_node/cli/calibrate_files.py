@@ -1,0 +1,241 @@
+"""What the `l2lidar calibrate` verbs share: their options, files, prompts and recordings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from l2lidar_node.calibration import report
+from l2lidar_node.calibration.file import CalibrationFile, CalibrationFileError, load
+from l2lidar_node.calibration.observation import Gathering, Place
+from l2lidar_node.cli.console import say
+from l2lidar_node.cli.device import Device
+from l2lidar_node.command_line import CommandError, UsageError
+from l2lidar_node.config import NetworkConfig
+from l2lidar_node.driver.driver import Driver
+from l2lidar_node.protocol.framing import Frame, Framer
+from l2lidar_node.protocol.packets import DecodeError, ImuPacket, PointPacket, Version, decode
+from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.recording import Received, Recording
+
+_SPIN_UP_S: Final = 60.0
+_HEARD_S: Final = 6.0  # a unit that was just switched on needs 4 s for its first IMU packet
+_MOMENT_S: Final = 1.5
+_LOOK_S: Final = 0.1
+
+OutputOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--output", "-o", metavar="FILE.yaml", help="Calibration file to write or to add to."
+    ),
+]
+EmulatorOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="UNIT",
+        help="Calibrate a virtual unit instead: perfect, typical, poor or a number.",
+    ),
+]
+PictureOption = Annotated[
+    Path | None,
+    typer.Option("--picture", metavar="FILE.png", help="Picture of before and after to write."),
+]
+
+
+def existing(output: Path | None) -> CalibrationFile | None:
+    """Return what the file to add to holds; None if there is none yet.
+
+    Raises
+    ------
+    CommandError
+        If it is there and cannot be used.
+    """
+    if output is None or not output.exists():
+        return None
+    try:
+        return load(output)
+    except CalibrationFileError as error:
+        raise CommandError(f"{error}; give --output another name") from None
+
+
+def unused(path: Path) -> Path:
+    """Return the path of a capture that is about to be written.
+
+    Raises
+    ------
+    UsageError
+        If there is a file already: recordings are never replaced.
+    """
+    if path.exists():
+        raise UsageError(f"{path} is there already; give --keep another folder")
+    return path
+
+
+def write(
+    made: CalibrationFile, output: Path | None, unneeded: str, advice: str, *, quiet: bool
+) -> None:
+    """Write a calibration file, or say why there is none to write.
+
+    Parameters
+    ----------
+    made : CalibrationFile
+        Added to what the file holds of the same unit.
+    output : Path or None
+    unneeded : str
+        Why there is nothing to write; empty if there is.
+    advice : str
+        What to do with the file.
+    quiet : bool
+
+    Raises
+    ------
+    CommandError
+        If the file is there and of another unit, or cannot be written.
+    """
+    if unneeded:
+        words = unneeded
+    elif output is None:
+        words = "nothing is written without --output FILE.yaml"
+    else:
+        old = existing(output)
+        if old is not None and not old.matches(made.block):
+            raise CommandError(f"{output} is of another unit; give --output another name")
+        output.parent.mkdir(parents=True, exist_ok=True)
+        report.joined(made, old).save(output)
+        words = f"{output}: {advice}"
+    if not quiet:
+        say(words)
+
+
+def ask(text: str, *, unattended: bool) -> None:
+    """Say what to do and wait for Enter; go on at once where nobody is there."""
+    if not unattended:
+        say(text)
+        _answer("Press Enter when it stands still (Ctrl-C ends it): ")
+
+
+def confirmed(question: str) -> bool:
+    """Ask a question until the answer is yes or no; Enter is yes."""
+    while True:
+        answer = _answer(f"{question} [Y/n]: ").strip().lower()
+        if answer in ("", "y", "yes"):
+            return True
+        if answer in ("n", "no"):
+            return False
+        say(f"'{answer}' is neither yes nor no: type y or n")
+
+
+def _answer(prompt: str) -> str:
+    try:
+        return input(prompt)
+    except EOFError:
+        say("")
+        raise CommandError(
+            "nobody answers; run it in a terminal, or with --yes and the sensor in its place"
+        ) from None
+
+
+def require_unit(network: NetworkConfig, *, quiet: bool) -> None:
+    """Look for the unit before anybody carries it about.
+
+    Raises
+    ------
+    CommandError
+        If it is not there or does not measure.
+    """
+    if not quiet:
+        say(f"looking for the L2 at {network.serial_port or network.l2_ip} ...")
+    with Device(network) as device:
+        if device.is_measuring(_HEARD_S):
+            return
+        answers = device.ask(lambda driver: driver.counters.frames.total())
+        if answers:
+            raise CommandError("the L2 is in standby; wake it with l2lidar start")
+        raise CommandError(f"no measurements from the L2; {device.advice()}")
+
+
+def wait_for_points(device: Device, *, quiet: bool) -> None:
+    """Wait until the head turns and points come.
+
+    Raises
+    ------
+    CommandError
+        If none come.
+    """
+    if device.wait_for(_sends_points, _MOMENT_S):
+        return
+    if not quiet:
+        say("waiting for points: a head that starts takes 12 to 45 s ...")
+    if device.wait_for(_sends_points, _SPIN_UP_S) is None:
+        raise CommandError(f"no points from the L2; {device.advice()}")
+
+
+def pass_time(seconds: float, failures: list[str], told: Callable[[float], bool | None]) -> None:
+    """Let time pass while a recorder writes, until one of them ends it.
+
+    Parameters
+    ----------
+    seconds : float
+    failures : list of str
+        What the recorder says: nothing is worth waiting for any more.
+    told : callable
+        Given the seconds that have passed; returns True to end it.
+    """
+    begun = time.monotonic()
+    while (passed := time.monotonic() - begun) < seconds and not failures:
+        if told(passed):
+            return
+        time.sleep(_LOOK_S)
+    told(seconds)
+
+
+def _sends_points(driver: Driver) -> bool:
+    return driver.counters.frames[PacketType.POINTS_3D] > 0
+
+
+def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
+    """Return what a capture holds of a still place, and the unit's firmware if it says so.
+
+    Raises
+    ------
+    CommandError
+        If it cannot be read or holds no 3D packets.
+    """
+    gathering = Gathering(path.stem, power_up)
+    framer = Framer()
+    firmware = ""
+    try:
+        with path.open("rb") as stream:
+            for entry in Recording(stream):
+                if not isinstance(entry, Received):
+                    continue
+                for item in framer.feed(entry.data):
+                    if isinstance(item, Frame):
+                        firmware = _gathered(gathering, item) or firmware
+        return gathering.place(), firmware
+    except OSError as error:
+        raise CommandError(f"{path}: {error.strerror}") from None
+    except (CaptureError, ValueError) as error:
+        raise CommandError(f"{path}: {error}") from None
+
+
+def _gathered(gathering: Gathering, frame: Frame) -> str:
+    """Add a frame to a place; return the firmware if it says so."""
+    packet = decode(frame)
+    if isinstance(packet, PointPacket):
+        if packet.packet_type == PacketType.POINTS_3D:
+            gathering.points(packet.stamp / 1e9, packet.payload)
+        else:
+            gathering.flat()
+    elif isinstance(packet, ImuPacket):
+        gathering.imu(packet.stamp / 1e9, frame.payload)
+    elif isinstance(packet, DecodeError):
+        gathering.rejected()
+    elif isinstance(packet, Version):
+        return packet.firmware
+    return ""

@@ -1,0 +1,392 @@
+"""Calibration of an IMU against the odometry: turns of the clouds, turns of the gyro, a verdict.
+
+The odometry runs over the recording, each time with what is known of the IMU so far: a rotation or
+a delay of the samples that deskew a sweep moves its pose a little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from l2lidar_node.calibration.file import ImuCalibration
+from l2lidar_node.calibration.result import Estimate, Refusal, Verdict
+from l2lidar_node.types import F64, Sweep
+from l2lidar_proc import rotations
+from l2lidar_proc.config import ImuConfig, OdometryConfig
+from l2lidar_proc.motion import gyro_alignment as gyro
+from l2lidar_proc.motion.gyro_alignment import GyroAlignment, GyroError, GyroModel, Turns
+from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.odometry import Odometry
+
+NAMES: Final = (
+    *(f"rotation {axis}" for axis in "xyz"),
+    *(f"scale {axis}" for axis in "xyz"),
+    *(f"skew {axes}" for axes in ("xy", "xz", "yz")),
+    *(f"bias {axis}" for axis in "xyz"),
+    "time offset",
+)
+"""Parameters in the order of :mod:`gyro_alignment`."""
+
+UNITS: Final = (
+    *[("deg", float(np.rad2deg(1.0)))] * 3,
+    *[("%", 100.0)] * 3,
+    *[("mrad", 1e3)] * 3,
+    *[("rad/s", 1.0)] * 3,
+    ("ms", 1e3),
+)
+"""Unit for people and factor, in the same order."""
+
+ENOUGH: Final = 10.0
+"""Excitation of an axis [rad^2/s] that gives rotations to 0.05 degrees and scales to 0.1 %.
+
+1 rad/s for 10 s: with poses good to 0.05 degrees at 4.35 Hz and 0.04 rad/s of gyro noise the rate
+of an interval is known to 0.0036 rad/sqrt(s), and the square root of the excitation divides it.
+"""
+
+_MODEL_SD: Final = np.array(
+    [*[np.deg2rad(0.03)] * 3, *[2e-4] * 3, *[5e-4] * 3, *[1.5e-3] * 3, 5e-5]
+)
+"""What the odometry itself may be off, beside what the recording shows: from virtual units."""
+
+_LARGEST_SD: Final = np.array(
+    [*[np.deg2rad(0.3)] * 3, *[5e-3] * 3, *[5e-3] * 3, *[2e-2] * 3, 1e-3]
+)
+"""Beyond that nothing is known that the drawing does not say as well: half of its tolerance for
+scales (1 %), a seventh for rotations (2 degrees), since twice as much shows in a sweep."""
+
+_SIGNIFICANT: Final = 2.0  # standard deviations of a correction that is worth having
+_PASSES: Final = 3
+_SETTLED: Final = 0.3  # of a standard deviation, between passes
+_FEWEST_ALIGNED: Final = 0.8  # of the sweeps
+_SHORTEST_S: Final = 15.0
+_LEAST_EXCITATION: Final = 0.5  # [rad^2/s]
+_LARGEST_ROTATION: Final = np.deg2rad(15.0)
+_LARGEST_OFFSET_S: Final = 0.1
+_LARGEST_RESIDUAL: Final = np.deg2rad(0.6)  # of a turn between two sweeps
+_CONTRADICTION: Final = 6.0  # standard deviations by which a part may differ from the others
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuResult:
+    """What a motion tells about an IMU.
+
+    Attributes
+    ----------
+    estimates : dict of Estimate
+        By the names of :data:`NAMES`.
+    weakest : str
+        What is known worst, in words.
+    refusals : tuple of Refusal
+        Why nothing may be written; empty if it may.
+    notes : tuple of str
+    alignment : GyroAlignment
+    before : Turns
+        What was off from sweep to sweep under the drawing, but for the bias; what is left now
+        is in the alignment.
+    seconds : float
+        Of the recording.
+    sweeps, aligned : int
+    """
+
+    estimates: dict[str, Estimate]
+    weakest: str
+    refusals: tuple[Refusal, ...]
+    notes: tuple[str, ...]
+    alignment: GyroAlignment
+    before: Turns
+    seconds: float
+    sweeps: int
+    aligned: int
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether there is anything to store."""
+        return not self.refusals and any(
+            item.verdict is Verdict.CORRECTED for item in self.estimates.values()
+        )
+
+    def calibration(self) -> ImuCalibration:
+        """Return what a file stores: what is not known, or not wrong, is as in the drawing."""
+        values = [
+            item.value if item.verdict is Verdict.CORRECTED else 0.0
+            for item in self.estimates.values()
+        ]
+        x, y, z = rotations.to_rpy(
+            rotations.matrices(rotations.exp(values[gyro.ROTATION]))
+        ).tolist()
+        bias = [self.estimates[f"bias {axis}"].value for axis in "xyz"]
+        return ImuCalibration(
+            (x, y, z),
+            values[gyro.OFFSET],
+            (bias[0], bias[1], bias[2]),
+            (values[3], values[4], values[5]),
+            (values[6], values[7], values[8]),
+            {
+                name.replace(" ", "_"): item.sd
+                for name, item in self.estimates.items()
+                if np.isfinite(item.sd)
+            },
+        )
+
+
+def calibrate(
+    sweeps: Sequence[Sweep],
+    samples: Samples,
+    config: OdometryConfig | None = None,
+    progress: Progress = lambda share: None,
+) -> ImuResult:
+    """Estimate what an IMU is off by.
+
+    Parameters
+    ----------
+    sweeps : sequence of Sweep
+        Of full turns, in order; not deskewed.
+    samples : ndarray, shape (N,), dtype IMU_SAMPLE
+        As measured, in order.
+    config : OdometryConfig, optional
+    progress : callable
+        Told the share that is done, 0 to 1.
+
+    Raises
+    ------
+    GyroError
+        If nothing can be estimated; the message says why and what to do.
+    """
+    if not len(samples):
+        raise GyroError(
+            "there are no IMU samples: switch the IMU on (l2lidar set work-mode -- -imu_off), "
+            "and record for 30 s"
+        )
+    if not sweeps:
+        raise GyroError(
+            "there are no 3D sweeps: set the unit to 3D (l2lidar set work-mode -- -mode_2d)"
+        )
+    config = config or OdometryConfig()
+    found: GyroAlignment | None = None
+    estimates: list[OdometryEstimate] = []
+    for number in range(_PASSES):
+
+        def told(share: float, number: int = number) -> None:
+            progress((number + share) / _PASSES)
+
+        model = found.model if found else GyroModel.ideal()
+        estimates = _poses(sweeps, samples, config, model, told)
+        before = found
+        found = _aligned(estimates, samples, model)
+        if before is not None and _is_same(before, found):
+            break
+    assert found is not None
+    progress(1.0)
+    return judged(found, estimates, sweeps, samples)
+
+
+def _poses(
+    sweeps: Sequence[Sweep],
+    samples: Samples,
+    config: OdometryConfig,
+    model: GyroModel,
+    progress: Progress,
+) -> list[OdometryEstimate]:
+    """Return the odometry of the recording with an IMU that is known so far."""
+    known = ImuExtrinsics(model.rotation, 1e3 * model.offset_s, model.unmixing)
+    odometry = Odometry(config, known.mounted(ImuConfig().T_cloud_imu))
+    right = known.corrected(samples)
+    estimates: list[OdometryEstimate] = []
+    first = 0
+    for number, sweep in enumerate(sweeps):
+        last = int(np.searchsorted(right["stamp"], sweep.end)) + 1
+        odometry.imu(right[first:last])
+        first = last
+        estimates += odometry.register(sweep)
+        progress((number + 1) / len(sweeps))
+    return estimates
+
+
+def _aligned(
+    estimates: Sequence[OdometryEstimate], samples: Samples, model: GyroModel
+) -> GyroAlignment:
+    good = [item for item in estimates if item.is_aligned]
+    if not good:
+        raise GyroError(
+            "no sweep could be aligned; record in a furnished room, and turn more slowly"
+        )
+    stamps = np.array([item.stamp for item in good], dtype=np.int64)
+    turns = np.array([rotations.from_matrix(item.T_map_lidar[:3, :3]) for item in good])
+    return gyro.align(stamps, turns, samples, model)
+
+
+def _is_same(before: GyroAlignment, after: GyroAlignment) -> bool:
+    away = np.abs(after.model.values - before.model.values)
+    away[gyro.BIAS] = 0.0  # nothing is computed with it
+    return bool((away < _SETTLED * np.hypot(after.sd, _MODEL_SD)).all())
+
+
+def judged(
+    found: GyroAlignment,
+    estimates: Sequence[OdometryEstimate],
+    sweeps: Sequence[Sweep],
+    samples: Samples,
+) -> ImuResult:
+    """Return the result of an alignment: verdicts, refusals, what is known worst.
+
+    Parameters
+    ----------
+    found : GyroAlignment
+    estimates : sequence of OdometryEstimate
+        It comes from.
+    sweeps : sequence of Sweep
+    samples : ndarray, shape (N,), dtype IMU_SAMPLE
+        As measured.
+    """
+    seconds = (sweeps[-1].end - sweeps[0].start) * 1e-9
+    aligned = sum(item.is_aligned for item in estimates)
+    sd = np.hypot(found.sd, _MODEL_SD)
+    items = {
+        name: _estimate(number, float(found.model.values[number]), float(sd[number]), found)
+        for number, name in enumerate(NAMES)
+    }
+    drawn = GyroModel.of(np.where(_is_bias(), found.model.values, 0.0))
+    good = [item for item in estimates if item.is_aligned]
+    stamps = np.array([item.stamp for item in good], dtype=np.int64)
+    turns = np.array([rotations.from_matrix(item.T_map_lidar[:3, :3]) for item in good])
+    return ImuResult(
+        items,
+        _weakest(sd, found),
+        tuple(_refusals(found, seconds, aligned, len(sweeps))),
+        tuple(_notes(items, found)),
+        found,
+        gyro.turns_between(stamps, turns, samples, drawn),
+        seconds,
+        len(sweeps),
+        aligned,
+    )
+
+
+def _is_bias() -> F64:
+    mask = np.zeros(gyro.PARAMETERS)
+    mask[gyro.BIAS] = 1.0
+    return mask
+
+
+def _estimate(number: int, value: float, sd: float, found: GyroAlignment) -> Estimate:
+    """Return one parameter with its verdict."""
+    if gyro.BIAS.start <= number < gyro.BIAS.stop:
+        reason = "deskew and odometry estimate it anew" if number == gyro.BIAS.start else ""
+        return Estimate(value, sd, Verdict.SHOWN, reason)
+    if sd > _LARGEST_SD[number]:
+        return Estimate(value, sd, Verdict.UNKNOWN, f"turn more about {_needed(number, found)}")
+    if abs(value) < _SIGNIFICANT * sd:
+        return Estimate(value, sd, Verdict.UNCHANGED)
+    return Estimate(value, sd, Verdict.CORRECTED)
+
+
+def _needed(number: int, found: GyroAlignment) -> str:
+    """Return about which axes one would have to turn to know a parameter."""
+    if number < gyro.ROTATION.stop:
+        axes = [axis for axis in range(3) if axis != number]
+    elif number < gyro.SCALE.stop:
+        axes = [number - gyro.SCALE.start]
+    elif number < gyro.SKEW.stop:
+        axes = list(((0, 1), (0, 2), (1, 2))[number - gyro.SKEW.start])
+    else:
+        axes = [0, 1, 2]
+    weak = [axis for axis in axes if found.excitation[axis] < ENOUGH] or axes
+    return " and ".join("xyz"[axis] for axis in weak)
+
+
+def _weakest(sd: F64, found: GyroAlignment) -> str:
+    """Return in words which direction of the rotation is known worst."""
+    values, vectors = np.linalg.eigh(found.covariance[gyro.ROTATION, gyro.ROTATION])
+    axis = vectors[:, -1]
+    name = "xyz"[int(np.argmax(np.abs(axis)))]
+    worst = max(float(np.sqrt(values[-1])), float(sd[gyro.ROTATION].max()))
+    return (
+        f"the rotation about {name} ({np.rad2deg(worst):.3f} degrees): turning about the other "
+        "two axes tells it"
+    )
+
+
+def _refusals(found: GyroAlignment, seconds: float, aligned: int, sweeps: int) -> list[Refusal]:
+    """Return why nothing can be believed."""
+    again = "stand in a furnished room, turn and shake vividly about all three axes for 30 s"
+    refusals = []
+    if seconds < _SHORTEST_S:
+        refusals.append(
+            Refusal(f"{seconds:.0f} s of recording, {_SHORTEST_S:.0f} s are needed", again)
+        )
+    if aligned < _FEWEST_ALIGNED * sweeps:
+        refusals.append(
+            Refusal(
+                f"the odometry lost its way: {aligned} of {sweeps} sweeps could be aligned",
+                "turn more slowly, below 3 rad/s, in a furnished room of 4 to 10 m",
+            )
+        )
+    if found.excitation.max() < _LEAST_EXCITATION:
+        refusals.append(Refusal("the sensor hardly turned", again))
+    if found.turns.rms > _LARGEST_RESIDUAL:
+        refusals.append(
+            Refusal(
+                f"gyro and clouds differ by {np.rad2deg(found.turns.rms):.2f} degrees from "
+                "sweep to sweep: they do not turn together",
+                "check that the IMU is the sensor's own and that nobody walks through the scene",
+            )
+        )
+    rotation = float(np.linalg.norm(found.model.values[gyro.ROTATION]))
+    if rotation > _LARGEST_ROTATION:
+        refusals.append(
+            Refusal(
+                f"an IMU turned by {np.rad2deg(rotation):.0f} degrees: not a calibration error",
+                "give its mount in /tf_static or imu_rpy",
+            )
+        )
+    if abs(found.model.offset_s) > _LARGEST_OFFSET_S:
+        refusals.append(
+            Refusal(
+                f"a time offset of {1e3 * found.model.offset_s:.0f} ms: not that of the L2's IMU",
+                "record the unit itself: l2lidar record",
+            )
+        )
+    refusals += _contradictions(found)
+    return refusals
+
+
+def _contradictions(found: GyroAlignment) -> list[Refusal]:
+    """Return whether one part of the recording says something else than the others."""
+    which = [*range(gyro.ROTATION.stop), gyro.OFFSET]
+    away = np.abs(found.parts[:, which] - found.model.values[which])
+    own = np.hypot(found.parts_sd[:, which], _MODEL_SD[which])
+    limit = np.maximum(_CONTRADICTION * own, _LARGEST_SD[which])
+    part, column = np.unravel_index(int(np.argmax(away / limit)), away.shape)
+    if away[part, column] <= limit[part, column]:
+        return []
+    name, (unit, factor) = NAMES[which[column]], UNITS[which[column]]
+    return [
+        Refusal(
+            f"part {part + 1} of {len(away)} of the recording says {name} "
+            f"{away[part, column] * factor:.2f} {unit} off the others",
+            "fasten what is loose, keep people out, and record again",
+        )
+    ]
+
+
+def _notes(items: dict[str, Estimate], found: GyroAlignment) -> list[str]:
+    notes = []
+    unknown = [name for name, item in items.items() if item.verdict is Verdict.UNKNOWN]
+    if unknown:
+        notes.append(
+            f"not known from this motion, and left as in the drawing: {', '.join(unknown)}"
+        )
+    if found.outliers > 0.1 * len(found.turns.ends):
+        notes.append(
+            f"{found.outliers} of {len(found.turns.ends)} turns between sweeps are far off: did "
+            "something hit the sensor, or hide the scene?"
+        )
+    return notes

@@ -1,0 +1,92 @@
+"""A gyro against poses: derivatives, recovery of what was put in, what a motion cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_proc import rotations
+from l2lidar_proc.motion import gyro_alignment as gyro
+from l2lidar_proc.motion.gyro_alignment import GyroError, GyroModel
+from tests.l2lidar_proc.motion.turned_gyro import EPOCH, TRUE, recording
+
+
+def test_the_derivatives_are_those_of_differences() -> None:
+    stamps, q, samples = recording(seconds=3.0)
+    around = GyroModel.of(TRUE.values * 0.7)
+    turns = gyro.turns_between(stamps, q, samples, around)
+    for number in range(gyro.PARAMETERS):
+        h = 1e-5 if number != gyro.OFFSET else 2e-4
+        residuals = []
+        for sign in (1.0, -1.0):
+            values = around.values
+            step = np.zeros(3)
+            if number < 3:
+                step[number] = sign * h
+            else:
+                values[number] += sign * h
+            model = GyroModel.of(values)
+            turned = model.rotation @ rotations.matrices(rotations.exp(step))
+            model = GyroModel(turned, model.scale, model.skew, model.bias, model.offset_s)
+            residuals.append(gyro.turns_between(stamps, q, samples, model).residual)
+        numeric = (residuals[0] - residuals[1]) / (2 * h)
+        np.testing.assert_allclose(
+            turns.jacobian[:, :, number], numeric, atol=0.03 * np.abs(numeric).max() + 1e-6
+        )
+
+
+def test_what_was_put_in_is_found() -> None:
+    found = gyro.align(*recording())
+    off = np.abs(found.model.values - TRUE.values)
+    assert off[gyro.ROTATION].max() < np.deg2rad(0.01)
+    assert off[gyro.SCALE].max() < 3e-4
+    assert off[gyro.SKEW].max() < 3e-4
+    assert off[gyro.BIAS].max() < 3e-4
+    assert off[gyro.OFFSET] < 5e-5
+    assert (found.excitation > 50.0).all()
+
+
+def test_the_truth_is_within_the_stated_deviations() -> None:
+    away = []
+    for seed in range(12):
+        found = gyro.align(*recording(noise=1e-3, seed=seed))
+        away.append((found.model.values - TRUE.values) / found.sd)
+    assert np.abs(away).max() < 6.0
+    assert np.mean(np.abs(away) < 3.0) > 0.95
+    # the deviations are not just large
+    assert np.sqrt(np.mean(np.square(away))) > 0.4
+
+
+def test_turning_about_one_axis_tells_what_it_can() -> None:
+    found = gyro.align(*recording(axes=(0.0, 0.0, 1.3), noise=1e-3))
+    assert found.sd[2] > np.deg2rad(3.0)  # a turn about that very axis
+    # about the others but for a misalignment, which looks the same, so far as that is known
+    assert found.sd[:2].max() < np.deg2rad(0.6)
+    assert found.sd[gyro.SCALE][:2].min() > 0.01
+    assert found.sd[gyro.SCALE][2] < 3e-3
+    assert found.excitation[2] > 50.0
+    assert found.excitation[:2].max() < 1.0
+
+
+def test_axes_that_turn_together_are_not_excited() -> None:
+    t = np.arange(0, 20, 0.004)
+    stamps = np.round(t * 1e9).astype(np.int64)
+    together = np.outer(np.sin(2 * np.pi * 0.5 * t), [1.0, 1.0, 0.0])
+    assert gyro.excitation(stamps, together).max() < 0.6
+    head = 0.5 * np.outer(np.sin(2 * np.pi * 4.35 * t), [1.0, 1.0, 1.0])
+    assert gyro.excitation(stamps, head).max() < 0.05  # a line of the head is no turning
+    assert gyro.excitation(stamps[:0], together[:0]).max() == 0.0
+
+
+def test_gaps_and_strays_do_not_spoil_it() -> None:
+    stamps, q, samples = recording()
+    samples = samples[(samples["stamp"] - EPOCH) % 7_000_000_000 > 400_000_000]
+    q = q.copy()
+    q[40] = rotations.multiply(q[40], rotations.exp((0.0, 0.3, 0.0)))  # a pose that is wrong
+    found = gyro.align(stamps, q, samples)
+    assert found.outliers >= 2
+    assert np.abs(found.model.values - TRUE.values)[gyro.ROTATION].max() < np.deg2rad(0.2)
+    with pytest.raises(GyroError, match="32 are needed"):
+        gyro.align(stamps[:20], q[:20], samples)
+    with pytest.raises(GyroError, match="0 turns"):
+        gyro.align(stamps, q, samples[:0])
