@@ -22,18 +22,25 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from PIL import Image
+from scipy.linalg import polar
 
-from benchmarks import calibration_pages, real_l2
+from benchmarks import calibrated_unit, calibration_pages, odometry_methods, real_l2
+from benchmarks.bench_odometry import score
 from benchmarks.results import FOLDER, Target, at_least, at_most, publish
 from l2lidar_node.calibration import picture, report
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
 from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate
 from l2lidar_node.cli.calibrate_files import capture_place
+from l2lidar_node.cli.calibrate_imu import over_time
 from l2lidar_node.cli.virtual_places import still_places
 from l2lidar_node.emulator.unit.errors import UnitErrors, drawn
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.units import UNITS, Unit
+from l2lidar_proc import rotations
+from l2lidar_proc.odometry import imu_calibration
+from tests.support import odometry_runs
 
 Row = dict[str, Any]
 
@@ -41,6 +48,9 @@ INJECTED: Final = UnitErrors(xi=0.4 * DEG, beta=-0.3 * DEG, alpha=0.3 * DEG, ran
 BOUNDS: Final = {"xi": 0.02 * DEG, "beta": 0.02 * DEG, "alpha": 0.01 * DEG, "b": 0.5e-3,
                  "bias": 8e-3}  # fmt: skip
 SECONDS: Final = 4.0
+RUNS: Final = (("room", "walk"), ("corridor", "walk"), ("yard", "walk"))
+_RUN_S: Final = 30.0
+_TURNING_S: Final = 32.0
 _FACTORS: Final = {name: factor for name, (_, factor) in report.UNITS.items()}
 
 
@@ -115,7 +125,7 @@ def main() -> int:
     cases = [
         Case(name, seed)
         for name in given.only or CASES
-        for seed in range(given.seeds if name in POPULATIONS else 1)
+        for seed in range(min(given.seeds, POPULATIONS.get(name, 1)))
     ]
     until = time.monotonic() + 60.0 * given.minutes
     orders = [(case, kept, until) for case in cases if case not in kept.read()]
@@ -222,11 +232,18 @@ def population_targets(rows: list[Row]) -> Iterator[Target]:
 
 def draw() -> None:
     """Draw the pictures of ``docs/calibration.md``."""
-    for result, name in (
-        (calibrate(still_places(_unit(INJECTED), seconds=SECONDS)), "calibration_room"),
-        *((calibrate([place]), f"{place.name}_calibrated") for place in _real_places()),
-    ):
-        picture.save(result, Path("docs") / f"{name}.png")
+    folder = Path("docs")
+    picture.save(
+        calibrate(still_places(_unit(INJECTED), seconds=SECONDS)), folder / "calibration_room.png"
+    )
+    for place in _real_places()[:1]:
+        picture.save(calibrate([place]), folder / f"{place.name}_calibrated.png")
+    run = odometry_runs.record("room", "shake", 0, _TURNING_S, unit=calibrated_unit.TYPICAL)
+    result = imu_calibration.calibrate(list(odometry_runs.sweeps(run, "turn")), run.imu)
+    turns = folder / "calibration_turns.png"
+    picture.save_turns(over_time(result.before), over_time(result.alignment.turns), turns)
+    for path in (*folder.glob("calibration_*.png"), *folder.glob("capture_*_calibrated.png")):
+        Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
 
 
 def refused(seed: int) -> Iterator[Row | Target]:
@@ -329,16 +346,71 @@ def _half(place: Place, half: int) -> Place:
     return replace(place, name=name, returns=returns, turns=place.turns / 2, gyro=place.gyro[:0])
 
 
+def odometry(seed: int) -> Iterator[Row | Target]:
+    """Yield what the odometry is off on a typical unit, before and after its calibration."""
+    file = calibrated_unit.calibrated()
+    for scene, motion in RUNS:
+        ates = {}
+        for name, unit, used in (
+            ("perfect", "perfect", None),
+            ("typical", calibrated_unit.TYPICAL, None),
+            ("calibrated", calibrated_unit.TYPICAL, file),
+        ):
+            run = calibrated_unit.recorded(scene, motion, seed, _RUN_S, unit, used)
+            found = odometry_methods.run_method(odometry_methods.OURS, run, "turn")
+            assert found is not None
+            ates[name] = 1e3 * score(run, found)[0]
+        words = ", ".join(f"{name} {value:.1f}" for name, value in ates.items())
+        yield {**_empty(f"odometry: {scene}, {motion}", seed), "corrected": f"ATE, mm: {words}"}
+        ratio = ates["calibrated"] / ates["perfect"]
+        yield at_most(f"odometry, {scene}, {motion}: ATE calibrated over perfect", ratio, 1.5)
+
+
+def imu(seed: int) -> Iterator[Row | Target]:
+    """Yield what turning a unit of the population tells about its IMU."""
+    errors = drawn(seed + 1)
+    run = odometry_runs.record("room", "shake", seed, _TURNING_S, unit=str(seed + 1))
+    result = imu_calibration.calibrate(list(odometry_runs.sweeps(run, "turn")), run.imu)
+    turn, mixing = polar(
+        errors.gyro_matrix() @ rotations.matrices(errors.imu_quaternion()).T, side="left"
+    )
+    true = np.concatenate((
+        rotations.log(rotations.from_matrix(turn.T)),
+        np.diag(mixing) - 1.0,
+        [mixing[0, 1], mixing[0, 2], mixing[1, 2]],
+        np.zeros(3),
+        [errors.imu_time_offset],
+    ))  # fmt: skip
+    told = []
+    covered = True
+    for number, (name, item) in enumerate(result.estimates.items()):
+        unit, factor = imu_calibration.UNITS[number]
+        if name.startswith("bias") or item.verdict is Verdict.UNKNOWN:
+            continue
+        off = item.value - float(true[number])
+        covered &= abs(off) <= 3.0 * item.sd
+        told.append(f"{name} {off * factor:+.3f} +- {item.sd * factor:.3f} {unit}")
+    yield {
+        **_empty("imu", seed + 1),
+        "corrected": "; ".join(told),
+        "refused": result.refusals[0].reason if result.refusals else "",
+    }
+    yield at_least(f"imu of unit {seed + 1}: all within 3 stated deviations", int(covered), 1)
+
+
 CASES: Final[dict[str, Callable[[int], Iterator[Row | Target]]]] = {
     "real": real,
     "injected": injected,
     "refused": refused,
     "poor_places": poor_places,
     "rocking": rocking,
+    "odometry": odometry,
+    "imu": imu,
     "perfect": perfect,
     "population": population,
 }
-POPULATIONS: Final = ("perfect", "population")
+POPULATIONS: Final = {"perfect": 20, "population": 20, "imu": 3}
+"""Cases of many units, and how many of them at the most."""
 
 
 def _unit(errors: UnitErrors) -> Unit:

@@ -16,7 +16,7 @@ import numpy as np
 from kiss_icp.pybind import kiss_icp_pybind
 from numpy.typing import NDArray
 
-from benchmarks import deskew_pages, deskew_real
+from benchmarks import calibrated_unit, deskew_pages, deskew_real
 from benchmarks.results import Target, at_least, at_most, publish
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
@@ -27,7 +27,9 @@ from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.motion.tracker import MotionTracker
 from l2lidar_proc.odometry.odometry import Odometry
+from tests.support import odometry_runs
 from tests.support.deskew_scenarios import Recording, Scenario, TrueSweep, record, stamp
+from tests.support.odometry_runs import Run
 
 F64 = NDArray[np.float64]
 
@@ -63,6 +65,9 @@ SCENARIOS: Final = (
     replace(_WALK, name="walk, mounted forward", mount="forward"),
     replace(_WALK, name="walk, mounted tilted", mount="tilted"),
 )
+_WALLS_S: Final = 14.0
+_PATCH_M: Final = 0.5
+_PATCH_POINTS: Final = 60
 _SETTLED_S: Final = 4.0  # rest and start of the motion are over; judged from here on
 
 
@@ -71,8 +76,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--docs", action="store_true", help="write docs/deskew.{md,png} as well")
     parser.add_argument("--no-node", action="store_true", help="leave the latency of the node out")
+    parser.add_argument("--units", action="store_true", help="the walls of units alone")
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    if arguments.units:
+        rows = walls()
+        publish("deskew_units", "Thickness of walls in deskewed sweeps, mm", rows, _thin(rows))
+        return
     shown = {}
     for scenario in SCENARIOS:
         recording = record(scenario)
@@ -82,7 +92,8 @@ def main() -> None:
         print(f"{scenario.name}: done", flush=True)
     costs = cost(record(replace(_WALK, seconds=5.0)))
     changed = _changed_bits(record(SCENARIOS[0]))
-    targets = [*_targets(rows), *_cost_targets(costs)]
+    of_units = walls()
+    targets = [*_targets(rows), *_cost_targets(costs), *_thin(of_units)]
     targets.append(at_most("sweeps of a still sensor that changed", changed, 0))
     if not arguments.no_node:
         from benchmarks.deskew_latency import latency_ms
@@ -91,11 +102,12 @@ def main() -> None:
         targets.append(at_most("sweep end to published cloud, p99, ms", milliseconds, 15.0))
     real = deskew_real.newer_college()
     targets += [at_most(f"{name}, median, mm", after, bound) for name, _, after, bound in real]
+    rows += of_units
     publish("deskew", "RMS and 95th percentile of the error of deskewed points, mm", rows, targets)
     for name, value in costs.items():
         print(f"{name}: {value:.2f}")
     if arguments.docs:
-        deskew_pages.write(rows, targets, costs, real, shown["walk 1.2 m/s"])
+        deskew_pages.write(rows, of_units, targets, costs, real, shown["walk 1.2 m/s"])
 
 
 def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]]:
@@ -181,6 +193,68 @@ def _pose(recording: Recording, start_s: float, end_s: float) -> F64:
     positions, q = recording.motion.poses(np.array([start_s, end_s]))
     ends = [rotations.transform(q[i], positions[i]) for i in range(2)]
     return rotations.inverse(ends[0]) @ ends[1]
+
+
+def walls() -> list[dict[str, Any]]:
+    """Return how thick walls are in deskewed sweeps of three units, with their range noise."""
+    rows = []
+    for name, unit, file in (
+        ("perfect unit", "perfect", None),
+        ("typical unit", calibrated_unit.TYPICAL, None),
+        ("typical unit calibrated", calibrated_unit.TYPICAL, calibrated_unit.calibrated()),
+    ):
+        run = calibrated_unit.recorded("room", "walk", 0, _WALLS_S, unit, file)
+        row: dict[str, Any] = {"scenario": name, "figure": "wall", **dict.fromkeys(METHODS, "")}
+        for method, found in _thicknesses(run).items():
+            row[method] = round(1e3 * float(np.median(found)), 2)
+        rows.append(row)
+    return rows
+
+
+def _thicknesses(run: Run) -> dict[str, F64]:
+    """Return the thickness of every flat patch of every settled sweep, by method [m]."""
+    trackers = {name: MotionTracker(MotionConfig()) for name in ("gyro only", "odometry")}
+    odometry = Odometry(OdometryConfig(), MotionConfig().T_cloud_imu)
+    found: dict[str, list[F64]] = {"none": [], **{name: [] for name in trackers}}
+    fed = 0
+    for sweep in odometry_runs.sweeps(run, "turn"):
+        until = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+        for first in range(fed, until, 5):
+            part = run.imu[first : min(first + 5, until)]
+            for tracker in trackers.values():
+                tracker.imu(part)
+            odometry.imu(part)
+        fed = until
+        if sweep.start - odometry_runs.EPOCH >= _SETTLED_S * 1e9:
+            found["none"].append(_flat_patches(_xyz(sweep.points)))
+            for name, tracker in trackers.items():
+                path, _ = tracker.trajectory(sweep.start, sweep.end)
+                points = deskew(sweep.points, sweep.start, path, sweep.start)
+                found[name].append(_flat_patches(_xyz(points)))
+        for estimate in odometry.register(sweep):
+            trackers["odometry"].velocity(estimate.stamp, estimate.velocity, "odometry")
+    return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def _flat_patches(xyz: F64) -> F64:
+    """Return the thickness of the flat cells of a cloud (N, 3): one standard deviation [m]."""
+    cells = np.floor(xyz / _PATCH_M).astype(np.int64)
+    order = np.lexsort(cells.T)
+    cells, points = cells[order], xyz[order]
+    first = np.flatnonzero(np.r_[True, (np.diff(cells, axis=0) != 0).any(axis=1)])
+    counts = np.diff(np.append(first, len(points)))
+    mean = np.add.reduceat(points, first) / counts[:, None]
+    away = points - np.repeat(mean, counts, axis=0)
+    spread = np.add.reduceat(away[:, :, None] * away[:, None, :], first) / counts[:, None, None]
+    values = np.linalg.eigvalsh(spread[counts >= _PATCH_POINTS])
+    flat = (values[:, 0] < 0.05 * values[:, 1]) & (values[:, 1] > 0.02 * _PATCH_M**2)
+    return np.asarray(np.sqrt(np.maximum(values[flat, 0], 0.0)))
+
+
+def _thin(rows: list[dict[str, Any]]) -> list[Target]:
+    by_name = {row["scenario"]: row["odometry"] for row in rows}
+    value = by_name["typical unit calibrated"] / by_name["perfect unit"]
+    return [at_most("walls of a calibrated unit over those of a perfect one", value, 1.1)]
 
 
 def cost(recording: Recording, rounds: int = 100) -> dict[str, float]:

@@ -18,14 +18,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import odometry_methods as methods, odometry_pages
+from benchmarks import calibrated_unit, odometry_methods as methods, odometry_pages
 from benchmarks.odometry_plan import Plan, Rows, Task
 from benchmarks.results import Target, at_least, at_most, publish
 from tests.support.odometry_runs import CUTS, Run, count, record, truth
 
 SCENES = ("room", "yard", "corridor", "box")
 MOTIONS = ("walk", "trot", "drone")
-LOCAL = (methods.OURS, methods.PLAIN, methods.DESKEWED)
+LOCAL = (
+    methods.OURS,
+    methods.TYPICAL,
+    methods.CALIBRATED,
+    methods.PLAIN,
+    methods.DESKEWED,
+)
 DIVERGED_M = 1.0
 RPE_M = 1.0
 FEWEST = 0.7  # poses for each sweep: with fewer it is lost
@@ -120,6 +126,12 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         if len(here):
             name = f"median ATE of lio_sam in the {scene}, velodyne profile, full turns, m"
             yield at_most(name, float(np.median(here)), 0.1)
+    for scene in SCENES:
+        calibrated = ates(rows, methods.CALIBRATED, scene=scene)
+        perfect = ates(rows, methods.OURS, scene=scene)
+        if len(calibrated) and len(perfect):
+            value = float(np.median(calibrated) / np.median(perfect))
+            yield at_most(f"{scene}: calibrated unit over perfect one, median ATE", value, 1.5)
     turns = [
         row["real_time_factor"]
         for row in rows
@@ -135,9 +147,22 @@ def _same(row: Row, other: Row) -> bool:
 
 def carry_out(task: Task) -> Iterator[Row]:
     """Yield the rows of one task: one recording, several methods."""
-    run = record(task.scene, task.motion, task.seed, task.seconds)
+    recorded: dict[str, Run] = {}
     for cut, name in task.wanted:
-        yield measure(run, task.scene, task.motion, task.seed, cut, name)
+        kind = name if name in (methods.TYPICAL, methods.CALIBRATED) else methods.OURS
+        if kind not in recorded:
+            recorded[kind] = _recorded(task, kind)
+        yield measure(recorded[kind], task.scene, task.motion, task.seed, cut, name)
+
+
+def _recorded(task: Task, kind: str) -> Run:
+    """Return what a perfect unit measures, or a typical one before and after its calibration."""
+    if kind == methods.OURS:
+        return record(task.scene, task.motion, task.seed, task.seconds)
+    file = calibrated_unit.calibrated() if kind == methods.CALIBRATED else None
+    return calibrated_unit.recorded(
+        task.scene, task.motion, task.seed, task.seconds, calibrated_unit.TYPICAL, file
+    )
 
 
 def _work(given: tuple[Task, Rows, float]) -> int:

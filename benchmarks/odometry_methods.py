@@ -27,6 +27,8 @@ from tests.support.odometry_runs import Run
 OURS = "ours"
 PLAIN = "kiss-icp"
 DESKEWED = "kiss-icp, our deskew"
+TYPICAL = "ours, typical unit"
+CALIBRATED = "ours, typical unit calibrated"
 REFEREES = ("rko_lio", "genz_lio", "ct_icp", "lio_sam")
 PACKAGES = ("numpy", "rko_lio", "genz-lio", "evalio")
 FOLDER = Path("out") / "referees"
@@ -67,7 +69,9 @@ def run_method(name: str, run: Run, cut: str) -> Found | None:
         return _referee(name, run, cut)
     some = list(odometry_runs.sweeps(run, cut))
     begin = time.process_time()
-    poses = {OURS: _ours, PLAIN: _plain, DESKEWED: _deskewed}[name](run, some)
+    poses = {
+        OURS: _ours, TYPICAL: _ours, CALIBRATED: _ours, PLAIN: _plain, DESKEWED: _deskewed
+    }[name](run, some)  # fmt: skip
     seconds = time.process_time() - begin
     stamps = np.array([stamp for stamp, _ in poses], dtype=np.int64)
     return Found(stamps, np.array([pose for _, pose in poses]), seconds)

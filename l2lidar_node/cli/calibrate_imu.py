@@ -30,9 +30,10 @@ from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Recorder, Recording
 from l2lidar_node.recording.replay import feed
 from l2lidar_node.settings import build
-from l2lidar_node.types import IMU_SAMPLE, ImuSample, Sweep
+from l2lidar_node.types import F64, IMU_SAMPLE, ImuSample, Sweep
 
 if TYPE_CHECKING:
+    from l2lidar_proc.motion.gyro_alignment import Turns
     from l2lidar_proc.odometry.imu_calibration import ImuResult
 
 _BEFORE: Final = """\
@@ -115,7 +116,7 @@ def imu(
         result = _estimated(path, known, quiet=json_)
     about = _about(result, firmware, known)
     if figure is not None:
-        picture.save_turns(_times(result.before), _times(result.alignment.turns), figure)
+        picture.save_turns(over_time(result.before), over_time(result.alignment.turns), figure)
     if json_:
         print_json(_as_data(result, about))
     else:
@@ -279,10 +280,10 @@ def _measured(
     return sweeps, np.array([tuple(item) for item in samples], IMU_SAMPLE)
 
 
-def _times(turns: Any) -> tuple[Any, Any]:
+def over_time(turns: Turns) -> tuple[F64, F64]:
+    """Return the instants (N,) [s] of turns, and what they are off by, (N, 3) [rad]."""
     ends = turns.ends
-    seconds = (ends - ends[0]) * 1e-9 if len(ends) else np.empty(0)
-    return seconds, turns.residual
+    return np.asarray((ends - ends[:1]) * 1e-9), turns.residual
 
 
 def _about(result: ImuResult, firmware: str, known: CalibrationFile | None) -> dict[str, Any]:

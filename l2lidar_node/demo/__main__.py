@@ -54,6 +54,13 @@ def demo(
     motion: Annotated[
         str, typer.Option(help="still, spin, shake, walk, trot, drone, or a TUM file.")
     ] = "walk",
+    unit: Annotated[
+        str,
+        typer.Option(
+            help="Which virtual unit: typical and poor are not quite what they report, perfect "
+            "is; a number is one of many."
+        ),
+    ] = "typical",
     forward: Annotated[
         bool,
         typer.Option(
@@ -86,6 +93,7 @@ def demo(
         duration or (mapping.MAPPING_S if slam else _WATCHING_S),
         world or (mapping.WORLD if slam else _WORLD),
         motion,
+        unit,
         forward,
         driver_only,
         slam,
@@ -103,6 +111,7 @@ class _Options(NamedTuple):
     duration: float
     world: str
     motion: str
+    unit: str
     forward: bool
     driver_only: bool
     slam: bool
@@ -130,8 +139,8 @@ def _run(options: _Options) -> int:
     if options.slam:
         chain = "driver, deskew, odometry and SLAM"
     console.print(
-        f"A virtual L2 in a {options.world} ({options.motion}) streams over UDP to {chain}; "
-        f"watching the topics for {options.duration:.0f} s ..."
+        f"A {options.unit} virtual L2 in a {options.world} ({options.motion}) streams over UDP "
+        f"to {chain}; watching the topics for {options.duration:.0f} s ..."
     )
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C interrupts this one
     observer = Observer()
@@ -199,6 +208,7 @@ def _start(programs: Programs, options: _Options) -> None:
             "--world", options.world,
             "--motion", options.motion,
             *(["--motion-speed", str(mapping.SPEED)] if options.slam else []),
+            "--unit", options.unit,
             "--mount", "forward" if options.forward else "upright",
             "--host-port", str(host_port),
             "--lidar-port", str(lidar_port),
