@@ -139,8 +139,8 @@ def _run(options: _Options) -> int:
     if options.slam:
         chain = "driver, deskew, odometry and SLAM"
     console.print(
-        f"A {options.unit} virtual L2 in a {options.world} ({options.motion}) streams over UDP "
-        f"to {chain}; watching the topics for {options.duration:.0f} s ..."
+        f"A virtual L2 ({options.unit} unit) in a {options.world} ({options.motion}) streams over "
+        f"UDP to {chain}; watching the topics for {options.duration:.0f} s ..."
     )
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C interrupts this one
     observer = Observer()
