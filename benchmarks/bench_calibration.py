@@ -27,7 +27,7 @@ from scipy.linalg import polar
 
 from benchmarks import calibrated_unit, calibration_pages, odometry_methods, real_l2
 from benchmarks.bench_odometry import score
-from benchmarks.results import FOLDER, Target, at_least, at_most, publish
+from benchmarks.results import FOLDER, Target, at_least, at_most, keep, publish
 from l2lidar_node.calibration import picture, report
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
@@ -144,7 +144,12 @@ def main() -> int:
     rows = [item for item in found if not isinstance(item, Target)]
     targets = [item for item in found if isinstance(item, Target)]
     targets += [*perfect_targets(rows), *population_targets(rows)]
-    publish("calibration", "Calibration of units: what is left, and its deviation", rows, targets)
+    shown = [
+        {name: row[name] for name in ("case", "seed", *_FACTORS, "corrected", "refused")}
+        for row in rows
+    ]
+    publish("calibration", "Calibration of units: what is left [deg, mm]", shown, targets)
+    keep("calibration", rows, targets)
     if given.docs:
         draw()
     if given.page:

@@ -26,8 +26,10 @@ def write(rows: list[Row], targets: list[Target]) -> Path:
     parts = [
         _HEAD,
         _targets(targets),
-        "## What was found",
-        _table(rows),
+        "## Beams",
+        table(rows),
+        *_words(rows, "imu", "IMU: what is left, and its deviation"),
+        *_words(rows, "odometry", "Odometry of a typical unit"),
         f"Measured with Python {facts['python']} on {facts['system']}.",
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)
@@ -45,14 +47,25 @@ def _targets(targets: list[Target]) -> str:
     return "\n".join(lines)
 
 
-def _table(rows: Iterable[Row]) -> str:
+def _words(rows: Iterable[Row], kind: str, title: str) -> list[str]:
+    """Return a section of what is told in words."""
+    lines = [
+        f"- {row['case']}, seed {row['seed']}: {row['refused'] or row['corrected']}"
+        for row in rows
+        if row["case"].startswith(kind)
+    ]
+    return [f"## {title}", "\n".join(lines)] if lines else []
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Return the table of what was found about beams."""
     lines = [
         "| Case | Seed | xi [deg] | beta [deg] | alpha [deg] | b [mm] | bias [mm] | "
         "Thickness [mm] | Gap [mm] | Corrected, or why not |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        if "xi" not in row:
+        if row["case"].startswith(("imu", "odometry")):
             continue
         figures = [_figure(row, name) for name in ("xi", "beta", "alpha", "b", "bias")]
         cells = [

@@ -1,0 +1,87 @@
+"""The calibration bench: what it keeps, and what its rows say about the targets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import bench_calibration, calibrated_unit, calibration_pages
+from benchmarks.bench_calibration import Case, Kept
+from benchmarks.results import at_most
+from l2lidar_node.calibration.file import CalibrationFile, ImuCalibration, load
+
+
+def row(case: str, seed: int, **values: object) -> dict[str, object]:
+    measured = dict.fromkeys(("xi", "beta", "alpha", "b", "bias"), 0.001)
+    deviations = {f"{name} sd": 0.01 for name in measured}
+    thickness = {"thick before": 20.0, "thick after": 10.0}
+    return {
+        **bench_calibration._empty(case, seed),
+        **measured,
+        **deviations,
+        **thickness,
+        **values,
+    }
+
+
+def test_a_case_that_was_cut_off_is_measured_again(tmp_path: Path) -> None:
+    kept = Kept(tmp_path / "bench" / "rows.jsonl")
+    assert kept.read() == {}
+    kept.append(Case("perfect", 3), [row("perfect", 3), at_most("off", 2.0, 1.0)])
+    with (tmp_path / "bench" / "rows.jsonl").open("a") as file:
+        file.write('{"case": ["perfect", 4], "rows": [')
+    kept.append(Case("real"), [])
+    found = kept.read()
+    assert list(found) == [Case("perfect", 3), Case("real", 0)]
+    first, target = found[Case("perfect", 3)]
+    assert isinstance(first, dict)
+    assert first["seed"] == 3
+    assert target == at_most("off", 2.0, 1.0)
+    kept.clear()
+    assert kept.read() == {}
+
+
+def test_one_unit_that_is_off_shows_in_the_targets() -> None:
+    rows = [row("perfect", 0), row("perfect", 1, b=0.9, corrected="b")]
+    rows += [row("population", 0), row("population", 1, xi=0.05, refused="moved")]
+    targets = {
+        item.name: item
+        for item in (
+            *bench_calibration.perfect_targets(rows),
+            *bench_calibration.population_targets(rows),
+        )
+    }
+    missed = {name for name, item in targets.items() if not item.met}
+    assert missed == {
+        "of 2 perfect units get a correction",
+        "perfect units, worst |b|, mm",
+        "units whose xi is within 3 stated deviations",
+        "units of the population that are refused",
+    }
+    assert list(bench_calibration.perfect_targets([])) == []
+
+
+def test_the_page_has_a_line_for_every_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration_pages, "PAGE", tmp_path / "page.md")
+    rows = [row("perfect", 0, bias=""), row("imu", 1, corrected="rotation x +0.01 deg")]
+    text = calibration_pages.write(rows, [at_most("worst |xi|", 2.0, 1.0)]).read_text()
+    assert "| perfect | 0 | +0.001 +- 0.010 |" in text
+    assert "not known" in text
+    assert "- imu, seed 1: rotation x +0.01 deg" in text
+    assert "| worst \\|xi\\| | 2 | 1 | **not met** |" in text
+
+
+def test_a_calibrated_recording_is_that_of_an_imu_as_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "unit.yaml"
+    imu = ImuCalibration((0.0, 0.0, 0.2), 0.002)
+    CalibrationFile(bytes(32), {}, {}, imu).save(path)
+    plain = calibrated_unit.recorded("box", "spin", 0, 1.0, "perfect", None)
+    turned = calibrated_unit.recorded("box", "spin", 0, 1.0, "perfect", load(path))
+    assert (plain.imu["stamp"] - turned.imu["stamp"] == 2_000_000).all()
+    x, y = plain.imu["linear_acceleration"][:, 0], plain.imu["linear_acceleration"][:, 1]
+    expected = np.cos(0.2) * x - np.sin(0.2) * y
+    np.testing.assert_allclose(turned.imu["linear_acceleration"][:, 0], expected, atol=1e-6)
