@@ -107,7 +107,7 @@ def main() -> None:
     for name, value in costs.items():
         print(f"{name}: {value:.2f}")
     if arguments.docs:
-        deskew_pages.write(rows, of_units, targets, costs, real, shown["walk 1.2 m/s"])
+        deskew_pages.write(rows, targets, costs, real, shown["walk 1.2 m/s"])
 
 
 def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]]:

@@ -19,7 +19,6 @@ PICTURE: Final = Path("docs") / "deskew.png"
 
 def write(
     rows: Sequence[dict[str, Any]],
-    of_units: Sequence[dict[str, Any]],
     targets: Sequence[Target],
     costs: dict[str, float],
     real: Sequence[tuple[str, float, float, float]],
@@ -31,8 +30,6 @@ def write(
     ----------
     rows : sequence of dict
         RMS and p95 of each scenario: error of every method [mm].
-    of_units : sequence of dict
-        Thickness of walls by unit and method [mm].
     targets : sequence of Target
     costs : dict of float
         [ms] by what was timed.
@@ -43,7 +40,6 @@ def write(
     """
     text = PAGE.read_text(encoding="utf-8")
     text = _replaced(text, "errors", _errors(rows))
-    text = _replaced(text, "units", units(of_units))
     text = _replaced(text, "targets", _targets(targets))
     text = _replaced(text, "costs", _costs(costs))
     text = _replaced(text, "real", _real(real))
@@ -79,13 +75,6 @@ def _errors(rows: Sequence[dict[str, Any]]) -> str:
             pairs = (f"{row[m]:.1f} / {far[row['scenario']][m]:.1f}" for m in methods)
             lines.append([row["scenario"], *pairs])
     return _table(["RMS / p95 [mm]", *methods], lines)
-
-
-def units(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the table of wall thickness by unit."""
-    methods = [name for name, value in rows[0].items() if isinstance(value, float)]
-    lines = [[row["scenario"], *(f"{row[name]:.1f}" for name in methods)] for row in rows]
-    return _table(["wall, one standard deviation [mm]", *methods], lines)
 
 
 def _targets(targets: Sequence[Target]) -> str:
