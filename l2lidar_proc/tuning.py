@@ -108,10 +108,17 @@ ODOMETRY_MEMORY_S: Final = 12.0  # [s] of IMU samples; more than a held-up node 
 
 FIRST_REACH_M: Final = 0.5  # [m] farthest point from its plane in the first step; halved each step
 LAST_REACH_SCALES: Final = 3.0  # outlier scales, down to which it shrinks
-TILT_SAMPLE: Final = 4  # one in so many matches stands for the noise of the normals. Speed only
 SCATTER_SHARED: Final = 3.0  # points in a cell that is not flat err together. Tuned on: foliage
 CONVERGED: Final = 2e-4  # [rad, m] a smaller step is the last
 DEGENERATE_SHARE: Final = 0.01  # of the points; with fewer a direction is hardly observed
+# Weak directions. Tuned on: camera in the room, corridor with a view of 80 degrees, rosette lidar
+WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals may prevail
+WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off in the finest cells
+WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above the noise
+WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller
+WEAK_FEW: Final = 0.5  # of that share; sweep after sweep sees the same few surfaces
+WEAK_STEPS: Final = 2  # iterations with the weak directions known
+WEAK_LEAST_ARM: Final = 0.3  # [m] however near the points are
 # Range noise of two captures of a real unit, along lines of smooth surface: 10-13 mm to 10 m,
 # 17 mm to 15 m, 24-30 mm to 25 m. A floor of 10 mm and a part linear in range fit that within
 # 2 mm. The floor is part of the parameter point_noise, whose size hides the rest: half or double

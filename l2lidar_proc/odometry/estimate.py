@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs
+from l2lidar_proc import tuning
 
 F64 = NDArray[np.float64]
 
@@ -119,3 +120,10 @@ def degeneracy_ratio(information: F64) -> float:
     """Return the share of some information (3, 3) that its least observed direction has."""
     strength = np.linalg.eigvalsh(information)
     return float(strength[0] / max(float(strength.sum()), 1e-12))
+
+
+def unobserved_directions(information: F64) -> F64:
+    """Return the directions (3, K), orthonormal, of which some information (3, 3) says nothing."""
+    strength, directions = np.linalg.eigh(information)
+    total = max(float(strength.sum()), 1e-12)
+    return np.asarray(directions[:, strength < tuning.DEGENERATE_SHARE * total])

@@ -45,6 +45,38 @@ class MapDrift:
             rows = np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
             self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
 
+    def meet_partly(
+        self, support: tuple[NDArray[np.int64], F64], place: F64, free: F64, ways: F64
+    ) -> None:
+        """Take surfaces that leave some directions free: along these nothing is held.
+
+        What is registered along them is where the sensor is relative to what the last sweeps put
+        into the map with the same wrong velocity: that error adds up linearly, not by chance.
+
+        Parameters
+        ----------
+        support : tuple of ndarray
+            As in :meth:`meet`.
+        place : ndarray, shape (3,)
+            Of the sensor, map frame [m].
+        free : ndarray, shape (3, K)
+            The directions, orthonormal, map axes.
+        ways : ndarray, shape (K,)
+            By how much the place may have run away along each since the sweep before, 1 sigma [m].
+        """
+        moved = _carried(place)
+        before = moved @ self._current @ moved.T
+        self.meet(support)
+        along = np.zeros((6, 6))
+        along[:3, :3] = free @ free.T
+        across = np.eye(6) - along
+        now = across @ moved @ self._current @ moved.T @ across + along @ before @ along
+        for direction, way in zip(free.T, ways.tolist(), strict=True):
+            sigma = float(np.sqrt(max(direction @ now[:3, :3] @ direction, 0.0)))
+            now[:3, :3] += (2.0 * sigma + way) * way * np.outer(direction, direction)
+        back = _carried(-place)
+        self._current = back @ now @ back.T
+
     def record(self, sweep: int, place: F64, covariance: F64) -> None:
         """Remember how uncertain the pose was that added a sweep.
 

@@ -12,10 +12,21 @@ from l2lidar_node.types import Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.deskew.deskew import deskew
-from l2lidar_proc.motion.filter import POSITION, ROTATION, InertialState, update_with_information
+from l2lidar_proc.motion.filter import (
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    InertialState,
+    update_with_information,
+)
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.alignment import Alignment, Source, align
-from l2lidar_proc.odometry.estimate import AlignmentQuality, degeneracy_ratio
+from l2lidar_proc.odometry.alignment import Alignment, align
+from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.estimate import (
+    AlignmentQuality,
+    degeneracy_ratio,
+    unobserved_directions,
+)
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.map_drift import MapDrift
 from l2lidar_proc.odometry.relocalization import pose_hypotheses, rotation_is_loose
@@ -164,6 +175,24 @@ class SweepMatcher:
             self.surfaces.forget(state.position, self.config.max_range)
             self._pruned_at = state.position
         return fresh
+
+    def meet(self, found: Alignment, seconds: float) -> None:
+        """Let a pose be as uncertain as the surfaces that an alignment has met.
+
+        Parameters
+        ----------
+        found : Alignment
+        seconds : float
+            Since the sweep before.
+        """
+        free = unobserved_directions(found.information[POSITION, POSITION])
+        if not free.size:
+            self.drift.meet(found.support)
+            return
+        speeds = np.einsum("ik,ij,jk->k", free, found.covariance[VELOCITY, VELOCITY], free)
+        self.drift.meet_partly(
+            found.support, found.state.position, free, np.sqrt(speeds) * seconds
+        )
 
     def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
         """Return how well a sweep with so many points to align could be matched."""

@@ -193,7 +193,7 @@ class Odometry:
             posterior = predicted.state, predicted.covariance
         else:
             self._note_aligned(sweep, found.state, found.covariance)
-            self.matcher.drift.meet(found.support)
+            self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
         lasted = (predicted.state.stamp - state.stamp) * 1e-9
         motion = predicted.with_state(*eskf.apply_zero_velocity_prior(*posterior, lasted))

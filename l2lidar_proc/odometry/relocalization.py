@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from l2lidar_proc import rotations, tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
-from l2lidar_proc.odometry.alignment import Source
+from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 F64 = NDArray[np.float64]

@@ -61,10 +61,6 @@ class Matches:
         Of the plane's place under the point [m^2].
     scatter : ndarray, shape (M,)
         Variance of the map's points about the plane where they are no flat surface, else 0 [m^2].
-    across : ndarray, shape (M, 2, 3)
-        The other two axes of the surface, unit, map frame.
-    tilts : ndarray, shape (M, 2)
-        Variance of the normal towards each of these, for the noise of the points [rad^2].
     born : ndarray, shape (M,)
         Number of the sweep that opened the surface's cell.
     """
@@ -74,8 +70,6 @@ class Matches:
     distances: F64
     variances: F64
     scatter: F64
-    across: F64
-    tilts: F64
     born: I64
 
 
@@ -183,18 +177,12 @@ def _distances(points: F64, index: I64, cells: NDArray[np.void], axis: int) -> M
     # a plane fitted to n points is worst known far from their middle
     reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
     scatter = np.where(cells["flat"], 0.0, spread[:, axis])
-    thin, others = spread[:, axis, None], spread[:, [1 - axis, 2]]
-    tilts = thin * others / (cells["count"][:, None] * (others - thin) ** 2 + 1e-12)
-    # the two axes across a line are one as good as the other
-    tilts[cells["narrow"] > 1, 0] = 0.0
     return Matches(
         index,
         cells["axes"][:, axis],
         along[:, axis],
         spread[:, axis] * reach / cells["count"],
         scatter,
-        cells["axes"][:, [1 - axis, 2]],
-        np.minimum(tilts, 1.0),
         cells["born"],
     )
 

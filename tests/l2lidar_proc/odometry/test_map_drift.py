@@ -9,6 +9,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.odometry.map_drift import MapDrift
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
+ZERO = np.zeros(3)
 SURE = np.diag([1e-6] * 6)
 
 
@@ -60,6 +61,27 @@ def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
     np.testing.assert_array_equal(drift.at(np.zeros(3)), np.zeros((6, 6)))
     drift.meet(held_by(17))  # nothing is known yet
     np.testing.assert_array_equal(drift.at(np.zeros(3)), np.zeros((6, 6)))
+
+
+def test_along_a_direction_that_nothing_holds_the_errors_of_a_velocity_add_up() -> None:
+    drift = MapDrift()
+    free = np.array([[0.6], [0.8], [0.0]])
+    place = np.array([4.0, 2.0, 0.0])
+    drift.record(0, ZERO, SURE)
+    drift.meet(held_by(0))
+    before = drift.at(place)
+    for number in range(1, 101):  # 10 s with an error of 5 cm/s
+        drift.meet_partly(held_by(0), place, free, np.array([0.005]))
+        drift.record(number * tuning.DRIFT_GROUP, place, SURE)
+    gained = (drift.at(place) - before)[:3, :3]
+    assert np.sqrt(free[:, 0] @ gained @ free[:, 0]) == pytest.approx(0.5, rel=0.02)
+    assert gained[2, 2] < 3e-5
+    assert np.linalg.eigvalsh(drift.at(place)).min() > 0.0
+    # what was put there meanwhile is as uncertain; the first part of the map is not
+    drift.meet(held_by(100 * tuning.DRIFT_GROUP))
+    assert drift.at(place)[0, 0] - before[0, 0] == pytest.approx(0.6**2 * 0.25, rel=0.1)
+    drift.meet(held_by(0))
+    np.testing.assert_allclose(drift.at(place), before, atol=1e-5)
 
 
 def test_cells_remember_the_sweep_that_opened_their_place() -> None:

@@ -13,7 +13,8 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc.config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
 from l2lidar_proc.motion.initialization import initial_state
-from l2lidar_proc.odometry.alignment import Source, align
+from l2lidar_proc.odometry.alignment import align
+from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.odometry import Odometry

@@ -1,0 +1,199 @@
+"""Correspondences of a sweep's points with the map's surfaces: residuals, weights, derivatives.
+
+The residual of a point y (deskewed to the reference, IMU axes) measured dt after the reference is
+``n . (R y + p - m)``. It also depends on what deskewed the point, velocity, gravity and biases,
+linearly in dt: so a sweep corrects the motion within itself as well as its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc import rotations, tuning
+from l2lidar_proc.config import SurfaceConfig
+from l2lidar_proc.motion.filter import (
+    ACCEL_BIAS,
+    ERRORS,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    InertialState,
+)
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """The points to align.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        Deskewed to the reference, from the IMU's origin, cloud axes [m].
+    times : ndarray, shape (N,)
+        Instant of each point after the reference [s], negative before it.
+    ranges : ndarray, shape (N,)
+        [m]
+    """
+
+    points: F64
+    times: F64
+    ranges: F64
+
+    def some(self, index: I64) -> Source:
+        """Return the points of some indices."""
+        return Source(self.points[index], self.times[index], self.ranges[index])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correspondences:
+    """Points that are near a surface of the map, seen from one state.
+
+    Attributes
+    ----------
+    index : ndarray, shape (M,)
+        Which of the source's points; one point may have two surfaces.
+    points : ndarray, shape (M, 3)
+        Deskewed by the state's motion, IMU axes [m].
+    times : ndarray, shape (M,)
+        Instant after the reference [s].
+    normals : ndarray, shape (M, 3)
+        Of the surfaces, map axes.
+    distances : ndarray, shape (M,)
+        The residuals [m].
+    variances : ndarray, shape (M,)
+        Of the residuals at the true state [m^2].
+    scales : ndarray, shape (M,)
+        Distance at which the robust kernel leaves a quarter of the weight [m].
+    weights : ndarray, shape (M,)
+        Robust weight by variance [1/m^2].
+    born : ndarray, shape (M,)
+        Number of the sweep that opened the surface.
+    met : int
+        Points at known surfaces, near or not.
+    """
+
+    index: I64
+    points: F64
+    times: F64
+    normals: F64
+    distances: F64
+    variances: F64
+    scales: F64
+    weights: F64
+    born: I64
+    met: int
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the points at known surfaces that are near them, 0 to 1."""
+        return np.count_nonzero(np.abs(self.distances) < 2.0 * self.scales) / max(self.met, 1)
+
+    @property
+    def residual(self) -> float:
+        """Weighted root mean square of the distances [m]."""
+        total = max(float(self.weights.sum()), 1e-12)
+        return float(np.sqrt((self.weights * self.distances**2).sum() / total))
+
+    @property
+    def support(self) -> tuple[I64, F64]:
+        """Numbers of the sweeps that opened the surfaces, and the share of the weight of each."""
+        born, place = np.unique(self.born, return_inverse=True)
+        total = max(float(self.weights.sum()), 1e-12)
+        return born, np.bincount(place, self.weights) / total
+
+
+def correspondences(
+    prior: InertialState,
+    state: InertialState,
+    source: Source,
+    surfaces: SurfelMap,
+    config: SurfaceConfig,
+    reach: float,
+) -> Correspondences:
+    """Return the points that are near a surface.
+
+    Parameters
+    ----------
+    prior : InertialState
+        Its motion deskewed the source.
+    state : InertialState
+        From which the points are seen.
+    source : Source
+    surfaces : SurfelMap
+    config : SurfaceConfig
+    reach : float
+        Largest distance [m]; more where a surface is thick.
+    """
+    points = _deskewed_again(source, state.boxminus(prior), prior.rotation)
+    found = surfaces.match(points @ state.rotation.T + state.position, narrow=True)
+    scales = np.sqrt(config.outlier_scale**2 + found.scatter)
+    near = np.abs(found.distances) < np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
+    index, distances, scales = found.index[near], found.distances[near], scales[near]
+    far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * source.ranges[index]
+    surface = found.variances[near] + tuning.SCATTER_SHARED * found.scatter[near]
+    variances = config.point_noise**2 + far**2 + surface
+    return Correspondences(
+        index,
+        points[index],
+        source.times[index],
+        found.normals[near],
+        distances,
+        variances,
+        scales,
+        robust_weights(distances, scales) / variances,
+        found.born[near],
+        len(near),
+    )
+
+
+def pose_jacobian(found: Correspondences, rotation: F64) -> F64:
+    """Return the derivatives (M, 6) of the residuals by the errors of turn and place."""
+    return np.hstack([rotations.cross(found.points, found.normals @ rotation), found.normals])
+
+
+def residual_jacobian(pose: F64, since: F64, rotation: F64) -> F64:
+    """Return the derivatives (M, 18) of the residuals by all errors.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (M, 6)
+        Derivatives by the errors of turn and place.
+    since : ndarray, shape (M,)
+        Instants after the reference [s].
+    rotation : ndarray, shape (3, 3)
+        Sensor axes to map axes.
+    """
+    dt = since[:, None]
+    turn, place = pose[:, :3], pose[:, 3:]
+    h = np.empty((len(pose), ERRORS))
+    h[:, ROTATION] = turn
+    h[:, POSITION] = place
+    h[:, VELOCITY] = dt * place
+    h[:, GYRO_BIAS] = -dt * turn
+    h[:, ACCEL_BIAS] = -0.5 * dt * dt * (place @ rotation)
+    h[:, GRAVITY] = 0.5 * dt * dt * place
+    return h
+
+
+def robust_weights(distances: F64, scales: F64) -> F64:
+    """Return the weights (N,) of Geman and McClure: 1 for no distance, a quarter at the scale."""
+    return np.asarray(1.0 / (1.0 + (distances / scales) ** 2) ** 2)
+
+
+def _deskewed_again(source: Source, error: F64, rotation: F64) -> F64:
+    """Return the points (N, 3) as a corrected motion deskews them, to first order."""
+    since = source.times[:, None]
+    turned = rotations.cross(-error[GYRO_BIAS] * since, source.points)
+    moved = since * error[VELOCITY] + 0.5 * since**2 * error[GRAVITY]
+    return np.asarray(
+        source.points + turned + moved @ rotation - 0.5 * since**2 * error[ACCEL_BIAS]
+    )

@@ -1,0 +1,124 @@
+"""Degeneracy: which directions of the pose a sweep does not fix, however many points it has.
+
+A wall fixes nothing along itself, yet its points seem to: normals a few degrees off, by noise or
+because the wall was mapped from a pose that turned, and the rounded rims of what has just been
+seen, add up to a few percent of the strongest direction. They agree with every place along the
+wall, so the pose stays where it was predicted, and velocity, biases and gravity are learned from
+that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
+
+* only surfaces that face it count, as in X-ICP (Tuna et al. 2024);
+* these are put to the test. The sweep is moved both ways along the direction and matched again:
+  what the residuals pull back, by what they should if the surfaces were there, is the share of the
+  information that is real. The rest is the noise of the gradient.
+
+The few surfaces that are left are seen by one sweep after another with the same error, so they
+count for less than as many independent ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import ERRORS, POSE, InertialState
+from l2lidar_proc.odometry.correspondences import Correspondences, pose_jacobian, robust_weights
+
+F64 = NDArray[np.float64]
+
+MatchAgain = Callable[[InertialState, NDArray[np.int64]], Correspondences]
+"""Correspondences of some of the source's points, seen from another state."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeakDirections:
+    """Directions of the pose about which a sweep says less than its points claim.
+
+    Attributes
+    ----------
+    scale : ndarray, shape (6,)
+        Errors of turn and place [rad, m] for a unit of a direction.
+    axes : ndarray, shape (6, K)
+        The directions, orthonormal in these units.
+    shares : ndarray, shape (K,)
+        How much of what facing surfaces claim is real, 0 to 1.
+    """
+
+    scale: F64
+    axes: F64
+    shares: F64
+
+    def reduced(self, pose: F64) -> F64:
+        """Return derivatives (M, 6) by turn and place, of residuals that claim no more than so.
+
+        A residual of which the share f is real measures 1/f times as coarsely: information falls
+        by f^2 and the gradient by f, so that where it is zero stays.
+        """
+        scaled = pose * self.scale
+        along = scaled @ self.axes
+        lost = along * np.where(np.abs(along) > tuning.WEAK_FACING, 1.0 - self.shares, 1.0)
+        return np.asarray((scaled - lost @ self.axes.T) / self.scale)
+
+
+def weak_directions(
+    state: InertialState, found: Correspondences, match_again: MatchAgain
+) -> WeakDirections | None:
+    """Return the directions that a sweep hardly fixes, None where it fixes all.
+
+    Parameters
+    ----------
+    state : InertialState
+        From which the correspondences were found.
+    found : Correspondences
+    match_again : callable
+    """
+    pose = pose_jacobian(found, state.rotation)
+    # a turn counts as the way that it moves the points
+    arm = float(np.sqrt((found.points**2).sum(axis=1).mean()))
+    scale = np.repeat((1.0 / max(arm, tuning.WEAK_LEAST_ARM), 1.0), 3)
+    scaled = pose * scale
+    strength, axes = np.linalg.eigh((scaled * found.weights[:, None]).T @ scaled)
+    weak = strength < tuning.WEAK_SHARE * strength[-1]
+    if not weak.any():
+        return None
+    axes = axes[:, weak]
+    shares = np.array(
+        [_real_share(state, found, scaled @ axis, scale * axis, match_again) for axis in axes.T]
+    )
+    return WeakDirections(scale, axes, shares)
+
+
+def _real_share(
+    state: InertialState, found: Correspondences, levers: F64, axis: F64, match_again: MatchAgain
+) -> float:
+    """Return how much of the information about a direction (6,) [rad, m] moved points confirm.
+
+    ``levers`` (M,) are the derivatives of the residuals along it.
+    """
+    facing = np.flatnonzero(np.abs(levers) > tuning.WEAK_FACING)
+    if not len(facing):
+        return 0.0
+    some = np.unique(found.index[facing])
+    levers, distances = levers[facing], found.distances[facing]
+    scales, variances = found.scales[facing], found.variances[facing]
+    move = np.zeros(ERRORS)
+    claimed = pulled = noise = 0.0
+    for step in (tuning.WEAK_STEP, -tuning.WEAK_STEP):
+        expected = distances + step * levers
+        claimed += step * float(
+            (robust_weights(expected, scales) / variances * levers * expected).sum()
+        )
+        move[POSE] = step * axis
+        moved = state.boxplus(move)
+        there = match_again(moved, some)
+        along = pose_jacobian(there, moved.rotation) @ axis
+        pulls = there.weights * along * there.distances * (np.abs(along) > tuning.WEAK_FACING)
+        pulled += step * float(pulls.sum())
+        noise += step**2 * float((pulls**2).sum())
+    if claimed <= 0.0:
+        return 0.0
+    share = (pulled - tuning.WEAK_SIGMAS * np.sqrt(noise)) / claimed
+    return tuning.WEAK_FEW * float(np.clip(share, 0.0, 1.0))

@@ -1,0 +1,152 @@
+"""Degeneracy: what a bare corridor seems to fix, and what door posts really fix."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc import rotations, tuning
+from l2lidar_proc.config import SurfaceConfig
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.odometry.alignment import Alignment, align
+from l2lidar_proc.odometry.correspondences import (
+    Source,
+    correspondences,
+    pose_jacobian,
+    residual_jacobian,
+)
+from l2lidar_proc.odometry.degeneracy import WeakDirections, weak_directions
+from l2lidar_proc.odometry.estimate import unobserved_directions
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+
+STEP = 1e-6
+SIZES = (0.15, 0.3, 0.6, 1.5)
+ZERO = np.zeros(3)
+
+
+def corridor(rng: np.random.Generator, count: int, *, posts: bool) -> F64:
+    """Return points of two walls and a floor along x, with the noise of a depth camera."""
+    points = rng.uniform((-4.0, -1.2, -1.0), (4.0, 1.2, 1.5), (count, 3))
+    kind = rng.integers(0, 3, count)
+    points[kind == 0, 1], points[kind == 1, 1], points[kind == 2, 2] = -1.2, 1.2, -1.0
+    points += 0.02 * rng.standard_normal(points.shape)
+    if posts:
+        for x in (-2.0, 0.5, 3.0):
+            post = rng.uniform((x, 0.7, -1.0), (x, 1.2, 1.5), (count // 12, 3))
+            post[:, 0] += 0.02 * rng.standard_normal(len(post))
+            points = np.vstack([points, post])
+    return points
+
+
+def source_of(points: F64, times: F64) -> Source:
+    return Source(points, times, np.linalg.norm(points, axis=1))
+
+
+def still(**changes: F64) -> InertialState:
+    start = {"rotation": np.eye(3), "position": ZERO, "velocity": ZERO} | changes
+    return InertialState(
+        HostNs(0), gyro_bias=ZERO, accel_bias=ZERO, gravity=np.array([0.0, 0.0, -9.8]), **start
+    )
+
+
+def aligned(*, posts: bool, off: F64, seed: int = 5) -> tuple[Alignment, F64]:
+    """Return a sweep's alignment in a corridor from a wrong place, and the prior covariance."""
+    rng = np.random.default_rng(seed)
+    surfaces = SurfelMap(SIZES)
+    for number in range(6):
+        surfaces.add(corridor(rng, 5000, posts=posts), number)
+    sigma = np.full(eskf.ERRORS, 1e-3)
+    sigma[eskf.POSITION], sigma[eskf.ROTATION], sigma[eskf.VELOCITY] = 0.1, 0.01, 0.1
+    covariance = np.diag(sigma**2)
+    # as after a prediction, a wrong velocity comes with a wrong place
+    covariance[3:6, 6:9] = covariance[6:9, 3:6] = 0.009 * np.eye(3)
+    points = corridor(rng, 2000, posts=posts)
+    source = source_of(points, rng.uniform(-0.05, 0.05, len(points)))
+    found = align(still(position=off), covariance, source, surfaces, SurfaceConfig(), 100)
+    assert found is not None
+    return found, covariance
+
+
+def test_along_a_bare_corridor_nothing_is_learned() -> None:
+    off = np.array([0.05, 0.03, -0.02])
+    found, before = aligned(posts=False, off=off)
+    free = unobserved_directions(found.information[eskf.POSITION, eskf.POSITION])
+    assert free.shape == (3, 1)
+    assert abs(free[0, 0]) > 0.999
+    # across, the place is found; along, place, velocity and their covariance stay as they were
+    np.testing.assert_allclose(found.state.position[1:], 0.0, atol=0.005)
+    assert found.state.position[0] == pytest.approx(off[0], abs=0.005)
+    assert abs(found.state.velocity[0]) < 0.005
+    for row in (3, 6):
+        assert found.covariance[row, row] > 0.95 * before[row, row]
+        assert found.covariance[row + 1, row + 1] < 0.3 * before[row + 1, row + 1]
+
+
+def test_door_posts_fix_the_place_along_a_corridor() -> None:
+    found, before = aligned(posts=True, off=np.array([0.05, 0.03, -0.02]))
+    np.testing.assert_allclose(found.state.position, 0.0, atol=0.008)
+    assert found.covariance[3, 3] < 0.1 * before[3, 3]
+
+
+def test_all_is_kept_where_the_scene_fixes_the_pose() -> None:
+    rng = np.random.default_rng(2)
+    surfaces = SurfelMap(SIZES)
+
+    def box() -> F64:
+        points = rng.uniform(-2.0, 2.0, (6000, 3))
+        points[np.arange(6000), rng.integers(0, 3, 6000)] = rng.choice((-2.0, 2.0), 6000)
+        return points + 0.01 * rng.standard_normal(points.shape)
+
+    for number in range(4):
+        surfaces.add(box(), number)
+    source = source_of(box(), np.zeros(6000))
+
+    def match_again(state: InertialState, some: np.ndarray) -> object:
+        raise AssertionError("nothing is weak")
+
+    found = correspondences(still(), still(), source, surfaces, SurfaceConfig(), 0.15)
+    assert weak_directions(still(), found, match_again) is None  # type: ignore[arg-type]
+
+
+def test_reduced_derivatives_scale_information_by_the_square_of_the_share() -> None:
+    rng = np.random.default_rng(1)
+    scale = np.repeat((0.5, 1.0), 3)
+    axes, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    shares = np.array([0.0, 0.5])
+    weak = WeakDirections(scale, axes[:, :2], shares)
+    pose = rng.normal(size=(200, 6)) * 3.0  # all of them face both directions
+    along = (pose * scale) @ axes
+    pose = pose[(np.abs(along[:, :2]) > tuning.WEAK_FACING).all(axis=1)]
+    before, after = (pose * scale) @ axes, (weak.reduced(pose) * scale) @ axes
+    np.testing.assert_allclose(after[:, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(after[:, 1], 0.5 * before[:, 1])
+    np.testing.assert_allclose(after[:, 2:], before[:, 2:])
+    # residuals that hardly face a direction say nothing of it, whatever the share
+    slight = (axes[:, 3] + 0.1 * axes[:, 1]) / scale
+    assert (weak.reduced(slight[None]) * scale @ axes)[0, 1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_derivatives_by_all_errors_are_those_of_the_residuals() -> None:
+    rng = np.random.default_rng(3)
+    turn = rotations.matrices(rotations.exp((0.3, -0.2, 1.0)))
+    state = still(rotation=turn, position=np.array([0.1, 0.0, 0.2]))
+    surfaces = SurfelMap((1.5,))
+    wall = rng.uniform((-3.0, 2.24, -3.0), (3.0, 2.26, 3.0), (20000, 3))
+    surfaces.add(wall)
+    points = (wall[::100] - state.position) @ turn
+    source = source_of(points, rng.uniform(-0.1, 0.1, len(points)))
+
+    def residuals(error: F64) -> F64:
+        moved = state.boxplus(error)
+        return correspondences(state, moved, source, surfaces, SurfaceConfig(), 1.0).distances
+
+    base = correspondences(state, state, source, surfaces, SurfaceConfig(), 1.0)
+    assert len(base.index) > 150
+    h = residual_jacobian(pose_jacobian(base, turn), base.times, turn)
+    for column in range(eskf.ERRORS):
+        error = np.zeros(eskf.ERRORS)
+        error[column] = STEP
+        moved = residuals(error)
+        np.testing.assert_allclose(h[:, column], (moved - base.distances) / STEP, atol=5e-5)
