@@ -116,7 +116,6 @@ WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals
 WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off in the finest cells
 WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above the noise
 WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller
-WEAK_FEW: Final = 0.5  # of that share; sweep after sweep sees the same few surfaces
 WEAK_STEPS: Final = 2  # iterations with the weak directions known
 WEAK_LEAST_ARM: Final = 0.3  # [m] however near the points are
 # Range noise of two captures of a real unit, along lines of smooth surface: 10-13 mm to 10 m,

@@ -10,9 +10,6 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
 * these are put to the test. The sweep is moved both ways along the direction and matched again:
   what the residuals pull back, by what they should if the surfaces were there, is the share of the
   information that is real. The rest is the noise of the gradient.
-
-The few surfaces that are left are seen by one sweep after another with the same error, so they
-count for less than as many independent ones.
 """
 
 from __future__ import annotations
@@ -121,4 +118,4 @@ def _real_share(
     if claimed <= 0.0:
         return 0.0
     share = (pulled - tuning.WEAK_SIGMAS * np.sqrt(noise)) / claimed
-    return tuning.WEAK_FEW * float(np.clip(share, 0.0, 1.0))
+    return float(np.clip(share, 0.0, 1.0))
