@@ -33,6 +33,8 @@ class Alignment:
     covariance : ndarray, shape (18, 18)
     information : ndarray, shape (18, 18)
         What the points alone say, at the last step; nothing in directions they do not fix.
+    claimed : ndarray, shape (3, 3)
+        About the place, if every surface fixed what its normal claims [1/m^2].
     matched : int
         Points that took part in the last step.
     inlier_ratio : float
@@ -48,6 +50,7 @@ class Alignment:
     state: InertialState
     covariance: F64
     information: F64
+    claimed: F64
     matched: int
     inlier_ratio: float
     residual: float
@@ -136,6 +139,7 @@ def _updated(
         state,
         posterior,
         information,
+        (found.normals * found.weights[:, None]).T @ found.normals,
         len(found.index),
         found.inlier_ratio,
         found.residual,

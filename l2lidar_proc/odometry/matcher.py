@@ -235,7 +235,8 @@ class SweepMatcher:
             motion.state, motion.covariance, place, information, still
         )
         nobody = np.empty(0, np.int64), np.empty(0)
-        return Alignment(state, covariance, information, 0, 0.0, 0.0, 1, nobody)
+        claimed = information[POSITION, POSITION]
+        return Alignment(state, covariance, information, claimed, 0, 0.0, 0.0, 1, nobody)
 
     def _registered(
         self, source: Source, guess: InertialState, most: float = np.inf

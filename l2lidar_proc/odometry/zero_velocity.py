@@ -22,7 +22,6 @@ from l2lidar_proc.motion.filter import (
     ERRORS,
     GYRO_BIAS,
     POSE,
-    POSITION,
     VELOCITY,
     InertialState,
 )
@@ -127,7 +126,7 @@ class ZeroVelocityTest:
         """
         assert self.anchor is not None
         deviation = found.state.boxminus(self.anchor)[POSE]
-        if degeneracy_ratio(found.information[POSITION, POSITION]) < tuning.DEGENERATE_SHARE:
+        if degeneracy_ratio(found.claimed) < tuning.DEGENERATE_SHARE:
             # along a bare corridor rest looks like motion
             self.clear()
             return False
