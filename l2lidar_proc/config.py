@@ -569,6 +569,15 @@ class OdometryConfig:
     min_points: int = setting(
         30, "a sweep with fewer points is predicted instead of aligned", lo=10, hi=100_000
     )
+    max_speed: float = setting(
+        30.0,
+        "largest speed of the carrier; a faster estimate is bounded and SUSPECT. 3 suits a sensor "
+        "held by hand",
+        unit="m/s",
+        lo=0.1,
+        hi=1000.0,
+        live=True,
+    )
     inertial: InertialConfig = field(default_factory=InertialConfig)
     surfaces: SurfaceConfig = field(default_factory=SurfaceConfig)
     kiss: KissConfig = field(default_factory=KissConfig)

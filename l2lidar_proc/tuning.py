@@ -38,6 +38,7 @@ ZERO_VELOCITY: Final = 0.003  # [m/s] noise of a zero-velocity update. Tuned on:
 # second with the second. Derived: walking and driving speeds are a few metres a second.
 PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
 PRIOR_SPEED: Final = 1.0  # [m/s]
+SPEED_BOUND_SHARE: Final = 0.02  # of max_speed: its noise as a measurement. Derived: a hard bound
 MAP_ORIGIN_SIGMA: Final = 1e-3  # [m, rad] of the pose with which a new map begins
 # After a time jump. Derived: somebody moved the sensor by hand meanwhile.
 TIME_JUMP_ROTATION: Final = 0.1  # [rad]

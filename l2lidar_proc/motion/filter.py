@@ -444,6 +444,38 @@ def apply_zero_velocity_prior(
     return found.state, found.covariance
 
 
+def bound_speed(
+    state: InertialState, covariance: F64, max_speed: float
+) -> tuple[InertialState, F64]:
+    """Return state and covariance with a speed that no carrier of this kind has brought back.
+
+    What is corrected with the velocity is what its covariance ties to it: a place that ran away
+    comes back as far as the wrong velocity explains it. How the estimate came to be is not known,
+    so the covariance does not shrink, and the velocity's allows for the whole excess.
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    max_speed : float
+        [m/s]; slower states are returned as they are.
+    """
+    speed = float(np.linalg.norm(state.velocity))
+    if speed <= max_speed:
+        return state, covariance
+    ahead = state.velocity / speed
+    excess = speed - max_speed
+    widened = covariance.copy()
+    widened[VELOCITY, VELOCITY] += excess**2 * np.outer(ahead, ahead)
+    jacobian = np.zeros((1, ERRORS))
+    jacobian[0, VELOCITY] = ahead
+    noise = np.array([[(tuning.SPEED_BOUND_SHARE * max_speed) ** 2]])
+    found = update(state, widened, np.array([-excess]), jacobian, noise)
+    velocity = found.state.velocity
+    velocity = velocity * min(1.0, max_speed / float(np.linalg.norm(velocity)))
+    return dataclasses.replace(found.state, velocity=velocity), widened
+
+
 # ---- changes of what is known
 
 

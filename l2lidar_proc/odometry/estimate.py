@@ -23,6 +23,7 @@ class Status(Enum):
     SPARSE = "too few points"
     UNMATCHED = "too few points meet the map"
     DEGENERATE = "the scene does not fix the pose in every direction"
+    SUSPECT = "faster than max_speed: the velocity is bounded, its covariance widened"
     IMU_GAP = "IMU samples are missing within the span of this estimate"
     NO_IMU = "no IMU sample at all: steady motion is assumed"
     GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"

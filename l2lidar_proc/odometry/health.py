@@ -14,7 +14,13 @@ OK: Final = 0
 WARN: Final = 1
 ERROR: Final = 2
 
-_SERIOUS: Final = {Status.PREDICTED, Status.LOST, Status.NO_IMU, Status.GRAVITY_UNTRUSTED}
+_SERIOUS: Final = {
+    Status.PREDICTED,
+    Status.SUSPECT,
+    Status.LOST,
+    Status.NO_IMU,
+    Status.GRAVITY_UNTRUSTED,
+}
 
 
 def judged(

@@ -196,7 +196,11 @@ class Odometry:
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
         lasted = (predicted.state.stamp - state.stamp) * 1e-9
-        motion = predicted.with_state(*eskf.apply_zero_velocity_prior(*posterior, lasted))
+        posterior = eskf.apply_zero_velocity_prior(*posterior, lasted)
+        bounded = eskf.bound_speed(*posterior, self.config.max_speed)
+        if bounded[0] is not posterior[0]:
+            status.append(Status.SUSPECT)
+        motion = predicted.with_state(*bounded)
         if self._unmatched_ns >= tuning.LOST_NS:
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)

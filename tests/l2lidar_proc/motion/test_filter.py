@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -124,6 +126,24 @@ def test_the_prior_touches_only_a_velocity_that_is_hardly_known() -> None:
     slowed, covariance = eskf.apply_zero_velocity_prior(state, loose, 1.0)
     np.testing.assert_allclose(slowed.velocity, 0.5 * state.velocity, atol=1e-9)
     assert covariance[6, 6] == pytest.approx(0.5)
+
+
+def test_a_speed_above_the_bound_comes_back_with_what_it_led_to() -> None:
+    state = dataclasses.replace(some_state(), velocity=np.array([6.0, 8.0, 0.0]))
+    covariance = 0.01 * np.eye(eskf.ERRORS)
+    # 2 s of a wrong velocity are in the place
+    covariance[3:6, 3:6] = 0.05 * np.eye(3)
+    covariance[3:6, 6:9] = covariance[6:9, 3:6] = 0.02 * np.eye(3)
+    assert eskf.bound_speed(state, covariance, 10.0)[0] is state
+    found, after = eskf.bound_speed(state, covariance, 3.0)
+    assert np.linalg.norm(found.velocity) == pytest.approx(3.0, abs=0.02)
+    np.testing.assert_allclose(found.velocity / np.linalg.norm(found.velocity), (0.6, 0.8, 0.0))
+    moved = found.position - state.position
+    np.testing.assert_allclose(np.cross(moved, (0.6, 0.8, 0.0)), 0.0, atol=1e-9)
+    assert moved @ (0.6, 0.8, 0.0) < 0.0
+    # nothing is surer than before, and the velocity allows for the excess
+    assert np.linalg.eigvalsh(after - covariance).min() > -1e-12
+    assert after[6, 6] == pytest.approx(0.01 + 7.0**2 * 0.36)
 
 
 def test_information_form_equals_the_ordinary_update() -> None:

@@ -162,6 +162,14 @@ def test_corridor_tells_its_weak_direction() -> None:
     assert any(Status.DEGENERATE in one.status for one in estimates)
 
 
+def test_no_estimate_is_faster_than_its_carrier_and_it_says_so() -> None:
+    run = recording("yard", "walk")
+    estimates = drive(run, config=OdometryConfig(max_speed=0.2))
+    speeds = [float(np.linalg.norm(one.velocity)) for one in estimates]
+    assert max(speeds) < 0.3  # of the cloud's frame, which turns about the IMU
+    assert any(Status.SUSPECT in one.status for one in estimates)
+
+
 def test_a_sweep_that_is_not_later_is_refused() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
