@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ from l2lidar_node.programs import held
 
 GRACE_S: Final = 30.0  # for a program that ends; only one that hangs takes so long
 _HANDED_OUT: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+_LINES: Final = 2_000  # of a program's output that are kept
 _USUAL_LAST: Final = 60_999
 _LAST: Final = 65_535
 _PORTS_AT_ONCE: Final = 90  # that a process takes for itself
@@ -40,6 +42,11 @@ class Program:
     ----------
     module : str
     arguments : list of str
+
+    Attributes
+    ----------
+    lines : deque of str
+        The last ones that it wrote.
     """
 
     def __init__(self, module: str, arguments: list[str]) -> None:
@@ -50,7 +57,12 @@ class Program:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            errors="replace",
         )
+        # A pipe that nobody reads fills up, and the program stops at its next word.
+        self.lines: deque[str] = deque(maxlen=_LINES)
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     @property
     def pid(self) -> int:
@@ -61,22 +73,31 @@ class Program:
         """Raise :class:`ProgramError` if it has ended."""
         code = self._process.poll()
         if code is not None:
-            said = self._process.stdout.read().strip() if self._process.stdout else ""
-            raise ProgramError(f"{self.module} ended with exit code {code}:\n{said}")
+            raise ProgramError(f"{self.module} ended with exit code {code}:\n{self._said()}")
 
     def stop(self) -> tuple[int, str]:
-        """Interrupt it as Ctrl-C does; return its exit code and everything it said."""
+        """Interrupt it as Ctrl-C does; return its exit code and the last lines that it wrote."""
         if self._ended is not None:
             return self._ended
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
         try:
-            said, _ = self._process.communicate(timeout=GRACE_S)
+            self._process.wait(timeout=GRACE_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            said, _ = self._process.communicate()
-        self._ended = self._process.returncode, said
+            self._process.wait()
+        self._ended = self._process.returncode, self._said()
         return self._ended
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as output:
+            self.lines.extend(output)
+
+    def _said(self) -> str:
+        """Return the last lines that the program wrote before it ended."""
+        self._reader.join(timeout=GRACE_S)  # whom it left behind may hold the pipe open
+        return "".join(tuple(self.lines)).strip()
 
 
 class Programs:

@@ -8,7 +8,7 @@ import sys
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from l2lidar_node.demo.processes import free_udp_ports
+from l2lidar_node.demo.processes import Program, free_udp_ports
 from tests.support.processes import ended_with_the_test
 
 ROOT = Path(__file__).parents[3]
@@ -37,6 +37,16 @@ def taker(*arguments: str) -> subprocess.Popen[str]:
 def said(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
     return process.stdout.readline().strip()
+
+
+def test_a_program_that_says_much_does_not_stop_at_a_full_pipe() -> None:
+    program = Program("dis", [str(ROOT / "l2lidar_node" / "clock" / "lower_envelope.py")])
+    assert program._process.wait(timeout=60) == 0
+    code, said = program.stop()
+    assert code == 0
+    assert len(said) > 1 << 16  # what a pipe holds
+    assert len(program.lines) <= 2_000
+    assert "RETURN_VALUE" in program.lines[-1]
 
 
 def test_processes_beside_each_other_have_domains_and_ports_of_their_own() -> None:

@@ -210,11 +210,10 @@ def test_a_serial_line_feeds_the_node(rig: Rig) -> None:
     emulator = rig.programs.start(
         "l2lidar_node.emulator", ["--serial", "pty", "--ready", "--world", "pattern"]
     )
-    assert emulator._process.stdout is not None
-    name = ""
-    while not name.startswith("serial "):
-        name = emulator._process.stdout.readline()
-        assert name, "the emulator ended"
+    rig.wait_for(
+        lambda: any(line.startswith("serial ") for line in tuple(emulator.lines)), "its port"
+    )
+    name = next(line for line in tuple(emulator.lines) if line.startswith("serial "))
     rig.driver(serial_port=name.split()[1].rstrip(","))
     rig.wait_for(lambda: len(rig.observer.clouds.stamps) >= 3, "clouds")
 
