@@ -242,7 +242,7 @@ def sampled(paths: Sequence[Path], count: int, seed: int) -> list[Mutant]:
     for path, mutants in found.items():
         share = max(round(count * len(mutants) / total), 1) if count else len(mutants)
         rng = random.Random(f"{seed} {path}")
-        some = rng.sample(mutants, min(share, len(mutants)))
+        some = rng.sample(mutants, len(mutants))[:share]  # a larger sample has these too
         chosen += sorted(some, key=lambda mutant: mutant.number)
     return chosen
 

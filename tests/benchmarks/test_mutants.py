@@ -41,6 +41,7 @@ def test_a_sample_is_the_same_for_a_seed_and_has_mutants_of_every_module() -> No
     assert some == mutants.sampled(paths, 20, 1)
     assert some != mutants.sampled(paths, 20, 2)
     assert {mutant.path for mutant in some} == set(paths)
+    assert set(mutants.sampled(paths, 10, 1)) < set(some)
     assert 19 <= len(some) <= 21
 
 
