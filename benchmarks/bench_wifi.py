@@ -262,8 +262,8 @@ one core of a PC.
 ## What arrives
 
 Driver and listener under Fast DDS in two network namespaces, with 20 Mbit/s, 2 % loss and 30 ms
-each way between them (`benchmarks/wifi_link.py`), {seconds:.0f} s for each line after 4 s of
-settling. *Late* counts from the last point of a cloud.
+each way between them (`benchmarks/wifi_link.py`), {seconds:.0f} s for each line once the
+first message has come, or after 25 s. *Late* counts from the last point of a cloud.
 
 {link}
 """
