@@ -103,7 +103,7 @@ _TO_INACTIVE: Final = (Transition.TRANSITION_DEACTIVATE,)
 _TO_UNCONFIGURED: Final = (*_TO_INACTIVE, Transition.TRANSITION_CLEANUP)
 _TO_ACTIVE: Final = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
 
-_TIMEOUT_S: Final = 60.0  # for good data to come through; beyond that a node is stuck
+_TIMEOUT_S: Final = 180.0  # for good data to come through; beyond that a node is stuck
 _ANSWER_S: Final = 10.0
 _TARGET_S: Final = 1.0
 # After hostility: what is under way arrives, and clouds that cannot be told from the sensor's own,
