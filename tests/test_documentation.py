@@ -22,11 +22,12 @@ ADMIN = "changes the machine"
 RUN_BY = {
     r"git clone .*": "CI, which starts in a fresh clone",
     r"make (test|setup|check|format|pytest|test-noble|docs)\b.*": "CI itself",
+    r"\.venv/bin/python -m pytest .*": "CI itself",
     r"PYTHON=.* make setup": "tests/test_setup.py",
     r"(python3 -m venv|\.venv/bin/(pip|python -m colcon)) .*": "tests/test_packaging.py",
     r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
     r"l2lidar (discover|info|set \w+).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
-    r"l2lidar calibrate (still|scale) .*": "tests/l2lidar_node/cli/test_calibrate.py",
+    r"l2lidar calibrate (still|imu|scale) .*": "tests/l2lidar_node/cli/test_calibrate.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
     r"(kiss_icp_pipeline|evo_ape|evo_traj) .*": "tests/l2lidar_node/recording/test_bag_readers.py",
     r"l2lidar (slam|export) .*": "tests/l2lidar_proc/verbs/test_slam.py",
