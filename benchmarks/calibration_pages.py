@@ -30,7 +30,7 @@ def write(rows: list[Row], targets: list[Target]) -> Path:
         table(rows),
         *_words(rows, "imu", "IMU: what is left, and its deviation"),
         *_words(rows, "odometry", "Odometry of a typical unit"),
-        f"Measured with Python {facts['python']} on {facts['system']}.",
+        f"Measured with Python {facts['python']}.",
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
