@@ -215,7 +215,7 @@ def test_mounts_come_from_tf(bench: Any) -> None:
     "bench", [("velocity_type:=twist", "velocity_topic:=twist")], indirect=True
 )
 def test_velocity_from_a_twist(bench: Any) -> None:
-    prime(bench, 0.1)
+    prime(bench, 1.4)
     message = TwistStamped()
     message.header.frame_id = FRAME
     message.header.stamp = to_time(at(1.5))
