@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import select
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -131,8 +133,21 @@ def confirmed(question: str) -> bool:
 
 
 def _answer(prompt: str) -> str:
+    """Return the line that is typed.
+
+    Raises
+    ------
+    CommandError
+        If the input has ended.
+    """
     try:
-        return input(prompt)
+        if not sys.stdin.isatty():
+            return input(prompt)
+        # input() misses a Ctrl-C that comes between its prompt and its reading.
+        print(prompt, end="", flush=True)
+        while not select.select([sys.stdin], [], [], _LOOK_S)[0]:
+            pass
+        return input()
     except EOFError:
         say("")
         raise CommandError(

@@ -70,8 +70,9 @@ class Terminal:
 
     def exit_code(self) -> int:
         """Read to the end; return the exit code."""
-        while self._read(LIMIT_S):
-            pass
+        deadline = time.monotonic() + LIMIT_S
+        while self._read(1.0):
+            assert time.monotonic() < deadline, f"it did not end:\n{self.said}"
         return self._process.wait(LIMIT_S)
 
     def _read(self, seconds: float) -> bool:
