@@ -63,6 +63,7 @@ class ManagedNode(LifecycleNode):
 
     def __init__(self, name: str) -> None:
         self._answering = 0  # calls of services that are waiting for something
+        self._is_destroyed = False
         super().__init__(name)
         self._problem: Exception | None = None
         self._before_set_up: set[Any] = set()
@@ -136,18 +137,25 @@ class ManagedNode(LifecycleNode):
     @property
     def is_active(self) -> bool:
         """Whether the node is at work."""
-        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+        return self._current_state[0] == State.PRIMARY_STATE_ACTIVE
 
     @property
     def is_configured(self) -> bool:
         """Whether the node is active or could be at once."""
         configured = (State.PRIMARY_STATE_INACTIVE, State.PRIMARY_STATE_ACTIVE)
-        return self._state_machine.current_state[0] in configured
+        return self._current_state[0] in configured
 
     @property
     def state_label(self) -> str:
         """Name of the state: unconfigured, inactive, active, finalized, or on the way to one."""
-        return str(self._state_machine.current_state[1])
+        return self._current_state[1]
+
+    @property
+    def _current_state(self) -> tuple[int, str]:
+        if self._is_destroyed:
+            return State.PRIMARY_STATE_FINALIZED, "finalized"
+        number, label = self._state_machine.current_state
+        return int(number), str(label)
 
     def start(self, autostart: bool) -> None:
         """Configure and activate the node if it is to start by itself; the end of a constructor.
@@ -167,9 +175,15 @@ class ManagedNode(LifecycleNode):
 
     def destroy_node(self) -> None:
         """Give everything up, then destroy the node."""
+        if self._is_destroyed:
+            return
         if self.is_configured:
             self.tear_down()
+        self._is_destroyed = True
         super().destroy_node()
+        # rclpy forgets this, and what it holds keeps the node in the graph. To ask it afterwards
+        # would crash.
+        self._state_machine.destroy_when_not_in_use()
 
     # ---- transitions, as rclpy calls them
 

@@ -200,3 +200,11 @@ def test_a_manager_is_told_what_cannot_be_done_and_nothing_ends(rig: Rig) -> Non
         assert rig.node.state_label == "unconfigured"
     assert rig.change("configure")
     assert rig.answers()
+
+
+def test_a_destroyed_node_leaves_the_graph_and_may_be_destroyed_twice(rig: Rig) -> None:
+    assert "l2lidar_node" in rig.peer.get_node_names()
+    rig.executor.remove_node(rig.node)
+    rig.node.destroy_node()
+    rig.until(lambda: "l2lidar_node" not in rig.peer.get_node_names())
+    rig.node.destroy_node()
