@@ -137,7 +137,7 @@ class ManagedNode(LifecycleNode):
     @property
     def is_active(self) -> bool:
         """Whether the node is at work."""
-        return self._current_state[0] == State.PRIMARY_STATE_ACTIVE
+        return bool(self._current_state[0] == State.PRIMARY_STATE_ACTIVE)
 
     @property
     def is_configured(self) -> bool:
