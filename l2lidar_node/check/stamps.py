@@ -17,7 +17,6 @@ _RATIO_TOLERANCE: Final = 0.05
 _HALF: Final = (0.45, 0.55)
 _MUCH_LOST: Final = 0.2
 _OLD_S: Final = 2.0
-_L2_IMU_HZ: Final = 250.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

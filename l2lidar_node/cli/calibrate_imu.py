@@ -46,7 +46,6 @@ _BEFORE: Final = """\
 _AXES: Final = ("roll about x", "nod about y", "turn about z")
 _STILL_S: Final = 5.0
 _SHORTEST_S: Final = 20.0  # of motion, however vivid
-_LOOK_S: Final = 0.1
 _VIRTUAL_S: Final = 36.0
 
 

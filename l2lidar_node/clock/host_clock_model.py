@@ -14,7 +14,6 @@ from l2lidar_node.clock.lower_envelope import (
 )
 
 _MS: Final = 1_000_000
-_TRY_NS: Final = 100 * _MS  # between attempts to lock
 _QUIET_LOCK_NS: Final = 400 * _MS  # data that suffice while arrivals hardly vary
 _LOCK_NS: Final = 1_600 * _MS  # data that must suffice
 _QUIET_NS: Final = 50_000.0  # median delay above the line below which arrivals hardly vary

@@ -33,7 +33,6 @@ from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import HostNs, ImuSample, Sweep, split_stamp
 
-_NS: Final = 1_000_000_000
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
