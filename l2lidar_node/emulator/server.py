@@ -144,9 +144,13 @@ class Server:
                 select.select([self._port], [], [], _CHUNK_NS * 1e-9)
             now_ns = min(max(next_ns or 0, now_ns) + _CHUNK_NS, end_ns)
             for _, data in self._device.advance(now_ns):
-                while not self._port.drain(_LONGEST_WAIT_S) and not self._is_stopped:
-                    pass
+                self._drain()
                 self.unsent += not self._port.send(data)
+        self._drain()  # a serial line may have taken only a part of the last packet
+
+    def _drain(self) -> None:
+        while not self._is_stopped and not self._port.drain(_LONGEST_WAIT_S):
+            pass
 
     def _listen(self, now_ns: int) -> None:
         for data in self._port.receive():

@@ -16,7 +16,6 @@ import pytest
 
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.config import AddressConfig, DeviceConfig, FaultConfig, IdentityConfig
-from l2lidar_node.emulator.link import port
 from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort, unread
 from l2lidar_node.emulator.server import MAX_SPEED, Latency, Server
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
@@ -147,7 +146,7 @@ def test_as_fast_as_the_receiver_takes_it_nothing_is_lost(host: Host) -> None:
 def test_a_stop_ends_even_a_race_that_nobody_reads(host: Host) -> None:
     device = unit(config_for(host.port))
     with running(device, UdpPort(device.network), speed=MAX_SPEED):
-        assert port.unread("127.0.0.1", host.port) is not None
+        assert unread("127.0.0.1", host.port) is not None
         host.read()
 
 
@@ -212,16 +211,16 @@ def test_an_address_in_use_or_elsewhere_is_named(host: Host) -> None:
 
 
 def test_the_backlog_is_what_the_receiver_has_not_read(host: Host) -> None:
-    assert port.unread("127.0.0.1", host.port) == 0
+    assert unread("127.0.0.1", host.port) == 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(5):
             sender.sendto(bytes(1000), ("127.0.0.1", host.port))
-    waiting = port.unread("127.0.0.1", host.port)
+    waiting = unread("127.0.0.1", host.port)
     assert waiting is not None
     assert waiting >= 5000
     for _ in range(5):
         host.socket.recv(2000)
-    assert port.unread("127.0.0.1", host.port) == 0
+    assert unread("127.0.0.1", host.port) == 0
 
 
 def serial_unit() -> VirtualL2:
@@ -258,7 +257,13 @@ def octets(device: VirtualL2) -> int:
     return sum(wire.FRAME_SIZES[kind] * count for kind, count in device.sent.items())
 
 
-def test_a_serial_line_sets_the_pace_of_a_race() -> None:
+@pytest.mark.parametrize("longest_write", [65536, 500])
+def test_a_serial_line_sets_the_pace_of_a_race(
+    longest_write: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = os.write
+    # A line that is almost full takes a part of a packet, the last one included.
+    monkeypatch.setattr(os, "write", lambda fd, data: write(fd, data[:longest_write]))
     device = serial_unit()
     port = SerialPort("pty")
     line = os.open(port.name.split()[1], os.O_RDWR | os.O_NOCTTY)
