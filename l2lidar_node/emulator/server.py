@@ -43,7 +43,7 @@ class Latency:
 
 
 _LONGEST_WAIT_S: Final = 0.05  # to notice a stop or a held-back packet
-_CHUNK_NS: Final = 20_000_000  # of the unit's time between two looks at the receiver
+_CHUNK_NS: Final = 20_000_000  # of the unit's time between two looks at receiver and stop
 MAX_SPEED: Final = math.inf
 
 
@@ -127,7 +127,8 @@ class Server:
             if due_ns is not None:
                 wait_s = min(max((due_ns - now()) / speed * 1e-9, 0.0), wait_s)
             is_spoken_to = bool(select.select([self._port], [], [], wait_s)[0])
-            until_ns = min(now(), end_ns)
+            # After a pause of the machine there is much to catch up with; a stop is heard between.
+            until_ns = min(now() if due_ns is None else due_ns + _CHUNK_NS, now(), end_ns)
             for time_ns, data in self._device.advance(until_ns):
                 self.unsent += not self._port.send(data)
                 self.latency.add(now() - time_ns)

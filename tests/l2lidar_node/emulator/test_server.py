@@ -210,6 +210,12 @@ def test_an_address_in_use_or_elsewhere_is_named(host: Host) -> None:
         UdpPort(network._replace(lidar_ip="192.0.2.1", lidar_port=6101))
 
 
+def test_a_stop_is_heard_while_a_unit_catches_up_with_days(host: Host) -> None:
+    device = unit(config_for(host.port))
+    with running(device, UdpPort(device.network), speed=1e9):
+        host.read()
+
+
 def test_the_backlog_is_what_the_receiver_has_not_read(host: Host) -> None:
     assert unread("127.0.0.1", host.port) == 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
