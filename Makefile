@@ -3,8 +3,10 @@
 RUN := .venv/bin/python
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
-# A process for every core; more than four find too little to do.
-WORKERS := -n logical --maxprocesses 4
+CORES := $(shell nproc)
+# Tests wait for units and nodes a good part of the time: one process more than there are cores.
+# More than four find too little to do.
+WORKERS := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 BENCH_ARGS ?=
 
 BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))
@@ -34,7 +36,7 @@ lint: setup
 	$(RUN) -m ruff format --check .
 
 types: setup
-	$(RUN) -m mypy
+	$(RUN) -m mypy --num-workers $(CORES)
 
 imports: setup
 	.venv/bin/lint-imports

@@ -65,7 +65,7 @@ setup(
         "dev": [
             "hypothesis>=6.100",
             "import-linter>=2.1",
-            "mypy>=1.11",
+            "mypy>=2.4",
             "pytest>=9",
             "pytest-xdist>=3.6",
             "ruff>=0.9",

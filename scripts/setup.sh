@@ -118,8 +118,9 @@ find_python() {
 
 # --- the steps ------------------------------------------------------------------------------------------
 
+# Most of what comes along is never imported here: what is imported is compiled then.
 pip_install() {
-    "$python" -m pip install --quiet --disable-pip-version-check "$@" >"$venv/pip.log" 2>&1 && return
+    "$python" -m pip install --quiet --no-compile --disable-pip-version-check "$@" >"$venv/pip.log" 2>&1 && return
     { grep -v '^WARNING' "$venv/pip.log" || true; } | tail -n 15 >&2
     die "pip could not install what is needed; its own words are above." \
         "Is there a network, and free disk space? Where PyPI cannot be reached, set PIP_INDEX_URL to a mirror" \
