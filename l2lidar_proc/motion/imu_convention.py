@@ -67,18 +67,24 @@ class ImuConvention:
         self._poses: list[tuple[HostNs, F64]] = []
         self._bends: list[tuple[F64, F64]] = []
 
+    def applied(self, samples: Samples) -> Samples:
+        """Return samples (N,) in m/s^2, as specific force, by what has been recognized so far."""
+        if not self.in_g and not self.reversed:
+            return samples
+        samples = samples.copy()
+        factor = tuning.STANDARD_GRAVITY if self.in_g else 1.0
+        samples["linear_acceleration"] *= -factor if self.reversed else factor
+        return samples
+
     def corrected(self, samples: Samples) -> Samples:
-        """Return samples (N,) in m/s^2, as specific force."""
+        """Learn from samples (N,); return them in m/s^2, as specific force."""
         if len(self._norms) < _DECIDED and len(samples):
             norms = np.linalg.norm(samples["linear_acceleration"], axis=1)
             norms = norms[np.isfinite(norms)]
             self._norms = np.concatenate((self._norms, norms))[:_DECIDED]
             if len(self._norms):
                 self.in_g = bool(_G_NORMS[0] < np.median(self._norms) < _G_NORMS[1])
-        if self.in_g or self.reversed:
-            samples = samples.copy()
-            factor = tuning.STANDARD_GRAVITY if self.in_g else 1.0
-            samples["linear_acceleration"] *= -factor if self.reversed else factor
+        samples = self.applied(samples)
         if len(self._stamps) > _MOST_KEPT:  # no poses come that would let them go
             self._drop(self._stamps[_MOST_KEPT // 2])
         stamps = samples["stamp"].tolist()

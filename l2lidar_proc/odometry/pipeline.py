@@ -146,17 +146,23 @@ class OdometryPipeline:
         """Stamp of the newest IMU sample."""
         return self._newest_imu
 
-    def imu(self, samples: Samples) -> Samples:
-        """Take IMU samples (N,) in any order and state; return them as they are used."""
-        samples = self.convention.corrected(self._extrinsics.corrected(samples))
+    def corrected(self, samples: Samples) -> Samples:
+        """Return IMU samples (N,) as they are used; changes nothing, so any thread may ask."""
+        return self._usable(self.convention.applied(self._extrinsics.corrected(samples)))
+
+    def _usable(self, samples: Samples) -> Samples:
         if not self._uses_accelerometer:
             samples = samples.copy()
             samples["linear_acceleration"] = 0.0
+        return samples
+
+    def imu(self, samples: Samples) -> None:
+        """Take IMU samples (N,) in any order and state."""
+        samples = self._usable(self.convention.corrected(self._extrinsics.corrected(samples)))
         self.odometry.imu(samples)
         self.check.imu(samples)
         if len(samples):
             self._newest_imu = HostNs(int(samples["stamp"][-1]))
-        return samples
 
     def sweep(self, sweep: Sweep, now: int) -> None:
         """Take a sweep that arrives at ``now`` [ns]."""

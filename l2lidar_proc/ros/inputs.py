@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any, Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
@@ -87,7 +88,7 @@ class InputMonitor:
 
     def usable(self, samples: Samples, frame: str) -> Samples:
         """Return the IMU samples (N,) of a frame that are to be used."""
-        fits = (samples["stamp"] >= FIRST_STAMP) & (samples["stamp"] <= LAST_STAMP)
+        fits = in_range(samples)
         for _ in range(int(np.count_nonzero(~fits))):
             self.refuse("IMU sample with a stamp that is out of range")
         samples = samples[fits]
@@ -192,6 +193,11 @@ class InputMonitor:
         if covered < 180:
             return [f"the points of a cloud cover {covered} of 360 degrees of azimuth"]
         return []
+
+
+def in_range(samples: Samples) -> NDArray[np.bool_]:
+    """Return which samples (N,) have a stamp that a ROS message can carry, shape (N,)."""
+    return (samples["stamp"] >= FIRST_STAMP) & (samples["stamp"] <= LAST_STAMP)
 
 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:

@@ -2,11 +2,14 @@
 
 The IMU subscription stays out of the executor's wait set: at 250 messages a second, waking up for
 each costs more than all the work on them. Its queue is drained when a cloud comes, on a slow
-timer, and quickly while a sweep waits for its last samples.
+timer, and quickly while a sweep waits for its last samples. Where a listener wants samples even
+while the executor is busy with a cloud, a thread drains the queue as well.
 """
 
 from __future__ import annotations
 
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -22,7 +25,7 @@ from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.ros import serialized
 from l2lidar_proc.ros.inputs import steady_timer
-from l2lidar_proc.ros.serialized import Cloud
+from l2lidar_proc.ros.serialized import Cloud, ImuBatch
 
 # A node that is held up for some seconds catches up at once: better late than a hole in the map.
 CLOUD_DEPTH: Final = 30
@@ -140,7 +143,7 @@ class SensorIntake:
     reliability : str
         Asked of both: "best_effort" or "reliable".
     period_s : float
-        Between looks into the IMU's queue.
+        Between the looks of the thread into the IMU's queue.
     """
 
     def __init__(
@@ -154,7 +157,11 @@ class SensorIntake:
         self._node = node
         self._topics = cloud_topic, imu_topic
         self._reliability = RELIABILITY[reliability]
-        self._period_s = min(period_s, SLOW_LOOK_S)
+        self._period_s = period_s
+        self._queue = threading.Lock()  # held while the IMU's messages are taken
+        self._taken: deque[ImuBatch] = deque(maxlen=IMU_DEPTH)  # and not handed out yet
+        self._fast: dict[Listener, Callable[..., None]] = {}
+        self._thread: tuple[threading.Thread, threading.Event] | None = None
         self._listeners: list[Listener] = []
         self._feeds: list[_Feed] = []
         self._open: _Entities | None = None
@@ -164,7 +171,14 @@ class SensorIntake:
         """Subscriptions and timers that there are at the moment."""
         return list(self._open) if self._open is not None else []
 
-    def add(self, listener: Listener, guard: Guard, *, is_first: bool = False) -> None:
+    def add(
+        self,
+        listener: Listener,
+        guard: Guard,
+        *,
+        is_first: bool = False,
+        fast: Callable[[Samples, str], None] | None = None,
+    ) -> None:
         """Feed a listener.
 
         Parameters
@@ -174,6 +188,9 @@ class SensorIntake:
             Makes a callback survive its own errors: one listener must not stop another.
         is_first : bool
             Feed it before the others rather than after them.
+        fast : callable, optional
+            Gets the samples as well, earlier: from a thread, also while a cloud is worked on.
+            It must survive its own errors.
         """
         feed = _Feed(
             guard(listener.take_samples),
@@ -186,6 +203,9 @@ class SensorIntake:
         self._feeds.insert(at, feed)
         if self._open is None:
             self._open = self._subscribed()
+        if fast is not None:
+            self._fast[listener] = fast
+            self._start_thread()
 
     def remove(self, listener: Listener) -> None:
         """Feed a listener no more."""
@@ -193,9 +213,13 @@ class SensorIntake:
             return
         at = self._listeners.index(listener)
         del self._listeners[at], self._feeds[at]
+        if self._fast.pop(listener, None) is not None and not self._fast:
+            self._stop_thread()
         if not self._listeners and self._open is not None:
             node, opened = self._node, self._open
-            self._open = None
+            with self._queue:
+                self._open = None
+            self._taken.clear()
             node.destroy_timer(opened.soon)
             node.destroy_timer(opened.look)
             node.destroy_subscription(opened.clouds)
@@ -218,19 +242,53 @@ class SensorIntake:
             QoSProfile(depth=CLOUD_DEPTH, reliability=self._reliability),
             raw=True,
         )
-        look = steady_timer(node, self._period_s, self.look)
+        look = steady_timer(node, SLOW_LOOK_S, self.look)
         soon = steady_timer(node, _WAIT_S, self.look)
         soon.cancel()
         return _Entities(imu, clouds, look, soon)
 
     def drain(self) -> None:
         """Hand out the IMU samples that have come."""
-        if self._open is None:
-            return
-        messages = [bytes(message) for message in waiting(self._open.imu, IMU_DEPTH)]
-        for samples, frame in serialized.imu_batches(messages):
+        self._take()
+        while self._taken:
+            samples, frame = self._taken.popleft()
             for feed in self._feeds:
                 feed.samples(samples, frame)
+
+    def _take(self) -> None:
+        """Take the IMU's messages out of their queue; the executor and the thread do."""
+        with self._queue:
+            if self._open is None:
+                return
+            messages = [bytes(message) for message in waiting(self._open.imu, IMU_DEPTH)]
+            for batch in serialized.imu_batches(messages):
+                for fast in list(self._fast.values()):
+                    fast(*batch)
+                self._taken.append(batch)
+
+    def _start_thread(self) -> None:
+        if self._thread is not None:
+            return
+        stopped = threading.Event()
+
+        def run() -> None:
+            try:
+                while not stopped.wait(self._period_s):
+                    self._take()
+            except Exception:
+                if self._node.context.ok():  # else ROS was shut down meanwhile
+                    raise
+
+        thread = threading.Thread(target=run, name="imu", daemon=True)
+        self._thread = thread, stopped
+        thread.start()
+
+    def _stop_thread(self) -> None:
+        if self._thread is not None:
+            thread, stopped = self._thread
+            stopped.set()
+            thread.join()
+            self._thread = None
 
     def look(self) -> None:
         """Hand out the IMU samples, and let the listeners publish what is finished."""

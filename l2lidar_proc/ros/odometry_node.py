@@ -25,7 +25,7 @@ from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import F64, HostNs, Sweep
+from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.config import DeskewTopics, OdometryNodeConfig, OdometryTopics
@@ -34,7 +34,6 @@ from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
-from l2lidar_proc.odometry.dead_reckoning import DeadReckoning
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
@@ -43,16 +42,15 @@ from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import (
     InputMonitor,
     answer_or_error,
+    in_range,
     load_libraries,
     steady_timer,
 )
 from l2lidar_proc.ros.intake import SLOW_LOOK_S, OneCloud, SensorIntake
+from l2lidar_proc.ros.pose_broadcaster import PoseBroadcaster
 from l2lidar_proc.ros.static_frames import StaticFrames, untied
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
-_JITTER_NS = 2_000_000  # a step may come by half an IMU period early, or it would miss one
-_MOST_SAMPLES = 250  # that wait for the next step of dead reckoning, whatever their stamps are
-_TIME_JUMP_NS = 1_000_000_000  # samples older than the latest TF by more: time was set back
 
 
 class OdometryNode(ManagedNode):
@@ -92,16 +90,16 @@ class OdometryNode(ManagedNode):
         self._looked_at = 0
         self._path: deque[PoseStamped] = deque(maxlen=topics.path_length)
         self._path_end = np.full((4, 4), np.inf)
-        self._reckoning = self._dead_reckoning()
-        self._samples: list[Samples] = []  # since the latest step of dead reckoning
-        self._reckoned_ns = self._transform_ns = 0
         self._open(config)
+        self._poses.mount(self._imu_mount)
 
     def begin(self) -> None:
         """Listen. After a pause the map is the one of before."""
-        self._samples.clear()
-        self._reckoning.reset(None)
-        self.intake.add(self, self._guarded, is_first=True)  # a deskew uses what it finds
+        self._poses.reset()
+        # A deskew uses what the odometry finds.
+        is_fast = self._settings.value.topics.imu_rate > 0.0
+        fast = self._inputs.guarded(self.take_fast, self._poses.reset) if is_fast else None
+        self.intake.add(self, self._guarded, is_first=True, fast=fast)
         guarded = self._guarded
         steady_timer(self, 1.0, guarded(self._diagnose))
         map_period_s = self._settings.value.topics.map_period_s
@@ -138,13 +136,18 @@ class OdometryNode(ManagedNode):
         out = QoSProfile(depth=10, reliability=reliability)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._odometry = self.create_publisher(OdometryMessage, topics.odometry_topic, out)
-        self._fast = self.create_publisher(OdometryMessage, topics.fast_odometry_topic, out)
         self._path_publisher = self.create_publisher(Path, topics.path_topic, latched)
         self._map = self.create_publisher(PointCloud2, topics.map_topic, latched)
         self._registered = self.create_publisher(PointCloud2, topics.registered_topic, out)
         self._deskewed = self.create_publisher(PointCloud2, topics.deskewed_topic, out)
         self._status = self.create_publisher(DiagnosticArray, topics.status_topic, out)
         self._tf = self.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
+        self._poses = PoseBroadcaster(
+            lambda: self._settings.value.topics,
+            lambda: self._base_name,
+            self._tf,
+            self.create_publisher(OdometryMessage, topics.fast_odometry_topic, out),
+        )
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         for name, answer in (
             ("reset", self._reset),
@@ -200,11 +203,15 @@ class OdometryNode(ManagedNode):
         samples = self._inputs.usable(samples, frame)
         if not len(samples):
             return
-        samples = self.pipeline.imu(samples)
+        self.pipeline.imu(samples)
         for note in self.pipeline.convention.notes:
             self._say(f"{frame}: {note}")
-        if self._settings.value.topics.imu_rate > 0.0:
-            self._samples.append(samples)
+
+    def take_fast(self, samples: Samples, frame: str) -> None:
+        """Publish poses at IMU samples (N,) that have just come, in the intake's thread."""
+        pipeline = self._pipeline
+        if pipeline is not None and frame == self._inputs.imu.name:
+            self._poses.take(pipeline.corrected(samples[in_range(samples)]))
 
     def take_cloud(self, item: OneCloud) -> None:
         """Take a cloud; one that cannot be read is counted and left out."""
@@ -227,7 +234,7 @@ class OdometryNode(ManagedNode):
         self._mount()
         self._inputs.sweep(sweep)
         # Whoever shows the deskewed cloud needs the transform up to its end, and needs it first.
-        self._carry_on(at_once=True)
+        self._poses.catch_up()
         self.pipeline.sweep(sweep, time.monotonic_ns())
 
     def refuse_cloud(self, error: ValueError) -> None:
@@ -249,17 +256,18 @@ class OdometryNode(ManagedNode):
             T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
             if T_cloud_imu is not None and not self.pipeline.is_mounted(T_cloud_imu):
                 self.pipeline.mount(T_cloud_imu)
-                self._reckoning = self._dead_reckoning()
+                self._poses.mount(self._imu_mount)
         base = self._settings.value.topics.base_frame
         if base and base != self._cloud_frame:
             T_cloud_base = self._frames.find(self._cloud_frame, base)
             if T_cloud_base is not None and not np.allclose(T_cloud_base, self._base.T_lidar_base):
                 self._base = BaseFrame(T_cloud_base)
 
-    def _dead_reckoning(self) -> DeadReckoning:
-        """Return dead reckoning with the IMU where the odometry has it."""
+    @property
+    def _imu_mount(self) -> F64:
+        """Where the odometry has the IMU, (4, 4)."""
         odometry = self.pipeline.odometry
-        return DeadReckoning(odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4))
+        return odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
 
     def _say(self, note: str) -> None:
         """Warn of something once."""
@@ -277,15 +285,14 @@ class OdometryNode(ManagedNode):
             and not self.pipeline.is_mounted(np.eye(4))
         ):
             self.pipeline.mount(np.eye(4))
-            self._reckoning = self._dead_reckoning()
+            self._poses.mount(self._imu_mount)
             self._say(
                 f"IMU and clouds have the same frame '{imu_frame}': the IMU is taken to be "
                 "at its origin"
             )
 
     def advance(self) -> None:
-        """Publish what is finished, and the pose at the newest IMU sample."""
-        self._carry_on()
+        """Publish what is finished."""
         for estimate in self.pipeline.poll(time.monotonic_ns()):
             self._publish(estimate)
 
@@ -302,7 +309,7 @@ class OdometryNode(ManagedNode):
             messages.set_unknown(message)
         self._odometry.publish(message)
         self._status.publish(messages.odometry_status(estimate, self._base_name))
-        self._send_transform(motion.T_odom_base, stamp)
+        self._poses.sweep(estimate, self._base)
         self._extend_path(motion.T_odom_base, estimate)
         if self._registered.get_subscription_count():
             pose = self._base.odom_from_map(estimate.T_map_lidar) @ estimate.T_map_lidar
@@ -313,22 +320,6 @@ class OdometryNode(ManagedNode):
             points = messages.moved(estimate.points, T_base_lidar)
             self._deskewed.publish(to_cloud(points, stamp, self._base_name))
         self._go_on_from_here()
-
-    def _send_transform(self, T_odom_base: F64, stamp: HostNs) -> None:
-        """Publish a pose on /tf, unless that already has a later one."""
-        topics = self._settings.value.topics
-        # A sweep may be seconds late on a busy machine; only where the samples went back as well
-        # has time itself.
-        newest = self.pipeline.newest_imu or stamp
-        is_late = stamp <= self._transform_ns < max(newest, stamp) + _TIME_JUMP_NS
-        if not topics.publish_tf or is_late:
-            return
-        self._transform_ns = stamp
-        frames = topics.odom_frame, self._base_name
-        if topics.invert_tf:
-            T_odom_base, frames = rotations.inverse(T_odom_base), frames[::-1]
-        made = messages.transform(T_odom_base, stamp, *frames)
-        self._tf.publish(TFMessage(transforms=[made]))
 
     def _extend_path(self, pose: F64, estimate: OdometryEstimate) -> None:
         topics = self._settings.value.topics
@@ -347,42 +338,7 @@ class OdometryNode(ManagedNode):
         """Let dead reckoning go on from the latest sweep."""
         odometry, newest = self.pipeline.odometry, self.pipeline.newest_imu
         if newest is not None and isinstance(odometry, Odometry):
-            self._reckoning.reset(odometry.extrapolated(newest))
-
-    def _carry_on(self, at_once: bool = False) -> None:
-        """Publish poses at IMU samples, ``imu_rate`` times a second of their time.
-
-        Parameters
-        ----------
-        at_once : bool
-            Publish one at the newest sample in any case.
-        """
-        if not self._samples:
-            return
-        samples = np.concatenate(self._samples)
-        self._samples.clear()
-        step = round(1e9 / self._settings.value.topics.imu_rate) - _JITTER_NS
-        first = 0
-        for last, stamp in enumerate(samples["stamp"].tolist()):
-            is_due = not 0 <= stamp - self._reckoned_ns < step
-            if is_due or (at_once and last == len(samples) - 1):
-                self._reckon(samples[first : last + 1])
-                first = last + 1
-        if first < len(samples):
-            self._samples.append(samples[first:][-_MOST_SAMPLES:])
-
-    def _reckon(self, samples: Samples) -> None:
-        """Publish the pose at the last of some samples (N,)."""
-        topics = self._settings.value.topics
-        self._reckoned_ns = int(samples["stamp"][-1])
-        estimate = self._reckoning.carry(samples)
-        if estimate is None:
-            return
-        motion = self._base.motion(estimate)
-        self._send_transform(motion.T_odom_base, estimate.stamp)
-        if self._fast.get_subscription_count():
-            odom = topics.odom_frame
-            self._fast.publish(messages.odometry(motion, estimate.stamp, odom, self._base_name))
+            self._poses.go_on_from(odometry.extrapolated(newest))
 
     def _show_map(self) -> None:
         last = self.pipeline.last
@@ -405,8 +361,7 @@ class OdometryNode(ManagedNode):
     def _begin_again(self) -> None:
         self.pipeline.reset()
         self._base.reset()
-        self._reckoning.reset(None)
-        self._samples.clear()
+        self._poses.reset()
         self._path.clear()
         self._path_end = np.full((4, 4), np.inf)
         self._looked_at = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,9 @@ from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_cloud, from_time  # noqa: E402
+from l2lidar_node.types import Sweep  # noqa: E402
+from l2lidar_proc.odometry.estimate import OdometryEstimate  # noqa: E402
+from l2lidar_proc.ros.intake import NeverExecuted, waiting  # noqa: E402
 from l2lidar_proc.ros.odometry_messages import matrix  # noqa: E402
 from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
 from tests.l2lidar_proc.odometry.odometry_world import recording  # noqa: E402
@@ -226,6 +230,47 @@ def test_transforms_ascend_where_sweeps_come_seconds_late(bench: OdometryBench) 
     stamps = np.array([stamp for _, stamp in bench.transforms_out])
     assert len(stamps) > 1
     assert (np.diff(stamps) > 0).all()
+
+
+def test_transforms_go_on_while_a_sweep_is_registered(bench: OdometryBench) -> None:
+    """On a small computer that takes longer than a controller can do without a pose."""
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:12]
+    bench.send(run, some[:-1])
+    bench.until(lambda: len(bench.poses) == len(some) - 1)
+    heard = bench.peer.create_subscription(
+        TFMessage, "/tf", lambda message: None, 100, callback_group=NeverExecuted()
+    )
+    bench.until(lambda: bench.node._tf.get_subscription_count() == 2)
+    odometry = bench.node._pipeline.odometry
+    register = odometry.register
+    first = int(np.searchsorted(run.imu["stamp"], some[-1].end)) + 1
+    later = run.imu[first : first + 100]  # as many as 0.4 s of work let come
+    stamps: list[int] = []
+
+    def slow(sweep: Sweep) -> list[OdometryEstimate]:
+        for sample in later:
+            bench.send_sample(sample)
+        deadline = time.monotonic() + 60.0
+        while not stamps or stamps[-1] < later["stamp"][-1] - 24_000_000:
+            assert time.monotonic() < deadline
+            for message in waiting(heard, 100):
+                stamps.extend(from_time(item.header.stamp) for item in message.transforms)
+        odometry.register = register
+        return register(sweep)
+
+    odometry.register = slow
+    bench.send(run, some[-1:])
+    bench.until(lambda: len(bench.poses) == len(some))
+    assert np.diff(stamps).max() <= 24_000_000
+    # What came meanwhile moves the new estimate as well: no later pose is missing.
+    for sample in run.imu[first + 100 : first + 110]:
+        bench.send_sample(sample)
+    newest = int(run.imu["stamp"][first + 109])
+    bench.until(lambda: bench.known_until(2**62) >= newest - 24_000_000)
+    ascending = np.array([stamp for _, stamp in bench.transforms_out])
+    assert (np.diff(ascending) > 0).all()
+    assert np.diff(ascending[ascending >= stamps[0]]).max() <= 24_000_000
 
 
 @pytest.mark.parametrize("bench", [("imu_rate:=0.0",)], indirect=True)
