@@ -28,6 +28,7 @@ from scipy.linalg import polar
 from benchmarks import calibrated_unit, calibration_pages, odometry_methods, real_l2
 from benchmarks.bench_odometry import score
 from benchmarks.results import FOLDER, Target, at_least, at_most, keep, publish
+from l2lidar_node import rotations
 from l2lidar_node.calibration import picture, report
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
@@ -38,7 +39,6 @@ from l2lidar_node.cli.virtual_places import still_places
 from l2lidar_node.emulator.unit.errors import UnitErrors, drawn
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.units import UNITS, Unit
-from l2lidar_proc import rotations
 from l2lidar_proc.odometry import imu_calibration
 from tests.support import odometry_runs
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from benchmarks import calibrated_unit, deskew_pages, deskew_real
 from benchmarks.results import Target, at_least, at_most, publish
+from l2lidar_node import rotations
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.config import MotionConfig, OdometryConfig, ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline

@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 
 from benchmarks.results import FOLDER
+from l2lidar_node import rotations
 from l2lidar_node.calibration import report
 from l2lidar_node.calibration.file import CalibrationFile, load
 from l2lidar_node.calibration.scale import by_tape
 from l2lidar_node.calibration.still import calibrate
 from l2lidar_node.cli.virtual_places import slide, still_places
 from l2lidar_node.types import Sweep
-from l2lidar_proc import rotations
 from l2lidar_proc.config import ImuConfig
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.odometry import imu_calibration

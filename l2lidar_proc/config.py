@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from l2lidar_node import rotations
 from l2lidar_node.clouds.fields import RINGS
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.config import LifecycleConfig
 from l2lidar_node.settings import FILE_NAME, FRAME, TOPIC, SettingError, setting
 from l2lidar_node.types import F64
-from l2lidar_proc import rotations
 
 AS_INPUT = "as_input"
 """Choice of a layout: whatever the input has."""

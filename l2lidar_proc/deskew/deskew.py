@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F32, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
 
 

@@ -18,8 +18,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations, tuning
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration
 

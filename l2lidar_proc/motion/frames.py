@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from l2lidar_node.rotations import inverse, normalised, transform
 from l2lidar_node.types import F64
-from l2lidar_proc.rotations import inverse, normalised, transform
 
 _MAX_DISTANCE_M: Final = 1000.0  # between a frame and its parent
 _NORM_TOLERANCE: Final = 0.1  # of a quaternion; a driver's rounding stays far below

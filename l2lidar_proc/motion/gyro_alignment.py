@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64
-from l2lidar_proc import rotations
 from l2lidar_proc.motion.imu_buffer import Samples
 
 ROTATION: Final = slice(0, 3)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.preintegration import Preintegration
 

@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations, tuning
+from l2lidar_proc import tuning
 from l2lidar_proc.config import MotionConfig
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.preintegration import coverage

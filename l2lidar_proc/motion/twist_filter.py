@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations, tuning
+from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples

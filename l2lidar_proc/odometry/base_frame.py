@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations
+from l2lidar_node import rotations
 from l2lidar_proc.motion.filter import skew
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.recording.trajectory import StampedPoses, levelled_start

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations, tuning
+from l2lidar_node import rotations
+from l2lidar_proc import tuning
 from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,

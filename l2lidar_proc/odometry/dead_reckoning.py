@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, IMU_SAMPLE
-from l2lidar_proc import rotations
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.gyro_alignment import GyroModel
 from l2lidar_proc.motion.imu_buffer import Samples

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
+from l2lidar_node import rotations
 from l2lidar_node.calibration.file import ImuCalibration
 from l2lidar_node.calibration.result import Estimate, Refusal, Verdict
 from l2lidar_node.types import F64, Sweep
-from l2lidar_proc import rotations
 from l2lidar_proc.config import ImuConfig, OdometryConfig
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.gyro_alignment import GyroAlignment, GyroError, GyroModel, Turns

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc import rotations, tuning
+from l2lidar_proc import tuning
 from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations, tuning
+from l2lidar_node import rotations
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.surfel_map import SurfelMap

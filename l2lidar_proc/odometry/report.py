@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations, tuning
+from l2lidar_node import rotations
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status

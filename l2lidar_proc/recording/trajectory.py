@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations
 
 STAMPED_POSE: Final = np.dtype([("stamp", "<i8"), ("pose", "<f8", (4, 4))])
 """Instant [ns], and coordinates of the moving frame to those of the fixed one."""

@@ -10,9 +10,9 @@ from geometry_msgs.msg import Pose, PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseMotion
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 

@@ -19,6 +19,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node import rotations
 from l2lidar_node.files import DataFolder, FileNameError, write_whole
 from l2lidar_node.ros.conversions import to_cloud
 from l2lidar_node.ros.managed_node import ManagedNode
@@ -26,7 +27,6 @@ from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, Sweep
-from l2lidar_proc import rotations
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.config import DeskewTopics, OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.motion.imu_buffer import Samples

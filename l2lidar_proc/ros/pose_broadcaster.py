@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.config import OdometryTopics
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.base_frame import BaseFrame

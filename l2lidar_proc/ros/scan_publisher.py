@@ -8,9 +8,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.config import ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
 from l2lidar_proc.deskew.pipeline import Deskewed

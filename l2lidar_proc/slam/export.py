@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.files import whole, write_whole
-from l2lidar_proc import rotations
 from l2lidar_proc.recording import map_file, trajectory
 from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses
 from l2lidar_proc.slam.nodes import Map

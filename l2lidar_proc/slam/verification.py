@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc import rotations
+from l2lidar_node import rotations
 from l2lidar_proc.slam import places
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.places import Place

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_proc import rotations
+from l2lidar_node import rotations
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.sweep_trajectory import still_trajectory
 from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from l2lidar_node import rotations
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, POINT
-from l2lidar_proc import rotations
 from l2lidar_proc.config import MotionConfig, ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation, slice_of
 from l2lidar_proc.motion.tracker import MotionTracker

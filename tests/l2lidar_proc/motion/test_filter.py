@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState, Noise
 from l2lidar_proc.motion.preintegration import integrate, segment

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64
-from l2lidar_proc import rotations
 from l2lidar_proc.motion.frames import FrameTree
 
 

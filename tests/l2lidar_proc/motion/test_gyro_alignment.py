@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from l2lidar_proc import rotations
+from l2lidar_node import rotations
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.gyro_alignment import GyroError, GyroModel
 from tests.l2lidar_proc.motion.turned_gyro import EPOCH, TRUE, recording

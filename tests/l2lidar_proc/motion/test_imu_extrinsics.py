@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.calibration.file import CalibrationFile, ImuCalibration
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import IMU_SAMPLE
-from l2lidar_proc import rotations
 from l2lidar_proc.config import ImuConfig, MotionConfig, OdometryTopics
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from l2lidar_node import rotations
 from l2lidar_node.types import IMU_SAMPLE, HostNs
-from l2lidar_proc import rotations, tuning
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.preintegration import coverage, integrate, segment
 from tests.l2lidar_proc.motion.analytic import EPOCH, G, Motion, at
 

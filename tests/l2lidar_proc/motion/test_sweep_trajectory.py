@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.preintegration import integrate, segment
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory, still_trajectory

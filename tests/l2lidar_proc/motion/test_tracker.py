@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from l2lidar_node import rotations
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.config import MotionConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.tracker import Flag, MotionTracker, carried_over

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_proc import rotations, tuning
+from l2lidar_node import rotations
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import ImuBuffer
 from l2lidar_proc.motion.twist_filter import TwistFilter
 from tests.l2lidar_proc.motion.analytic import EPOCH, T_CLOUD_IMU, G, Motion, at, noisy

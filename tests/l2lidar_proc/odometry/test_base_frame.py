@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, POINT, HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc import rotations, tuning
+from l2lidar_proc import tuning
 from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState

@@ -7,12 +7,12 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.unit.inertial import Inertial
 from l2lidar_node.emulator.unit.units import unit
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.types import F64, IMU_SAMPLE
-from l2lidar_proc import rotations
 from l2lidar_proc.config import ImuConfig
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.estimate import Status

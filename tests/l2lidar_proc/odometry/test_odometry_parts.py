@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import POINT, HostNs, Sweep
-from l2lidar_proc import rotations
 from l2lidar_proc.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import Status

@@ -11,10 +11,10 @@ import rclpy
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
+from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import from_cloud, from_time
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import Sweep
-from l2lidar_proc import rotations
 from l2lidar_proc.ros.companion_node import make_nodes
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.l2lidar_proc.ros.bench import Bench

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
-from l2lidar_proc import rotations
 from l2lidar_proc.odometry.base_frame import BaseMotion
 from l2lidar_proc.ros import odometry_messages as messages
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2lidar_proc import rotations
+from l2lidar_node import rotations
 
 RNG = np.random.default_rng(4)
 VECTORS = RNG.normal(size=(50, 3)) * RNG.uniform(0, 1.7, (50, 1))
