@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.hard_recordings import Recording
-from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node import rotations
 from l2lidar_node.types import F64
 
 Row = dict[str, Any]
@@ -76,7 +76,7 @@ def errors(recording: Recording, track: Track) -> Errors:
     """Return the errors of every pose."""
     truth = recording.truth_at(track.stamps)
     T_world_sensor = np.tile(np.eye(4), (len(truth), 1, 1))
-    T_world_sensor[:, :3, :3] = rotation_matrices(truth["quaternion_wxyz"])
+    T_world_sensor[:, :3, :3] = rotations.matrices(truth["quaternion_wxyz"])
     T_world_sensor[:, :3, 3] = truth["position"]
     T_odom_world = track.poses[0] @ np.linalg.inv(T_world_sensor[0])
     expected = T_odom_world @ T_world_sensor

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.clouds.fields import points_of
 
 F64 = NDArray[np.float64]
@@ -101,7 +102,8 @@ class Viewer:
         position = (place.x, place.y, place.z)
         rerun = self._rerun
         # A matrix, since rerun's quaternions before 0.24 want NumPy 2.
-        rotation = _rotation(turn.w, turn.x, turn.y, turn.z)
+        q = np.array([turn.w, turn.x, turn.y, turn.z])
+        rotation = rotations.matrices(rotations.normalised(q)) if q.any() else np.eye(3)
         rerun.log(_SENSOR, rerun.Transform3D(translation=position, mat3x3=rotation))
         self._track.append(position)
         rerun.log(f"{_ODOMETRY}/path", rerun.LineStrips3D([self._track]))
@@ -169,7 +171,7 @@ class Viewer:
             rerun.Ellipsoids3D(
                 centers=[position],
                 half_sizes=[_SIGMAS * deviations],
-                quaternions=_quaternion_xyzw(axes)[None],
+                quaternions=np.roll(rotations.from_matrix(axes), -1)[None],  # x, y, z, w
             ),
         )
         unseen = deviations > _DEGENERATE_RATIO * deviations[0]
@@ -290,37 +292,6 @@ def range_colors(distance: F64) -> NDArray[np.uint8]:
     share = np.clip(distance / _MAX_RANGE_M, 0.0, 1.0)[:, None]
     peaks = np.array([[0.1, 0.5, 0.9]])
     return np.asarray(255 * np.clip(1.4 - 2.8 * np.abs(share - peaks), 0.0, 1.0), np.uint8)
-
-
-def _rotation(w: float, x: float, y: float, z: float) -> F64:
-    """Return the matrix of a quaternion, which need not be normalized."""
-    q = np.array([w, x, y, z], np.float64)
-    norm = float(np.linalg.norm(q))
-    if norm == 0.0:
-        return np.eye(3)
-    w, x, y, z = q / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _quaternion_xyzw(turn: F64) -> F64:
-    """Return the quaternion of a rotation matrix, by its dominant eigenvector (Bar-Itzhack)."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = turn.ravel()
-    k = np.array(
-        [
-            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
-            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
-            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
-            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-        ]
-    )
-    vector: F64 = np.linalg.eigh(k)[1][:, -1]
-    return vector
 
 
 def _entity(name: str) -> str:

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.check.observation import Observation
 from l2lidar_node.check.requirements import Consumer, Finding, Use, not_judged, ok
 from l2lidar_node.types import F64, STANDARD_GRAVITY, Level
@@ -137,13 +138,6 @@ _WINDOW_S: Final = 0.1
 _TURNED_RAD: Final = 0.05
 
 
-def rotated(wxyz: F64, vectors: F64) -> F64:
-    """Return vectors, (N, 3), turned by unit quaternions, (N, 4)."""
-    w, axis = wxyz[:, :1], wxyz[:, 1:]
-    twice = 2.0 * np.cross(axis, vectors)
-    return np.asarray(vectors + w * twice + np.cross(axis, twice))
-
-
 def unit(wxyz: F64) -> F64:
     """Return quaternions, (N, 4), of norm 1; those near 0 become the identity."""
     norms = np.linalg.norm(wxyz, axis=1)
@@ -219,7 +213,7 @@ def _check_gravity(imu: NDArray[np.void], consumer: Consumer) -> Finding:
 
 def _from_vertical(q: F64, acceleration: F64) -> float:
     """Return the median angle of accelerations from the world's z axis [deg]."""
-    up = rotated(q, acceleration)
+    up = rotations.rotate(q, acceleration)
     cosine = up[:, 2] / np.linalg.norm(up, axis=1)
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
 

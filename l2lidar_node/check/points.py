@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from l2lidar_node.check.imu import rotated, unit
+from l2lidar_node import rotations
+from l2lidar_node.check.imu import unit
 from l2lidar_node.check.observation import (
     COLUMNS,
     TIME_FIELDS,
@@ -388,7 +389,7 @@ def _verdict(seen: Observation) -> tuple[bool | None, str]:
             continue
         at = min(int(np.searchsorted(imu["stamp"], cloud.stamp)), len(imu) - 1)
         q = unit(imu["orientation_wxyz"][at : at + 1].astype(np.float64))
-        up = rotated(q, np.array([[0.0, 0.0, 1.0]]))[0, 2]
+        up = rotations.rotate(q, np.array([[0.0, 0.0, 1.0]]))[0, 2]
         points = cloud.contents.sample.astype(np.float64)
         points = points[np.linalg.norm(points, axis=1) > _NEAREST_M]
         if len(points) < 50 or np.degrees(np.arccos(np.clip(up, -1.0, 1.0))) < _TILT_DEG:
@@ -419,5 +420,5 @@ def _turned_back(points: F64, q: F64, with_yaw: bool) -> F64:
     if not with_yaw:
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         turn = np.array([[np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]])
-        points = rotated(np.repeat(turn, len(points), axis=0), points)
-    return rotated(np.repeat(inverse, len(points), axis=0), points)
+        points = rotations.rotate(np.repeat(turn, len(points), axis=0), points)
+    return rotations.rotate(np.repeat(inverse, len(points), axis=0), points)

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import HostNs, ImuSample
 
 MAX_AGE_NS: Final = 80_000_000  # upstream's tolerance between a packet and its orientation
@@ -81,11 +82,11 @@ class GravityAlignment:
         before = np.maximum(after - 1, 0)
         is_before_nearer = instants - stamps[before] <= stamps[after] - instants
         nearest = self._samples[np.where(is_before_nearer, before, after)]
-        rotations = _rotations(nearest["wxyz"])
+        turns = rotations.matrices(nearest["wxyz"])
         if self.roll_pitch_only:
-            rotations = _without_yaw(rotations)
-        rotations[np.abs(nearest["stamp"] - instants) > MAX_AGE_NS] = np.nan
-        return rotations
+            turns = _without_yaw(turns)
+        turns[np.abs(nearest["stamp"] - instants) > MAX_AGE_NS] = np.nan
+        return turns
 
     def _forget(self, count: int) -> None:
         """Forget so many of the oldest samples."""
@@ -93,23 +94,12 @@ class GravityAlignment:
         self._samples[: self._count] = self._samples[count : count + self._count]
 
 
-def _rotations(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrices, (P, 3, 3), of unit quaternions, (P, 4)."""
-    w, x, y, z = wxyz.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
-
-
-def _without_yaw(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_yaw(turns: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rotations, (P, 3, 3), turned back about the vertical by their yaw."""
-    yaw = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+    yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
     cos, sin, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
     rows = [[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]
-    return np.asarray(np.array(rows).transpose(2, 0, 1) @ rotations)
+    return np.asarray(np.array(rows).transpose(2, 0, 1) @ turns)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from benchmarks import bench_odometry_hard, hard_pages, hard_recordings
 from benchmarks.hard_recordings import EPOCH, Recording, recording
 from benchmarks.hard_scenarios import FAMILIES, SCENES, SHORT, prepare, scenario
 from benchmarks.hard_scores import Track, errors, score, sequence
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import tours, trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
-from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.unit import view
 from l2lidar_node.emulator.unit.other_sensors import SENSORS
 
@@ -37,7 +37,7 @@ def true_track(given: Recording, count: int = 0) -> Track:
         middles = np.linspace(middles[0], middles[-1], count).astype(np.int64)
     truth = given.truth_at(middles)
     poses = np.tile(np.eye(4), (len(truth), 1, 1))
-    poses[:, :3, :3] = rotation_matrices(truth["quaternion_wxyz"])
+    poses[:, :3, :3] = rotations.matrices(truth["quaternion_wxyz"])
     poses[:, :3, 3] = truth["position"]
     elsewhere = np.eye(4)
     elsewhere[:3, :3] = Rotation.from_euler("xyz", [0.1, -0.2, 2.0]).as_matrix()

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import tum
-from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product, rotation_matrices
+from l2lidar_node.emulator.motion.spline import PoseSpline
 from l2lidar_node.types import STANDARD_GRAVITY
 
 MOUNTS: Final[dict[str, tuple[float, float, float]]] = {
@@ -196,7 +197,7 @@ def rpy_quaternions(rpy: NDArray[np.float64]) -> NDArray[np.float64]:
     roll = np.stack([cr, sr, zero, zero], axis=1)
     pitch = np.stack([cp, zero, sp, zero], axis=1)
     yaw = np.stack([cy, zero, zero, sy], axis=1)
-    return quaternion_product(yaw, quaternion_product(pitch, roll))
+    return rotations.multiply(yaw, rotations.multiply(pitch, roll))
 
 
 def from_tum(
@@ -240,5 +241,5 @@ def _ramp(
 def _into_body(
     quaternions_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    matrices = rotation_matrices(quaternions_wxyz)
+    matrices = rotations.matrices(quaternions_wxyz)
     return np.asarray(np.einsum("nij,ni->nj", matrices, vectors))

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
+
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
@@ -84,7 +86,7 @@ class PoseSpline:
         copy = object.__new__(PoseSpline)
         copy.start, copy.end, copy.periodic = self.start, self.end, self.periodic
         coefficients = self._pieces.c.copy()
-        coefficients[..., 3:] = quaternion_product(coefficients[..., 3:], mount_wxyz)
+        coefficients[..., 3:] = rotations.multiply(coefficients[..., 3:], mount_wxyz)
         copy._pieces = type(self._pieces)(
             coefficients, self._pieces.x, extrapolate=self._pieces.extrapolate
         )
@@ -102,43 +104,12 @@ class PoseSpline:
         q, dq, ddq = value[:, 3:], first[:, 3:], second[:, 3:]
         square = np.sum(q * q, axis=1, keepdims=True)
         conjugate = q * np.array([1.0, -1.0, -1.0, -1.0])
-        rate = 2.0 * quaternion_product(conjugate, dq)[:, 1:] / square
+        rate = 2.0 * rotations.multiply(conjugate, dq)[:, 1:] / square
         shrink = 2.0 * np.sum(q * dq, axis=1, keepdims=True) / square
-        acceleration = 2.0 * quaternion_product(conjugate, ddq)[:, 1:] / square - rate * shrink
+        acceleration = 2.0 * rotations.multiply(conjugate, ddq)[:, 1:] / square - rate * shrink
         return Derivatives(
             value[:, :3], first[:, :3], second[:, :3], q / np.sqrt(square), rate, acceleration
         )
-
-
-def quaternion_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Hamilton product of quaternions on the last axis, with broadcasting."""
-    pw, px, py, pz = np.moveaxis(p, -1, 0)
-    qw, qx, qy, qz = np.moveaxis(q, -1, 0)
-    return np.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
-
-
-def rotation_matrices(quaternions_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return matrices (N, 3, 3) of unit quaternions (N, 4)."""
-    w, x, y, z = quaternions_wxyz.T
-    matrix = np.empty((len(quaternions_wxyz), 3, 3))
-    matrix[:, 0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    matrix[:, 0, 1] = 2.0 * (x * y - w * z)
-    matrix[:, 0, 2] = 2.0 * (x * z + w * y)
-    matrix[:, 1, 0] = 2.0 * (x * y + w * z)
-    matrix[:, 1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    matrix[:, 1, 2] = 2.0 * (y * z - w * x)
-    matrix[:, 2, 0] = 2.0 * (x * z - w * y)
-    matrix[:, 2, 1] = 2.0 * (y * z + w * x)
-    matrix[:, 2, 2] = 1.0 - 2.0 * (x * x + y * y)
-    return matrix
 
 
 def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,8 +9,9 @@ from typing import Final
 
 import numpy as np
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion.motion import Motion, mount_quaternion, rpy_quaternions
-from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product
+from l2lidar_node.emulator.motion.spline import PoseSpline
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.world.scene import Scene
 from l2lidar_node.types import F64
@@ -148,7 +149,7 @@ def hit(motion: Motion, seconds: float, instants: Sequence[float], seed: int = 0
         turn = bump[:, None] * _direction(rng) * np.deg2rad(4.0)
         half = np.linalg.norm(turn, axis=1, keepdims=True) / 2.0
         blow = np.hstack([np.cos(half), 0.5 * turn * np.sinc(half / np.pi)])
-        quaternions = quaternion_product(quaternions, blow)
+        quaternions = rotations.multiply(quaternions, blow)
     return Motion(PoseSpline(t, places, quaternions, degree=5), rest_s=0.0)
 
 

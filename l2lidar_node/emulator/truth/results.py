@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.truth.packet_log import Fault, FaultEvent, PacketLog
 from l2lidar_node.emulator.unit.scanner import Scan
 from l2lidar_node.files import write_whole
@@ -54,7 +54,7 @@ def into_cloud(
 ) -> NDArray[np.float64]:
     """Return world points (..., 3) [m] in the cloud frame of the instant ``reference_s`` [s]."""
     position, quaternion = motion.poses(np.array([reference_s]))
-    moved: NDArray[np.float64] = (points - position[0]) @ rotation_matrices(quaternion)[0]
+    moved: NDArray[np.float64] = (points - position[0]) @ rotations.matrices(quaternion)[0]
     return moved
 
 

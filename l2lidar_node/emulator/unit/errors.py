@@ -7,10 +7,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion.motion import Kinematics, Motion
-from l2lidar_node.emulator.motion.spline import quaternion_product, rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 
 F64 = NDArray[np.float64]
@@ -137,8 +136,7 @@ class UnitErrors:
 
     def imu_quaternion(self) -> F64:
         """Return the rotation from the IMU frame to the cloud frame (w, x, y, z)."""
-        x, y, z, w = Rotation.from_rotvec(self.imu_rotation).as_quat()
-        return np.array([w, x, y, z])
+        return rotations.exp(self.imu_rotation)
 
 
 def drawn(seed: int, size: float = 1.0) -> UnitErrors:
@@ -270,7 +268,7 @@ class RockingMotion(Motion):
         """Return positions (N, 3) [m] and quaternions (N, 4); see :meth:`Motion.poses`."""
         position, quaternion = self._base.poses(t_s)
         tilt = self._tilt(np.asarray(t_s, np.float64), 0)
-        turned = quaternion_product(quaternion, _small_quaternion(tilt))
+        turned = rotations.multiply(quaternion, rotations.exp(tilt))
         return position + self._shift(quaternion, tilt), turned
 
     def kinematics(self, t_s: F64) -> Kinematics:
@@ -278,14 +276,14 @@ class RockingMotion(Motion):
         t = np.asarray(t_s, np.float64)
         base = self._base.kinematics(t)
         tilt, speed, change = (self._tilt(t, order) for order in range(3))
-        rocking = _small_quaternion(tilt)
-        back = np.swapaxes(rotation_matrices(rocking), 1, 2)
+        rocking = rotations.exp(tilt)
+        back = np.swapaxes(rotations.matrices(rocking), 1, 2)
         q = base.quaternion_wxyz
         return Kinematics(
             base.position + self._shift(q, tilt),
             base.velocity + self._shift(q, speed),
             base.acceleration + self._shift(q, change),
-            quaternion_product(q, rocking),
+            rotations.multiply(q, rocking),
             np.einsum("nij,nj->ni", back, base.angular_velocity) + speed,
             np.einsum("nij,nj->ni", back, base.angular_acceleration) + change,
         )
@@ -303,10 +301,5 @@ class RockingMotion(Motion):
     def _shift(self, quaternion: F64, tilt: F64) -> F64:
         arm = np.array([0.0, 0.0, self._errors.whirl_pivot])
         return np.asarray(
-            np.einsum("nij,nj->ni", rotation_matrices(quaternion), np.cross(tilt, arm))
+            np.einsum("nij,nj->ni", rotations.matrices(quaternion), np.cross(tilt, arm))
         )
-
-
-def _small_quaternion(tilt: F64) -> F64:
-    x, y, z, w = Rotation.from_rotvec(tilt).as_quat().T
-    return np.stack((w, x, y, z), axis=-1)

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion.motion import Motion, rpy_quaternions
-from l2lidar_node.emulator.motion.spline import quaternion_product, rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.unit.scanner import mean_angle
 from l2lidar_node.emulator.unit.units import UNITS, Unit
@@ -156,7 +156,7 @@ class Inertial:
         """Return vectors (N, 3) of the cloud frame in the IMU frame."""
         if not any(self.unit.errors.imu_rotation):
             return vectors
-        return np.asarray(vectors @ rotation_matrices(self._to_cloud[None])[0])
+        return np.asarray(vectors @ rotations.matrices(self._to_cloud[None])[0])
 
     def _line(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the turning head shakes into the gyro, amplitude 1, shape (N, 3).
@@ -176,7 +176,7 @@ class Inertial:
         error[:, 0] = tilt * np.sin(2.0 * np.pi * times / 17.0 + 1.0)
         error[:, 1] = tilt * np.sin(2.0 * np.pi * times / 23.0 + 2.0)
         error[:, 2] = np.deg2rad(self.noise.yaw_drift) / 60.0 * times - self._start_yaw
-        return quaternion_product(rpy_quaternions(error), truth)
+        return rotations.multiply(rpy_quaternions(error), truth)
 
     def _normal(self, first: int, count: int) -> NDArray[np.float64]:
         """Return six standard normal numbers per sample, shape (count, 6)."""

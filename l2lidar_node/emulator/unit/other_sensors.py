@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.types import F64
@@ -74,7 +74,7 @@ class RangeSensor:
 
         times, directions = self.beams(k)
         position, quaternion = motion.poses(k * self.sweep_s + times)
-        ahead = np.einsum("nij,nj->ni", rotation_matrices(quaternion), directions)
+        ahead = np.einsum("nij,nj->ni", rotations.matrices(quaternion), directions)
         hits = world.cast(position, ahead, k * self.sweep_s + times)
         rng = generator(seed, Stream.RETURN, k)
         distance = hits["distance"].copy()

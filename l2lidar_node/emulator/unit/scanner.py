@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.unit import returns
 from l2lidar_node.emulator.unit.returns import RangeNoise
@@ -271,7 +271,7 @@ class Scanner:
         ] * np.arange(slots)
         origin, direction = local_rays(true)
         position, quaternion = self.motion.poses(rays["time"].ravel())
-        turn = rotation_matrices(quaternion)
+        turn = rotations.matrices(quaternion)
         flat = rays.reshape(-1)
         flat["origin"] = position + np.einsum("nij,nj->ni", turn, origin.reshape(-1, 3))
         flat["direction"] = np.einsum("nij,nj->ni", turn, direction.reshape(-1, 3))

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node import rotations
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.types import F64
 
@@ -136,7 +136,7 @@ class MovingWorld(World):
             if not len(near):
                 continue
             position, quaternion = mover.poses(when[near])
-            turn = rotation_matrices(quaternion)
+            turn = rotations.matrices(quaternion)
             start = np.einsum("nji,nj->ni", turn, origins[near] - position)
             ahead = np.einsum("nji,nj->ni", turn, directions[near])
             met = mover.body.cast(start, ahead)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.recfunctions import append_fields, drop_fields
 
-from l2lidar_node.check.imu import rotated
+from l2lidar_node import rotations
 from l2lidar_node.types import Level
 from tests.l2lidar_node.check import recordings
 from tests.l2lidar_node.check.recordings import Recording
@@ -224,7 +224,7 @@ def levelled(made: Recording) -> None:
         stamp = recordings.stamp_of(message)
         now = np.searchsorted(at, (stamp - recordings.stamp_of(made.imu[0])) / NS)
         xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(float)
-        turned = rotated(np.repeat(q[now : now + 1], len(xyz), axis=0), xyz)
+        turned = rotations.rotate(np.repeat(q[now : now + 1], len(xyz), axis=0), xyz)
         for column, axis in enumerate("xyz"):
             points[axis] = turned[:, column]
         made.clouds[index] = recordings.cloud(points, stamp)

@@ -14,8 +14,8 @@ from rosbags import interfaces
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from l2lidar_node import rotations
 from l2lidar_node.check.consumers import CONSUMERS
-from l2lidar_node.check.imu import rotated
 from l2lidar_node.check.observation import CLOUD, IMU, TRANSFORMS, Gathering, Observation, Qos
 from l2lidar_node.clouds import fields
 from l2lidar_node.clouds.fields import RINGS
@@ -135,7 +135,7 @@ def orientations() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def imu_messages() -> list[Any]:
     at, q, rates = orientations()
-    up = rotated(q * [1.0, -1.0, -1.0, -1.0], np.tile([0.0, 0.0, 9.81], (len(at), 1)))
+    up = rotations.rotate(q * [1.0, -1.0, -1.0, -1.0], np.tile([0.0, 0.0, 9.81], (len(at), 1)))
     return [
         imu(build.EPOCH_NS + round(at[i] * 1e9), q[i], rates[i], up[i]) for i in range(len(at))
     ]

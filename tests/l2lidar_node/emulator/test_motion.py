@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories, tum
 from l2lidar_node.emulator.motion.motion import (
     MOUNTS,
@@ -17,7 +18,7 @@ from l2lidar_node.emulator.motion.motion import (
     mount_quaternion,
     rpy_quaternions,
 )
-from l2lidar_node.emulator.motion.spline import PoseSpline, quaternion_product, rotation_matrices
+from l2lidar_node.emulator.motion.spline import PoseSpline
 from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
@@ -164,7 +165,7 @@ def test_a_mount_turns_gravity_in_the_cloud_frame(
 
 
 def test_the_forward_mount_looks_ahead() -> None:
-    matrix = rotation_matrices(np.array([mount_quaternion("forward")]))[0]
+    matrix = rotations.matrices(np.array([mount_quaternion("forward")]))[0]
 
     np.testing.assert_allclose(matrix @ [0, 0, 1], [1, 0, 0], atol=1e-12)
 
@@ -191,11 +192,11 @@ def test_an_unknown_mount_is_refused() -> None:
 def test_quaternion_products_and_matrices_agree_with_scipy() -> None:
     rng = np.random.default_rng(3)
     p, q = rotation(rng.normal(size=(20, 4))), rotation(rng.normal(size=(20, 4)))
-    product = quaternion_product(
+    product = rotations.multiply(
         np.roll(p.as_quat(), 1, axis=-1), np.roll(q.as_quat(), 1, axis=-1)
     )
 
-    np.testing.assert_allclose(rotation_matrices(product), (p * q).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotations.matrices(product), (p * q).as_matrix(), atol=1e-12)
 
 
 def test_a_file_is_followed_from_the_end_of_the_rest(tmp_path: Path) -> None:

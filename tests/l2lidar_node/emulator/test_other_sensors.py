@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
-from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.unit.other_sensors import SENSORS
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
@@ -28,7 +28,7 @@ def test_points_lie_on_the_world_where_the_sensor_was_at_their_time(name: str) -
     assert len(cloud) > 3000
     points = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float64)
     position, quaternion = motion.poses(7 * sensor.sweep_s + times)
-    placed = position + np.einsum("nij,nj->ni", rotation_matrices(quaternion), points)
+    placed = position + np.einsum("nij,nj->ni", rotations.matrices(quaternion), points)
     # range noise along the beam: no more across the surface
     off = world.clearance(placed)
     assert np.sqrt(np.mean(off**2)) < 1.2 * (sensor.noise_m + 9.0 * sensor.noise_rate)

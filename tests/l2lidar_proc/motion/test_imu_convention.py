@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
-from l2lidar_node.emulator.motion.spline import rotation_matrices
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.types import IMU_SAMPLE, HostNs
@@ -38,7 +38,7 @@ def watched(
         first = last
         place, quaternion = motion.poses(np.array([t]))
         place = place[0] + rng.normal(0.0, noise_m, 3)
-        turn = rotation_matrices(quaternion)[0]
+        turn = rotations.matrices(quaternion)[0]
         if convention.watch(HostNs(round(t * 1e9)), turn, place):
             return convention, number
     return convention, -1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.emulator.motion.spline import rotation_matrices
+from l2lidar_node import rotations
 from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
@@ -84,7 +84,7 @@ def test_the_cloud_is_the_one_of_the_stamp() -> None:
     for index, p, q in ((-1, position[0], quaternion), (5, first[0], q0)):
         cloud = estimates[index].points
         xyz = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        points[index] = xyz @ rotation_matrices(q)[0].T + p
+        points[index] = xyz @ rotations.matrices(q)[0].T + p
     # both in the world: the ceiling is at one height
     for xyz in points.values():
         ceiling = xyz[(xyz[:, 2] > 2.72) & (np.abs(xyz[:, 0]) < 0.9)]
@@ -157,7 +157,7 @@ def test_corridor_tells_its_weak_direction() -> None:
     item = estimates[-1]
     along = np.abs(np.linalg.eigh(item.covariance[:3, :3])[1][:, -1])
     _, q = truth(run, np.array([item.stamp, estimates[0].stamp]))
-    axis = rotation_matrices(q)[1].T @ [1.0, 0.0, 0.0]
+    axis = rotations.matrices(q)[1].T @ [1.0, 0.0, 0.0]
     assert along @ np.abs(axis) > 0.8
     assert any(Status.DEGENERATE in one.status for one in estimates)
 
