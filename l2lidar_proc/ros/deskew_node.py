@@ -22,6 +22,7 @@ from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
+from l2lidar_node.ros.static_frames import StaticFrames, untied
 from l2lidar_node.types import HostNs, Level, Sweep, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, without_time
 from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
@@ -32,7 +33,6 @@ from l2lidar_proc.motion.tracker import KnownMotion, carried_over
 from l2lidar_proc.ros.inputs import InputMonitor, load_libraries, steady_timer
 from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
 from l2lidar_proc.ros.scan_publisher import ScanPublisher
-from l2lidar_proc.ros.static_frames import StaticFrames, untied
 
 if TYPE_CHECKING:
     from l2lidar_proc.ros.odometry_node import OdometryNode  # brings kiss-icp along

@@ -25,6 +25,7 @@ from l2lidar_node.ros.conversions import to_cloud
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
+from l2lidar_node.ros.static_frames import StaticFrames, untied
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc.cloud import CloudError
@@ -48,7 +49,6 @@ from l2lidar_proc.ros.inputs import (
 )
 from l2lidar_proc.ros.intake import SLOW_LOOK_S, OneCloud, SensorIntake
 from l2lidar_proc.ros.pose_broadcaster import PoseBroadcaster
-from l2lidar_proc.ros.static_frames import StaticFrames, untied
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
 

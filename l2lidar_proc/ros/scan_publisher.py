@@ -10,13 +10,13 @@ from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import to_time
+from l2lidar_node.ros.static_frames import StaticFrames
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.config import ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
 from l2lidar_proc.deskew.pipeline import Deskewed
 from l2lidar_proc.motion.tracker import MotionTracker
 from l2lidar_proc.ros import odometry_messages as messages
-from l2lidar_proc.ros.static_frames import StaticFrames
 
 
 class ScanPublisher:

@@ -10,12 +10,12 @@ import typer
 from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.command_line import CommandError, UsageError
+from l2lidar_node.frames import FrameTree
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.types import is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
-from l2lidar_proc.motion.frames import FrameTree
 from l2lidar_proc.motion.tracker import carried_over
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.recording import bag

@@ -18,6 +18,7 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.files import whole, write_whole
+from l2lidar_node.frames import FrameTree
 from l2lidar_node.recording.pcap import CaptureError, is_capture_file
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.recording.replay import measurements
@@ -26,7 +27,6 @@ from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.config import OdometryNodeConfig, OdometryTopics
-from l2lidar_proc.motion.frames import FrameTree
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status

@@ -120,7 +120,14 @@ def test_a_chain_of_frames_is_followed_and_loops_and_damage_are_not(node: Any) -
     loop = TransformStamped(child_frame_id="base")
     loop.header.frame_id = "lidar"
     loop.transform.rotation.w = 1.0
-    monitor._take(TFMessage(transforms=[loop]))
+    before = monitor._frames.version
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(TFMessage, "/tf_static", latched)
+    publisher.publish(TFMessage(transforms=[loop]))
+    deadline = time.monotonic() + TIMEOUT_S
+    while monitor._frames.version == before:
+        assert time.monotonic() < deadline
+        rclpy.spin_once(node, timeout_sec=0.05)
     assert np.isfinite(monitor.tilt_deg()[1])
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from l2lidar_node import rotations
+from l2lidar_node.frames import FrameTree
 from l2lidar_node.types import F64
-from l2lidar_proc.motion.frames import FrameTree
 
 
 def found(tree: FrameTree, to: str, source: str) -> F64:
@@ -65,3 +65,15 @@ def test_mounts_in_a_circle_and_long_chains_have_an_end() -> None:
         tree.add(f"{number + 1}", f"{number}", np.eye(4))
     assert tree.find("5000", "0") is None
     assert tree.find("900", "0") is not None
+
+
+def test_the_root_is_the_topmost_frame() -> None:
+    tree = FrameTree()
+    T_base_mast, T_mast_lidar = pose((0, 0, 1.0), (1, 0, 0)), pose((0.5, 0, 0), (0, 0, 2))
+    tree.add("mast", "lidar", T_mast_lidar)
+    tree.add("base", "mast", T_base_mast)
+    name, T_root_lidar = tree.root("/lidar")
+    assert name == "base"
+    np.testing.assert_allclose(T_root_lidar, T_base_mast @ T_mast_lidar)
+    assert tree.root("base")[0] == "base"
+    np.testing.assert_array_equal(tree.root("base")[1], np.eye(4))

@@ -52,6 +52,14 @@ class FrameTree:
                 return np.asarray(inverse(T_frame_target) @ ups[frame])
         return None
 
+    def root(self, frame: str) -> tuple[str, F64]:
+        """Return the topmost frame above a frame, and what takes its coordinates there, (4, 4).
+
+        The frame itself where nothing is above it.
+        """
+        *_, (name, T_root_frame) = self._ancestors(frame.lstrip("/")).items()
+        return name, T_root_frame
+
     def _ancestors(self, frame: str) -> dict[str, F64]:
         """Return a frame and all above it, nearest first, each with the transform to it."""
         found = {frame: np.eye(4)}

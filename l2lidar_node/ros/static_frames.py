@@ -6,8 +6,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node.frames import FrameTree
 from l2lidar_node.types import F64
-from l2lidar_proc.motion.frames import FrameTree
 
 
 class StaticFrames:
@@ -37,6 +37,10 @@ class StaticFrames:
     def find(self, target: str, source: str) -> F64 | None:
         """Return source coordinates to target coordinates, (4, 4), None if not known."""
         return self._tree.find(target, source)
+
+    def root(self, frame: str) -> tuple[str, F64]:
+        """Return the topmost frame above a frame, and what takes its coordinates there, (4, 4)."""
+        return self._tree.root(frame)
 
     def _take(self, message: TFMessage) -> None:
         problems = self._tree.take(message)
