@@ -17,7 +17,7 @@ from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_t
 from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.tracker import carried_over
-from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
 
@@ -52,9 +52,15 @@ class _Deskewer:
         self._output = "/" + config.topics.output_topic.lstrip("/")
         self._topics = topics
         self._writer = writer
-        self._odometry: Odometry | None = None
+        self._odometry: OdometryPipeline | None = None
         if not topics.velocity and config.topics.velocity_type == "odometry":
-            self._odometry = Odometry(OdometryConfig(), self.pipeline.T_cloud_imu)
+            self._odometry = OdometryPipeline(
+                OdometryConfig(),
+                config.proc.motion.T_cloud_imu,
+                config.proc.deskew.imu_wait_ms,
+                self.pipeline.extrinsics,
+            )
+            self.pipeline.odometry_motion = self._odometry.motion_of
         self._frames = FrameTree()
         self._cloud_frame = ""
 
@@ -67,7 +73,7 @@ class _Deskewer:
             sample = bag.sample_of(message)
             self.pipeline.imu(sample)
             if self._odometry is not None:
-                self._odometry.imu(self.pipeline.extrinsics.corrected(sample))
+                self._odometry.imu(sample)
         elif topic == self._topics.velocity:
             self._velocity(message)
         elif kind == bag.TRANSFORMS and topic.endswith("tf_static") and self._uses_tf:
@@ -80,15 +86,16 @@ class _Deskewer:
         if T_cloud_imu is None or self._cloud_frame == imu_frame:
             return
         if self.pipeline.mount(T_cloud_imu) and self._odometry is not None:
-            self._odometry = Odometry(OdometryConfig(), self.pipeline.T_cloud_imu)
+            self._odometry.mount(T_cloud_imu)
 
     def finish(self, now: int) -> None:
         """Write what is finished by ``now`` [ns]."""
+        # The odometry first, as in the companion: a sweep is deskewed with its own motion.
+        if self._odometry is not None:
+            for estimate in self._odometry.poll(now):
+                self.pipeline.velocity(estimate.stamp, estimate.velocity, "own odometry")
         for item in self.pipeline.poll(now):
             self._write(item, min(now, int(item.sweep.end) + item.waited_ns))
-            if self._odometry is not None:
-                for estimate in self._odometry.register(item.sweep):
-                    self.pipeline.velocity(estimate.stamp, estimate.velocity, "own odometry")
 
     def _write(self, item: Deskewed, now: int) -> None:
         self._writer.cloud(self._output, now, item.points, item.stamp, self._cloud_frame)
@@ -107,6 +114,8 @@ class _Deskewer:
         except ValueError as error:
             self._refuse(str(error))
         else:
+            if self._odometry is not None:
+                self._odometry.sweep(sweep, now)
             self.pipeline.sweep(sweep, now)
 
     def _refuse(self, reason: str) -> None:

@@ -230,5 +230,5 @@ def test_without_a_velocity_our_odometry_finds_it(tmp_path: Path) -> None:
     assert len(late) >= 5
     for item in late:
         points = bag.points_of(clouds[HostNs(item.sweep.start + shift)])
-        assert rms(xyz(points) - item.at_start) < 0.01
+        assert rms(xyz(points) - item.at_start) < 0.001
         assert rms(xyz(item.sweep.points) - item.at_start) > 0.1
