@@ -26,9 +26,11 @@ _LOADS: Final = """## Under load and after it
 
 A load delays all packets. `path` is what it adds to the least delay of the path: the largest, over
 the load, of the least delay in half a second. A clock that sees arrivals alone cannot know it when
-a load lasts since the start. `during` is the largest error until the load ends, `after` the errors
-from one second after its end. The constant delay of the unloaded path is set aside. Largest values
-of all seeds, in ms; `held` counts packets that got no stamp, all seeds together.
+a load lasts since the start. `during` is the largest error until the load ends, `unsaid` by how
+much an error was at most beyond the uncertainty in the status and the least delay seen so far,
+`after` the errors from one second after its end. The constant delay of the unloaded path is set
+aside. Largest values of all seeds, in ms; `held` counts packets that got no stamp, all seeds
+together.
 `tests/support/clock_loads.py` defines the shapes.
 """
 
@@ -91,11 +93,12 @@ def _load_table(loaded: list[Row]) -> str:
     for name in dict.fromkeys(row["load"] for row in loaded):
         mine = [row for row in loaded if row["load"] == name]
         most = {key: max(row[key] for row in mine) for key in (
-            "least_delay_ms", "during_max_ms", "after_p99_ms", "after_max_ms"
+            "least_delay_ms", "during_max_ms", "unsaid_ms", "after_p99_ms", "after_max_ms"
         )}  # fmt: skip
         figures = [f"{value:.3f}" for value in most.values()]
         cells.append([name, str(len(mine)), *figures, str(sum(row["held"] for row in mine))])
-    return _lines(["load", "seeds", "path", "during", "after, p99", "after, max", "held"], cells)
+    heads = ["load", "seeds", "path", "during", "unsaid", "after, p99", "after, max", "held"]
+    return _lines(heads, cells)
 
 
 def _lines(heads: list[str], rows: list[list[str]]) -> str:

@@ -27,7 +27,7 @@ _SEGMENTS: Final = 8
 # Published stamps jump by more than this instead of closing in: the rest is gone after a second.
 _STEP_NS: Final = 1_500_000
 _EARLY_NS: Final = 300_000  # a single block earlier than that is an error, more of them are news
-_SPREADS: Final = 2.0  # these margins grow by that many times the uncertainty
+_SPREADS: Final = 2.0  # these margins grow by that many times what the least delay varies by
 # A foreign step that was bridged wrongly makes all packets late from then on.
 _SLIPPED_NS: Final = 100_000
 _SLIPPED_BLOCKS: Final = 4
@@ -140,6 +140,7 @@ class HostClockModel:
         "_before_step",
         "_envelope",
         "_from",
+        "_guess",
         "_host",
         "_low",
         "_low_at",
@@ -169,14 +170,18 @@ class HostClockModel:
         self._from = 0  # arrivals before may be told in a time before the clock was set
         self.steps: deque[int] = deque(maxlen=64)
         self._slewing = HostSlewing()
+        self._envelope: LowerEnvelope | None = None
+        self._guess = ratio
         self.reset()
 
     def reset(self) -> None:
         """Forget everything but the ratio, as a guess."""
+        if self._envelope is not None and self._envelope.is_known:
+            self._guess = self.line.ratio
         self.ready = False
         self.late_ns = 0
         self.uncertainty_ns = 0.0
-        self._envelope: LowerEnvelope | None = None
+        self._envelope = None
         self._packets: list[tuple[int, int]] = []
         self._suspects: list[tuple[int, int]] = []
         self._reanchors = 0
@@ -285,9 +290,10 @@ class HostClockModel:
             return
         if span < _LOCK_NS and line.excess > _QUIET_NS:
             return
-        self._envelope = LowerEnvelope(line, packets, is_told=self.is_told)
+        self._envelope = LowerEnvelope(line, packets, guess=self._guess, is_told=self.is_told)
         self._envelope.is_slewing_told = self._slewing.is_told
         self._packets = []
+        line = self._envelope.line
         self._go(u, self._wanted(line, u), line.ratio / (1.0 - self._slewing.rate))
         self.line = line
         self.uncertainty_ns = self._envelope.uncertainty_ns
@@ -331,7 +337,7 @@ class HostClockModel:
         line = envelope.line
         off = self._low_at[1] - line.at(self._low_at[0])
         self.late_ns = max(off, 0)
-        margin = _SPREADS * envelope.uncertainty_ns
+        margin = _SPREADS * envelope.spread_ns
         suspects = self._suspects
         if self._has_slipped(off > _SLIPPED_NS + margin):
             suspects.clear()

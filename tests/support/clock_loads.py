@@ -152,12 +152,16 @@ class LoadErrors:
         delay in half a second. A clock that sees nothing but arrivals cannot know it.
     during_ms : float
         Largest error until the end of the load.
+    unsaid_ms : float
+        Largest error beyond the stated uncertainty and the least delay of any packet so far, which
+        is the constant part of the path as far as anybody can know.
     after_p99_ms, after_max_ms : float
         Errors from one second after the end of the load.
     """
 
     least_ms: float
     during_ms: float
+    unsaid_ms: float
     after_p99_ms: float
     after_max_ms: float
 
@@ -170,7 +174,8 @@ def load_errors(
     Parameters
     ----------
     notes : ndarray, shape (N,)
-        Every packet, with ``truth``, ``duration``, ``arrival`` and ``published`` [ns].
+        Every packet, with ``truth``, ``duration``, ``arrival``, ``published`` and ``uncertainty``
+        [ns].
     loads : sequence of Load
     begin : int
         Instant that the loads count from [ns].
@@ -184,10 +189,12 @@ def load_errors(
     least = [float(delays[halves == half].min()) for half in np.unique(halves[at < end]).tolist()]
     stamped = notes["published"] != 0
     errors = np.abs(notes["published"] - notes["truth"] - path_ns) / _MS
+    unsaid = errors - notes["uncertainty"] / _MS - np.minimum.accumulate(np.maximum(delays, 0.0))
     after = errors[stamped & (at > end + 1.0)]
     return LoadErrors(
         max(least),
         float(errors[stamped & (at < end)].max(initial=0.0)),
+        float(unsaid[stamped].max()),
         float(np.percentile(after, 99)),
         float(after.max()),
     )

@@ -41,6 +41,7 @@ NOTE: Final = np.dtype(
         ("duration", "<i8"),  # [ns] first to last measurement
         ("sync", "<i8"),  # [ns] value of the last sync sent before the packet was handled; 0
         ("published", "<i8"),  # [ns] host clock; 0 for none
+        ("uncertainty", "<i8"),  # [ns] what the status says after the packet
     ]
 )
 """One packet that reached the clock, in the order in which it did."""
@@ -107,11 +108,14 @@ class RecordingClock(DeviceClock):
         Everything that happened, in order.
     sequence : dict
         What the driver counted by sequence numbers.
+    uncertainties : list of int
+        What the status said after each packet [ns].
     """
 
     def __init__(self, config: ClockConfig) -> None:
         super().__init__(config)
         self.notes: list[tuple[int, int, int, int, int, int, int]] = []
+        self.uncertainties: list[int] = []
         self._sync = 0
         self.reported: list[ClockEvent] = []
         self.sequence: dict[Stream, SequenceCounts] = {}
@@ -130,6 +134,7 @@ class RecordingClock(DeviceClock):
         self.notes.append(
             (_TYPES[stream], seq, stamp, arrival, duration_ns, self._sync, answer or 0)
         )
+        self.uncertainties.append(round(self._host.uncertainty_ns))
         return answer
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
@@ -266,5 +271,6 @@ def _with_truth(clock: RecordingClock, device: VirtualL2, case: Case) -> NDArray
     for at, (kind, seq, stamp, arrival, duration, sync, answer) in enumerate(clock.notes):
         boot, start = truth[kind, seq, stamp]
         start += slewed_ns(case, start)
-        notes[at] = (kind, boot, seq, stamp, start, arrival, duration, sync, answer)
+        said = clock.uncertainties[at]
+        notes[at] = (kind, boot, seq, stamp, start, arrival, duration, sync, answer, said)
     return notes

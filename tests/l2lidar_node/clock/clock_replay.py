@@ -23,7 +23,7 @@ from tests.support.clock_truth import (
     simulate,
 )  # fmt: skip
 
-STAMPED = np.dtype([*EVENT.descr, ("published", "<i8")])
+STAMPED = np.dtype([*EVENT.descr, ("published", "<i8"), ("uncertainty", "<i8")])
 Packet = tuple[int, int, int, int, int, int]
 
 
@@ -33,7 +33,8 @@ class Replay:
     Attributes
     ----------
     packets : ndarray, shape (N,), dtype STAMPED
-        Every packet given to the clock; ``published`` is 0 where it gave no stamp.
+        Every packet given to the clock; ``published`` is 0 where it gave no stamp, ``uncertainty``
+        is what the status says after it [ns].
     stamped : ndarray, shape (M,), dtype STAMPED
         Those with a stamp.
     """
@@ -44,7 +45,7 @@ class Replay:
         self.clock = DeviceClock(config or ClockConfig())
         self.events: list[ClockEvent] = []
         rows = [
-            (*packet, self._observe(packet))
+            (*packet, self._observe(packet), round(self.clock._host.uncertainty_ns))
             for packet in self._ordered(simulate(scenario, seed), window)
         ]
         self.packets: NDArray[np.void] = np.array(rows, STAMPED)
