@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -84,11 +85,18 @@ class SweepMatcher:
         self.kiss = KissMatcher(config)
         self.drift = MapDrift()
         self._pruned_at = np.zeros(3)
+        self._begin_way()
+
+    def _begin_way(self) -> None:
         self._sweeps = 0
+        self._way = 0.0
+        self._before: F64 | None = None  # place of the sweep before
+        self._oldest = 0  # sweep from which on places are still in the map
+        self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
 
     def clear(self) -> None:
         """Forget the maps."""
-        self._sweeps = 0
+        self._begin_way()
         self.surfaces.clear()
         self.kiss.clear()
         self.drift.clear()
@@ -166,15 +174,30 @@ class SweepMatcher:
         points = xyz(moved) - self.lever
         fresh = self.surfaces.add(points @ state.rotation.T + state.position, self._sweeps)
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
-        self._sweeps += 1
         self.kiss.update(points, _pose(state), _pose(guess))
-        if (
-            np.linalg.norm(state.position - self._pruned_at)
-            > tuning.PRUNE_SHARE * self.config.max_range
-        ):
-            self.surfaces.forget(state.position, self.config.max_range)
-            self._pruned_at = state.position
+        self._walk(state.position)
+        self._sweeps += 1
         return fresh
+
+    def _walk(self, place: F64) -> None:
+        """Count the way to a place; drop what is far, or was left behind long ago.
+
+        A place that is met again after a long way is not where the map has it: the odometry has
+        drifted meanwhile. Both cannot be matched at once; what was seen last is what an odometry
+        without jumps goes on from.
+        """
+        if self._before is not None:
+            self._way += float(np.linalg.norm(place - self._before))
+        self._before = place
+        if not self._ways or self._way - self._ways[-1][0] > tuning.MAP_WAY_STEP:
+            self._ways.append((self._way, self._sweeps))
+        aged = False
+        while self._way - self._ways[0][0] > tuning.MAP_WAY:
+            self._oldest, aged = self._ways.popleft()[1] + 1, True
+        far = np.linalg.norm(place - self._pruned_at) > tuning.PRUNE_SHARE * self.config.max_range
+        if far or aged:
+            self.surfaces.forget(place, self.config.max_range, self._oldest)
+            self._pruned_at = place
 
     def meet(self, found: Alignment, seconds: float) -> None:
         """Let a pose be as uncertain as the surfaces that an alignment has met.

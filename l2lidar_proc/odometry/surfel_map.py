@@ -126,6 +126,8 @@ class SurfelMap:
         born = coarsest.born_at(points)
         for level in finer:
             level.add(points, born)
+        for level in self._levels:
+            level.see(points, sweep)
         return fresh
 
     def match(self, points: F64, *, narrow: bool = False) -> Matches:
@@ -159,10 +161,10 @@ class SurfelMap:
         columns = zip(*map(_columns, found), strict=True)
         return Matches(*(np.concatenate(column) for column in columns))
 
-    def forget(self, origin: F64, distance: float) -> None:
-        """Drop the cells farther than a distance [m] from a place (3,)."""
+    def forget(self, origin: F64, distance: float, since: int = 0) -> None:
+        """Drop cells farther than a distance [m] from a place (3,), or not seen since a sweep."""
         for level in self._levels:
-            level.forget(origin, distance)
+            level.forget(origin, distance, since)
 
     def points(self) -> F64:
         """Return the middles of the finest level's surfaces [m], shape (N, 3), map frame."""
@@ -206,6 +208,7 @@ class _Level:
         self._flat: NDArray[np.bool_] = np.zeros(1, np.bool_)
         self._narrow: NDArray[np.bool_] = np.zeros(1, np.bool_)
         self._count: I64 = np.zeros(1, np.int64)
+        self._seen: I64 = np.zeros(1, np.int64)  # number of the latest sweep with points in it
 
     def clear(self) -> None:
         used = len(self._keys)
@@ -265,14 +268,20 @@ class _Level:
         self.cells["products"][rows] += products
         self._fit(rows, middles)
 
-    def forget(self, origin: F64, distance: float) -> None:
-        near = ((self._middle(self._keys) - origin) ** 2).sum(axis=1) <= distance * distance
-        if near.all():
+    def see(self, points: F64, sweep: int) -> None:
+        """Note that a sweep had points in their cells, which all exist."""
+        self._seen[self._find(self._key(points))] = sweep
+
+    def forget(self, origin: F64, distance: float, since: int) -> None:
+        kept = ((self._middle(self._keys) - origin) ** 2).sum(axis=1) <= distance * distance
+        kept &= self._seen[self._rows] >= since
+        if kept.all():
             return
-        rows = self._rows[near]
-        self._keys, self._rows = self._keys[near], np.arange(len(rows))
+        rows = self._rows[kept]
+        self._keys, self._rows = self._keys[kept], np.arange(len(rows))
         self.cells, self._flat = self.cells[rows].copy(), self._flat[rows]
         self._count, self._narrow = self._count[rows], self._narrow[rows]
+        self._seen = self._seen[rows]
         self._reserve(1)
 
     def points(self) -> F64:
@@ -341,7 +350,7 @@ class _Level:
             size = max(count, 2 * len(self.cells))
             self.cells = _grown(self.cells, size)
             self._flat, self._narrow = _grown(self._flat, size), _grown(self._narrow, size)
-            self._count = _grown(self._count, size)
+            self._count, self._seen = _grown(self._count, size), _grown(self._seen, size)
 
 
 def _grown(rows: NDArray[Any], size: int) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,16 @@ from l2lidar_node import rotations
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc.config import OdometryConfig, OdometryNodeConfig
+from l2lidar_proc.motion.filter import ERRORS, InertialState
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.kiss import thinned_indices
+from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.plain import PlainOdometry
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.recording.trajectory import Trajectory, kitti, levelled_start, tum
-from tests.l2lidar_proc.motion.analytic import Motion, at
+from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 
@@ -71,6 +74,45 @@ def test_far_cells_are_forgotten_and_the_rest_stays() -> None:
     assert len(surfaces.match(np.array([[2.12, 0.1, 1.1], [52.12, 0.1, 1.1]])).index) == 1
     surfaces.add(wall(52.12))
     assert len(surfaces) == count
+
+
+def test_cells_out_of_sight_are_forgotten_and_full_ones_in_sight_stay() -> None:
+    surfaces = SurfelMap((0.25,), capacity=10)
+    places = np.array([[2.12, 0.1, 1.1], [5.12, 0.1, 1.1]])
+    surfaces.add(np.concatenate((wall(2.12), wall(5.12))), 0)
+    surfaces.add(wall(2.12), 7)  # full already: not fitted again, but seen
+    surfaces.forget(np.zeros(3), 10.0, 7)
+    assert surfaces.match(places).index.tolist() == [0]
+    surfaces.forget(np.zeros(3), 10.0, 8)
+    assert not len(surfaces)
+
+
+def test_what_was_left_behind_a_long_way_ago_is_forgotten_however_near_it_is() -> None:
+    """Around a block and back: the beginning of the lap has drifted away from the present."""
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    predictor.imu(Motion().imu(0, 40))
+    start = EPOCH
+    state = InertialState(start, np.eye(3), *np.zeros((5, 3)))
+    motion = predictor.over(state, np.eye(ERRORS) * 1e-4, (start, HostNs(EPOCH + 10**8)), start)
+
+    def seen_from(place: float, x: float) -> None:
+        """Extend the map with a wall across x, seen from a place on the x axis."""
+        at = dataclasses.replace(state, position=np.array([place, 0.0, 0.0]))
+        points = np.zeros(4000, [(axis, "<f4") for axis in "xyz"])
+        points["x"], points["y"], points["z"] = (wall(x) - at.position).T
+        matcher.extend(points, dataclasses.replace(motion, state=at), at)
+
+    seen_from(0.0, 3.0)
+    for place in np.arange(1.0, 14.0):  # there,
+        seen_from(float(place), 13.0)
+    for place in np.arange(12.0, -1.0, -1.0):  # and back
+        seen_from(float(place), -4.0)
+    probe = np.array([[3.0, 0.1, 1.1], [13.0, 0.1, 1.1]])
+    assert matcher.surfaces.match(probe).index.tolist() == [0, 1]  # 26 m
+    for place in np.arange(1.0, 8.0):
+        seen_from(float(place), 13.0)
+    assert matcher.surfaces.match(probe).index.tolist() == [1]
 
 
 def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> None:
