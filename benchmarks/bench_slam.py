@@ -26,7 +26,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks import slam_pages
-from benchmarks.results import FOLDER, publish
+from benchmarks.results import FOLDER, publish, show
 from benchmarks.slam_pages import Row, targets
 from benchmarks.slam_referee import STYLES
 from l2lidar_node.emulator.world import mapping_scenes as scenes
@@ -425,7 +425,10 @@ def main(arguments: list[str] | None = None) -> int:
                     {name: value for name, value in row.items() if name != "refused"}, flush=True
                 )
     met = list(targets(rows))
-    publish("slam", "Back end on simulated odometry", slam_pages.summary(rows), met)
+    show("Kidnapped starts", slam_pages.start_table(rows))
+    show("Round after round", slam_pages.lap_table(rows))
+    show("kiss-slam on the same scans", slam_pages.kiss_table(rows))
+    publish("slam", "Back end on simulated odometry", slam_pages.mapping_table(rows), met)
     if missing:
         print(f"not run: {slam_pages.counted(missing)}; go on with --resume")
     if given.page:

@@ -93,6 +93,38 @@ class KeptRows:
                 continue
 
 
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """Return rows with the same keys, at least one, as a table in Markdown."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
+    return "\n".join(
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+        for cells in lines
+    )
+
+
+def verdicts(targets: Iterable[Target]) -> list[dict[str, Any]]:
+    """Return one row for each target, for :func:`markdown`."""
+    return [
+        {
+            "Target": target.name,
+            "measured": f"{target.value:.4g}",
+            "bound": f"{target.bound:.4g}",
+            "": "met" if target.met else "**not met**",
+        }
+        for target in targets
+    ]
+
+
+def show(title: str, rows: list[dict[str, Any]]) -> None:
+    """Print rows with the same keys as a table; nothing where there are none."""
+    if not rows:
+        return
+    table = Table(*rows[0], title=title)
+    for row in rows:
+        table.add_row(*(_text(value) for value in row.values()))
+    Console().print(table)
+
+
 def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable[Target]) -> Path:
     """Print rows and targets and write ``out/bench/NAME.json``; return its path.
 
@@ -108,10 +140,7 @@ def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable
     """
     targets = list(targets)
     console = Console()
-    table = Table(*rows[0], title=title) if rows else Table(title=title)
-    for row in rows:
-        table.add_row(*(_text(value) for value in row.values()))
-    console.print(table)
+    show(title, rows)
     for target in targets:
         mark = "[green]met" if target.met else "[red]not met"
         console.print(

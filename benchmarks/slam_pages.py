@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import beta
 
-from benchmarks.results import Target, at_least, at_most, machine
+from benchmarks.results import Target, at_least, at_most, machine, markdown, verdicts
 
 Row = dict[str, Any]
 
@@ -28,6 +28,15 @@ claims to know. ATE is the root mean square distance from the truth after the be
 A submap that comes back to a place (3 m) is *tied* when the way to it through the graph is below
 20 m. Rates have their 95 % bound beside them (Clopper and Pearson; with no failure in N runs that
 is about 3/N)."""
+_STARTS: Final = """\
+At a random place of a saved map, either way round, 20 m at 0.5 % of drift. Found: announced, then
+off by 5 cm and 0.5 degrees at most (medians of what follows). `ring` has identical doors and is
+symmetric: there is nothing to find, and nothing may be announced that is not so. `outside` starts
+in another world."""
+_KISS: Final = """\
+With its own KISS-ICP, and with the drifting odometry that ours is given; with its own settings,
+and with finer ones for rooms (local maps of 10 m, images of 0.2 m). It knows neither IMU nor
+gravity. Its loops count as wrong beyond 1 m or 10 degrees."""
 
 
 def upper_bound(failures: int, runs: int) -> float:
@@ -93,64 +102,100 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         yield at_most("growth in known ground, MB per km", grown, 3.0)
 
 
-def summary(rows: list[Row]) -> list[Row]:
-    """Return one row for each scene and drift, each kind of start, and what others found."""
+def mapping_table(rows: list[Row]) -> list[Row]:
+    """Return one row for each scene and drift."""
     table: list[Row] = []
     mapping = [row for row in rows if row["kind"] == "mapping"]
     for scene, percent in sorted({(r["scene"], r["drift_percent"]) for r in mapping}):
         some = [r for r in mapping if (r["scene"], r["drift_percent"]) == (scene, percent)]
         table.append(
             {
-                "what": f"{scene}, {percent} %" + (" (aliased)" if some[0]["aliased"] else ""),
+                "Scene, drift": f"{scene}, {percent} %"
+                + (" (aliased)" if some[0]["aliased"] else ""),
                 "runs": len(some),
-                "way_m": round(some[0]["way_m"]),
-                "alone_mm": _mm(np.median([r["odometry_ate_m"] for r in some])),
-                "median_mm": _mm(np.median([r["ate_m"] for r in some])),
-                "worst_mm": _mm(max(r["ate_m"] for r in some)),
-                "found": f"{sum(r['tied'] for r in some)}/{sum(r['revisits'] for r in some)}",
-                "loops": sum(r["loops"] for r in some),
-                "wrong": sum(r["wrong_loops"] for r in some),
-                "cores": round(float(np.median([r["cores"] for r in some])), 3),
+                "way [m]": round(some[0]["way_m"]),
+                "odometry alone [mm]": _mm(np.median([r["odometry_ate_m"] for r in some])),
+                "map, median [mm]": _mm(np.median([r["ate_m"] for r in some])),
+                "worst [mm]": _mm(max(r["ate_m"] for r in some)),
+                "revisits tied": f"{_total(some, 'tied')}/{_total(some, 'revisits')}",
+                "loops": _total(some, "loops"),
+                "wrong": _total(some, "wrong_loops"),
+                "cores at 1 m/s": f"{np.median([r['cores'] for r in some]):.3f}",
             }
         )
-    starts = [row for row in rows if row["kind"] == "kidnapped"]
-    for scene in sorted({r["scene"] for r in starts}):
-        some = [r for r in starts if r["scene"] == scene]
-        found = [r for r in some if r["announced"]]
-        table.append(
-            {
-                "what": f"kidnapped: {scene}",
-                "runs": len(some),
-                "way_m": "-",
-                "alone_mm": "-",
-                "median_mm": _mm(np.median([r["error_m"] for r in found])) if found else "-",
-                "worst_mm": _mm(max(r["error_m"] for r in found)) if found else "-",
-                "found": f"{len(found)}/{len(some)}",
-                "loops": "-",
-                "wrong": sum(bool(r["wrong"]) for r in some),
-                "cores": round(float(np.median([r["cores"] for r in some])), 3),
-            }
-        )
-    for row in rows:
-        if row["kind"] == "kiss-slam":
-            table.append(_kiss(row))
     return table
 
 
-def _kiss(row: Row) -> Row:
-    found = not row["failed"]
-    return {
-        "what": f"kiss-slam, {row['odometry']} odometry, {row['style']}: {row['scene']}",
-        "runs": 1,
-        "way_m": "-",
-        "alone_mm": _mm(row["alone_m"]) if row["odometry"] == "ours" else "-",
-        "median_mm": _mm(row["ate_m"]) if found else row["failed"],
-        "worst_mm": "-",
-        "found": "-",
-        "loops": row["loops"] if found else "-",
-        "wrong": row["wrong_loops"] if found else "-",
-        "cores": round(row["cores"], 3) if found else "-",
-    }
+def start_table(rows: list[Row]) -> list[Row]:
+    """Return one row for each map in which something starts at an unknown place."""
+    table: list[Row] = []
+    starts = [row for row in rows if row["kind"] == "kidnapped"]
+    for scene in sorted({row["scene"] for row in starts}):
+        some = [row for row in starts if row["scene"] == scene]
+        said = [row for row in some if row["announced"]]
+        good, wrong = sum(map(is_found, some)), _total(some, "wrong")
+        table.append(
+            {
+                "Map": scene,
+                "starts": len(some),
+                "announced": len(said),
+                "found": good,
+                "at least (95 %)": f"{lower_bound(good, len(some)):.0%}",
+                "after [m], median": f"{np.median([r['found_after_m'] for r in said]):.1f}"
+                if said
+                else "-",
+                "off [mm], median": _mm(np.median([r["error_m"] for r in said])) if said else "-",
+                "worst [mm]": _mm(max(r["error_m"] for r in said)) if said else "-",
+                "wrong": wrong,
+                "at most (95 %)": f"{upper_bound(wrong, len(some)):.0%}",
+                "cores at 1 m/s": f"{np.median([r['cores'] for r in some]):.2f}",
+            }
+        )
+    return table
+
+
+def lap_table(rows: list[Row]) -> list[Row]:
+    """Return some of the laps of the long run."""
+    laps = [row for row in rows if row["kind"] == "hour"]
+    chosen = {0, 1, len(laps) // 4, len(laps) // 2, len(laps) - 1} & set(range(len(laps)))
+    return [
+        {
+            "Lap": row["lap"],
+            "way [m]": f"{row['way_m']:.0f}",
+            "submaps": row["submaps"],
+            "map [MB]": f"{row['megabytes']:.2f}",
+            "peak memory, process [MB]": f"{row['rss_mb']:.0f}",
+            "cores at 1 m/s": f"{row['cores']:.3f}",
+        }
+        for row in (laps[number] for number in sorted(chosen))
+    ]
+
+
+def kiss_table(rows: list[Row]) -> list[Row]:
+    """Return one row for each run of kiss-slam, beside ours of the same walk."""
+    table: list[Row] = []
+    for row in rows:
+        if row["kind"] != "kiss-slam":
+            continue
+        same = (row["scene"], row["seed"], 0.5)
+        ours = [
+            _mm(r["ate_m"])
+            for r in rows
+            if r["kind"] == "mapping" and (r["scene"], r["seed"], r["drift_percent"]) == same
+        ]
+        failed = row["failed"]
+        table.append(
+            {
+                "kiss-slam": f"{row['odometry']} odometry, {row['style']}: {row['scene']}",
+                "odometry given [mm]": _mm(row["alone_m"]) if row["odometry"] == "ours" else "-",
+                "ATE [mm]": failed or _mm(row["ate_m"]),
+                "loops": "-" if failed else row["loops"],
+                "wrong": "-" if failed else row["wrong_loops"],
+                "cores at 1 m/s": "-" if failed else f"{row['cores']:.3f}",
+                "ours on the same [mm]": ours[0] if ours else "-",
+            }
+        )
+    return table
 
 
 def counted(missing: Iterable[Row]) -> str:
@@ -164,7 +209,20 @@ def counted(missing: Iterable[Row]) -> str:
 def write(rows: list[Row], met: list[Target], missing: list[Row]) -> Path:
     """Write the page; return its path."""
     facts = machine()
-    parts = [_HEAD, _targets(met), _mapping(rows), _kidnapped(rows), _hour(rows), _others(rows)]
+    laps = sum(row["kind"] == "hour" for row in rows)
+    parts = [
+        _HEAD,
+        _section("Targets", "", verdicts(met)),
+        _section("Mapping", "", mapping_table(rows)),
+        _refused(rows),
+        _section("Kidnapped starts", _STARTS, start_table(rows)),
+        _section(
+            "Round after round",
+            f"{laps} laps of the furnished office, 0.2 % of drift.",
+            lap_table(rows),
+        ),
+        _section("kiss-slam on the same scans", _KISS, kiss_table(rows)),
+    ]
     if missing:
         parts.append(f"## Not run\n\nOf the full plan these runs are missing: {counted(missing)}.")
     parts.append(
@@ -175,117 +233,23 @@ def write(rows: list[Row], met: list[Target], missing: list[Row]) -> Path:
     return PAGE
 
 
-def _targets(met: list[Target]) -> str:
-    lines = ["## Targets", "", "| | measured | bound | |", "|---|---|---|---|"]
-    for target in met:
-        verdict = "met" if target.met else "**not met**"
-        lines.append(f"| {target.name} | {target.value:.4g} | {target.bound:.4g} | {verdict} |")
-    return "\n".join(lines)
-
-
-def _mapping(rows: list[Row]) -> str:
-    some = [row for row in rows if row["kind"] == "mapping"]
-    if not some:
+def _section(title: str, text: str, table: list[Row]) -> str:
+    """Return a section with a table; empty if that has no rows."""
+    if not table:
         return ""
-    refused: Counter[str] = Counter()
-    for row in some:
-        refused.update(row["refused"])
-    reasons = ", ".join(f"{reason} {count}" for reason, count in refused.most_common())
-    lines = [
-        "## Mapping",
-        "",
-        "| Scene, drift | runs | way [m] | odometry alone [mm] | map, median [mm] | worst [mm] "
-        "| revisits tied | loops | wrong | cores at 1 m/s |",
-        "|---" * 10 + "|",
-    ]
-    lines += [_line(row) for row in summary(some)]
-    return "\n".join([*lines, "", f"Candidates that were refused, by reason: {reasons}."])
+    return "\n\n".join(part for part in (f"## {title}", text, markdown(table)) if part)
 
 
-def _kidnapped(rows: list[Row]) -> str:
-    starts = [row for row in rows if row["kind"] == "kidnapped"]
-    if not starts:
-        return ""
-    lines = [
-        "## Kidnapped starts",
-        "",
-        "At a random place of a saved map, either way round, 20 m at 0.5 % of drift. Found: "
-        "announced, then off by 5 cm and 0.5 degrees at most (medians of what follows). "
-        "`ring` has identical doors and is symmetric: there is nothing to find, and nothing may "
-        "be announced that is not so. `outside` starts in another world.",
-        "",
-        "| Map | starts | announced | found | at least (95 %) | after [m], median | off [mm], "
-        "median | worst [mm] | wrong | at most (95 %) |",
-        "|---" * 10 + "|",
-    ]
-    for scene in sorted({row["scene"] for row in starts}):
-        some = [row for row in starts if row["scene"] == scene]
-        said = [row for row in some if row["announced"]]
-        good, wrong = sum(map(is_found, some)), sum(bool(row["wrong"]) for row in some)
-        after = f"{np.median([r['found_after_m'] for r in said]):.1f}" if said else "-"
-        off = _mm(np.median([r["error_m"] for r in said])) if said else "-"
-        worst = _mm(max(r["error_m"] for r in said)) if said else "-"
-        lines.append(
-            f"| {scene} | {len(some)} | {len(said)} | {good} | {lower_bound(good, len(some)):.0%} "
-            f"| {after} | {off} | {worst} | {wrong} | {upper_bound(wrong, len(some)):.0%} |"
-        )
-    return "\n".join(lines)
+def _refused(rows: list[Row]) -> str:
+    counts: Counter[str] = Counter()
+    for row in rows:
+        counts.update(row.get("refused", {}))
+    reasons = ", ".join(f"{reason} {count}" for reason, count in counts.most_common())
+    return f"Candidates that were refused, by reason: {reasons}." if reasons else ""
 
 
-def _hour(rows: list[Row]) -> str:
-    hour = [row for row in rows if row["kind"] == "hour"]
-    if not hour:
-        return ""
-    lines = [
-        "## Round after round",
-        "",
-        f"{len(hour)} laps of the furnished office, 0.2 % of drift.",
-        "",
-        "| Lap | way [m] | submaps | map [MB] | peak memory, process [MB] | cores at 1 m/s |",
-        "|---" * 6 + "|",
-    ]
-    chosen = sorted({0, 1, len(hour) // 4, len(hour) // 2, len(hour) - 1} & set(range(len(hour))))
-    for row in (hour[number] for number in chosen):
-        lines.append(
-            f"| {row['lap']} | {row['way_m']:.0f} | {row['submaps']} | {row['megabytes']:.2f} "
-            f"| {row['rss_mb']:.0f} | {row['cores']:.3f} |"
-        )
-    return "\n".join(lines)
-
-
-def _others(rows: list[Row]) -> str:
-    some = [row for row in rows if row["kind"] == "kiss-slam"]
-    if not some:
-        return ""
-    lines = [
-        "## kiss-slam on the same scans",
-        "",
-        "With its own KISS-ICP, and with the drifting odometry that ours is given; with its own "
-        "settings, and with finer ones for rooms (local maps of 10 m, images of 0.2 m). It knows "
-        "neither IMU nor gravity. Its loops count as wrong beyond 1 m or 10 degrees.",
-        "",
-        "| kiss-slam | odometry given [mm] | ATE [mm] | loops | wrong | cores at 1 m/s "
-        "| ours on the same [mm] |",
-        "|---" * 7 + "|",
-    ]
-    for row in some:
-        ours = [
-            r["ate_m"]
-            for r in rows
-            if r["kind"] == "mapping"
-            and (r["scene"], r["seed"], r["drift_percent"]) == (row["scene"], row["seed"], 0.5)
-        ]
-        cells = _kiss(row)
-        name = str(cells["what"]).removeprefix("kiss-slam, ")
-        lines.append(
-            f"| {name} | {cells['alone_mm']} | {cells['median_mm']} | {cells['loops']} "
-            f"| {cells['wrong']} | {cells['cores']} | {_mm(ours[0]) if ours else '-'} |"
-        )
-    return "\n".join(lines)
-
-
-def _line(row: Row) -> str:
-    return "| " + " | ".join(str(value) for value in row.values()) + " |"
+def _total(rows: list[Row], name: str) -> int:
+    return sum(int(row[name]) for row in rows)
 
 
 def _mm(meters: Any) -> str:
