@@ -81,7 +81,10 @@ def stamp_errors_ms(truth: Results, packet_type: PacketType, stamps: list[int]) 
 
 _SPACING_MS: Final = {"/points": 229.8, "/imu/data": 4.0}  # a cloud per turn of the head
 _TOLERANCE: Final = 0.02
-_MAX_ATE_M: Final = 0.05
+# An error of the calibration makes an odometry drift in proportion to the way: a typical unit does
+# by 0.1 to 0.25 % (docs/mapping.md); calibrated it does by a tenth.
+_MAX_ATE_SHARE: Final = 0.003
+_LEAST_LIMIT_M: Final = 0.05  # over less than 17 m of way
 _SENSOR_HEIGHT_M: Final = 1.0  # of the built-in motions above the floor
 _HEIGHT_TOLERANCE_M: Final = 0.25  # a walk heaves and pitches
 _MIN_POSES: Final = 10
@@ -186,8 +189,9 @@ def _odometry(console: Console, observer: Observer, truth: Results, folder: Path
         picture.save_comparison(*moved[len(moved) // 2], folder / "deskew.png")
     if not observer.deskewed.stamps:
         return ["/points_deskewed: nothing received"]
-    if track.ate_m > _MAX_ATE_M:
-        return [f"odometry is off by {track.ate_m:.3f} m, expected less than {_MAX_ATE_M} m"]
+    limit = max(_LEAST_LIMIT_M, _MAX_ATE_SHARE * track.length_m)
+    if track.ate_m > limit:
+        return [f"odometry is off by {track.ate_m:.3f} m, expected less than {limit:.3f} m"]
     return []
 
 
