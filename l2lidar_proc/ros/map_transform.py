@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node.ros.conversions import from_time
 from l2lidar_node.types import HostNs
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.slam.config import SlamTopics
@@ -18,8 +19,14 @@ from l2lidar_proc.slam.se3 import interpolated, inverse
 
 F64 = NDArray[np.float64]
 
+AHEAD_NS: Final = 2_000_000_000
+"""How far beyond the newest odometry message the transform is carried on at most [ns].
+
+Dead reckoning ends 1 s after a sweep, whose message is some 0.3 s old when it comes.
+"""
+
 _OTHER_PARENT_S: Final = 3.0  # for which one message makes another parent be believed in
-_AHEAD_S: Final = 1.0  # the transform is carried on so long after the last odometry
+_SAME_TIME_NS: Final = 2_000_000_000  # a stamp that goes back by more begins a new time line
 
 
 class MapTransform:
@@ -40,13 +47,16 @@ class MapTransform:
         self._other_parent_s = 0.0
         self._publisher = node.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self._stamped = 0
+        self._odometry_until = 0  # stamp of the newest transform from odom to the body
         self._blend = Blend()
 
     def watch(self, message: TFMessage, topics: SlamTopics, odom_frame: str) -> None:
-        """Notice whether somebody else is the parent of the odometry frame already."""
+        """Note how far the odometry's transforms reach, and whether odom has another parent."""
         for transform in message.transforms:
             parent = transform.header.frame_id
-            if transform.child_frame_id == odom_frame and parent != topics.map_frame:
+            if parent == odom_frame:
+                self._odometry_until = from_time(transform.header.stamp)
+            elif transform.child_frame_id == odom_frame and parent != topics.map_frame:
                 self.other_parent, self._other_parent_s = parent, time.monotonic()
 
     def publish(
@@ -58,7 +68,12 @@ class MapTransform:
         odom_frame: str,
         topics: SlamTopics,
     ) -> None:
-        """Publish the transform, stamped a bit ahead of the newest odometry.
+        """Publish the transform, stamped ``transform_tolerance`` ahead of the newest odometry.
+
+        That is the later one of the newest transform from odom to the body and the newest
+        odometry message, carried on to the present. So whatever is stamped up to now can be
+        transformed into the map at once; a correction takes so long to reach those who look up
+        the present.
 
         Parameters
         ----------
@@ -79,13 +94,32 @@ class MapTransform:
         shown = self._blend.toward(T_map_odom, T_odom_body, now * 1e-9, topics.blend_s)
         if shown is None or not topics.publish_tf or self.other_parent:
             return
-        ahead = min(now - arrival_ns, round(_AHEAD_S * 1e9))
-        stamped = stamp + ahead + round(topics.tf_tolerance_s * 1e9)
-        if self._stamped - round(2e9 * _AHEAD_S) < stamped <= self._stamped:
+        covered = reach(stamp, now - arrival_ns, self._odometry_until)
+        stamped = covered + round(topics.transform_tolerance * 1e9)
+        if self._stamped - _SAME_TIME_NS < stamped <= self._stamped:
             return  # a transform of that instant is out already
         self._stamped = stamped
         made = messages.transform(shown, HostNs(stamped), topics.map_frame, odom_frame)
         self._publisher.publish(TFMessage(transforms=[made]))
+
+
+def reach(stamp: HostNs, waited_ns: int, transforms_until: int) -> int:
+    """Return the newest instant for which somebody may want the transform [ns].
+
+    Parameters
+    ----------
+    stamp : HostNs
+        Of the newest odometry message.
+    waited_ns : int
+        How long ago that came.
+    transforms_until : int
+        Stamp of the newest transform from the odometry frame to the body, 0 if there is none;
+        one that is much later than the odometry is of another clock.
+    """
+    carried = stamp + min(waited_ns, AHEAD_NS)
+    if transforms_until <= stamp + AHEAD_NS:
+        return max(carried, transforms_until)
+    return carried
 
 
 class Blend:

@@ -21,14 +21,14 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud
+from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud, to_time
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.types import F64, HostNs, is_ros_time
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
-from l2lidar_proc.ros.map_transform import MapTransform
+from l2lidar_proc.ros.map_transform import AHEAD_NS, MapTransform
 from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
 from l2lidar_proc.slam.atlas import AtlasError
 from l2lidar_proc.slam.config import SlamNodeConfig
@@ -36,7 +36,7 @@ from l2lidar_proc.slam.nodes import Health, Keyframe, Map, OdometrySweep, SlamSt
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 
 _FARTHEST_M: Final = 1e6  # from the origin; no odometry goes so far
-_LATER_NS: Final = 2_000_000_000  # than a pose that the transform is stamped, at most
+_LATER_NS: Final = 2 * AHEAD_NS  # than a pose that the transform is stamped, at most
 _PENDING: Final = 40  # stamps that wait for their other messages
 _SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
 _LEVELS: Final = {
@@ -181,6 +181,7 @@ class SlamNode(ManagedNode):
             return
         self._latest = _Latest(stamp, time.monotonic_ns(), message.header.frame_id, pose)
         self._part(stamp).odometry = message
+        self._publish_transform()  # at once: who gets the same odometry can transform it
         self._publish_pose(message)
         self._pair(stamp)
 
@@ -297,7 +298,7 @@ class SlamNode(ManagedNode):
                     for at, pose in zip(some["stamp"], some["pose"], strict=True)
                 ]
             )
-            path.header.frame_id = frame
+            path.header.stamp, path.header.frame_id = to_time(stamp), frame
             self._path.publish(path)
         if self._graph.get_subscription_count():
             self._graph.publish(_markers(built, loops, frame))

@@ -155,8 +155,12 @@ class SlamTopics:
     tf_rate: float = setting(
         30.0, "rate of the transform and of the pose", unit="Hz", lo=1.0, hi=100.0
     )
-    tf_tolerance_s: float = setting(
-        0.1, "how far ahead the transform is stamped", unit="s", lo=0.0, hi=1.0
+    transform_tolerance: float = setting(
+        0.2,
+        "how far ahead of the newest odometry the transform is stamped, as AMCL does",
+        unit="s",
+        lo=0.0,
+        hi=2.0,
     )
     blend_s: float = setting(
         0.0,

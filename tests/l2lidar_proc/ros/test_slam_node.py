@@ -29,8 +29,9 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_time, to_cloud, to_time  # noqa: E402
 from l2lidar_node.ros.program import StartError  # noqa: E402
+from l2lidar_node.types import HostNs  # noqa: E402
 from l2lidar_proc.ros import odometry_messages as messages  # noqa: E402
-from l2lidar_proc.ros.map_transform import Blend  # noqa: E402
+from l2lidar_proc.ros.map_transform import Blend, reach  # noqa: E402
 from l2lidar_proc.ros.slam_node import SlamNode, _sweep  # noqa: E402
 from l2lidar_proc.slam import atlas, se3  # noqa: E402
 from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState  # noqa: E402
@@ -144,7 +145,8 @@ def test_a_walk_becomes_a_map_that_is_saved_and_shown(
         stamps = [from_time(t.header.stamp) for t in bench.transforms]
         assert len(stamps) > 10
         assert np.all(np.diff(stamps) > 0)
-        assert stamps[0] >= some[0].stamp
+        assert stamps[0] >= some[0].stamp + 200_000_000  # transform_tolerance
+        assert from_time(bench.paths[-1].header.stamp) in {sweep.stamp for sweep in some}
         assert {t.child_frame_id for t in bench.transforms} == {"odom"}
         assert len(bench.maps[-1].data) > 10_000
         assert len(bench.graphs[-1].markers) == 3
@@ -215,6 +217,23 @@ def test_the_map_stays_while_it_localizes_and_grows_again_afterwards(
         assert np.linalg.norm((grown.poses[-1] - true)[:3, 3]) < 0.3
     finally:
         bench.close()
+
+
+@pytest.mark.parametrize(
+    ("waited_s", "transforms_s", "expected_s"),
+    [
+        (0.0, 0.0, 100.0),  # there are none
+        (0.1, 100.05, 100.1),
+        (0.1, 100.3, 100.3),  # dead reckoning is ahead
+        (5.0, 100.3, 102.0),  # the odometry has stopped
+        (0.1, 200.0, 100.1),  # another clock
+    ],
+)
+def test_the_transform_reaches_as_far_as_the_odometry(
+    waited_s: float, transforms_s: float, expected_s: float
+) -> None:
+    found = reach(HostNs(100 * 10**9), round(waited_s * 1e9), round(transforms_s * 1e9))
+    assert found == round(expected_s * 1e9)
 
 
 def test_a_correction_is_blended_where_the_body_is() -> None:
