@@ -288,3 +288,6 @@ class ManagedNode(LifecycleNode):
             for entity in [some for some in found if some not in kept]:
                 if getattr(entity, "topic_name", "") != "/clock":  # use_sim_time is set live
                     destroy(entity)
+        # rclpy's group keeps a reference to every entity that there ever was.
+        known = self.default_callback_group.entities
+        known.difference_update([found for found in known if found() is None])

@@ -200,6 +200,11 @@ def test_a_manager_is_told_what_cannot_be_done_and_nothing_ends(rig: Rig) -> Non
         assert rig.node.state_label == "unconfigured"
     assert rig.change("configure")
     assert rig.answers()
+    references = len(rig.node.default_callback_group.entities)
+    for _ in range(10):  # each makes a dozen anew
+        assert rig.change("cleanup")
+        assert rig.change("configure")
+    assert len(rig.node.default_callback_group.entities) < 2 * references
 
 
 def test_a_destroyed_node_leaves_the_graph_and_may_be_destroyed_twice(rig: Rig) -> None:
