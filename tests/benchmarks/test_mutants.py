@@ -5,8 +5,11 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 from benchmarks import mutants
 from benchmarks.mutants import Called, Mutant
+from benchmarks.mutants_known import FAULTS
 
 CADENCE = Path("l2lidar_node/clock/cadence.py")
 
@@ -19,10 +22,18 @@ def changes(source: str) -> set[str]:
 
 
 def test_code_is_mutated_but_no_texts_and_no_annotations() -> None:
+    assert changes("x = a < b") == {"a < b -> a >= b"}
     assert changes("x = a < 3 and not b") == {
         "a < 3 -> a <= 3", "3 -> 4", "a < 3 and (not b) -> a < 3 or not b", "not b -> b",
     }  # fmt: skip
     assert changes("x += 2") == {"x += 2 -> x -= 2", "2 -> 3"}
+    assert changes("x = (0, 16, 17, 0.25, 0.0)") == {
+        "0 -> 1", "16 -> 17", "17 -> 170", "0.25 -> 2.5", "0.0 -> 1.0",
+    }  # fmt: skip
+    assert changes("def f(): return 17 * 0.25") == {
+        "17 -> 34", "0.25 -> 0.5", "17 * 0.25 -> 17 // 0.25",
+    }  # fmt: skip
+    assert changes("Text = str | bytes") == set()
     assert changes('def f(x: "a < b") -> int:\n    "1 < 2"\n    raise ValueError(3)') == set()
     assert changes("x = 'a' + b") == set()
 
@@ -46,18 +57,16 @@ def test_a_sample_is_the_same_for_a_seed_and_has_mutants_of_every_module() -> No
 
 
 def test_a_mutant_meets_the_tests_that_call_its_function_its_own_first() -> None:
-    lines = (mutants.ROOT / CADENCE).read_text().splitlines()
-    first = next(n for n, line in enumerate(lines, 1) if "def advance(" in line)
-    inside = Mutant(CADENCE, 0, first + 2, "")
-    outside = Mutant(CADENCE, 1, 5, "")
+    inside = Mutant(CADENCE, 0, "Cadence.advance", "")
+    outside = Mutant(CADENCE, 1, "", "")
     path = str(CADENCE)
     calls = {
-        "tests/test_slow.py::a": Called(9.0, {path: [first]}),
-        "tests/test_quick.py::b": Called(0.1, {path: [first]}),
-        "tests/clock/test_cadence.py::c": Called(5.0, {path: [first]}),
-        "tests/test_other.py::d": Called(0.1, {path: [first + 1]}),
-        "tests/test_else.py::e": Called(0.1, {"l2lidar_node/clock/schedule.py": [first]}),
-        "tests/test_endless.py::f": Called(100.0, {path: [first]}),
+        "tests/test_slow.py::a": Called(4.0, {path: ["Cadence.advance"]}),
+        "tests/test_quick.py::b": Called(0.1, {path: ["Cadence.advance"]}),
+        "tests/clock/test_cadence.py::c": Called(5.0, {path: ["Cadence.advance"]}),
+        "tests/test_other.py::d": Called(0.1, {path: ["Cadence.noise"]}),
+        "tests/test_else.py::e": Called(0.1, {"l2lidar_node/clock/schedule.py": ["advance"]}),
+        "tests/test_endless.py::f": Called(100.0, {path: ["Cadence.advance"]}),
     }
     assert [test[-1] for test in mutants.tests_for(inside, calls)] == ["c", "b", "a"]
     assert {test[-1] for test in mutants.tests_for(outside, calls)} == {"a", "b", "c", "d"}
@@ -65,11 +74,30 @@ def test_a_mutant_meets_the_tests_that_call_its_function_its_own_first() -> None
 
 def test_the_page_names_what_lived_and_why() -> None:
     rows = [
-        {"path": "a.py", "change": "x: 1 -> 2", "killed": True},
-        {"path": "a.py", "change": "y: 1 -> 2", "killed": False},
-        {"path": "b.py", "change": "z: < -> <=", "killed": True},
+        {"path": "a.py", "number": 3, "change": "x: 1 -> 2", "killed": True},
+        {"path": "a.py", "number": 4, "change": "y: 1 -> 2", "killed": False},
+        {"path": "b.py", "number": 0, "change": "z: < -> <=", "killed": True},
+        {"path": "b.py", "number": -1, "change": "old -> new", "killed": True},
     ]
     page = mutants.report(rows, "--mutants 3")
-    assert "2 of 3 killed (67 %)" in page
+    assert "2 of 3 killed (66.7 %)" in page
+    assert "* `b.py`: `old -> new`: killed" in page
     assert "| `a.py` | 1 | 2 |" in page
     assert "* `a.py`: `y: 1 -> 2`: not explained" in page
+
+
+def test_a_mutant_knows_the_outermost_function_that_it_is_in() -> None:
+    functions = {mutant.function for mutant in mutants.mutants_of(CADENCE)}
+    assert {"", "Cadence.__init__", "Cadence.learn", "Cadence.gap"} <= functions
+    for mutant in mutants.mutants_of(CADENCE):
+        is_constant = mutant.change.startswith(("_", "FIRST_MODULUS"))
+        assert (mutant.function == "") == is_constant, mutant
+
+
+@pytest.mark.parametrize("number", range(len(FAULTS)))
+def test_a_known_fault_still_fits_the_code(number: int) -> None:
+    fault = FAULTS[number]
+    assert (mutants.ROOT / fault.path).read_text().count(fault.before) == 1
+    mutants.mutated(Path(fault.path), -1 - number)
+    for test in fault.tests:
+        assert (mutants.ROOT / test.partition("::")[0]).exists()

@@ -1,0 +1,124 @@
+"""Mutants that are tried in every run, and why some of the others live."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault that once went unnoticed by every test.
+
+    Attributes
+    ----------
+    path : str
+        Of the module, below the repository.
+    before, after : str
+        What stands there once, and what instead.
+    tests : tuple of str
+        Files, or single tests, that have to notice it.
+    """
+
+    path: str
+    before: str
+    after: str
+    tests: tuple[str, ...]
+
+
+_BASE: Final = "l2lidar_proc/odometry/base_frame.py"
+_MESSAGES: Final = "l2lidar_node/ros/conversions.py"
+_TRACKER: Final = "l2lidar_proc/motion/tracker.py"
+_PROC: Final = "tests/l2lidar_proc"
+_NODE: Final = "tests/l2lidar_node"
+
+FAULTS: Final = (
+    Fault(
+        "l2lidar_proc/ros/odometry_messages.py",
+        "quaternion.w, quaternion.x, quaternion.y, quaternion.z = w, x, y, z",
+        "quaternion.w, quaternion.x, quaternion.y, quaternion.z = x, y, z, w",
+        (f"{_PROC}/ros/test_odometry_messages.py",),
+    ),
+    Fault(
+        _BASE,
+        "velocity = estimate.velocity + rotations.cross(estimate.angular_velocity, arm)",
+        "velocity = estimate.velocity",
+        (f"{_PROC}/odometry/test_base_frame.py",),
+    ),
+    Fault(
+        _BASE,
+        "twist[:3, 3:] = -skew(arm)",
+        "twist[:3, 3:] = skew(arm)",
+        (f"{_PROC}/odometry/test_base_frame.py",),
+    ),
+    Fault(
+        _MESSAGES,
+        "(config.roll_covar, config.pitch_covar, config.yaw_covar)",
+        "(config.yaw_covar, config.pitch_covar, config.roll_covar)",
+        (f"{_NODE}/ros/test_conversions.py",),
+    ),
+    Fault(
+        _MESSAGES,
+        "(config.gyro_x_covar, config.gyro_y_covar, config.gyro_z_covar)",
+        "(config.accel_x_covar, config.accel_y_covar, config.accel_z_covar)",
+        (f"{_NODE}/ros/test_conversions.py",),
+    ),
+    Fault(
+        "l2lidar_proc/motion/preintegration.py",
+        " + (dt * dt / 12.0) * rotations.cross(before, after)",
+        "",
+        (f"{_PROC}/motion/test_preintegration.py",),
+    ),
+    Fault(
+        "l2lidar_proc/odometry/map_initialization.py",
+        "place = initial.state.rotation @ self._matcher.lever",
+        "place = 0.0 * self._matcher.lever",
+        (f"{_PROC}/odometry/test_odometry.py",),
+    ),
+    Fault(
+        "l2lidar_proc/odometry/prediction.py",
+        'max(settings.accel_noise, white_noise(samples["linear_acceleration"])) * scale',
+        'max(settings.accel_noise, white_noise(samples["linear_acceleration"]))',
+        (f"{_PROC}/odometry/test_odometry_parts.py",),
+    ),
+    Fault(
+        "l2lidar_node/clock/cadence.py",
+        "_MIN_TOLERANCE_NS: Final = 2_000.0",
+        "_MIN_TOLERANCE_NS: Final = 20_000.0",
+        (f"{_NODE}/clock/test_clock_parts.py",),
+    ),
+    Fault(
+        "l2lidar_node/clock/host_clock_model.py",
+        "if arrival < self._from:",
+        "if False:",
+        (f"{_NODE}/clock/test_clock_parts.py",),
+    ),
+    Fault(
+        _TRACKER,
+        "if speed is not None and speed > self._config.still_speed:",
+        "if False:",
+        (f"{_PROC}/motion/test_tracker.py",),
+    ),
+    Fault(
+        _TRACKER,
+        "speed = self.filter.speed_near(end, self._config.velocity_max_age_ms * 1_000_000)",
+        "speed = self.filter.speed_near(end, self._config.velocity_max_age_ms * 1_010_000)",
+        (f"{_PROC}/motion/test_tracker.py",),
+    ),
+    Fault(
+        _TRACKER,
+        "            start, self._config.velocity_max_age_ms * 1_000_000",
+        "            start, self._config.velocity_max_age_ms * 1_010_000",
+        (f"{_PROC}/motion/test_tracker.py",),
+    ),
+    Fault(
+        "l2lidar_node/driver/driver.py",
+        "return self.send(commands.standby(), now), self.sent(commands.standby(), now)",
+        "return self.send(commands.standby(), now), []",
+        (f"{_NODE}/driver/test_driver.py",),
+    ),
+)
+"""Faults named by those who tested the driver before; a run tries them all."""
+
+REASONS: Final[dict[tuple[str, str], str]] = {}
+"""By module and change, as ``docs/results/mutants.md`` shows them."""
