@@ -52,7 +52,8 @@ class ImuConfig:
     calibration_file: str = setting(
         "",
         "file of l2lidar calibrate imu for this unit: rotation of the IMU (in place of that in "
-        "/tf_static), time offset, gyro scale; imu_rpy and imu_time_offset_ms count more if set",
+        "/tf_static), time offset, gyro scale; imu_rpy and imu_time_offset_ms count more if set; "
+        "without a part imu the IMU is used as drawn",
     )
 
     def __post_init__(self) -> None:

@@ -23,6 +23,9 @@ def launch_setup(context):
     parameters = [file_given(context, "proc_params_file")]
     if given["use_sim_time"] == "true":
         parameters.append({"use_sim_time": True})
+    known = parameters_given(context, ["calibration_file"])
+    if known:
+        parameters.append(known)
     ros_arguments = ["--log-level", LaunchConfiguration("log_level")]
     name = {"executable": "deskew_node", "name": "deskew_node"}
     if given["odometry"] == "true":
@@ -78,6 +81,12 @@ def generate_launch_description():
                 default_value="",
                 description="frame whose pose is given, tied to the cloud's by /tf_static; empty "
                 "for what proc_params_file says",
+            ),
+            DeclareLaunchArgument(
+                "calibration_file",
+                default_value="",
+                description="file of l2lidar calibrate for this unit, for the driver, deskew and "
+                "odometry; empty for what params_file and proc_params_file say",
             ),
             DeclareLaunchArgument(
                 "use_sim_time",

@@ -160,7 +160,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "calibration_file",
                 default_value="",
-                description=f"calibration of the unit; {from_file}",
+                description=f"file of l2lidar calibrate for this unit; {from_file}",
             ),
             DeclareLaunchArgument(
                 "emulator",

@@ -18,7 +18,12 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from l2lidar_node.ros.launching import DRIVER_REMAPPINGS, file_given, required
+from l2lidar_node.ros.launching import (
+    DRIVER_REMAPPINGS,
+    file_given,
+    parameters_given,
+    required,
+)
 
 LIO_SAM_NODES = ("imuPreintegration", "imageProjection", "featureExtraction", "mapOptimization")
 # The first is that of the Fast DDS of Jazzy, the second that of newer ones.
@@ -56,6 +61,7 @@ def launch_setup(context):
         file_given(context, "lio_sam_params_file"),
         {"lidarFrame": lidar, "baselinkFrame": base},
     ]
+    known = parameters_given(context, ["calibration_file"])
     return [
         *(
             Node(
@@ -77,6 +83,7 @@ def launch_setup(context):
             parameters=[
                 file_given(context, "proc_params_file"),
                 file_given(context, "deskew_params_file"),
+                *([known] if known else []),
             ],
             remappings=DRIVER_REMAPPINGS,
             output="screen",
@@ -113,6 +120,12 @@ def generate_launch_description():
                 choices=["true", "false"],
                 description="whether to put the sensor at the origin of base_frame; false where a "
                 "robot's description says where it sits",
+            ),
+            DeclareLaunchArgument(
+                "calibration_file",
+                default_value="",
+                description="file of l2lidar calibrate for this unit, for the driver and deskew; "
+                "empty for what their parameter files say",
             ),
             DeclareLaunchArgument(
                 "lio_sam_params_file",

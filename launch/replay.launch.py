@@ -36,9 +36,11 @@ def launch_setup(context):
         "ros_arguments": ["--log-level", LaunchConfiguration("log_level")],
         "output": "screen",
     }
+    known = parameters_given(context, ["calibration_file"])
     replay = {
         **(FOR_DESKEW if is_followed else {}),
         **parameters_given(context, ["l2_name", "l2_ip"]),
+        **known,
         "replay_file": file_given(context, "file"),
         "replay_loop": given["loop"] == "true",
     }
@@ -59,7 +61,7 @@ def launch_setup(context):
         *(
             Node(
                 executable=name,
-                parameters=[file_given(context, "proc_params_file"), RECORDED_TIME],
+                parameters=[file_given(context, "proc_params_file"), {**RECORDED_TIME, **known}],
                 on_exit=required(),
                 **common,
             )
@@ -119,6 +121,12 @@ def generate_launch_description():
                 "proc_params_file",
                 default_value=PathJoinSubstitution([share, "config", "l2lidar_proc.yaml"]),
                 description="parameters of deskew and odometry",
+            ),
+            DeclareLaunchArgument(
+                "calibration_file",
+                default_value="",
+                description="file of l2lidar calibrate for this unit, for the driver, deskew and "
+                "odometry; empty for what params_file and proc_params_file say",
             ),
             DeclareLaunchArgument(
                 "log_level",

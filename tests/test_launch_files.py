@@ -53,7 +53,7 @@ ARGUMENTS = {
     "lio_input": WITH_RVIZ | {"consumer"},
     "replay": RVIZ
     | {"file", "rate", "loop", "deskew_odometry", "name", "l2_name", "l2_ip", "rviz"}
-    | {"log_level", "params_file", "proc_params_file"},
+    | {"log_level", "params_file", "proc_params_file", "calibration_file"},
     "l2_top_mount_example": WITH_RVIZ,
     "l2_forward_mount_example": WITH_RVIZ,
     "multi": {"sensors_file", "deskew_odometry", "emulator"},
@@ -567,6 +567,15 @@ def test_replay_is_told_to_the_driver_and_its_time_to_the_others(launched: Any) 
     assert made.node("l2lidar_node").parameters["replay_loop"] is True
     with pytest.raises(RuntimeError, match="deskew_odometry:=false"):
         launched("replay", loop="true")
+
+
+@needs_launch
+@pytest.mark.parametrize("name", ["deskew_odometry", "slam", "replay", "lio_sam"])
+def test_a_calibration_reaches_all_that_use_it(launched: Any, name: Any) -> None:
+    plain, given = launched(name), launched(name, calibration_file="/home/me/front.yaml")
+    for program in {"l2lidar_node", "deskew_node", "companion_node"} & set(given.executables):
+        assert plain.node(program).parameters.get("calibration_file", "") == ""
+        assert given.node(program).parameters["calibration_file"] == "/home/me/front.yaml"
 
 
 @needs_launch

@@ -29,22 +29,27 @@ class ImuExtrinsics:
     unmixing : ndarray, shape (3, 3)
         Takes scale and misalignment off the gyro's rates.
     source : str
-        Where it comes from; empty where nothing is put right.
+        Where it comes from, for people.
+    problem : str
+        What is wrong with the file; empty where it is used or none was given.
     """
 
     rotation: F64 | None = None
     time_offset_ms: float = 0.0
     unmixing: F64 = field(default_factory=lambda: np.eye(3))
-    source: str = ""
+    source: str = "drawing"
+    problem: str = ""
 
     @classmethod
     def of(cls, config: ImuConfig) -> ImuExtrinsics:
         """Return what the settings say; those set by hand count more than the file.
 
+        A file that has nothing about an IMU, as one of the beams alone, leaves it as drawn.
+
         Raises
         ------
         SettingError
-            If the calibration file cannot be used, or has nothing about an IMU.
+            If the calibration file cannot be used.
         """
         if not config.calibration_file:
             return cls(time_offset_ms=config.imu_time_offset_ms)
@@ -53,10 +58,11 @@ class ImuExtrinsics:
         except CalibrationFileError as error:
             raise SettingError(f"parameter 'calibration_file': {error}") from None
         if imu is None:
-            raise SettingError(
-                f"parameter 'calibration_file': {config.calibration_file} has no part 'imu'; add "
+            problem = (
+                f"{config.calibration_file} has no part 'imu', so the IMU is used as drawn; add "
                 "it with l2lidar calibrate imu"
             )
+            return cls(time_offset_ms=config.imu_time_offset_ms, problem=problem)
         by_hand = any(config.imu_rpy)
         turn = config.T_cloud_imu[:3, :3] if by_hand else rotations.from_rpy(imu.rotation_rpy)
         return cls(

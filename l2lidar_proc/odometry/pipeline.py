@@ -56,6 +56,8 @@ class OdometryPipeline:
         In which unit and with which sign the accelerometer measures.
     check : ExtrinsicCheck
         Whether the gyro turns as the clouds do.
+    extrinsics : ImuExtrinsics
+        What is known of the IMU beside its place.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class OdometryPipeline:
         self._uses_accelerometer = accelerometer
         self._wait_ns = imu_wait_ms * _MS if config.mode == "inertial" else 0
         self._newest_imu: HostNs | None = None
-        self._extrinsics = extrinsics or ImuExtrinsics()
+        self.extrinsics = extrinsics or ImuExtrinsics()
         self.convention = ImuConvention()
         self.mount(T_cloud_imu)
 
@@ -83,7 +85,7 @@ class OdometryPipeline:
         self.odometry: Odometry | PlainOdometry = (
             PlainOdometry(self._config)
             if self._config.mode == "plain"
-            else Odometry(self._config, self._extrinsics.mounted(T_cloud_imu))
+            else Odometry(self._config, self.extrinsics.mounted(T_cloud_imu))
         )
         self._begin()
 
@@ -91,7 +93,7 @@ class OdometryPipeline:
         """Return whether a mount (4, 4) is the one that is used, or none is."""
         odometry = self.odometry
         return not isinstance(odometry, Odometry) or np.allclose(
-            self._extrinsics.mounted(T_cloud_imu), odometry.T_cloud_imu, atol=1e-6
+            self.extrinsics.mounted(T_cloud_imu), odometry.T_cloud_imu, atol=1e-6
         )
 
     def configure(self, config: OdometryConfig) -> None:
@@ -148,7 +150,7 @@ class OdometryPipeline:
 
     def corrected(self, samples: Samples) -> Samples:
         """Return IMU samples (N,) as they are used; changes nothing, so any thread may ask."""
-        return self._usable(self.convention.applied(self._extrinsics.corrected(samples)))
+        return self._usable(self.convention.applied(self.extrinsics.corrected(samples)))
 
     def _usable(self, samples: Samples) -> Samples:
         if not self._uses_accelerometer:
@@ -158,7 +160,7 @@ class OdometryPipeline:
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,) in any order and state."""
-        samples = self._usable(self.convention.corrected(self._extrinsics.corrected(samples)))
+        samples = self._usable(self.convention.corrected(self.extrinsics.corrected(samples)))
         self.odometry.imu(samples)
         self.check.imu(samples)
         if len(samples):

@@ -73,6 +73,8 @@ class DeskewNode(ManagedNode):
         config = self._settings.value
         topics = config.topics
         self._pipeline = Pipeline(config.proc)
+        if self._pipeline.extrinsics.problem:
+            self.get_logger().warning(self._pipeline.extrinsics.problem)
         self._pipeline.odometry_motion = self._odometry_motion
         self._frames = StaticFrames(self) if topics.use_tf else None
         self._mounted: tuple[str, str, int] | None = None
@@ -283,7 +285,8 @@ class DeskewNode(ManagedNode):
         level, text = self._inputs.judge(judged.level, judged.message)
         if self._frames is not None and self._frames.refused:
             level, text = max(level, Level.WARN), f"{text}; {self._frames.refused}"
-        judged = replace(judged, level=Level(level), message=text)
+        values = {**judged.values, "calibration of the IMU": self.pipeline.extrinsics.source}
+        judged = replace(judged, level=Level(level), message=text, values=values)
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [self._status(judged, "deskew")]

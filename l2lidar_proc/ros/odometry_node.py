@@ -80,6 +80,8 @@ class OdometryNode(ManagedNode):
         self._pipeline = OdometryPipeline(
             config.odometry, topics.T_cloud_imu, topics.imu_wait_ms, ImuExtrinsics.of(topics)
         )
+        if self._pipeline.extrinsics.problem:
+            self.get_logger().warning(self._pipeline.extrinsics.problem)
         self._folder = DataFolder(config.files.data_dir, config.files.overwrite)
         self._frames = StaticFrames(self) if topics.use_tf else None
         self._base = BaseFrame(np.eye(4))
@@ -421,6 +423,7 @@ class OdometryNode(ManagedNode):
         level, text = self._inputs.judge(level, text)
         if self._frames is not None and self._frames.refused:
             level, text = max(level, health.WARN), f"{text}; {self._frames.refused}"
+        values["calibration of the IMU"] = self.pipeline.extrinsics.source
         if self._said:
             values["recognized"] = "; ".join(sorted(self._said))
         message = DiagnosticArray()

@@ -132,7 +132,8 @@ class OdometryRunner:
             accelerometer=accelerometer,
         )
         self.pipeline.convention.reversed = opposite
-        self.notes: list[str] = []
+        problem = self.pipeline.extrinsics.problem
+        self.notes: list[str] = [problem] if problem else []
         self.base = BaseFrame(np.eye(4))
         self.refused: Counter[str] = Counter()
 

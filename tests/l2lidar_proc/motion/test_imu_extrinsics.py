@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -72,10 +73,19 @@ def test_without_a_file_nothing_changes() -> None:
     np.testing.assert_array_equal(known.mounted(mount), mount)
 
 
-def test_a_file_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+def test_a_file_of_the_beams_alone_leaves_the_imu_as_drawn(tmp_path: Path) -> None:
+    """One launch argument gives a file to driver, deskew and odometry."""
     beams = tmp_path / "beams.yaml"
     CalibrationFile(bytes(32), {"xi_angle": 0.001}).save(beams)
-    with pytest.raises(SettingError, match=r"calibration_file.*no part 'imu'.*calibrate imu"):
-        ImuExtrinsics.of(build(ImuConfig, {"calibration_file": str(beams)}))
+    settings = {"calibration_file": str(beams), "imu_time_offset_ms": 3.0}
+    known = ImuExtrinsics.of(build(ImuConfig, settings))
+    assert known.source == "drawing"
+    assert re.search(r"beams.yaml has no part 'imu'.*l2lidar calibrate imu", known.problem)
+    assert known.rotation is None
+    np.testing.assert_array_equal(known.unmixing, np.eye(3))
+    assert known.time_offset_ms == 3.0
+
+
+def test_a_file_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"calibration_file.*No such file"):
         ImuExtrinsics.of(build(ImuConfig, {"calibration_file": str(tmp_path / "none.yaml")}))
