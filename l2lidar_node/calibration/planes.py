@@ -71,7 +71,7 @@ class Planes(NamedTuple):
         return np.asarray(np.einsum("ni,ni->n", away, self.normal[plane]))
 
 
-def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
+def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8, most: int = _MOST) -> Planes:
     """Return the flat cells of two grids that hold points of both halves of the fan.
 
     Parameters
@@ -82,16 +82,20 @@ def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8) -> Planes:
         Whether alpha is above 90 degrees.
     groups : ndarray, shape (N,), int
         Planes never hold points of two groups.
+    most : int
+        Points that a cell keeps.
     """
-    return joined([_cells(points, is_far_half, groups, size) for size in CELLS_M])
+    return joined([_cells(points, is_far_half, groups, size, most) for size in CELLS_M])
 
 
-def _cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8, size: float) -> Planes:
+def _cells(
+    points: F64, is_far_half: NDArray[np.bool_], groups: I8, size: float, most: int
+) -> Planes:
     found = _grid(points, groups, size, is_far_half)
     found = _kept(found, _flat(found, points))
     found = _trimmed(found, points)
     found = _kept(found, _both_halves(found, is_far_half) & _flat(found, points))
-    return _thinned(found, points)
+    return _thinned(found, points, most)
 
 
 def large(
@@ -251,7 +255,7 @@ def _trimmed(planes: Planes, points: F64) -> Planes:
     return _sorted(planes.member[inside], plane[inside], points)
 
 
-def _thinned(planes: Planes, points: F64, most: int = _MOST) -> Planes:
+def _thinned(planes: Planes, points: F64, most: int) -> Planes:
     """Return the planes with at most so many points each, evenly taken."""
     if not len(planes.first):
         return planes

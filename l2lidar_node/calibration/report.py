@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
+import numpy as np
+
 from l2lidar_node import __version__
 from l2lidar_node.calibration.file import CalibrationFile
+from l2lidar_node.calibration.model import NAMES
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import Quality, StillResult, Verdict
 from l2lidar_node.calibration.still import DEG
+from l2lidar_node.types import F64
 
 ENTRIES: Final = {
     "xi": "xi_angle",
@@ -95,6 +99,15 @@ def calibration_of(
         None,
         about,
     )
+
+
+def beams_of(file: CalibrationFile | None) -> F64:
+    """Return what a file corrects of the beams, shape (8,), in the order of model.NAMES.
+
+    The range scale is no part of it; nothing is corrected without a file.
+    """
+    known = {} if file is None else file.correction
+    return np.array([known.get(ENTRIES.get(name, ""), 0.0) for name in NAMES])
 
 
 def quality_mm(quality: Quality) -> dict[str, float]:

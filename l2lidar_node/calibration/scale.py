@@ -7,22 +7,29 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration.model import NAMES, beams
+from l2lidar_node.calibration import planes as flat, solver
+from l2lidar_node.calibration.model import NAMES, Beams, beams
 from l2lidar_node.calibration.observation import Place
-from l2lidar_node.calibration.planes import I8
+from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.still import CalibrationError
 from l2lidar_node.types import F64
 
-_SAME_RAD: Final = np.deg2rad(4.0)  # by which the sensor may turn between the places
 _WORST_SCALE: Final = 0.03
-_STEEP: Final = 0.95  # cosine of the incidence: a range bias moves steep points alike
-_NEAR_M: Final = 0.08  # between a predicted and a found surface
-_NOISE_M: Final = 1.5e-3  # what a surface's place is uncertain by, whatever its points say
-_FEWEST: Final = 60  # points of a surface seen from steep
-_EXTENT_M: Final = 0.4  # least standard deviation of a surface's points along it
 _SHORTEST_M: Final = 1.0
-_ITERATIONS: Final = 3
+_EXTENT_M: Final = 0.4  # least standard deviation of a wall's points along it
+_SAME_WAY: Final = np.cos(np.deg2rad(20.0))
+_REACHES_M: Final = (0.6, 0.4, 0.25, 0.15, 0.1, 0.1, 0.1)  # from a point to the other place's wall
+_MOST_COARSE: Final = 8000  # returns of the second place, to begin with
+_TURNED_RAD: Final = np.deg2rad(10.0)
+_ASSOCIATIONS: Final = 6
+_SETTLED_M: Final = 1e-4
+_MOST_OF_CELL: Final = 1000  # points: all of them
+_FEWEST: Final = 20  # patches that both places see
+_BIAS_SD_M: Final = 0.03  # of ranges, before the places are compared
+_MODEL_SD_M: Final = 0.7e-3  # what ranges that depend on incidence and surface leave in a way
+_SIGNIFICANT: Final = np.sqrt(2.0)
+"""Standard deviations of a scale that is worth having: from there on what is left without it,
+value^2 - sd^2 at the best guess, is more than the sd^2 that is left with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +43,7 @@ class ScaleResult:
     measured : float
         Distance between the places by the reported ranges [m].
     surfaces : int
-        Pairs of surfaces that were found again.
+        Flat patches that both places see.
     """
 
     scale: float
@@ -44,32 +51,47 @@ class ScaleResult:
     measured: float
     surfaces: int
 
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is worth having."""
+        return bool(abs(self.scale) > _SIGNIFICANT * self.sd)
 
-class _Surfaces(NamedTuple):
-    """Large surfaces of a place, arrays over surfaces.
+
+class _Way(NamedTuple):
+    """How the second place lies to the first.
 
     Attributes
     ----------
-    normal : ndarray, shape (S, 3)
-        Looks at the sensor.
-    center : ndarray, shape (S, 3)
-        Mean of the points that are seen from steep [m].
-    distance : ndarray, shape (S,)
-        From the sensor [m].
-    size : ndarray, shape (S,)
-        Points that are seen from steep.
+    turn : ndarray, shape (3, 3)
+    shift : ndarray, shape (3,)
+        [m]
     """
 
-    normal: F64
-    center: F64
-    distance: F64
-    size: I8
+    turn: F64
+    shift: F64
+
+    def applied(self, points: F64) -> F64:
+        """Return points (N, 3) of the second place in the frame of the first."""
+        return np.asarray(points @ self.turn.T + self.shift)
+
+    def moved(self, turn: F64, shift: F64) -> _Way:
+        """Return the way after a small turn about the second place, (3,) [rad], and a shift."""
+        from scipy.spatial.transform import Rotation
+
+        return _Way(Rotation.from_rotvec(turn).as_matrix() @ self.turn, self.shift + shift)
 
 
-def by_tape(first: Place, second: Place, length: float, length_sd: float = 0.002) -> ScaleResult:
+def by_tape(
+    first: Place,
+    second: Place,
+    length: float,
+    length_sd: float = 0.002,
+    correction: F64 | None = None,
+) -> ScaleResult:
     """Return the range scale from two places a known way apart.
 
-    A range bias cancels: it moves a wall alike at both places.
+    Both clouds are brought together on flat patches that both places see; a wrong scale makes
+    them and the way between them smaller alike. A range bias is estimated beside it.
 
     Parameters
     ----------
@@ -79,6 +101,8 @@ def by_tape(first: Place, second: Place, length: float, length_sd: float = 0.002
         Between them, by tape [m].
     length_sd : float
         What the tape is uncertain by [m].
+    correction : ndarray, shape (8,), optional
+        Of the beams, in the order of :data:`model.NAMES`; as reported if left out.
 
     Raises
     ------
@@ -92,114 +116,132 @@ def by_tape(first: Place, second: Place, length: float, length_sd: float = 0.002
         )
     if first.block != second.block:
         raise CalibrationError("the places are of different units; use one unit for both")
-    one, other = _surfaces(first), _surfaces(second)
-    shift = _towards_wall(one, other, length)
-    sd = np.inf
-    pairs: list[tuple[int, int]] = []
-    for _ in range(_ITERATIONS):
-        pairs = _pairs(one, other, shift)
-        if not pairs:
-            break
-        normals, nearer = _came_nearer(one, other, np.array(pairs))
-        along = shift / np.linalg.norm(shift)
-        # What no surface fixes stays as it is: across the way it hardly changes the length.
-        weak = 1e-3 * np.eye(3)
-        information = normals.T @ normals + weak
-        shift = np.asarray(
-            np.linalg.solve(information, -normals.T @ nearer + weak @ shift), np.float64
-        )
-        cover = np.linalg.inv(information)
-        sd = float(_NOISE_M * np.sqrt(2.0 * along @ cover @ along))
-    if not pairs:
+    used = np.zeros(len(NAMES)) if correction is None else correction
+    one, other = (beams(place.returns, place.block, used) for place in (first, second))
+    group = np.zeros(len(one.points), np.int64)
+    walls = flat.large(one.points, group > 0, group, _EXTENT_M)
+    if not len(walls.first):
         raise CalibrationError(
-            "no surface of the first place is found again at the second; slide the sensor "
-            "straight towards a flat wall, without turning it"
+            f"{first.name}: no large flat surfaces; use a room with a flat wall ahead"
         )
-    measured = float(np.linalg.norm(shift))
+    way = _together(one.points, other.points, walls, _ways(one, other, walls, length))
+    found, own, patches = _refined(one, other, way)
+    measured = float(np.linalg.norm(found.shift))
     scale = length / measured - 1.0
     if abs(scale) > _WORST_SCALE:
         raise CalibrationError(
             f"the sensor moved by {measured:.3f} m by its own ranges and {length:.3f} m by the "
             f"tape: {100 * scale:+.1f} % is not a range scale; read the tape again"
         )
-    return ScaleResult(scale, float(np.hypot(sd, length_sd) / length), measured, len(pairs))
+    along = found.shift / measured
+    sd = float(np.sqrt(along @ own @ along + _MODEL_SD_M**2 + length_sd**2)) / length
+    return ScaleResult(scale, sd, measured, patches)
 
 
-def _came_nearer(one: _Surfaces, other: _Surfaces, pairs: I8) -> tuple[F64, F64]:
-    """Return normals of pairs of surfaces and by how much the second place is nearer to them [m].
+def _ways(one: Beams, other: Beams, walls: Planes, length: float) -> list[_Way]:
+    """Return the ways that the sensor may have gone, best first: along the normals of walls."""
+    from scipy.spatial import cKDTree
 
-    Both places share the normal, since the parts of a surface that they see best lie apart.
+    directions: list[F64] = []
+    for normal in walls.normal[np.argsort(-walls.counts)]:
+        for direction in (normal, -normal):
+            if all(direction @ known < _SAME_WAY for known in directions):
+                directions.append(direction)
+    tree = cKDTree(_some(one.points, 4 * _MOST_COARSE))
+    some = _some(other.points, _MOST_COARSE // 4)
+    ways = [_Way(np.eye(3), direction * length) for direction in directions]
+    reach = _REACHES_M[0]
+    costs = [
+        float(
+            np.minimum(tree.query(way.applied(some), distance_upper_bound=reach)[0], reach).mean()
+        )
+        for way in ways
+    ]
+    return [ways[index] for index in np.argsort(costs)]
+
+
+def _some(points: F64, most: int) -> F64:
+    return points[:: max(1, len(points) // most)]
+
+
+def _together(one: F64, other: F64, walls: Planes, ways: list[_Way]) -> _Way:
+    """Return the best of two ways after points were brought to the walls of the first place."""
+    from scipy.spatial import cKDTree
+
+    target, normals = one[walls.member], walls.normal[walls.plane]
+    tree = cKDTree(target)
+    points = _some(other, _MOST_COARSE)
+    best: tuple[float, _Way] | None = None
+    for way in ways[:2]:
+        off = np.inf
+        for reach in _REACHES_M:
+            there = way.applied(points)
+            distance, index = tree.query(there, distance_upper_bound=reach)
+            near = np.isfinite(distance)
+            if np.count_nonzero(near) < _FEWEST:
+                break
+            normal = normals[index[near]]
+            height = np.einsum("ni,ni->n", there[near] - target[index[near]], normal)
+            jacobian = np.concatenate((np.cross(there[near] - way.shift, normal), normal), axis=1)
+            weight = 1.0 / np.maximum(np.abs(height), 0.03)  # of absolute values
+            square = (jacobian * weight[:, None]).T @ jacobian + 1e-6 * np.eye(6)
+            step = -np.linalg.solve(square, (jacobian * weight[:, None]).T @ height)
+            way = way.moved(step[:3], step[3:])
+            off = float(np.minimum(distance, reach).mean())
+        if best is None or off < best[0]:
+            best = off, way
+    assert best is not None
+    return best[1]
+
+
+def _refined(one: Beams, other: Beams, way: _Way) -> tuple[_Way, F64, int]:
+    """Return the way by the flat patches of both places, the covariance of its shift, and patches.
+
+    The unknowns are turn, shift and a range bias.
     """
-    first, second = pairs.T
-    weights = np.stack((one.size[first], other.size[second]), axis=-1)[..., None]
-    normals = one.normal[first] * weights[:, 0] + other.normal[second] * weights[:, 1]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    away = other.center[second] - one.center[first]
-    return normals, np.einsum("ni,ni->n", away, normals)
-
-
-def _surfaces(place: Place) -> _Surfaces:
-    group = np.zeros(len(place.returns), np.int64)
-    rays = beams(place.returns, place.block, np.zeros(len(NAMES)))
-    points = rays.points
-    far = place.returns["alpha"] > np.pi / 2
-    found = flat.large(points, far, group, _EXTENT_M)
-    if not len(found.first):
-        raise CalibrationError(
-            f"{place.name}: no large flat surfaces; use a room with a flat wall ahead"
+    is_second = np.arange(len(one.points) + len(other.points)) >= len(one.points)
+    nothing = np.zeros(len(is_second), np.int64)
+    begin = way.shift
+    bias = 0.0
+    information = np.diag([*[1e-9] * 6, _BIAS_SD_M**-2])
+    for _ in range(_ASSOCIATIONS):
+        rays = _joined(one, other, way, bias)
+        patches = flat.cells(rays.points, is_second, nothing, _MOST_OF_CELL)
+        if len(patches.first) < _FEWEST:
+            raise _not_found(begin)
+        chosen = patches.member
+        part = Beams(rays.origin[chosen], rays.direction[chosen], rays.distance[chosen])
+        own = patches.at()
+        met = solver.meeting(part, own)
+        normal = own.normal[own.plane]
+        jacobian = np.concatenate(
+            (np.cross(met.points - way.shift, normal), normal, met.cosine[:, None]), axis=1
         )
-    plane = found.plane
-    direction = rays.direction[found.member]
-    steep = np.abs(np.einsum("ni,ni->n", direction, found.normal[plane])) > _STEEP
-    normals, centers, sizes = [], [], []
-    for number in range(len(found.first)):
-        mine = found.member[(plane == number) & steep]
-        if len(mine) < _FEWEST:
-            continue
-        center = points[mine].mean(axis=0)
-        normal = found.normal[number]
-        if normal @ center > 0:
-            normal = -normal
-        normals.append(normal)
-        centers.append(center)
-        sizes.append(len(mine))
-    if not normals:
-        raise CalibrationError(
-            f"{place.name}: no large flat surface is seen from steep; stand before a wall"
-        )
-    normal, center = np.array(normals), np.array(centers)
-    distance = -np.einsum("ni,ni->n", normal, center)
-    return _Surfaces(normal, center, distance, np.array(sizes))
+        jacobian[:, :6] *= is_second[chosen][:, None]
+        before = information[6, 6] * np.array([0.0] * 6 + [bias])
+        group = np.zeros(len(own.first), np.int64)
+        found = solver.system(own, met, jacobian, group, information)
+        step = np.linalg.solve(found.hessian, -(found.gradient + before))
+        way, bias = way.moved(step[:3], step[3:6]), bias + float(step[6])
+        if np.abs(step[3:]).max() < _SETTLED_M:
+            break
+    turned = np.arccos(np.clip((np.trace(way.turn) - 1.0) / 2.0, -1.0, 1.0))
+    if turned > _TURNED_RAD:
+        raise _not_found(begin)
+    return way, found.covariance[3:6, 3:6], len(patches.first)
 
 
-def _towards_wall(one: _Surfaces, other: _Surfaces, length: float) -> F64:
-    """Return the first guess of the way: along the normal of the wall it leads to."""
-    best, found = np.inf, None
-    for i in range(len(one.normal)):
-        same = one.normal[i] @ other.normal.T > np.cos(_SAME_RAD)
-        for j in np.flatnonzero(same):
-            way = abs(one.distance[i] - other.distance[j])
-            off = abs(way / length - 1.0)
-            # Of walls that agree the one with most points counts.
-            if off < 2 * _WORST_SCALE and off - 1e-6 * one.size[i] < best:
-                best = off - 1e-6 * one.size[i]
-                found = -one.normal[i] * (one.distance[i] - other.distance[j])
-    if found is None:
-        raise CalibrationError(
-            f"no wall came nearer by {length:g} m; slide the sensor straight towards a flat wall, "
-            "without turning it"
-        )
-    return np.asarray(found)
+def _joined(one: Beams, other: Beams, way: _Way, bias: float) -> Beams:
+    """Return the rays of both places in the frame of the first."""
+    return Beams(
+        np.concatenate((one.origin, way.applied(other.origin))),
+        np.concatenate((one.direction, other.direction @ way.turn.T)),
+        np.concatenate((one.distance, other.distance)) + bias,
+    )
 
 
-def _pairs(one: _Surfaces, other: _Surfaces, shift: F64) -> list[tuple[int, int]]:
-    """Return surfaces of both places that are the same one after a shift of the sensor."""
-    found = []
-    for i in range(len(one.normal)):
-        predicted = one.distance[i] + one.normal[i] @ shift
-        same = one.normal[i] @ other.normal.T > np.cos(_SAME_RAD)
-        off = np.where(same, np.abs(other.distance - predicted), np.inf)
-        j = int(np.argmin(off))
-        if off[j] < _NEAR_M:
-            found.append((i, j))
-    return found
+def _not_found(shift: F64) -> CalibrationError:
+    return CalibrationError(
+        f"the surfaces of the first place are not found again {np.linalg.norm(shift):.2f} m on; "
+        "slide the sensor straight towards a flat wall, without turning it"
+    )

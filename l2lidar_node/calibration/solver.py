@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration.model import NAMES, Block, beams, derivatives
+from l2lidar_node.calibration.model import NAMES, Beams, Block, beams, derivatives
 from l2lidar_node.calibration.planes import I8, Planes
 from l2lidar_node.types import F64
 
@@ -239,7 +239,22 @@ def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F64:
     return np.asarray(solution.values + _newton(system.hessian, system.gradient, 1e-6))
 
 
-class _System(NamedTuple):
+class System(NamedTuple):
+    """Normal equations of unknowns, planes eliminated.
+
+    Attributes
+    ----------
+    hessian : ndarray, shape (P, P)
+        Of half the sum of squared weighted residuals, and what was known before.
+    gradient : ndarray, shape (P,)
+    covariance : ndarray, shape (P, P)
+        Sandwich over clusters of planes.
+    cost : float
+        Mean robust cost of a point.
+    scale : float
+        Residuals over what the noise model expects.
+    """
+
     hessian: F64
     gradient: F64
     covariance: F64
@@ -253,17 +268,84 @@ def _linearized(
     values: F64,
     planes: Planes,
     information: F64 | float = 0.0,
-) -> _System:
-    """Return the normal equations of the unknowns, planes eliminated; all returns are members."""
+) -> System:
+    """Return the normal equations of the unknowns; all returns are members."""
     returns, group = scene.returns, scene.group
     full = (scene.known + spread(unknowns, values, len(scene.known)))[group]
     rays = beams(returns, scene.block, full)
+    met = meeting(rays, planes)
+    whole = derivatives(returns, scene.block, full, planes.normal[planes.plane], met.distance)
+    jacobian = np.stack(
+        [
+            whole[:, item.parameter] * (1.0 if item.group is None else group == item.group)
+            for item in unknowns
+        ],
+        axis=-1,
+    )
+    return system(planes, met, jacobian, group[planes.first], information)
+
+
+class Meeting(NamedTuple):
+    """Where rays meet the planes that their points lie on.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        [m]
+    distance : ndarray, shape (N,)
+        On the ray [m].
+    cosine : ndarray, shape (N,)
+        Of the incidence.
+    height : ndarray, shape (N,)
+        Of the measured point above the plane [m].
+    """
+
+    points: F64
+    distance: F64
+    cosine: F64
+    height: F64
+
+
+def meeting(rays: Beams, planes: Planes) -> Meeting:
+    """Return where rays meet their planes.
+
+    Derivatives and places in a plane are taken there: at the measured point they would contain
+    its noise, which tilts a small plane and pulls towards short ranges.
+
+    Parameters
+    ----------
+    rays : Beams
+        One for each member of the planes, in that order.
+    planes : Planes
+    """
     plane = planes.plane
-    normal, center = planes.normal[plane], planes.center[plane]
+    normal = planes.normal[plane]
     cosine = np.einsum("ni,ni->n", rays.direction, normal)
-    height = np.einsum("ni,ni->n", rays.points - center, normal)
-    safe = np.where(np.abs(cosine) > _GRAZING, cosine, 1.0)
-    distance = rays.distance - height / safe
+    height = np.einsum("ni,ni->n", rays.points - planes.center[plane], normal)
+    distance = rays.distance - height / np.where(np.abs(cosine) > _GRAZING, cosine, 1.0)
+    return Meeting(rays.origin + rays.direction * distance[:, None], distance, cosine, height)
+
+
+def system(
+    planes: Planes, met: Meeting, jacobian: F64, group: I8, information: F64 | float = 0.0
+) -> System:
+    """Return the normal equations of unknowns that move points which lie on planes.
+
+    Parameters
+    ----------
+    planes : Planes
+    met : Meeting
+        Of the points of all planes, plane by plane.
+    jacobian : ndarray, shape (N, P)
+        How far each unknown moves a point along its plane's normal.
+    group : ndarray, shape (K,), int
+        Planes of different groups are never one piece of evidence.
+    information : ndarray, shape (P, P), optional
+        What is known before.
+    """
+    plane = planes.plane
+    offset = met.points - planes.center[plane]
+    distance, cosine, height = met.distance, met.cosine, met.height
     noise = np.interp(distance, NOISE_AT_M, NOISE_M)
     sigma = np.sqrt(
         (noise * cosine) ** 2 + (distance * _POINTING_RAD) ** 2 * (1.0 - cosine**2) + _FLOOR_M**2
@@ -275,19 +357,9 @@ def _linearized(
     robust = np.where(away <= _HUBER, 1.0, _HUBER / np.maximum(away, _HUBER))
     robust = np.where((away < _OUTLIER) & usable, robust, 0.0)
     weight = robust * _balance(planes)[plane] / (sigma * scale) ** 2
-
-    whole = derivatives(returns, scene.block, full, normal, distance)
-    jacobian = np.stack(
-        [
-            whole[:, item.parameter] * (1.0 if item.group is None else group == item.group)
-            for item in unknowns
-        ],
-        axis=-1,
-    )
-    offset = rays.points - center
     span = np.stack(
         (
-            np.ones(len(returns)),
+            np.ones(len(height)),
             np.einsum("ni,ni->n", offset, planes.u[plane]),
             np.einsum("ni,ni->n", offset, planes.v[plane]),
         ),
@@ -299,14 +371,15 @@ def _linearized(
     cross = products[:, :3, 3:]
     reduced = products[:, 3:, 3:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(own, cross)
     hessian = reduced[:, :-1, :-1].sum(axis=0)
-    scores = _per_cluster(reduced[:, :-1, -1], planes.center, group[planes.first])
+    scores = _per_cluster(reduced[:, :-1, -1], planes.center, group)
     hessian += information
     inverse = np.linalg.pinv(hessian)
     count = len(scores)
-    middle = scores.T @ scores * count / max(count - len(unknowns), 1) + information
+    unknowns = jacobian.shape[1]
+    middle = scores.T @ scores * count / max(count - unknowns, 1) + information
     loss = np.where(away <= _HUBER, away**2, 2.0 * _HUBER * away - _HUBER**2)
     loss = np.where(away < _OUTLIER, loss, 2.0 * _HUBER * _OUTLIER - _HUBER**2)
-    return _System(
+    return System(
         hessian,
         scores.sum(axis=0),
         inverse @ middle @ inverse,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -51,7 +52,8 @@ _SIGNIFICANT: Final = 2.0  # standard deviations of a correction that is worth h
 _STARTS: Final = (0.0, -0.6 * DEG, 0.6 * DEG)  # of alpha: a slot of the mirror each way
 _QUARTERS: Final = 4
 _MOST_RETURNS: Final = 300_000  # of all places: beyond that the surfaces limit, not the noise
-_MOST_RETURNS_LARGE: Final = 480_000  # walls at a distance are sparse
+_MOST_RETURNS_WHOLE: Final = 480_000  # for b, which moves points least, and for distant walls
+_MOST_OF_CELL: Final = 400  # points, for b: 80 leave 0.3 mm of noise in it, these 0.1 mm
 _MOST_RETURNS_COARSE: Final = 120_000
 _LEAST_RETURNS: Final = 70_000  # of a place, which fill the cells
 
@@ -85,8 +87,9 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
         refusals += refused
         scene = _scene(places, taken)
         solution = solver.solve(scene, _unknowns(len(places)), coarse.values)
-        angles = solver.widened(scene, solution, [Unknown(B)])
-        bias, reason = range_bias(_scene(places, taken, _MOST_RETURNS_LARGE), angles)
+        whole = _scene(places, taken, _MOST_RETURNS_WHOLE)
+        angles = _with_axis_distance(whole, solution)
+        bias, reason = range_bias(whole, angles)
     except FewPlanesError:
         raise CalibrationError(
             "there are too few flat surfaces that both halves of the fan see; calibrate in a "
@@ -492,6 +495,13 @@ def _unstored(estimate: Estimate) -> Estimate:
     return Estimate(
         estimate.value, estimate.sd, Verdict.SHOWN, "not stored without the beam angles"
     )
+
+
+def _with_axis_distance(scene: Scene, solution: Solution) -> Solution:
+    """Return the solution with b, on the cells of a scene of more returns."""
+    now = solver.points(scene, solution.per_group(len(scene.known)))
+    cells = flat.cells(now, scene.is_far_half, scene.group, _MOST_OF_CELL)
+    return solver.widened(scene, replace(solution, planes=cells), [Unknown(B)])
 
 
 def _axis_distance(angles: Solution) -> Estimate:

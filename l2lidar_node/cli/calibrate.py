@@ -23,13 +23,18 @@ from l2lidar_node.calibration.result import StillResult, Verdict
 from l2lidar_node.calibration.scale import by_tape
 from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate, problems
 from l2lidar_node.cli import calibrate_files as files
-from l2lidar_node.cli.calibrate_files import EmulatorOption, OutputOption, PictureOption
+from l2lidar_node.cli.calibrate_files import (
+    EmulatorOption,
+    KeepOption,
+    OutputOption,
+    PictureOption,
+    SecondsOption,
+)
 from l2lidar_node.cli.calibrate_imu import imu
 from l2lidar_node.cli.console import JsonOption, YesOption, out, print_json, say, with_network
 from l2lidar_node.cli.device import Device
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.recording.recording import Recorder
 
 _POSES: Final = (
     "upright, in the middle of the room",
@@ -77,12 +82,8 @@ def still(
     places: Annotated[
         int, typer.Option(min=1, max=12, help="Places to measure live, before and after.")
     ] = 4,
-    seconds: Annotated[
-        float, typer.Option(min=1.0, max=120.0, help="Seconds to record at each place.")
-    ] = 10.0,
-    keep: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
-    ] = None,
+    seconds: SecondsOption = 10.0,
+    keep: KeepOption = None,
     keep_alpha: Annotated[
         bool,
         typer.Option(
@@ -161,12 +162,8 @@ def scale(
         float, typer.Option(min=0.1, max=100.0, help="What the tape is uncertain by [mm].")
     ] = 2.0,
     emulator: EmulatorOption = None,
-    seconds: Annotated[
-        float, typer.Option(min=1.0, max=120.0, help="Seconds to record at each end.")
-    ] = 10.0,
-    keep: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
-    ] = None,
+    seconds: SecondsOption = 10.0,
+    keep: KeepOption = None,
     output: OutputOption = None,
     yes: YesOption = False,
     json_: JsonOption = False,
@@ -182,6 +179,7 @@ def scale(
 
     l2lidar calibrate scale --length 3.000 start.pcap end.pcap -o front.yaml
     """
+    known = files.existing(output)
     firmware = ""
     if emulator is not None:
         from l2lidar_node.cli.virtual_places import slide
@@ -206,11 +204,12 @@ def scale(
                 text = f"\nThe {name} of the tape; the sensor looks along it"
                 place, firmware = _measured(network, folder / name, seconds, 0, text, guide)
                 gathered.append(place)
+    for place in gathered:
+        files.check_identity(place, known, output)
     try:
-        found = by_tape(gathered[0], gathered[1], length, tape_mm / 1e3)
+        found = by_tape(gathered[0], gathered[1], length, tape_mm / 1e3, report.beams_of(known))
     except CalibrationError as error:
         raise CommandError(str(error)) from None
-    is_significant = abs(found.scale) > 2.0 * found.sd
     about = {
         "tool": f"l2lidar {__version__}",
         "date": time.strftime("%Y-%m-%d"),
@@ -224,8 +223,8 @@ def scale(
     else:
         say(
             f"the sensor measured {found.measured:.4f} m of {length:.4f} m, with "
-            f"{found.surfaces} surfaces: ranges have to be stretched by {100 * found.scale:+.3f} "
-            f"+- {100 * found.sd:.3f} %"
+            f"{found.surfaces} flat patches: ranges have to be stretched by "
+            f"{100 * found.scale:+.3f} +- {100 * found.sd:.3f} %"
         )
     made = CalibrationFile(
         gathered[0].block.octets,
@@ -237,7 +236,7 @@ def scale(
     files.write(
         made,
         output,
-        "" if is_significant else _RIGHT,
+        "" if found.is_significant else _RIGHT,
         "give it to the driver as calibration_file",
         quiet=json_,
     )
@@ -349,10 +348,7 @@ def _recorded(
 ) -> tuple[Place, str]:
     """Record a place with a bar, and return it."""
     failures: list[str] = []
-    try:
-        recorder = Recorder(path, network, failures.append)
-    except OSError as error:
-        raise CommandError(f"cannot write {path}: {error.strerror}") from None
+    recorder = files.recorder(path, network, failures)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     try:
         with Device(network, tap=recorder) as device:

@@ -23,7 +23,7 @@ from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import DecodeError, ImuPacket, PointPacket, Version, decode
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Received, Recording
+from l2lidar_node.recording.recording import Received, Recorder, Recording
 
 _SPIN_UP_S: Final = 60.0
 _HEARD_S: Final = 6.0  # a unit that was just switched on needs 4 s for its first IMU packet
@@ -42,6 +42,12 @@ EmulatorOption = Annotated[
         metavar="UNIT",
         help="Calibrate a virtual unit instead: perfect, typical, poor or a number.",
     ),
+]
+SecondsOption = Annotated[
+    float, typer.Option(min=1.0, max=120.0, help="Seconds to record at each place.")
+]
+KeepOption = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
 ]
 PictureOption = Annotated[
     Path | None,
@@ -63,6 +69,22 @@ def existing(output: Path | None) -> CalibrationFile | None:
         return load(output)
     except CalibrationFileError as error:
         raise CommandError(f"{error}; give --output another name") from None
+
+
+def check_identity(place: Place, known: CalibrationFile | None, output: Path | None) -> None:
+    """Refuse what was not measured by one unit in one mode, that of the file to add to.
+
+    Raises
+    ------
+    CommandError
+        If it was not.
+    """
+    if place.blocks > 1:
+        raise CommandError(
+            f"packets of {place.blocks} different calibration blocks: record one unit in one mode"
+        )
+    if known is not None and not known.matches(place.block.octets):
+        raise CommandError(f"{output} is of another unit; give --output another name")
 
 
 def unused(path: Path) -> Path:
@@ -188,6 +210,20 @@ def wait_for_points(device: Device, *, quiet: bool) -> None:
         say("waiting for points: a head that starts takes 12 to 45 s ...")
     if device.wait_for(_sends_points, _SPIN_UP_S) is None:
         raise CommandError(f"no points from the L2; {device.advice()}")
+
+
+def recorder(path: Path, network: NetworkConfig, failures: list[str]) -> Recorder:
+    """Return what writes a new capture; it adds to ``failures`` where it cannot go on.
+
+    Raises
+    ------
+    CommandError
+        If the file cannot be made.
+    """
+    try:
+        return Recorder(path, network, failures.append)
+    except OSError as error:
+        raise CommandError(f"cannot write {path}: {error.strerror}") from None
 
 
 def pass_time(seconds: float, failures: list[str], told: Callable[[float], bool | None]) -> None:
