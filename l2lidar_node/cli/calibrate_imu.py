@@ -15,19 +15,23 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from l2lidar_node import __version__
-from l2lidar_node.calibration import picture
+from l2lidar_node.calibration import picture, report
 from l2lidar_node.calibration.file import CalibrationFile
-from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import Verdict
 from l2lidar_node.cli import calibrate_files as files
-from l2lidar_node.cli.calibrate_files import EmulatorOption, OutputOption, PictureOption
+from l2lidar_node.cli.calibrate_files import (
+    EmulatorOption,
+    KeepOption,
+    OutputOption,
+    PictureOption,
+)
 from l2lidar_node.cli.console import JsonOption, YesOption, out, print_json, say, with_network
 from l2lidar_node.cli.device import Device
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Recorder, Recording
+from l2lidar_node.recording.recording import Recording
 from l2lidar_node.recording.replay import feed
 from l2lidar_node.settings import build
 from l2lidar_node.types import F64, IMU_SAMPLE, ImuSample, Sweep
@@ -74,9 +78,7 @@ def imu(
             min=_SHORTEST_S, max=300.0, help="Longest motion to record; full bars end it before."
         ),
     ] = 60.0,
-    keep: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
-    ] = None,
+    keep: KeepOption = None,
     output: OutputOption = None,
     figure: PictureOption = None,
     yes: YesOption = False,
@@ -111,7 +113,7 @@ def imu(
             files.require_unit(network, quiet=json_)
             _live(network, path, seconds, unattended=yes or json_, quiet=json_)
         place, firmware = files.capture_place(path)
-        _check_identity(place, known, output)
+        files.check_identity(place, known, output)
         result = _estimated(path, known, quiet=json_)
     about = _about(result, firmware, known)
     if figure is not None:
@@ -132,15 +134,6 @@ def imu(
         "give it to deskew_node and odometry_node as calibration_file",
         quiet=json_,
     )
-
-
-def _check_identity(place: Place, known: CalibrationFile | None, output: Path | None) -> None:
-    if place.blocks > 1:
-        raise CommandError(
-            f"packets of {place.blocks} different calibration blocks: record one unit in one mode"
-        )
-    if known is not None and not known.matches(place.block.octets):
-        raise CommandError(f"{output} is of another unit; give --output another name")
 
 
 def _virtual(path: Path, name: str, motion: str, *, quiet: bool) -> None:
@@ -189,10 +182,7 @@ def _live(
         say(_BEFORE)
         files.ask("\nHold the sensor still", unattended=False)
     failures: list[str] = []
-    try:
-        recorder = Recorder(path, network, failures.append)
-    except OSError as error:
-        raise CommandError(f"cannot write {path}: {error.strerror}") from None
+    recorder = files.recorder(path, network, failures)
     watch = _Watch()
     try:
         with ExitStack() as stack:
@@ -251,9 +241,15 @@ def _estimated(path: Path, known: CalibrationFile | None, *, quiet: bool) -> Imu
 
         sweeps, samples = _measured(path, known)
         try:
-            return imu_calibration.calibrate(sweeps, samples, progress=told)
+            return imu_calibration.calibrate(
+                sweeps, samples, progress=told, beams_calibrated=_has_beams(known)
+            )
         except GyroError as error:
             raise CommandError(str(error)) from None
+
+
+def _has_beams(known: CalibrationFile | None) -> bool:
+    return bool(report.beams_of(known).any())
 
 
 def _measured(
@@ -300,7 +296,7 @@ def _about(result: ImuResult, firmware: str, known: CalibrationFile | None) -> d
         "tool": f"l2lidar {__version__}",
         "date": time.strftime("%Y-%m-%d"),
         "firmware": firmware,
-        "beams": known.path if known is not None and known.correction else "as reported",
+        "beams": known.path if known is not None and _has_beams(known) else "as reported",
         "seconds": round(result.seconds, 1),
         "sweeps": result.sweeps,
         "aligned": result.aligned,
@@ -319,7 +315,7 @@ def _show(result: ImuResult, known: CalibrationFile | None) -> None:
     """Print what was found."""
     from l2lidar_proc.odometry.imu_calibration import ENOUGH, UNITS
 
-    if known is None or not known.correction:
+    if not _has_beams(known):
         say(
             "[yellow]note[/] the beams are used as reported; calibrated ones (l2lidar calibrate "
             "still, the same --output) make this more accurate"

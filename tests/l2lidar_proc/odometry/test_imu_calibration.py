@@ -56,6 +56,7 @@ def test_the_imu_of_a_typical_unit_is_found(shaken: Recording) -> None:
     for name in ("rotation x", "rotation y", "rotation z", "time offset"):
         assert result.estimates[name].verdict is Verdict.CORRECTED, name
     assert "the rotation about" in result.weakest
+    assert result.estimates["scale x"].sd > 5e-4, "the beams are as reported"
 
 
 def test_without_the_packets_it_says_what_to_switch_on(shaken: Recording) -> None:
