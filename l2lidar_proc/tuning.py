@@ -153,6 +153,11 @@ UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
 LOOSE_POSITION: Final = 0.06  # [m] a prediction less certain may be a surface off
 LOOSE_ROTATION: Final = 0.03  # [rad] or turned too far
 INLIER_RATIO: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
+# After a loose prediction it may have so many times the outliers that are usual of late. Tuned on:
+# wood in rain (inliers 0.85 to 0.90 at the right place, up to 0.72 at wrong ones), bare trunks
+USUAL_OUTLIERS: Final = 2.5
+USUAL_BLEND: Final = 0.1  # share of each newer sweep in what is usual
+USUAL_LEAST: Final = 0.75  # inliers needed whatever is usual
 OVERLAP: Final = (0.0, 0.25)  # likewise, share of the points that must meet the map
 MATCHED: Final = (0, 50)  # and how many: a few fit in many places
 MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them

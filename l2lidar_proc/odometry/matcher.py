@@ -93,6 +93,7 @@ class SweepMatcher:
         self._before: F64 | None = None  # place of the sweep before
         self._oldest = 0  # sweep from which on places are still in the map
         self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
+        self._inliers = 0.0, 0  # mean inlier ratio of late, and of how many sweeps
 
     def clear(self) -> None:
         """Forget the maps."""
@@ -139,23 +140,24 @@ class SweepMatcher:
         loose = sigma > tuning.LOOSE_POSITION or rotation_is_loose(motion.covariance)
         young = self._sweeps < tuning.YOUNG_SWEEPS
         strict = loose and not initial and not young
+        needed = self._needed_inliers(strict)
         found = self._align(source, motion, motion.state)
-        if not loose or (strict and _believable(found, source, strict)):
-            if _believable(found, source, strict):
-                return Match(found, False)
+        if not loose or (strict and _believable(found, source, strict, needed)):
+            if _believable(found, source, strict, needed):
+                return self._believed(found)
             return Match(None, young and not loose and found is None)
         starts = [self._registered(source, motion.state)]
         if strict:
             starts += pose_hypotheses(motion.state, motion.covariance, source, self.surfaces)
         others = [found, *(self._align(source, motion, start) for start in starts)]
-        good = [other for other in others if other and _believable(other, source, strict)]
+        good = [other for other in others if other and _believable(other, source, strict, needed)]
         best = max(good, key=lambda other: other.inlier_ratio * other.matched, default=None)
         if best is None and motion.imu.missing.all():
             # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
             best = self._placed(source, motion, np.inf)
         elif best is None and young and found is None:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
-        return Match(best, False)
+        return self._believed(best)
 
     def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> float:
         """Add the deskewed points (N,) of a sweep to the maps.
@@ -232,6 +234,27 @@ class SweepMatcher:
             degeneracy_ratio=degeneracy_ratio(found.information[POSITION, POSITION]),
         )
 
+    def _needed_inliers(self, strict: bool) -> float:
+        """Return the inlier ratio that a result needs.
+
+        In rain, foliage or a crowd the right place has one point in eight off every surface, and
+        none would ever be found again if it had to fit as in a bare room.
+        """
+        needed = tuning.INLIER_RATIO[strict]
+        usual, sweeps = self._inliers
+        if strict and sweeps:
+            usual = max(1.0 - tuning.USUAL_OUTLIERS * (1.0 - usual), tuning.USUAL_LEAST)
+            needed = min(needed, usual)
+        return needed
+
+    def _believed(self, found: Alignment | None) -> Match:
+        """Return a match, and learn from it what share of inliers is usual here."""
+        if found is not None and found.matched:
+            usual, sweeps = self._inliers
+            blend = max(tuning.USUAL_BLEND, 1.0 / (sweeps + 1))
+            self._inliers = usual + blend * (found.inlier_ratio - usual), sweeps + 1
+        return Match(found, False)
+
     def _align(
         self, source: Source, motion: SweepMotion, start: InertialState
     ) -> Alignment | None:
@@ -284,10 +307,10 @@ def xyz(points: NDArray[np.void]) -> F64:
     return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
 
 
-def _believable(found: Alignment | None, source: Source, strict: bool) -> bool:
+def _believable(found: Alignment | None, source: Source, strict: bool, inliers: float) -> bool:
     return (
         found is not None
-        and found.inlier_ratio >= tuning.INLIER_RATIO[strict]
+        and found.inlier_ratio >= inliers
         and found.matched
         >= max(tuning.OVERLAP[strict] * len(source.points), tuning.MATCHED[strict])
     )

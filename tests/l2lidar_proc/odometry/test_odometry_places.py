@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
 from l2lidar_proc.motion.initialization import initial_state
 from l2lidar_proc.odometry.alignment import align
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
-from l2lidar_proc.odometry.matcher import xyz
+from l2lidar_proc.odometry.matcher import SweepMatcher, xyz
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from tests.l2lidar_proc.odometry.odometry_places import SEED, shaken, visited
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
@@ -138,6 +140,53 @@ def test_noise_does_not_tell_the_place_along_a_corridor() -> None:
     across = np.sqrt(np.diag(found.covariance)[POSITION])
     assert across[0] > 0.08
     assert across[1:].max() < 0.01
+
+
+def _box(rng: np.random.Generator, drops: float) -> Any:
+    """Return a cloud from the middle of a box, with this share of rain drops before its walls."""
+    points = rng.uniform(-3.4, 3.4, (4000, 3))
+    walls, sides = rng.integers(0, 3, 4000), rng.choice((-1.0, 1.0), 4000)
+    rain = rng.random(4000) < drops
+    points[np.arange(4000), walls] = sides * (3.4 - rain * rng.uniform(0.2, 0.38, 4000))
+    cloud = np.zeros(4000, [(name, "<f4") for name in ("x", "y", "z", "time")])
+    for axis, values in zip("xyz", points.T, strict=True):
+        cloud[axis] = values + 0.01 * rng.standard_normal(4000)
+    return cloud
+
+
+@pytest.mark.parametrize("drops", [0.0, 0.15])
+def test_a_loose_prediction_is_matched_as_well_as_good_ones_were_of_late(drops: float) -> None:
+    rng = np.random.default_rng(SEED)
+    imu = np.zeros(100, IMU_SAMPLE)
+    imu["stamp"] = np.arange(100) * 4_000_000
+    imu["linear_acceleration"] = [0.0, 0.0, 9.80665]
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    predictor.imu(imu)
+    zero = np.zeros(3)
+    state = InertialState(HostNs(0), np.eye(3), zero, zero, zero, zero, np.array([0, 0, -9.8]))
+    span = (HostNs(0), HostNs(200_000_000))
+    matcher = SweepMatcher(OdometryConfig(), zero)
+
+    def matched(cloud: Any, sigma: float, place: Any = zero) -> Any:
+        covariance = np.diag(np.full(ERRORS, 1e-4))
+        covariance[POSITION, POSITION] = sigma**2 * np.eye(3)
+        here = dataclasses.replace(state, position=place)
+        motion = predictor.over(here, covariance, span, HostNs(100_000_000))
+        found, _ = matcher.match(matcher.source(Sweep(*span, cloud, 0, 0), motion), motion)
+        return motion, found
+
+    for _ in range(14):
+        motion, _ = matched(_box(rng, 0.0), 0.01)
+        matcher.extend(matcher.deskewed(Sweep(*span, _box(rng, 0.0), 0, 0), motion), motion, state)
+    if drops:
+        for _ in range(6):
+            assert matched(_box(rng, drops), 0.01)[1] is not None
+    # now a prediction that may be 20 cm off, in rain: the right place or none
+    _, found = matched(_box(rng, 0.15), 0.2)
+    assert (found is not None) == (drops > 0.0)
+    if found is not None:
+        assert found.inlier_ratio < tuning.INLIER_RATIO[True]
+        assert np.abs(found.state.position).max() < 0.01
 
 
 def test_a_pole_tells_two_directions_and_one_scan_line_none() -> None:
