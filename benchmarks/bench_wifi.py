@@ -13,6 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -38,13 +39,14 @@ _TOPICS: Final = {
     "packets": "/l2lidar_node/packets",
 }
 _CASES: Final = (
-    ("cloud", "off", "best_effort"),
-    ("cloud", "off", "reliable"),
+    ("cloud", "none", "best_effort"),
+    ("cloud", "none", "reliable"),
     ("zstd", "lossless", "best_effort"),
     ("zstd", "lossless", "reliable"),
     ("zstd", "millimeter", "best_effort"),
     ("zstd", "millimeter", "reliable"),
-    ("packets", "off", "reliable"),
+    ("packets", "none", "reliable"),
+    ("packets", "none", "best_effort"),
 )
 _DEVICES: Final = ("l2robot", "l2desk")
 _RATE: Final = 20e6  # [bit/s]
@@ -155,13 +157,16 @@ def arrived(kind: str, compressed: str, reliability: str, seconds: float) -> dic
         )
     ]
     watch = [*inside, _NAMES[1], sys.executable, "-m", "benchmarks.wifi_watch"]
-    running = [
-        subprocess.Popen(
-            words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        for words in robot
-    ]
-    try:
+    with ExitStack() as undo:
+        running = []
+        for words in robot:
+            said = undo.enter_context(tempfile.TemporaryFile("w+"))
+            process = subprocess.Popen(
+                words, env=environment, stdout=subprocess.DEVNULL, stderr=said
+            )
+            running.append((process, said))
+            undo.callback(process.wait)
+            undo.callback(process.kill)  # what was measured is at the other end
         found = subprocess.run(
             [*watch, _TOPICS[kind], kind, reliability, str(seconds)],
             env=environment,
@@ -170,10 +175,10 @@ def arrived(kind: str, compressed: str, reliability: str, seconds: float) -> dic
             timeout=seconds + 180.0,
             check=True,
         )
-    finally:
-        for process in running:
-            process.kill()  # nothing is lost: what was measured is at the other end
-            process.wait()
+        for process, said in running:
+            if process.poll() is not None:
+                said.seek(0)
+                raise OSError(f"a program on the robot ended: {said.read().strip()}")
     measured: dict[str, Any] = json.loads(found.stdout.splitlines()[-1])
     return measured
 

@@ -316,10 +316,10 @@ class TopicConfig:
         "~/packets", "topic for raw packets, with publish_packets", form=TOPIC
     )
     compressed_clouds: str = setting(
-        "off",
+        "none",
         "publish clouds on <point_cloud_topic_id>/zstd as well, while somebody subscribes, for "
         "point_cloud_transport: all fields, or x, y, z in steps of 1 mm and intensity",
-        choices=("off", "lossless", "millimeter"),
+        choices=("none", "lossless", "millimeter"),
     )
     zstd_level: int = setting(1, "effort of compressed_clouds", lo=1, hi=19)
     qos_reliability: str = setting(

@@ -191,7 +191,7 @@ class DriverNode(ManagedNode):
             QoSProfile(depth=_CLOUD_DEPTH, reliability=reliability),
         )
         self._compressed: Any = None
-        if topics.compressed_clouds != "off":
+        if topics.compressed_clouds != "none":
             self._open_compressed(config, reliability)
         self._imu_publisher = None
         if config.imu.enable_publishing:

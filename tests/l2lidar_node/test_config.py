@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import yaml
 
 from l2lidar_node.config import DriverConfig, FrameConfig, NetworkConfig, SweepConfig
 from l2lidar_node.settings import SettingError, build, change, settings_of, values_of
@@ -200,3 +201,10 @@ def test_groups_check_themselves_however_they_are_made() -> None:
         NetworkConfig(host_ip="somewhere")
     with pytest.raises(SettingError, match="'range_min'"):
         SweepConfig(range_min=5.0, range_max=1.0)
+
+
+def test_a_choice_means_itself_in_a_parameter_file() -> None:
+    """YAML takes off, on, yes, no and null for other things, also after ``-p NAME:=``."""
+    choices = [word for found in settings_of(DriverConfig) for word in found.choices]
+    assert choices
+    assert [yaml.safe_load(word) for word in choices] == choices
