@@ -43,7 +43,8 @@ _ODOMETRY: Final = (
     "zero_velocity",
 )  # fmt: skip
 FILES: Final = (
-    "l2lidar_proc/rotations.py", *(f"l2lidar_proc/odometry/{name}.py" for name in _ODOMETRY)
+    "l2lidar_node/frames.py", "l2lidar_node/rotations.py",
+    *(f"l2lidar_proc/odometry/{name}.py" for name in _ODOMETRY)
 )  # fmt: skip
 TESTS: Final = (
     *(f"tests/{folder}" for folder in FOLDERS),
@@ -53,7 +54,8 @@ TESTS: Final = (
         "zero_velocity",
     )),
     "tests/l2lidar_proc/test_hostile_input.py",
-    "tests/l2lidar_proc/test_rotations.py",
+    "tests/l2lidar_node/test_frames.py",
+    "tests/l2lidar_node/test_rotations.py",
 )  # fmt: skip
 SLOWEST_S: Final = 30.0
 """A test that takes longer [CPU s] is left to the gate."""
@@ -285,9 +287,13 @@ def sampled(paths: Sequence[Path], count: int, seed: int) -> list[Mutant]:
 def known() -> list[Mutant]:
     """Return the faults that are tried in every run."""
     return [
-        Mutant(Path(fault.path), -1 - at, "", f"{fault.before.strip()} -> {fault.after.strip()}")
+        Mutant(Path(fault.path), -1 - at, "", f"{_line(fault.before)} -> {_line(fault.after)}")
         for at, fault in enumerate(FAULTS)
     ]
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split()) or "nothing"
 
 
 def report(rows: list[dict[str, Any]], options: str) -> str:

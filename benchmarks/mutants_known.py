@@ -94,6 +94,12 @@ FAULTS: Final = (
         (f"{_NODE}/clock/test_clock_parts.py",),
     ),
     Fault(
+        "l2lidar_node/clock/host_clock_model.py",
+        "self._slewing.stepped(by_ns)\n        self._suspects.clear()",
+        "self._slewing.stepped(by_ns)",
+        (f"{_NODE}/clock/test_clock_parts.py",),
+    ),
+    Fault(
         _TRACKER,
         "if speed is not None and speed > self._config.still_speed:",
         "if False:",
@@ -120,5 +126,23 @@ FAULTS: Final = (
 )
 """Faults named by those who tested the driver before; a run tries them all."""
 
-REASONS: Final[dict[tuple[str, str], str]] = {}
+REASONS: Final[dict[tuple[str, str], str]] = {
+    (
+        "l2lidar_node/protocol/wire.py",
+        "WIDE_FOV = 1 << 0  # 192 degrees instead of 180; acts at once: 1 << 0 -> 1 >> 0",
+    ): "the same number",
+    (
+        "l2lidar_node/protocol/framing.py",
+        "at = data.find(wire.MAGIC, at + 1): 1 -> 2",
+    ): "a magic begins at `at`, so none begins one byte later",
+    (
+        "l2lidar_node/protocol/packets.py",
+        "if not math.isfinite(norm + p + q + r + ax + ay + az):: norm + p + q + r + ax -> "
+        "norm + p + q + r - ax",
+    ): "a difference is as little finite as a sum",
+    (
+        "l2lidar_node/clock/device_clock.py",
+        "self._now = 0  # arrival of the latest packet: 0 -> 1",
+    ): "replaced by the first packet, before anything reads it",
+}
 """By module and change, as ``docs/results/mutants.md`` shows them."""

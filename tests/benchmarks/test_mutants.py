@@ -38,6 +38,11 @@ def test_code_is_mutated_but_no_texts_and_no_annotations() -> None:
     assert changes("x = 'a' + b") == set()
 
 
+def test_everything_that_is_mutated_and_run_exists() -> None:
+    for name in (*mutants.FOLDERS, *mutants.FILES, *mutants.TESTS):
+        assert (mutants.ROOT / name).exists(), name
+
+
 def test_every_mutant_of_a_module_differs_from_it() -> None:
     whole = ast.dump(ast.parse((mutants.ROOT / CADENCE).read_text()))
     found = mutants.mutants_of(CADENCE)

@@ -165,6 +165,69 @@ def test_packets_from_before_a_told_step_do_not_count_in_the_new_time() -> None:
     assert model.at(740 * 2 * MS) == pytest.approx(begin + 740 * 4 * MS + 10**9, abs=1000)
 
 
+@pytest.mark.parametrize("step", [10**9, 20 * MS, -20 * MS])
+def test_an_early_block_of_before_a_told_step_does_not_count_after_it(step: int) -> None:
+    """From packet 500 on packets come 50 ms earlier; the step is told between the first two."""
+    model = HostClockModel(2.0)
+    model.stepped(0, 0)
+    begin = 10**18
+    for number in range(900):
+        is_stepped, is_early = number > 500, number >= 500
+        if number == 501:
+            assert not model.steps
+            model.stepped(step, begin + number * 4 * MS + step)
+        arrival = begin + number * 4 * MS + is_stepped * step - is_early * 50 * MS
+        model.add(number * 2 * MS, arrival)
+        if number * 2 * MS >= model.due:
+            model.update(number * 2 * MS)
+    assert list(model.steps) == [-50 * MS]
+    assert model.at(900 * 2 * MS) == begin + 900 * 4 * MS + step - 50 * MS
+
+
+def test_a_clock_that_is_being_slewed_while_it_locks_has_the_ratio_of_the_oscillators() -> None:
+    """Slewed by 1 %, then not any more: what is published follows at once."""
+    model = HostClockModel(2.0)
+    model.stepped(0, 0)
+    begin = 10**18
+
+    def shown(even: int) -> int:
+        return even + min(even, 8_000 * MS) // 100
+
+    for number in range(4_000):
+        even = number * 4 * MS
+        if number % 25 == 0:
+            model.slewed(shown(even) - even, begin + shown(even))
+        model.add(number * 2 * MS, begin + shown(even))
+        if number * 2 * MS >= model.due:
+            model.update(number * 2 * MS)
+        if model.ready:
+            assert model.line.ratio == pytest.approx(2.0, rel=1e-6)
+            place = number * 2 * MS
+            # the end of slewing is known when it is told, up to 100 ms later
+            assert model.at(place) == pytest.approx(begin + shown(even), abs=1_050_000)
+            if not 2_000 <= number < 2_600:
+                assert model.at(place) == pytest.approx(begin + shown(even), abs=20_000)
+    assert model.slew_rate == 0.0
+
+
+def test_what_a_cadence_allows_for() -> None:
+    cadence = _learned(2 * MS)
+    assert cadence.slip(1) == 2 * MS + 2_000  # a packet that was not counted
+    assert cadence.slip(40) == 4 * MS + 2_000  # 5 % of the advance
+    assert cadence.wander(1) == 102_000
+    assert cadence.wander(100) == 10 * MS + 16 * 2_000
+    cadence.resume(9, 2 * MS + 1_000)  # a small deviation corrects the phase by the gain
+    assert cadence.advance(1) == 2 * MS - 900
+    cadence.resume(10, 2 * MS + 9_000)  # the packet is the new reference
+    assert cadence.advance(1) == 2 * MS
+
+
+def test_a_cadence_whose_numbers_are_unknown_takes_each_packet_for_the_next() -> None:
+    cadence = _learned(2 * MS, first=2_000)  # beyond every modulus it knows of
+    assert cadence.gap(5, 500 * MS) == 1
+    assert cadence.gap(2_010, 500 * MS) == 2
+
+
 TOLD = st.lists(
     st.tuples(st.integers(-(10**18), 10**18), st.integers(-(10**12), 10**12)), min_size=1
 )

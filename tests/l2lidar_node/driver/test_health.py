@@ -182,6 +182,10 @@ def test_a_flood_is_named_with_its_sender_and_what_to_do() -> None:
         "50000 datagrams of other senders refused, the last seen from 10.0.0.7; it is a flood: "
         "shut it out with a firewall"
     )
+    watched = streaming(3.0)  # the last two seconds are judged; a second L2 sends 500 a second
+    for foreign, is_flood in ((1_800, False), (2_200, True)):
+        watched.link.foreign = foreign
+        assert ("flood" in watched.verdict("link")[1]) == is_flood
 
 
 def test_a_device_at_another_address_is_named() -> None:

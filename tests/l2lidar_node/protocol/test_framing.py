@@ -61,6 +61,12 @@ def test_coalesced_frames_and_a_piece_of_the_next() -> None:
     assert frames(POINTS[700:] + IMU[3], framer=framer) == [POINTS, IMU[3]]
 
 
+@pytest.mark.parametrize("cut", [1, 2, 3])
+def test_a_piece_of_a_magic_after_junk_is_kept(cut: int) -> None:
+    assert frames(b"junk" + ACK[:cut], ACK[cut:]) == [ACK]
+    assert errors(b"junk" + ACK[:cut], ACK[cut:]) == [FrameError(Fault.JUNK, 4)]
+
+
 @given(st.lists(st.integers(0, 1472), max_size=30))
 def test_cuts_anywhere(sizes: Any) -> None:
     assert frames(*build.cut(b"".join(MIXED), sizes)) == MIXED

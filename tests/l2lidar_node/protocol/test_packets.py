@@ -105,6 +105,10 @@ def test_an_imu_value_that_is_no_number(offset: Any, value: Any) -> None:
 @pytest.mark.parametrize("offset", [44, 48, 52, 56, 60, 64])
 def test_an_imu_value_beyond_any_sensor(offset: int) -> None:
     assert reason(104, patched(build.imu(), offset, "<f", 1e24)) == "implausible"
+    limit = 1e3 if offset < 56 else 1e4
+    assert reason(104, patched(build.imu(), offset, "<f", -1.1 * limit)) == "implausible"
+    good = decode(Frame(104, patched(build.imu(), offset, "<f", -0.9 * limit)))
+    assert isinstance(good, ImuPacket)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])

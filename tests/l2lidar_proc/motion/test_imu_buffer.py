@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ def test_any_order_ends_up_in_order() -> None:
         one_by_one.push(samples(value))
     at_once.push(samples(*order))
     assert kept(one_by_one) == kept(at_once) == [-1.0, *sorted(order)]
+    assert not any(asdict(ImuBuffer().counts).values())
     assert one_by_one.counts.accepted == 61
     assert one_by_one.counts.reordered == at_once.counts.reordered > 0
 

@@ -192,6 +192,19 @@ def test_the_mount_of_the_imu() -> None:
         build(MotionConfig, {"imu_xyz": [1.0]})
 
 
+def test_another_mount_turns_the_samples_so_far_and_forgets_what_was_learned() -> None:
+    tracker = tracked(noisy(Motion().imu(0, END)))
+    before = tracker.buffer.samples["angular_velocity"].copy()
+    learned = tracker.filter
+    assert not tracker.mount(T_CLOUD_IMU)
+    assert tracker.filter is learned
+    turn = rotations.transform([np.cos(0.5), 0, 0, np.sin(0.5)], (0, 0, 0))
+    assert tracker.mount(turn @ T_CLOUD_IMU)
+    assert tracker.filter is not learned
+    expected = before @ turn[:3, :3].T
+    np.testing.assert_allclose(tracker.buffer.samples["angular_velocity"], expected, atol=1e-12)
+
+
 def test_velocity_of_a_mounted_sensor() -> None:
     """A sensor one meter ahead of a body that turns left moves to the left as well."""
     mount = rotations.transform([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)], (1.0, 0.0, 0.2))
