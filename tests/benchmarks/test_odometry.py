@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from benchmarks import bench_odometry, odometry_methods, odometry_pages, odometry_referee
 from benchmarks.odometry_methods import OURS, PLAIN, REFEREES, Found
 from benchmarks.odometry_plan import SLOW, Plan, Rows
+from l2lidar_node import rotations
 from l2lidar_node.clouds.fields import rings
 from tests.support import odometry_runs
 
@@ -104,7 +104,7 @@ def test_a_score_is_the_distance_from_the_truth_after_an_alignment(run: Any) -> 
     stamps = odometry_runs.EPOCH + (np.arange(0.5, 6.0, 0.1) * 1e9).astype(np.int64)
     positions, quaternions = odometry_runs.truth(run, stamps)
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    poses[:, :3, :3] = rotations.matrices(quaternions)
     poses[:, :3, 3] = positions
     other = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
     exact = bench_odometry.score(run, Found(stamps, other @ poses, 1.0))
