@@ -619,8 +619,8 @@ class OdometryTopics(ImuConfig):
     )
     covariance_when_lost: bool = setting(
         False,
-        "put 9999 in all variances of an estimate that is LOST or RESTARTED: rtabmap then begins "
-        "a new map",
+        "put 9999 in all variances of an estimate that is LOST, RESTARTED or RETURNED: rtabmap "
+        "then begins a new map",
         live=True,
     )
     qos_reliability: str = setting(

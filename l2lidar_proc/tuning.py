@@ -219,3 +219,9 @@ LOST_NS: Final = 5_000_000_000  # [ns] of sweeps without a match
 UNSEEN_POSITION: Final = 0.5  # [m] a clock that went back may hide such a step,
 UNSEEN_ROTATION: Final = 0.5  # [rad] such a turn,
 UNSEEN_S: Final = 2.0  # [s] and going on for so long
+EARLIER_MAPS: Final = 2  # kept after losses. Bounds the memory
+# Searching them takes 0.2 to 0.4 s, so it is done once a second at first, then ever more rarely.
+EARLIER_PAUSE_NS: Final = 1_000_000_000  # [ns]
+EARLIER_PAUSE_SHARE: Final = 0.1  # of the time since the loss
+EARLIER_SIGMA: Final = (0.05, 0.1)  # [rad, m] of a pose that the search has found
+EARLIER_SAME: Final = (0.05, 0.25)  # [rad, m] within which two meetings agree

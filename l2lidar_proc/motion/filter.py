@@ -489,6 +489,26 @@ def decorrelated(covariance: F64, errors: slice, sigma: float) -> F64:
     return out
 
 
+def with_loose_pose(state: InertialState, covariance: F64, more: F64) -> F64:
+    """Return a covariance (18, 18) in which the pose is more uncertain, independent of the rest.
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    more : ndarray, shape (6, 6)
+        What is added, of x, y, z and of the turns about the map's axes [m, rad].
+    """
+    axes = np.zeros((6, 6))
+    axes[:3, 3:] = state.rotation.T  # turns come first here, about the sensor's axes
+    axes[3:, :3] = np.eye(3)
+    pose = covariance[POSE, POSE] + axes @ more @ axes.T
+    out = covariance.copy()
+    out[POSE, :] = out[:, POSE] = 0.0
+    out[POSE, POSE] = pose
+    return out
+
+
 def at_map_origin(covariance: F64) -> F64:
     """Return a covariance (18, 18) in which the pose is known: a new map begins with it."""
     for errors in (ROTATION, POSITION):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,12 @@ class Status(Enum):
     GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"
     RESTARTED = "time jumped: the motion is unknown, pose and map were kept"
     LOST = "too long without a match: a new map begins at the predicted pose"
+    RETURNED = "an earlier map was met again: the pose jumped back into it"
     REFUSED = "not later than the previous sweep: nothing was done with it"
+
+
+CUTS: Final = frozenset({Status.LOST, Status.RESTARTED, Status.RETURNED})
+"""What cuts a trajectory: across such an estimate the motion is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +81,8 @@ class OdometryEstimate:
         Cloud coordinates to map coordinates. Where gravity is trusted z is up there.
     covariance : ndarray, shape (6, 6)
         Of x, y, z and of the turns about the axes of the odometry frame [m, rad], relative to the
-        map, and from the first RESTARTED or LOST on what the map's own place is uncertain by.
+        map, and from the first RESTARTED or LOST on what the map's own place is uncertain by,
+        until an earlier map is met again.
     velocity : ndarray, shape (3,)
         Of the cloud frame's origin, cloud axes [m/s].
     angular_velocity : ndarray, shape (3,)

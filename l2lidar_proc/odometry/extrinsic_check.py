@@ -15,7 +15,7 @@ from l2lidar_node.types import F64, IMU_SAMPLE
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.gyro_alignment import GyroModel
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
 
 _PART_NS: Final = 5_000_000_000
 _FEWEST_PARTS: Final = 5
@@ -91,7 +91,7 @@ class ExtrinsicCheck:
 
     def pose(self, estimate: OdometryEstimate) -> None:
         """Take an estimate; one that was not aligned with the map tells nothing."""
-        if {Status.LOST, Status.RESTARTED} & set(estimate.status):
+        if CUTS & set(estimate.status):
             self._begin()
             return
         if not estimate.is_aligned:

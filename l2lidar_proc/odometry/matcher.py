@@ -95,6 +95,11 @@ class SweepMatcher:
         self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
         self._inliers = 0.0, 0  # mean inlier ratio of late, and of how many sweeps
 
+    @property
+    def is_young(self) -> bool:
+        """Whether the maps have only just begun."""
+        return self._sweeps < tuning.YOUNG_SWEEPS
+
     def clear(self) -> None:
         """Forget the maps."""
         self._begin_way()
@@ -138,7 +143,7 @@ class SweepMatcher:
             return Match(None, False)
         sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
         loose = sigma > tuning.LOOSE_POSITION or rotation_is_loose(motion.covariance)
-        young = self._sweeps < tuning.YOUNG_SWEEPS
+        young = self.is_young
         strict = loose and not initial and not young
         needed = self._needed_inliers(strict)
         found = self._align(source, motion, motion.state)

@@ -15,6 +15,7 @@ from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry.frame_jump import FrameJump
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
@@ -80,13 +81,17 @@ class Odometry:
         self.matcher = SweepMatcher(self.config, self._lever)
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()
-        self._initializer = MapInitializer(
-            self._predictor, self.matcher, self._zero_velocity, self.config.min_points
-        )
+        self._initializer = self._new_initializer()
         self._first_sweeps: list[Sweep] = []  # of a rest that may still turn out to be none
         self._unmatched_ns = 0
         self._jump = FrameJump()
+        self._earlier = EarlierMaps()
         self._last: OdometryEstimate | None = None
+
+    def _new_initializer(self) -> MapInitializer:
+        return MapInitializer(
+            self._predictor, self.matcher, self._zero_velocity, self.config.min_points
+        )
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
@@ -204,11 +209,16 @@ class Odometry:
         if self._unmatched_ns >= tuning.LOST_NS:
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
+        guess = predicted.state
+        back = self._way_back(sweep, motion)
+        if back is not None:
+            found, motion, guess = back.alignment, self._return(back, motion), motion.state
+            status.append(Status.RETURNED)
         self._keep(motion)
         quality = self.matcher.quality(len(source.points), found)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None or uncharted or Status.LOST in status:
-            fresh = self.matcher.extend(estimate.points, motion, predicted.state)
+            fresh = self.matcher.extend(estimate.points, motion, guess)
             self._anchor_anew(fresh)
         return estimate
 
@@ -240,14 +250,39 @@ class Odometry:
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
-        """Begin a new map at the predicted pose."""
-        self._jump = self._jump.added(
+        """Begin a new map at the predicted pose; keep the one before, it may be seen again."""
+        before = self._jump
+        self._jump = before.added(
             motion.state, motion.covariance, self.matcher.drift.at(motion.state.position)
         )
-        self.matcher.clear()
+        if self.matcher.is_young:
+            self.matcher.clear()
+        else:
+            self._earlier.keep(self.matcher, before, motion.state.stamp)
+            self.matcher = SweepMatcher(self.config, self._lever)
+            self._initializer = self._new_initializer()
         self._unmatched_ns = 0
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
+
+    # ---- returning
+
+    def _way_back(self, sweep: Sweep, motion: SweepMotion) -> Return | None:
+        """Search the earlier maps, if there are any and it is time to."""
+        if not self._earlier.is_due(motion.state.stamp):
+            return None
+        return self._earlier.search(self.matcher.source(sweep, motion), motion, self._jump)
+
+    def _return(self, back: Return, motion: SweepMotion) -> SweepMotion:
+        """Go on in an earlier map; return the motion of the sweep that met it."""
+        self.matcher, self._jump = back.map.matcher, back.map.jump
+        self.matcher.config = self.config
+        self._initializer = self._new_initializer()
+        self.matcher.meet(back.alignment, 0.0)
+        self._zero_velocity.clear()
+        self._unmatched_ns = 0
+        self.phase = Phase.TRACKING
+        return motion.with_state(back.alignment.state, back.alignment.covariance)
 
     # ---- stationary
 
@@ -276,6 +311,11 @@ class Odometry:
             self._first_sweeps = []
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
+        back = self._way_back(sweep, still)
+        if back is not None:
+            self._first_sweeps = []
+            still = self._return(back, still)
+            status.append(Status.RETURNED)
         self._keep(still)
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)

@@ -35,7 +35,7 @@ from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
-from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import map_file, trajectory
@@ -307,7 +307,7 @@ class OdometryNode(ManagedNode):
         motion = self._base.motion(estimate)
         stamp, odom = estimate.stamp, topics.odom_frame
         message = messages.odometry(motion, stamp, odom, self._base_name)
-        if topics.covariance_when_lost and {Status.LOST, Status.RESTARTED} & set(estimate.status):
+        if topics.covariance_when_lost and CUTS & set(estimate.status):
             messages.set_unknown(message)
         self._odometry.publish(message)
         self._status.publish(messages.odometry_status(estimate, self._base_name))

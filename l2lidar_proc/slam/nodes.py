@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.base_frame import BaseFrame
-from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
 from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses, Trajectory
 from l2lidar_proc.slam.candidates import odometry_covariance
 from l2lidar_proc.slam.config import SlamConfig
@@ -94,7 +94,7 @@ class OdometrySweep:
 def health_of(names: Iterable[str]) -> Health:
     """Return what the names of an estimate's remarks mean for the map."""
     remarks = set(names)
-    if remarks & {"LOST", "RESTARTED"}:
+    if remarks & {status.name for status in CUTS}:
         return Health.CUT
     if "PREDICTED" in remarks:
         return Health.PREDICTED

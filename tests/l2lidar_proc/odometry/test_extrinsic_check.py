@@ -93,7 +93,7 @@ def test_late_stamps_are_said() -> None:
 
 def test_poses_that_are_not_aligned_tell_nothing() -> None:
     turned = rotations.matrices(rotations.exp(np.deg2rad([0.0, 0.0, 9.0])))
-    for status in (Status.PREDICTED, Status.LOST, Status.RESTARTED):
+    for status in (Status.PREDICTED, Status.LOST, Status.RESTARTED, Status.RETURNED):
         assert followed("perfect", rotation=turned, status=(status,), seconds=40).values == {}
 
 

@@ -200,20 +200,36 @@ def test_clock_that_goes_back_keeps_pose_and_map() -> None:
     assert np.sqrt(np.diag(estimates[-1].covariance)).min() > 0.3
 
 
-def test_a_map_begun_elsewhere_is_as_uncertain_as_the_way_there() -> None:
-    """Carried blindly into another place: five seconds without a match, then a new map."""
-    room, yard = recording("room", "walk", 9.0), recording("yard", "walk", 9.0)
-    at = room.imu["stamp"][0] + 2_500_000_000
-    some = [one for one in sweeps(room, "half turn") if one.end < at]
-    some += [one for one in sweeps(yard, "half turn") if one.start >= at]
+def test_lost_elsewhere_it_begins_a_new_map_and_returns_into_the_old_one() -> None:
+    """Carried blindly into another place, and back: the pose jumps back to where it is."""
+    room, yard = recording("room", "walk", 10.5), recording("yard", "walk", 10.5)
+    epoch = sweep_epoch(room)
+    away, home = epoch + 3_300_000_000, epoch + 9_000_000_000
+    some = [one for one in sweeps(room, "turn") if one.end < away]
+    some += [one for one in sweeps(yard, "turn") if away <= one.start < home]
+    some += [one for one in sweeps(room, "turn") if one.start >= home]
     estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), room, some)
-    lost = next(k for k, item in enumerate(estimates) if Status.LOST in item.status)
-    after = estimates[lost + 1 :]
-    assert estimates[lost].stamp > at + 4_000_000_000
-    assert len(after) > 3
-    assert any(item.is_aligned for item in after)
-    before = np.linalg.eigvalsh(estimates[lost - 1].covariance[:3, :3])[-1]
-    assert all(np.linalg.eigvalsh(item.covariance[:3, :3])[-1] > before for item in after)
+
+    def largest(item: Any) -> float:
+        return float(np.linalg.eigvalsh(item.covariance[:3, :3])[-1])
+
+    lost, back = (
+        next(k for k, item in enumerate(estimates) if status in item.status)
+        for status in (Status.LOST, Status.RETURNED)
+    )
+    assert estimates[lost].stamp > away + 4_000_000_000
+    there = estimates[lost + 1 : back]
+    assert any(item.is_aligned for item in there)
+    # a map begun elsewhere is as uncertain as the way there
+    assert all(largest(item) > largest(estimates[lost - 1]) for item in there)
+    assert estimates[back].stamp > home
+    after = estimates[back:]
+    assert len(after) > 1
+    assert all(item.is_aligned for item in after)
+    assert max(map(largest, after)) < 0.03**2
+    before = [item for item in estimates if item.stamp < away]
+    assert errors(room, before + after).max() < 0.03
+    assert [item for item in estimates if Status.RETURNED in item.status] == [estimates[back]]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 9, 50])
