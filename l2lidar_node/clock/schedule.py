@@ -11,6 +11,7 @@ _AGAIN_NS: Final = (
     1_000_000_000  # a single sync that did not take effect is repeated after this long
 )
 _SLACK_NS: Final = 50_000_000
+_END_NS: Final = (1 << 32) * 1_000_000_000  # the device counts seconds in 32 bits
 _FASTEST: Final = 2  # device seconds per true second, at most
 
 
@@ -37,8 +38,8 @@ class SyncSchedule:
         self._value = HostNs(0)
 
     def due(self, now: HostNs) -> bool:
-        """Return whether a sync should be sent now."""
-        if not self._wanted or (self._once and self.in_force):
+        """Return whether a sync should be sent now; never where the device's clock has no room."""
+        if not 0 <= now < _END_NS or not self._wanted or (self._once and self.in_force):
             return False
         return self._sent is None or not 0 <= now - self._sent < self._interval
 

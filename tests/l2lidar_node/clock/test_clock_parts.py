@@ -117,6 +117,7 @@ def test_a_single_sync_is_repeated_until_it_is_in_force() -> None:
     now = HostNs(10**18)
 
     assert schedule.due(now)
+    assert not schedule.due(HostNs((1 << 32) * 1000 * MS))  # 2106, more than the device can show
     schedule.sent(now, now)
     assert not schedule.due(HostNs(now + 900 * MS))
     schedule.seen(stamp=60_000 * MS, arrival=now + 100 * MS)
