@@ -10,7 +10,7 @@ First every test runs once, to see which functions it calls and how long it take
 meets only the tests that call the function it is in, the module's own and the quickest first, and
 the first that fails ends it. A test that hangs, or takes memory without end, counts as failed.
 Every mutant is kept in ``out/bench/mutants.jsonl`` as soon as it is judged: ``--resume`` goes on,
-and judges those anew whose module, or tests, have changed.
+and judges those anew whose module has changed, and those that lived and have other tests now.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import os
 import random
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -60,7 +60,7 @@ TESTS: Final = (
 SLOWEST_S: Final = 30.0
 """A test that takes longer [CPU s] is left to the gate."""
 
-_KEY: Final = ("path", "number", "digest")
+_KEY: Final = ("path", "number", "code")
 _TARGET: Final = 0.9
 _TESTS_S: Final = 10.0  # of tests for one mutant
 _SMALL: Final = 16  # integers up to this are counts and indices
@@ -368,17 +368,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for row in kept_calls.read()
         if row["test"] in names and row["seconds"] < SLOWEST_S
     }
-    judged = {kept.key_of(row) for row in kept.read()}
+    judged = {kept.key_of(row): row for row in kept.read()}
     wanted, todo = [], []
     chosen = sampled(_modules(given.modules), given.mutants, given.seed)
     for mutant in chosen if given.modules else [*known(), *chosen]:
         tests = tests_for(mutant, calls)
         row = {
-            "path": str(mutant.path), "number": mutant.number, "digest": _digest(mutant, tests),
+            "path": str(mutant.path), "number": mutant.number,
+            "code": _digest([str(mutant.path)], mutant.change),
+            "by": _digest({test.partition("::")[0] for test in tests}, *tests),
             "function": mutant.function, "change": mutant.change, "tests": len(tests),
         }  # fmt: skip
         wanted.append(kept.key_of(row))
-        if wanted[-1] not in judged:
+        before = judged.get(wanted[-1])
+        if before is None or not (before["killed"] or before["by"] == row["by"]):
             expected = sum(calls[test].seconds if test in calls else SLOWEST_S for test in tests)
             todo.append((row, mutant, tests, expected))
     judge(todo, kept, given.jobs, until)
@@ -400,11 +403,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return int(sum(tried) < _TARGET * len(tried) or not all(faults))
 
 
-def _digest(mutant: Mutant, tests: Sequence[str]) -> str:
-    """Return what a verdict holds for: the module and the tests as they are."""
-    paths = [str(mutant.path), *sorted({test.partition("::")[0] for test in tests})]
-    content = b"".join(_content(path) for path in paths)
-    return hashlib.sha256(content + mutant.change.encode()).hexdigest()[:16]
+def _digest(paths: Iterable[str], *texts: str) -> str:
+    """Return what tells files as they are now, and texts, from all others."""
+    content = b"".join(_content(path) for path in sorted(paths))
+    return hashlib.sha256(content + "\n".join(texts).encode()).hexdigest()[:16]
 
 
 @cache
