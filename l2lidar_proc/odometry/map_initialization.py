@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.filter import POSITION, InertialState
 from l2lidar_proc.motion.initialization import InitialState, initial_state
 from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
@@ -35,10 +36,23 @@ class Trial(NamedTuple):
         One for each sweep; empty if the sweeps contradict it.
     met : bool
         Whether any sweep saw what those before it saw.
+    last : Alignment or None
+        Of the last sweep, where it was aligned.
     """
 
     motions: list[SweepMotion]
     met: bool
+    last: Alignment | None = None
+
+    def fits_better(self, other: Trial) -> bool:
+        """Return whether this trial fits clearly better, and fixes more than another one."""
+        if self.last is None or other.last is None or not self.last.matched:
+            return False
+        one, two = (
+            trial.inlier_ratio / max(trial.residual, 1e-6) for trial in (self.last, other.last)
+        )
+        weakest = [weak_axis(trial.information)[0] for trial in (self.last, other.last)]
+        return bool(one > tuning.INITIAL_BETTER * two and weakest[0] > weakest[1])
 
 
 class Begun(NamedTuple):
@@ -194,20 +208,45 @@ class MapInitializer:
         return Trial(motions, met)
 
     def _in_motion(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
-        """Begin the map in rounds, each with the velocity that the round before has shown."""
+        """Begin the map in rounds, each with the velocity that the round before has shown.
+
+        Where the first sweeps hardly fix a direction, as in a corridor, rounds that begin at rest
+        may end at the wrong velocity along it: rounds from a walk either way are tried as well.
+        """
         start = self._at_cloud_origin(initial)
+        trial, begun = self._rounds(sweeps, since, start, initial)
+        if initial.at_rest or trial.last is None:
+            return trial
+        strength, axis = weak_axis(trial.last.information)
+        if strength >= tuning.WEAK_SHARE:
+            return trial
+        best, best_begun, latest = trial, begun, trial
+        for speed in (tuning.INITIAL_SPEED, -tuning.INITIAL_SPEED):
+            walking = dataclasses.replace(start, velocity=speed * axis)
+            latest, begun = self._rounds(sweeps, since, walking, initial)
+            if latest.motions and latest.fits_better(best):
+                best, best_begun = latest, begun
+        if best is not latest:  # the maps are those of the latest one
+            best = self._round(sweeps, since, best_begun, initial)
+        return best
+
+    def _rounds(
+        self, sweeps: list[Sweep], since: HostNs, start: InertialState, initial: InitialState
+    ) -> tuple[Trial, InertialState]:
+        """Return the last one of some rounds, and the state that it began with."""
         trial = Trial([], False)
         for _ in range(tuning.INITIAL_ROUNDS):
-            trial = self._round(sweeps, since, start, initial)
+            begun = start
+            trial = self._round(sweeps, since, begun, initial)
             if not trial.motions:
-                return trial
+                break
             velocity = trial.motions[1].state_at(start.stamp).velocity
             if initial.at_rest and np.linalg.norm(velocity) > tuning.INITIAL_REST_SPEED:
-                return Trial([], False)
+                return Trial([], False), begun
             if not trial.met or np.linalg.norm(velocity - start.velocity) < tuning.INITIAL_STEP:
                 break
             start = dataclasses.replace(start, velocity=velocity)
-        return trial
+        return trial, begun
 
     def _round(
         self, sweeps: list[Sweep], since: HostNs, start: InertialState, initial: InitialState
@@ -217,19 +256,28 @@ class MapInitializer:
         first = self._predictor.over_sweep(sweeps[0], start, initial.covariance, since)
         motions = [first]
         matcher.extend(matcher.deskewed(sweeps[0], first), first, first.state)
-        met = False
+        met, last = False, None
         for sweep in sweeps[1:]:
             motion = self._predictor.over_sweep(sweep, motions[-1].state, motions[-1].covariance)
             source = matcher.source(sweep, motion)
             found, uncharted = matcher.match(source, motion, initial=True)
             if found is not None:
                 motion = motion.with_state(found.state, found.covariance)
-                met = True
+                met, last = True, found
             elif not (uncharted and initial.at_rest):
                 return Trial([], False)
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
-        return Trial(motions, met)
+        return Trial(motions, met, last)
+
+
+def weak_axis(information: F64) -> tuple[float, F64]:
+    """Return the direction of the place (3,) that an alignment fixes least, map axes.
+
+    Before it comes its share of the strongest one's information.
+    """
+    strength, axes = np.linalg.eigh(information[POSITION, POSITION])
+    return float(strength[0] / max(strength[-1], 1e-9)), axes[:, 0]
 
 
 def joined(sweeps: list[Sweep], least_ns: int) -> list[Sweep]:
