@@ -1,6 +1,7 @@
 """Localization in a saved map: searches for the place, then keeps it; the map stays as it is.
 
-What is estimated is ``T_map_odom`` with its covariance. It grows with the odometry's way and
+What is estimated is ``T_map_odom`` with its covariance, all six components: the vertical of an
+odometry that began in motion is off by degrees. The covariance grows with the odometry's way and
 shrinks with each look at the map that fits; along what a place does not fix it keeps growing.
 """
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from l2lidar_proc.slam.candidates import odometry_covariance
 from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.hypotheses import PlaceHypotheses
 from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.se3 import (
@@ -35,7 +37,6 @@ F64 = NDArray[np.float64]
 
 _LOOK_BACK: Final = 3  # steps whose sweeps a look is made of
 _VOTES: Final = 3  # looks that must agree before a place is announced
-_LOOKS_WITHIN_M: Final = 10.0  # of way; older looks no longer count
 _AGREE: Final = (np.radians(2.0), 0.25)  # [rad, m] between looks that mean the same place
 _DRIFT: Final = 0.01  # part of the way by which they may differ more
 _NEAR_M: Final = 8.0
@@ -92,13 +93,14 @@ class Localizer:
         self._eligible = saved.largest_part()
         self._eligible &= np.array([node.submap is not None for node in saved.nodes])
         self._views = ViewCache()
-        self._search = PlaceSearch(self._view_of)
+        self._hypotheses = PlaceHypotheses(PlaceSearch(self._view_of), config.loop)
         self._sweeps: deque[tuple[float, OdometrySweep]] = deque()
         self._latest: OdometrySweep | None = None
         self._way = 0.0
         self._looked_at = 0.0
         self._confirmed_at = 0.0
         self._looks: list[Look] = []
+        self._against: list[Look] = []  # that agree with each other, not with the place
         self._jump: Look | None = None
         self._may_search = config.localization.relocalize == "auto"
 
@@ -189,17 +191,20 @@ class Localizer:
         ):
             self.state = SlamState.LOST
             self._looks = []
+            self._hypotheses.clear()
 
     def _cut(self) -> None:
         """Begin again after the odometry lost its way: what was known is held, not believed."""
         self._sweeps.clear()
         self._looks = []
+        self._hypotheses.clear()
         if self.T_map_odom is not None:
             self.state = SlamState.LOST
 
     def _forget(self) -> None:
         self.T_map_odom, self.state = None, SlamState.SEARCHING
-        self._looks, self._jump = [], None
+        self._looks, self._against, self._jump = [], [], None
+        self._hypotheses.clear()
 
     def _look(self) -> None:
         origin, query = self._query()
@@ -255,11 +260,12 @@ class Localizer:
         spread = self.covariance + noise
         if self.state is not SlamState.TENTATIVE and off @ np.linalg.solve(spread, off) > _GATE:
             self.counts["odometry"] += 1
-            return False
+            return self._contradicted(origin, measured, noise)
+        self._against = []
         gain = self.covariance @ np.linalg.inv(spread)
         change = gain @ off
         moved = predicted @ exp(adjoint(_only_turn(predicted)).T @ change)
-        believed = Look(leveled(moved) @ inverse(origin), self._way)
+        believed = Look(moved @ inverse(origin), self._way)
         turn, way = magnitude(off)
         if self.state is not SlamState.TENTATIVE and (
             way > self.config.localization.max_jump_m or turn > _JUMP
@@ -282,30 +288,40 @@ class Localizer:
         self.state, self._looks = SlamState.LOCALIZED, []
         return True
 
+    def _contradicted(self, origin: F64, measured: F64, noise: F64) -> bool:
+        """Take a look that the known place does not allow; believe the third that says the same.
+
+        Then the place was known less well than its covariance says.
+        """
+        look = Look(measured @ inverse(origin), self._way)
+        if self._against and not _same(self._against[-1], look, origin):
+            self._against = []
+        if not self._against or look.way > self._against[-1].way:  # one for each step
+            self._against.append(look)
+        if len(self._against) < _VOTES:
+            return False
+        self.T_map_odom, self.covariance = look.T_map_odom, noise
+        self._confirmed_at, self._against, self._jump = self._way, [], None
+        self.state = SlamState.LOCALIZED
+        return True
+
     def _find(self, origin: F64, query: SubmapView) -> None:
-        """Search the whole map; announce a place when several looks agree."""
-        found = self._search.find(
-            query, self._map.nodes, self._map.poses, self._eligible, self.config.loop
+        """Search the whole map; announce a place when the looks leave only one."""
+        found = self._hypotheses.look(
+            origin, query, self._map.nodes, self._map.poses, self._eligible
         )
+        if self.state is not SlamState.LOST:
+            self.state = SlamState.TENTATIVE if len(self._hypotheses) else SlamState.SEARCHING
         if isinstance(found, str):
             self.counts[found] += 1
             return
-        look = Look(found.T_map_query @ inverse(origin), self._way)
-        self._looks = [old for old in self._looks if look.way - old.way <= _LOOKS_WITHIN_M]
-        if self._looks and not _same(self._looks[-1], look, origin):
-            self.counts["looks disagree"] += 1
-            self._looks = []
-        self._looks.append(look)
-        if self.state is SlamState.SEARCHING:
-            self.state = SlamState.TENTATIVE
-        if len(self._looks) < _VOTES:
-            return
-        self.T_map_odom = leveled(found.T_map_query) @ inverse(origin)
+        self.T_map_odom = found.T_map_query @ inverse(origin)
         ad = adjoint(_only_turn(found.T_map_query))
         self.covariance = ad @ found.match.covariance @ ad.T
         self.covariance += np.diag(np.repeat(np.square(_BENT), 3))
         self._confirmed_at, self._looks = self._way, []
         self.state = SlamState.LOCALIZED
+        self._hypotheses.clear()
 
     def _view_of(self, number: int) -> SubmapView:
         submap = self._map.nodes[number].submap

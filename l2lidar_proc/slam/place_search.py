@@ -49,10 +49,14 @@ class PlaceSearch:
     ----------
     view_of : callable
         Returns the view of a node by its number.
+
+    Attributes
+    ----------
+    view_of : callable
     """
 
     def __init__(self, view_of: Callable[[int], SubmapView]) -> None:
-        self._view_of = view_of
+        self.view_of = view_of
         self._structures: dict[int, F64] = {}
 
     def find(
@@ -78,18 +82,17 @@ class PlaceSearch:
         among = np.flatnonzero(eligible)
         if not len(among):
             return "no map"
-        structure = self._structure(nodes, poses, among)
         found: list[Found] = []
         refused = "no fit"
-        for peak in places.anywhere(query.structure, structure, _PEAKS):
-            for node in _around(peak, poses, among):
-                z = poses[node][2, 3]
-                guess = inverse(poses[node]) @ planar(peak.x, peak.y, peak.yaw, z)
-                match = verify(query, self._view_of(node), guess, _WINDOW, config)
-                if isinstance(match, str):
-                    refused = match
-                    continue
-                found.append(Found(node, match, poses[node] @ match.T_target_query))
+        for start in self.candidates(query, nodes, poses, among, _PEAKS):
+            node = nearest(start, poses, among)
+            assert node is not None
+            guess = inverse(poses[node]) @ start
+            match = verify(query, self.view_of(node), guess, _WINDOW, config)
+            if isinstance(match, str):
+                refused = match
+                continue
+            found.append(Found(node, match, poses[node] @ match.T_target_query))
         if not found:
             return refused
         best = max(found, key=lambda item: item.match.fit.agreement)
@@ -99,6 +102,34 @@ class PlaceSearch:
             if (turn > _SAME[0] or way > _SAME[1]) and alike > config.max_second_best:
                 return "ambiguous"
         return best
+
+    def candidates(
+        self,
+        query: SubmapView,
+        nodes: Sequence[Node],
+        poses: F64,
+        among: NDArray[np.int64],
+        count: int,
+    ) -> list[F64]:
+        """Return where a query may be by its plan: ``T_map_query`` (4, 4), likeliest first.
+
+        Parameters
+        ----------
+        query : SubmapView
+        nodes : sequence of Node
+        poses : ndarray, shape (N, 4, 4)
+            Of the nodes in the map.
+        among : ndarray of int
+            Nodes that count.
+        count : int
+            Largest number of places of the plan; each is returned once for each storey there.
+        """
+        structure = self._structure(nodes, poses, among)
+        return [
+            planar(peak.x, peak.y, peak.yaw, poses[node][2, 3])
+            for peak in places.anywhere(query.structure, structure, count)
+            for node in _around(peak, poses, among)
+        ]
 
     def _structure(self, nodes: Sequence[Node], poses: F64, among: NDArray[np.int64]) -> F64:
         """Return the cells of upright structure of the whole map, shape (M, 2)."""
@@ -111,6 +142,13 @@ class PlaceSearch:
             parts.append(cells @ poses[node][:2, :2].T + poses[node][:2, 3])
         cells = np.unique(np.floor(np.concatenate(parts) / _CELL_M), axis=0)
         return np.asarray((cells + 0.5) * _CELL_M)
+
+
+def nearest(place: F64, poses: F64, among: NDArray[np.int64]) -> int | None:
+    """Return the node that shows a place (4, 4) best; None if none is near."""
+    distance = np.linalg.norm(poses[among, :3, 3] - place[:3, 3], axis=1)
+    closest = int(np.argmin(distance))
+    return int(among[closest]) if distance[closest] <= _NEAR_M else None
 
 
 def _around(peak: places.Place, poses: F64, among: NDArray[np.int64]) -> list[int]:

@@ -44,6 +44,7 @@ _STARTS: Final = 8  # at least
 _HEIGHT_STEP_M: Final = 0.4
 _SAME: Final = (np.radians(3.0), 0.3)  # [rad, m] results closer than this are one
 _NOISE_SHARE: Final = 0.02  # true places disagree by 0.4 to 4 % in our scenes
+_HOPELESS: Final = 0.7  # a place that agrees with less is not compared more closely
 _SIMILAR_OVERLAP: Final = 0.7  # a rival place needs this part of the best one's overlap
 _BOTH_WAYS: Final = (np.radians(0.5), 0.03)  # [rad, m] between the results of either way round
 _OBSERVED: Final = 0.01  # part of the points that must speak for a direction
@@ -169,6 +170,46 @@ def verify(
         return "one way"
     middle = pose @ exp(0.5 * difference)
     return Match(middle, covariance, fit, rival, bool(np.trace(directions) > 2.5))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """How two submaps fit where registration from one guess leads.
+
+    Attributes
+    ----------
+    T_target_query : ndarray, shape (4, 4)
+    fit, reverse : Fit
+        Of the query in the target, and of the target in the query.
+    """
+
+    T_target_query: F64
+    fit: Fit
+    reverse: Fit
+
+    @property
+    def contradiction(self) -> float:
+        """Part of the points that lie on no surface of the other submap, mean of both ways."""
+        return 1.0 - 0.5 * (self.fit.agreement + self.reverse.agreement)
+
+
+def compare(query: SubmapView, target: SubmapView, guess: F64) -> Comparison | None:
+    """Return how two submaps fit near a guess; None if they hardly meet. A tenth of a verdict.
+
+    Parameters
+    ----------
+    query, target : SubmapView
+    guess : ndarray, shape (4, 4)
+        Query coordinates to target coordinates.
+    """
+    pose, information = _registered(query.source[: _POINTS[0]], target, guess, _STEPS[1])
+    if information is None:
+        return None
+    rough = fit_of(query, target, pose, _POINTS[0])
+    if rough.agreement < _HOPELESS:
+        return Comparison(pose, rough, rough)
+    fit = fit_of(query, target, pose, _POINTS[1])
+    return Comparison(pose, fit, fit_of(target, query, inverse(pose), _POINTS[1]))
 
 
 def likeness(rival: float, best: float) -> float:

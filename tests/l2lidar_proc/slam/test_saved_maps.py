@@ -176,9 +176,10 @@ def test_a_kidnapped_start_is_found_and_kept(mapped: Slam) -> None:
     run = scan(scene, truth, step=STEP, rays=4000, seed=4)
     localizer = Localizer(SlamConfig(), mapped.map())
     before = len(mapped.map().points())
+    tilt = se3.exp((0.03, -0.02, 0.0, 0.0, 0.0, 0.0))  # of an odometry that began in motion
 
     seen = []
-    for number, sweep in enumerate(run.sweeps(drifting(truth, 0.5, 4, STEP))):
+    for number, sweep in enumerate(run.sweeps(tilt @ drifting(truth, 0.5, 4, STEP))):
         localizer.add(sweep)
         seen.append(localizer.state)
         if localizer.state is SlamState.SEARCHING:
@@ -230,6 +231,26 @@ def test_a_given_pose_is_corrected_by_the_map(office: MappingRun, mapped: Slam) 
     assert localizer.state is SlamState.LOCALIZED
     assert localizer.T_map_odom is not None
     assert np.linalg.norm((localizer.T_map_odom @ odometry[-1] - true[-1])[:3, 3]) < 0.12
+
+
+def test_a_place_that_three_looks_contradict_is_given_up_for_theirs(
+    office: MappingRun, mapped: Slam
+) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    true = se3.inverse(se3.leveled(office.truth[0])) @ office.truth[20:60]
+    sweeps = list(office.part(20, 60).sweeps(true))
+    beside = se3.planar(0.3, -0.3, 0.0)
+    localizer.take_over(beside, np.eye(6) * 1e-4)  # more certain than it should be
+    off = []
+    for sweep in sweeps:
+        localizer.add(sweep)
+        assert localizer.state is SlamState.LOCALIZED
+        assert localizer.T_map_odom is not None
+        here = (localizer.T_map_odom @ sweep.T_odom_body - sweep.T_odom_body)[:3, 3]
+        off.append(float(np.linalg.norm(here)))
+
+    assert off[10] > 0.35  # one look is not believed
+    assert off[-1] < 0.12
 
 
 def test_far_from_the_map_the_place_is_carried_on_then_lost(
