@@ -144,6 +144,7 @@ DRIFT_MOST_FRESH: Final = 0.9  # share of a sweep that counts as new map at most
 # beam angles 0.4 degrees off; with that, ranges 0.2 % off and an IMU turned by 0.5 degrees the
 # hard runs drift by 0.2 to 0.9 % of the distance from the start and turn by 0.1 to 0.7 degrees.
 UNIT_SHARE: Final = 0.004  # of the distance from the map's origin, each axis
+UNIT_WAY_SHARE: Final = 0.002  # of the way, around and back. Tuned on: as MAP_WAY, 0.19 of 80 m
 UNIT_TURN: Final = 0.005  # [rad] each axis
 UNIT_SHIFT: Final = 0.006  # [m] each axis
 UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold

@@ -25,12 +25,15 @@ class MapDrift:
 
     def __init__(self) -> None:
         self._history = np.zeros((64, 6, 6), np.float32)
+        self._ways = np.zeros(64)  # on which they were [m]
         self.clear()
 
     def clear(self) -> None:
         """Forget everything: a new map begins, without error by definition."""
         self._known = 0
         self._current = np.zeros((6, 6))
+        self._way, self._before = 0.0, np.zeros(3)
+        self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
 
     def meet(self, support: tuple[NDArray[np.int64], F64]) -> None:
         """Take the surfaces that hold the latest sweep.
@@ -44,6 +47,7 @@ class MapDrift:
         if len(sweeps) and self._known:
             rows = np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
             self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
+            self._behind = float(shares @ self._ways[rows])
 
     def meet_partly(
         self, support: tuple[NDArray[np.int64], F64], place: F64, free: F64, ways: F64
@@ -93,17 +97,27 @@ class MapDrift:
         if row >= len(self._history):
             grown = np.zeros((2 * row, 6, 6), np.float32)
             grown[: len(self._history)] = self._history
+            self._ways = np.concatenate((self._ways, np.zeros(2 * row - len(self._ways))))
             self._history = grown
+        if self._known:
+            self._way += float(np.linalg.norm(place - self._before))
+        self._before = place
+        self._ways[self._known : row + 1] = self._way
         moved = _carried(-place)
         self._history[self._known : row + 1] = self._current + moved @ covariance @ moved.T
         self._known = max(self._known, row + 1)
 
     def at(self, place: F64) -> F64:
-        """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m]."""
+        """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m].
+
+        What a unit's calibration is wrong by adds up with the distance; and with the way, where
+        the map of the place that was there first is forgotten.
+        """
         moved = _carried(place)
         away = float(np.linalg.norm(place))
-        left = 1.0 - np.exp(-away / tuning.UNIT_FROM_M)  # the first pose defines the frame
-        shift = (tuning.UNIT_SHIFT * left) ** 2 + (tuning.UNIT_SHARE * away) ** 2
+        left = 1.0 - np.exp(-max(away, self._behind) / tuning.UNIT_FROM_M)  # 0 defines the frame
+        share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self._behind)
+        shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
         unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2] * 3)
         return np.asarray(moved @ self._current @ moved.T + unit)
 

@@ -49,6 +49,19 @@ def test_a_pose_is_as_uncertain_as_what_holds_it() -> None:
     np.testing.assert_allclose(drift.at(place) - unit_alone(place), SURE, atol=3e-5)
 
 
+def test_around_and_back_only_the_first_map_of_the_place_holds_it() -> None:
+    drift = MapDrift()
+    corners = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0], [0, 0, 0]], np.float64)
+    for number, corner in enumerate(corners):
+        drift.record(number * tuning.DRIFT_GROUP, corner, SURE)
+    drift.meet(held_by(4 * tuning.DRIFT_GROUP))
+    added = (drift.at(ZERO) - SURE)[:3, :3]
+    expected = (tuning.UNIT_WAY_SHARE * 80.0) ** 2 + tuning.UNIT_SHIFT**2
+    np.testing.assert_allclose(added, np.eye(3) * expected, rtol=1e-4)
+    drift.meet(held_by(0))
+    np.testing.assert_allclose(drift.at(ZERO), SURE, atol=1e-9)
+
+
 def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
     drift = MapDrift()
     step = np.diag([1e-4] * 3 + [0.0] * 3)
