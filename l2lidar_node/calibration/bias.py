@@ -72,8 +72,8 @@ def _bowed(scene: Scene, solution: Solution) -> tuple[int, bool, int]:
     """Return large surfaces that show a bias, whether from steep to shallow, and directions."""
     planes = solution.planes
     members = scene.part(planes.member)
-    full = (members.known + solution.per_group(len(members.known)))[members.group]
-    rays = beams(members.returns, members.block, full)
+    full = members.known + solution.per_group(len(members.known))
+    rays = beams(members.returns, members.block, full, members.group)
     cosine = np.abs(np.einsum("ni,ni->n", rays.direction, planes.normal[planes.plane]))
     highest = np.maximum.reduceat(cosine, planes.first)
     lowest = np.minimum.reduceat(cosine, planes.first)

@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64
 
+I8 = NDArray[np.int64]
+
 RETURN: Final = np.dtype(
     [
         ("packet", "<i4"),  # number of the packet within its place
@@ -86,44 +88,102 @@ class Beams(NamedTuple):
         return self.origin + self.direction * self.distance[:, None]
 
 
-def beams(returns: NDArray[np.void], block: Block, correction: F64) -> Beams:
+class Angles(NamedTuple):
+    """Sines and cosines of the corrected angles of returns, each of shape (N,) or ()."""
+
+    cos_theta: F64
+    sin_theta: F64
+    cos_alpha: F64
+    sin_alpha: F64
+    cos_beta: F64
+    sin_beta: F64
+    cos_xi: F64
+    sin_xi: F64
+
+    @property
+    def direction(self) -> tuple[F64, F64, F64]:
+        """The rays along e_A, e_B and z, each of shape (N,)."""
+        return (
+            -self.cos_beta * self.sin_xi + self.sin_beta * self.cos_xi * self.sin_alpha,
+            self.cos_alpha * self.cos_xi,
+            self.sin_beta * self.sin_xi + self.cos_beta * self.cos_xi * self.sin_alpha,
+        )
+
+
+def angles(
+    returns: NDArray[np.void], block: Block, correction: F64, group: I8 | None = None
+) -> Angles:
+    """Return what :func:`beams` and :func:`derivatives` need of the angles; see there."""
+    own = block.values
+    theta = np.ascontiguousarray(returns["theta"])
+    alpha = np.ascontiguousarray(returns["alpha"])
+    if correction[..., STRETCH].any():
+        alpha = alpha + _each(correction[..., STRETCH], group) * (alpha - np.pi / 2)
+    alpha = alpha + _each(correction[..., ALPHA], group)
+    xi = own["xi_angle"] + correction[..., XI]
+    beta = own["beta_angle"] + correction[..., BETA]
+    cos_beta, sin_beta = _each(np.cos(beta), group), _each(np.sin(beta), group)
+    if correction[..., ROCK_COS:].any():
+        cosine, sine = np.cos(2.0 * theta), np.sin(2.0 * theta)
+        rock_cos = _each(correction[..., ROCK_COS], group)
+        rock_sin = _each(correction[..., ROCK_SIN], group)
+        alpha = alpha + rock_cos * cosine + rock_sin * sine
+        tilted = _each(beta, group) - rock_cos * sine + rock_sin * cosine
+        cos_beta, sin_beta = np.cos(tilted), np.sin(tilted)
+    return Angles(
+        np.cos(theta),
+        np.sin(theta),
+        np.cos(alpha),
+        np.sin(alpha),
+        cos_beta,
+        sin_beta,
+        _each(np.cos(xi), group),
+        _each(np.sin(xi), group),
+    )
+
+
+def beams(
+    returns: NDArray[np.void],
+    block: Block,
+    correction: F64,
+    group: I8 | None = None,
+    at: Angles | None = None,
+) -> Beams:
     """Return the rays of returns under a corrected block.
 
     Parameters
     ----------
     returns : ndarray, shape (N,), dtype RETURN
     block : Block
-    correction : ndarray, shape (8,) or (N, 8)
+    correction : ndarray, shape (8,) or (G, 8)
         In the order of :data:`NAMES`.
+    group : ndarray, shape (N,), int, optional
+        Which row of the correction is that of each return.
+    at : Angles, optional
+        Where they are known already.
     """
     own = block.values
-    xi = own["xi_angle"] + correction[..., XI]
-    alpha, beta = _angles(returns, own, correction)
-    cos_theta, sin_theta = np.cos(returns["theta"]), np.sin(returns["theta"])
-    along = -np.cos(beta) * np.sin(xi) + np.sin(beta) * np.cos(xi) * np.sin(alpha)
-    across = np.cos(alpha) * np.cos(xi)
-    up = np.sin(beta) * np.sin(xi) + np.cos(beta) * np.cos(xi) * np.sin(alpha)
-    b = own["b_axis_dist"] + correction[..., B]
-    origin = np.stack(
-        (cos_theta * b, sin_theta * b, np.full(len(returns), own["a_axis_dist"])), axis=-1
-    )
-    direction = np.stack(
-        (cos_theta * along - sin_theta * across, sin_theta * along + cos_theta * across, up),
-        axis=-1,
-    )
-    return Beams(origin, direction, returns["range"] + correction[..., BIAS])
+    at = angles(returns, block, correction, group) if at is None else at
+    along, across, up = at.direction
+    b = own["b_axis_dist"] + _each(correction[..., B], group)
+    origin = np.empty((len(returns), 3))
+    origin[:, 0] = at.cos_theta * b
+    origin[:, 1] = at.sin_theta * b
+    origin[:, 2] = own["a_axis_dist"]
+    direction = np.empty((len(returns), 3))
+    direction[:, 0] = at.cos_theta * along - at.sin_theta * across
+    direction[:, 1] = at.sin_theta * along + at.cos_theta * across
+    direction[:, 2] = up
+    return Beams(origin, direction, returns["range"] + _each(correction[..., BIAS], group))
 
 
-def derivatives(
-    returns: NDArray[np.void], block: Block, correction: F64, normals: F64, distance: F64
-) -> F64:
+def derivatives(returns: NDArray[np.void], at: Angles, normals: F64, distance: F64) -> F64:
     """Return how far each parameter moves a point along a normal.
 
     Parameters
     ----------
     returns : ndarray, shape (N,), dtype RETURN
-    block : Block
-    correction : ndarray, shape (8,) or (N, 8)
+    at : Angles
     normals : ndarray, shape (N, 3)
         Unit, cloud frame.
     distance : ndarray, shape (N,)
@@ -135,40 +195,27 @@ def derivatives(
     ndarray, shape (N, 8)
         [m/rad], for ``b`` and ``bias`` [1], for ``stretch`` [m].
     """
-    own = block.values
-    xi = own["xi_angle"] + correction[..., XI]
-    alpha, beta = _angles(returns, own, correction)
-    cos_theta, sin_theta = np.cos(returns["theta"]), np.sin(returns["theta"])
-    n_a = cos_theta * normals[:, 0] + sin_theta * normals[:, 1]
-    n_b = cos_theta * normals[:, 1] - sin_theta * normals[:, 0]
+    along, across, up = at.direction
+    n_a = at.cos_theta * normals[:, 0] + at.sin_theta * normals[:, 1]
+    n_b = at.cos_theta * normals[:, 1] - at.sin_theta * normals[:, 0]
     n_c = normals[:, 2]
-    sx, cx, sb, cb = np.sin(xi), np.cos(xi), np.sin(beta), np.cos(beta)
-    s, c = np.sin(alpha), np.cos(alpha)
-    along, across, up = -cb * sx + sb * cx * s, c * cx, sb * sx + cb * cx * s
-    found = np.empty((len(returns), len(NAMES)))
-    found[:, XI] = n_a * (-cb * cx - sb * sx * s) - n_b * c * sx + n_c * (sb * cx - cb * sx * s)
-    found[:, BETA] = n_a * up - n_c * along
-    found[:, ALPHA] = n_a * sb * cx * c - n_b * s * cx + n_c * cb * cx * c
-    found[:, STRETCH] = found[:, ALPHA] * (returns["alpha"] - np.pi / 2)
-    cosine, sine = np.cos(2.0 * returns["theta"]), np.sin(2.0 * returns["theta"])
-    found[:, ROCK_COS] = found[:, ALPHA] * cosine - found[:, BETA] * sine
-    found[:, ROCK_SIN] = found[:, ALPHA] * sine + found[:, BETA] * cosine
-    found[:, [XI, BETA, ALPHA, STRETCH, ROCK_COS, ROCK_SIN]] *= distance[:, None]
-    found[:, B] = n_a
-    found[:, BIAS] = n_a * along + n_b * across + n_c * up
-    return found
+    s, c, sb, cb = at.sin_alpha, at.cos_alpha, at.sin_beta, at.cos_beta
+    sx, cx = at.sin_xi, at.cos_xi
+    found = np.empty((len(NAMES), len(returns)))
+    found[XI] = n_a * (-cb * cx - sb * sx * s) - n_b * c * sx + n_c * (sb * cx - cb * sx * s)
+    found[BETA] = n_a * up - n_c * along
+    found[ALPHA] = n_a * sb * cx * c - n_b * s * cx + n_c * cb * cx * c
+    found[[XI, BETA, ALPHA]] *= distance
+    found[STRETCH] = found[ALPHA] * (returns["alpha"] - np.pi / 2)
+    cosine = at.cos_theta**2 - at.sin_theta**2
+    sine = 2.0 * at.sin_theta * at.cos_theta
+    found[ROCK_COS] = found[ALPHA] * cosine - found[BETA] * sine
+    found[ROCK_SIN] = found[ALPHA] * sine + found[BETA] * cosine
+    found[B] = n_a
+    found[BIAS] = n_a * along + n_b * across + n_c * up
+    return found.T
 
 
-def _angles(returns: NDArray[np.void], own: dict[str, float], correction: F64) -> tuple[F64, F64]:
-    """Return alpha and beta of every return [rad]."""
-    alpha = returns["alpha"]
-    alpha = alpha + correction[..., ALPHA] + correction[..., STRETCH] * (alpha - np.pi / 2)
-    beta = np.broadcast_to(own["beta_angle"] + correction[..., BETA], alpha.shape)
-    if not correction[..., ROCK_COS:].any():
-        return alpha, beta
-    cosine, sine = np.cos(2.0 * returns["theta"]), np.sin(2.0 * returns["theta"])
-    rock_cos, rock_sin = correction[..., ROCK_COS], correction[..., ROCK_SIN]
-    return (
-        alpha + rock_cos * cosine + rock_sin * sine,
-        beta - rock_cos * sine + rock_sin * cosine,
-    )
+def _each(values: F64, group: I8 | None) -> F64:
+    """Return a value () as it is, values (G,) for each return."""
+    return values if group is None else values[group]

@@ -41,6 +41,8 @@ class Planes(NamedTuple):
         Where the points of each plane begin in ``member``; none is empty.
     center, normal, u, v : ndarray, shape (K, 3)
         Mean [m] and orthonormal axes; u and v lie in the plane.
+    spread : ndarray, shape (K, 3)
+        Variances of the points along the normal and two axes in the plane, ascending [m^2].
     """
 
     member: I8
@@ -49,6 +51,7 @@ class Planes(NamedTuple):
     normal: F64
     u: F64
     v: F64
+    spread: F64
 
     @property
     def plane(self) -> I8:
@@ -92,9 +95,9 @@ def _cells(
     points: F64, is_far_half: NDArray[np.bool_], groups: I8, size: float, most: int
 ) -> Planes:
     found = _grid(points, groups, size, is_far_half)
-    found = _kept(found, _flat(found, points))
+    found = _kept(found, _flat(found))
     found = _trimmed(found, points)
-    found = _kept(found, _both_halves(found, is_far_half) & _flat(found, points))
+    found = _kept(found, _both_halves(found, is_far_half) & _flat(found))
     return _thinned(found, points, most)
 
 
@@ -113,7 +116,7 @@ def large(
 
     del is_far_half
     found = _grid(points, groups, _LARGE_CELL_M)
-    found = _kept(found, _flat(found, points))
+    found = _kept(found, _flat(found))
     if not len(found.first):
         return found
     owner = groups[found.member[found.first]]
@@ -136,7 +139,7 @@ def large(
     merged = _sorted(found.member, label[found.plane], points)
     for _ in range(3):
         merged = _trimmed(merged, points)
-    sides = np.sqrt(_eigen(merged, points)[0])
+    sides = np.sqrt(merged.spread)
     return _thinned(_kept(merged, sides[:, 2] > extent), points, _MOST_LARGE)
 
 
@@ -146,7 +149,7 @@ def joined(parts: Sequence[Planes]) -> Planes:
     return Planes(
         np.concatenate([part.member for part in parts]),
         np.concatenate([part.first + offset for part, offset in zip(parts, offsets, strict=True)]),
-        *(np.concatenate([part[i] for part in parts]) for i in range(2, 6)),
+        *(np.concatenate(values) for values in zip(*(part[2:] for part in parts), strict=True)),
     )
 
 
@@ -203,28 +206,26 @@ def _sorted(member: I8, key: I8, points: F64) -> Planes:
 def _fitted(member: I8, first: I8, points: F64) -> Planes:
     if not len(first):
         none = np.empty((0, 3))
-        return Planes(member, first, none, none, none, none)
+        return Planes(member, first, none, none, none, none, none)
     counts = np.diff(np.append(first, len(member)))
-    center = np.add.reduceat(points[member], first) / counts[:, None]
-    bare = Planes(member, first, center, center, center, center)
-    axes = _eigen(bare, points)[1]
-    return Planes(member, first, center, axes[..., 0], axes[..., 1], axes[..., 2])
+    mine = points[member]
+    center = np.add.reduceat(mine, first) / counts[:, None]
+    scatter = products(mine - np.repeat(center, counts, axis=0), first) / counts[:, None, None]
+    values, axes = np.linalg.eigh(scatter)
+    return Planes(
+        member,
+        first,
+        center,
+        axes[..., 0],
+        axes[..., 1],
+        axes[..., 2],
+        np.maximum(values, 0.0),
+    )
 
 
-def _eigen(planes: Planes, points: F64) -> tuple[F64, F64]:
-    """Return eigenvalues (K, 3) [m^2], ascending, and eigenvectors (K, 3, 3) of the scatter."""
-    if not len(planes.first):
-        return np.empty((0, 3)), np.empty((0, 3, 3))
-    away = points[planes.member] - planes.center[planes.plane]
-    scatter = products(away, planes.first) / planes.counts[:, None, None]
-    values, vectors = np.linalg.eigh(scatter)
-    return np.maximum(values, 0.0), vectors
-
-
-def _flat(planes: Planes, points: F64) -> NDArray[np.bool_]:
-    values, _ = _eigen(planes, points)
-    flat = (values[:, 0] < _FLATNESS * values[:, 1]) & (values[:, 0] < _THICKEST_M**2)
-    return np.asarray(flat)
+def _flat(planes: Planes) -> NDArray[np.bool_]:
+    thin, wide = planes.spread[:, 0], planes.spread[:, 1]
+    return np.asarray((thin < _FLATNESS * wide) & (thin < _THICKEST_M**2))
 
 
 def _both_halves(planes: Planes, is_far_half: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -239,9 +240,7 @@ def _kept(planes: Planes, keep: NDArray[np.bool_]) -> Planes:
     counts = planes.counts
     member = planes.member[np.repeat(keep, counts)]
     first = np.concatenate(([0], np.cumsum(counts[keep])))[:-1].astype(np.int64)
-    return Planes(
-        member, first, planes.center[keep], planes.normal[keep], planes.u[keep], planes.v[keep]
-    )
+    return Planes(member, first, *(values[keep] for values in planes[2:]))
 
 
 def _trimmed(planes: Planes, points: F64) -> Planes:

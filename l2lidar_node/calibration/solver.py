@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.calibration import planes as flat
-from l2lidar_node.calibration.model import NAMES, Beams, Block, beams, derivatives
+from l2lidar_node.calibration.model import (
+    NAMES,
+    Beams,
+    Block,
+    angles,
+    beams,
+    derivatives,
+)
 from l2lidar_node.calibration.planes import I8, Planes
 from l2lidar_node.types import F64
 
@@ -125,8 +132,8 @@ def spread(unknowns: Sequence[Unknown], values: F64, groups: int) -> F64:
 
 def points(scene: Scene, corrections: F64) -> F64:
     """Return the returns in their places' cloud frames under corrections (G, 8) [m]."""
-    full = (scene.known + corrections)[scene.group]
-    return beams(scene.returns, scene.block, full).points
+    full = scene.known + corrections
+    return beams(scene.returns, scene.block, full, scene.group).points
 
 
 def solve(
@@ -169,31 +176,28 @@ def solve(
             raise FewPlanesError("the scene has hardly any flat surfaces")
         members, own = scene.part(found.member), found.at()
         for _ in range(_ITERATIONS):
-            system = _linearized(members, unknowns, values, own, information)
-            gradient = system.gradient + information @ (values - begin)
-            step = _newton(system.hessian, gradient)
+            here, own = _linearized(members, unknowns, values, own, information)
+            gradient = here.gradient + information @ (values - begin)
+            step = _newton(here.hessian, gradient)
             values = values + _bounded(step, unknowns)
-            own = flat.refitted(own, points(members, spread(unknowns, values, groups)))
-        system = _linearized(members, unknowns, values, own, information)
-        if np.all(np.abs(values - before) < _CONVERGED * np.sqrt(np.diag(system.covariance))):
+        if np.all(np.abs(values - before) < _CONVERGED * np.sqrt(np.diag(here.covariance))):
             break
+    end, own = _linearized(members, unknowns, values, own, information)
     return Solution(
         unknowns,
         values,
-        system.hessian,
-        system.covariance,
-        system.cost,
+        end.hessian,
+        end.covariance,
+        end.cost,
         own._replace(member=found.member),
-        system.scale,
+        end.scale,
     )
 
 
 def cost_on(scene: Scene, unknowns: Sequence[Unknown], values: F64, planes: Planes) -> float:
     """Return the mean robust cost of values on planes found with others."""
-    members, own = scene.part(planes.member), planes.at()
-    unknowns = tuple(unknowns)
-    own = flat.refitted(own, points(members, spread(unknowns, values, len(scene.known))))
-    return _linearized(members, unknowns, values, own).cost
+    members = scene.part(planes.member)
+    return _linearized(members, tuple(unknowns), values, planes.at())[0].cost
 
 
 def widened(scene: Scene, solution: Solution, more: Sequence[Unknown]) -> Solution:
@@ -201,21 +205,19 @@ def widened(scene: Scene, solution: Solution, more: Sequence[Unknown]) -> Soluti
     unknowns = (*solution.unknowns, *more)
     values = np.concatenate((solution.values, np.zeros(len(more))))
     members, own = scene.part(solution.planes.member), solution.planes.at()
-    groups = len(scene.known)
-    for _ in range(_ITERATIONS + 1):
-        system = _linearized(members, unknowns, values, own)
-        step = _newton(system.hessian, system.gradient)
+    for _ in range(_ITERATIONS):
+        here, own = _linearized(members, unknowns, values, own)
+        step = _newton(here.hessian, here.gradient)
         values = values + _bounded(step, unknowns)
-        own = flat.refitted(own, points(members, spread(unknowns, values, groups)))
-    system = _linearized(members, unknowns, values, own)
+    end, own = _linearized(members, unknowns, values, own)
     return Solution(
         unknowns,
         values,
-        system.hessian,
-        system.covariance,
-        system.cost,
+        end.hessian,
+        end.covariance,
+        end.cost,
         own._replace(member=solution.planes.member),
-        system.scale,
+        end.scale,
     )
 
 
@@ -235,8 +237,8 @@ def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F64:
     now = points(scene.part(planes.member), solution.per_group(len(scene.known)))
     part = flat.part(planes.at(), keep, now)
     members = scene.part(planes.member[part.member])
-    system = _linearized(members, solution.unknowns, solution.values, part.at())
-    return np.asarray(solution.values + _newton(system.hessian, system.gradient, 1e-6))
+    here, _ = _linearized(members, solution.unknowns, solution.values, part.at())
+    return np.asarray(solution.values + _newton(here.hessian, here.gradient, 1e-6))
 
 
 class System(NamedTuple):
@@ -268,13 +270,18 @@ def _linearized(
     values: F64,
     planes: Planes,
     information: F64 | float = 0.0,
-) -> System:
-    """Return the normal equations of the unknowns; all returns are members."""
+) -> tuple[System, Planes]:
+    """Return the normal equations of the unknowns, and the planes through the points at values.
+
+    All returns are members.
+    """
     returns, group = scene.returns, scene.group
-    full = (scene.known + spread(unknowns, values, len(scene.known)))[group]
-    rays = beams(returns, scene.block, full)
+    full = scene.known + spread(unknowns, values, len(scene.known))
+    at = angles(returns, scene.block, full, group)
+    rays = beams(returns, scene.block, full, group, at)
+    planes = flat.refitted(planes, rays.points)
     met = meeting(rays, planes)
-    whole = derivatives(returns, scene.block, full, planes.normal[planes.plane], met.distance)
+    whole = derivatives(returns, at, planes.normal[planes.plane], met.distance)
     jacobian = np.stack(
         [
             whole[:, item.parameter] * (1.0 if item.group is None else group == item.group)
@@ -282,7 +289,7 @@ def _linearized(
         ],
         axis=-1,
     )
-    return system(planes, met, jacobian, group[planes.first], information)
+    return system(planes, met, jacobian, group[planes.first], information), planes
 
 
 class Meeting(NamedTuple):

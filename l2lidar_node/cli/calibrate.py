@@ -48,6 +48,10 @@ _BEFORE: Final = """\
   - a furnished room of 4 to 10 m with a flat ceiling and free walls; not a corridor, not outdoors
   - screw or clamp the sensor to something heavy: not foam, not a tripod, not your hand
   - clean the cover; nobody walks about"""
+_WITHIN: Final = (
+    "within what tape and surfaces leave: nothing to correct; a better tape (--tape-mm) or a "
+    "longer way tells more"
+)
 _RIGHT: Final = "the block that the unit reports is right: nothing to correct"
 
 app = typer.Typer(
@@ -236,7 +240,7 @@ def scale(
     files.write(
         made,
         output,
-        "" if found.is_significant else _RIGHT,
+        "" if found.is_significant else _WITHIN,
         "give it to the driver as calibration_file",
         quiet=json_,
     )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.calibration.model import NAMES, RETURN, Block, beams, derivatives
+from l2lidar_node.calibration.model import NAMES, RETURN, Block, angles, beams, derivatives
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.protocol import wire
 from tests.support.build import UNIT_B, points_3d
@@ -54,8 +54,19 @@ def test_derivatives_are_those_of_the_points(index: Any) -> None:
     ahead, back = (beams(made, BLOCK, correction + sign * step).points for sign in (1, -1))
     numeric = np.einsum("ni,ni->n", ahead - back, normals) / 2e-6
     distance = beams(made, BLOCK, correction).distance
-    exact = derivatives(made, BLOCK, correction, normals, distance)[:, index]
+    at = angles(made, BLOCK, correction)
+    exact = derivatives(made, at, normals, distance)[:, index]
     np.testing.assert_allclose(exact, numeric, atol=1e-6, rtol=1e-6)
+
+
+def test_groups_have_corrections_of_their_own() -> None:
+    made = returns(3)
+    rows = np.random.default_rng(4).normal(0, 3e-3, (2, len(NAMES)))
+    group = np.arange(len(made)) % 2
+    both = beams(made, BLOCK, rows, group).points
+    for number, row in enumerate(rows):
+        mine = group == number
+        np.testing.assert_allclose(both[mine], beams(made[mine], BLOCK, row).points, atol=1e-12)
 
 
 def test_a_mount_that_rocks_is_alpha_and_beta() -> None:
