@@ -82,6 +82,8 @@ def main() -> None:
     if arguments.units:
         rows = walls()
         publish("deskew_units", "Thickness of walls in deskewed sweeps, mm", rows, _thin(rows))
+        if arguments.docs:
+            deskew_pages.write_units(rows)
         return
     shown = {}
     for scenario in SCENARIOS:
@@ -108,6 +110,7 @@ def main() -> None:
         print(f"{name}: {value:.2f}")
     if arguments.docs:
         deskew_pages.write(rows, targets, costs, real, shown["walk 1.2 m/s"])
+        deskew_pages.write_units(of_units)
 
 
 def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]]:

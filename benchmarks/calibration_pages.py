@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import statistics
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.results import Target, machine
+from benchmarks.results import Target, machine, replaced
 
 PAGE: Final = Path("docs") / "results" / "calibration.md"
+ODOMETRY: Final = Path("docs") / "odometry.md"
 _HEAD: Final = """# Calibration of units
 
 Written by `make bench-calibration BENCH_ARGS="--page"`; [calibration](../calibration.md) says what
@@ -29,12 +31,41 @@ def write(rows: list[Row], targets: list[Target]) -> Path:
         "## Beams",
         table(rows),
         *_words(rows, "imu", "IMU: what is left, and its deviation"),
-        *_words(rows, "odometry", "Odometry of a typical unit"),
+        "[Odometry](../odometry.md#units-that-are-not-perfect) and "
+        "[deskew](../deskew.md#what-it-achieves) have what calibration is worth to them.",
         f"Measured with Python {facts['python']}.",
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
     return PAGE
+
+
+def write_odometry(rows: Iterable[Row], methods: Sequence[str]) -> None:
+    """Replace the table of units in the page of the odometry.
+
+    Parameters
+    ----------
+    rows : iterable of dict
+        ATE [mm] of each run by method.
+    methods : sequence of str
+    """
+    runs: dict[str, list[Row]] = {}
+    for row in rows:
+        if row["case"].startswith("odometry: "):
+            runs.setdefault(row["case"].removeprefix("odometry: "), []).append(row)
+    if not runs:
+        return
+    lines = [f"| ATE, median / largest [mm] | {' | '.join(methods)} | runs |"]
+    lines.append("|---|" + "---|" * (len(methods) + 1))
+    for name, mine in runs.items():
+        cells = [
+            f"{statistics.median(row[key] for row in mine):.1f} / "
+            f"{max(row[key] for row in mine):.1f}"
+            for key in methods
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} | {len(mine)} |")
+    text = ODOMETRY.read_text(encoding="utf-8")
+    ODOMETRY.write_text(replaced(text, "units", "\n".join(lines)), encoding="utf-8")
 
 
 def _targets(targets: list[Target]) -> str:

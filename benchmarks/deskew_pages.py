@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks.results import Target, machine
+from benchmarks.results import Target, machine, replaced
 from l2lidar_node.types import F64
 
 PAGE: Final = Path("docs") / "deskew.md"
@@ -39,25 +39,23 @@ def write(
         One sweep as different methods leave it, and the truth.
     """
     text = PAGE.read_text(encoding="utf-8")
-    text = _replaced(text, "errors", _errors(rows))
-    text = _replaced(text, "targets", _targets(targets))
-    text = _replaced(text, "costs", _costs(costs))
-    text = _replaced(text, "real", _real(real))
+    text = replaced(text, "errors", _errors(rows))
+    text = replaced(text, "targets", _targets(targets))
+    text = replaced(text, "costs", _costs(costs))
+    text = replaced(text, "real", _real(real))
     PAGE.write_text(text, encoding="utf-8")
     _draw(clouds)
 
 
-def _marks(name: str) -> tuple[str, str]:
-    return f"<!-- {name}: generated -->\n", f"<!-- /{name} -->"
-
-
-def _replaced(text: str, name: str, content: str) -> str:
-    begin, end = _marks(name)
-    before, found, rest = text.partition(begin)
-    _, closed, after = rest.partition(end)
-    if not (found and closed):
-        raise ValueError(f"{PAGE}: the marks of block '{name}' are missing")
-    return f"{before}{begin}{content}\n{end}{after}"
+def write_units(rows: Sequence[dict[str, Any]]) -> None:
+    """Replace the table of how thick walls are [mm], by unit and method."""
+    methods = [name for name, value in rows[0].items() if isinstance(value, float)]
+    table = _table(
+        ["walls [mm]", *methods],
+        ([row["scenario"], *(f"{row[name]:.1f}" for name in methods)] for row in rows),
+    )
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replaced(text, "units", table), encoding="utf-8")
 
 
 def _table(heading: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

@@ -45,6 +45,22 @@ def at_most(name: str, value: float, bound: float) -> Target:
     return Target(name, value, bound, value <= bound)
 
 
+def replaced(text: str, name: str, content: str) -> str:
+    """Return a page with the generated block of a name replaced.
+
+    Raises
+    ------
+    ValueError
+        If the page has no such block.
+    """
+    begin, end = f"<!-- {name}: generated -->\n", f"<!-- /{name} -->"
+    before, found, rest = text.partition(begin)
+    _, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"the marks of block '{name}' are missing")
+    return f"{before}{begin}{content}\n{end}{after}"
+
+
 @dataclass(frozen=True, slots=True)
 class KeptRows:
     """The rows found so far, one a line of a file; several processes may append.

@@ -75,6 +75,33 @@ def test_the_page_has_a_line_for_every_case(
     assert "| worst \\|xi\\| | 2 | 1 | **not met** |" in text
 
 
+def test_the_odometry_of_units_is_judged_and_shown_by_its_medians(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = tmp_path / "odometry.md"
+    page.write_text("before\n<!-- units: generated -->\nold\n<!-- /units -->\nafter\n")
+    monkeypatch.setattr(calibration_pages, "ODOMETRY", page)
+    methods = bench_calibration.METHODS
+    rows = [
+        row("odometry: yard, walk", seed, **dict(zip(methods, values, strict=True)))
+        for seed, values in enumerate([(1.0, 8.0, 1.4), (1.2, 9.0, 2.0), (2.0, 7.0, 1.7)])
+    ]
+    (target,) = bench_calibration.odometry_targets(rows)
+    assert target.value == pytest.approx(1.7 / 1.2)
+    assert target.met
+    calibration_pages.write_odometry(rows, methods)
+    line = "| yard, walk | 1.2 / 2.0 | 8.0 / 9.0 | 1.7 / 2.0 | 3 |"
+    assert page.read_text().splitlines()[2:] == [
+        "| ATE, median / largest [mm] | " + " | ".join(methods) + " | runs |",
+        "|---|---|---|---|---|",
+        line,
+        "<!-- /units -->",
+        "after",
+    ]
+    calibration_pages.write_odometry([], methods)
+    assert line in page.read_text()
+
+
 def test_a_calibrated_recording_is_that_of_an_imu_as_drawn(tmp_path: Path) -> None:
     path = tmp_path / "unit.yaml"
     imu = ImuCalibration((0.0, 0.0, 0.2), 0.002)
