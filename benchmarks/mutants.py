@@ -62,7 +62,7 @@ SLOWEST_S: Final = 30.0
 
 _KEY: Final = ("path", "number", "code")
 _TARGET: Final = 0.9
-_TESTS_S: Final = 10.0  # of tests for one mutant
+_TESTS_S: Final = (10.0, 30.0)  # of tests for a mutant, and for one that lives through those
 _SMALL: Final = 16  # integers up to this are counts and indices
 _FACTOR: Final = 2  # of other constants
 _TUNED_FACTOR: Final = 10  # of those of a module, which are tuned: half of one may do as well
@@ -251,7 +251,7 @@ class _KeptCalls(KeptRows):
         return f"{row['seconds']:.1f} s {row['test']}"
 
 
-def tests_for(mutant: Mutant, calls: dict[str, Called]) -> list[str]:
+def tests_for(mutant: Mutant, calls: dict[str, Called], most_s: float) -> list[str]:
     """Return the tests that can notice a mutant, the likeliest first, as many as time allows."""
     if mutant.number < 0:
         return list(FAULTS[-1 - mutant.number].tests)
@@ -262,10 +262,11 @@ def tests_for(mutant: Mutant, calls: dict[str, Called]) -> list[str]:
         for test, called in calls.items()
         if path in called.functions and (not function or function in called.functions[path])
     ]
-    chosen, total = [], 0.0
+    chosen: list[str] = []
+    total = 0.0
     for _, seconds, test in sorted(found):
         total += seconds
-        if total > _TESTS_S:
+        if chosen and total > most_s:
             break
         chosen.append(test)
     return chosen
@@ -314,8 +315,8 @@ def report(rows: list[dict[str, Any]], options: str) -> str:
         "round; of counts by one), a constant (counts up to 16 by one, others twice as large, "
         "those of a module ten times). It is killed when a test fails or does not end. The sample "
         "is spread over the modules by their size. Each mutant meets the tests that call its "
-        f"function, at most {_TESTS_S:.0f} s of them. What lived before an assertion was added is "
-        "counted as killed.",
+        f"function, at most {_TESTS_S[-1]:.0f} s of them. What lived before an assertion was "
+        "added is counted as killed.",
         "",
         "| Module | Killed | Tried |",
         "|---|---|---|",
@@ -368,24 +369,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for row in kept_calls.read()
         if row["test"] in names and row["seconds"] < SLOWEST_S
     }
-    judged = {kept.key_of(row): row for row in kept.read()}
-    wanted, todo = [], []
     chosen = sampled(_modules(given.modules), given.mutants, given.seed)
-    for mutant in chosen if given.modules else [*known(), *chosen]:
-        tests = tests_for(mutant, calls)
-        row = {
-            "path": str(mutant.path), "number": mutant.number,
-            "code": _digest([str(mutant.path)], mutant.change),
-            "by": _digest({test.partition("::")[0] for test in tests}, *tests),
-            "function": mutant.function, "change": mutant.change, "tests": len(tests),
-        }  # fmt: skip
-        wanted.append(kept.key_of(row))
-        before = judged.get(wanted[-1])
-        if before is None or not (before["killed"] or before["by"] == row["by"]):
-            expected = sum(calls[test].seconds if test in calls else SLOWEST_S for test in tests)
-            todo.append((row, mutant, tests, expected))
-    judge(todo, kept, given.jobs, until)
+    if not given.modules:
+        chosen = [*known(), *chosen]
+    for stage, most_s in enumerate(_TESTS_S):
+        judged = {kept.key_of(row): row for row in kept.read()}
+        todo = []
+        for mutant in chosen:
+            tests = tests_for(mutant, calls, most_s)
+            row = _row(mutant, tests)
+            before = judged.get(kept.key_of(row))
+            if before is None or not (before["killed"] or _is_settled(before, calls, stage)):
+                expected = (calls[test].seconds if test in calls else SLOWEST_S for test in tests)
+                todo.append((row, mutant, tests, sum(expected)))
+        judge(todo, kept, given.jobs, until)
     found = {kept.key_of(row): row for row in kept.read()}
+    wanted = [kept.key_of(_row(mutant, [])) for mutant in chosen]
     if left := len(set(wanted) - set(found)):
         print(f"{left} mutants were left out; go on with --resume", file=sys.stderr)
         return 1
@@ -401,6 +400,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tried = [row["killed"] for row in rows if row["number"] >= 0]
     faults = [row["killed"] for row in rows if row["number"] < 0]
     return int(sum(tried) < _TARGET * len(tried) or not all(faults))
+
+
+def _is_settled(row: dict[str, Any], calls: dict[str, Called], stage: int) -> bool:
+    """Return whether a mutant has lived through all tests that a stage has for it."""
+    mutant = Mutant(Path(row["path"]), row["number"], row["function"], row["change"])
+    return any(
+        row["by"] == _row(mutant, tests_for(mutant, calls, most_s))["by"]
+        for most_s in _TESTS_S[stage:]
+    )
+
+
+def _row(mutant: Mutant, tests: Sequence[str]) -> dict[str, Any]:
+    """Return what is kept of a mutant, without the verdict: also what that holds for."""
+    return {
+        "path": str(mutant.path),
+        "number": mutant.number,
+        "code": _digest([str(mutant.path)], mutant.change),
+        "by": _digest({test.partition("::")[0] for test in tests}, *tests),
+        "function": mutant.function,
+        "change": mutant.change,
+        "tests": len(tests),
+    }
 
 
 def _digest(paths: Iterable[str], *texts: str) -> str:

@@ -119,6 +119,7 @@ def test_load_that_lasts_since_the_start_is_said_to_make_stamps_uncertain() -> N
 
     assert replay.kinds[:2] == [ClockEventKind.LOCKED, ClockEventKind.UNCERTAIN]
     assert "stamps may be" in replay.events[1].text
+    assert replay.clock.status().events[ClockEventKind.UNCERTAIN] == 1  # until it is certain
     assert replay.clock.status().uncertainty_ns < 0.1 * UNCERTAIN_NS  # and certain again later
 
 

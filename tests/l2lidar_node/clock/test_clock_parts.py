@@ -229,6 +229,24 @@ def test_a_cadence_whose_numbers_are_unknown_takes_each_packet_for_the_next() ->
     assert cadence.gap(2_010, 500 * MS) == 2
 
 
+def test_packets_on_no_credible_line_are_left_behind() -> None:
+    """A second and a half at a ratio that no clock has, then a clock that is right."""
+    model = HostClockModel(2.0)
+    begin = 10**18
+    for number in range(400):
+        model.add(number * 40 * MS, begin + number * 4 * MS)
+        model.update(number * 40 * MS)
+    assert not model.ready
+    place, arrival = 400 * 40 * MS, begin + 400 * 4 * MS
+    needed = 0
+    while not model.ready and needed < 1_500:
+        needed += 1
+        model.add(place + needed * 2 * MS, arrival + needed * 4 * MS)
+        model.update(place + needed * 2 * MS)
+    assert 100 <= needed <= 1_000
+    assert model.line.ratio == pytest.approx(2.0, rel=1e-6)
+
+
 TOLD = st.lists(
     st.tuples(st.integers(-(10**18), 10**18), st.integers(-(10**12), 10**12)), min_size=1
 )

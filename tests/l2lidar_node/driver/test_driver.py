@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver.counters import Counters
 from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer, DeviceState
 from l2lidar_node.driver.driver import Driver, Event, Silence
-from l2lidar_node.driver.reorder import REORDER_NS
+from l2lidar_node.driver.reorder import REORDER_NS, SequenceCounts
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.packets import Parameters, Version
 from l2lidar_node.protocol.wire import AckStatus, PacketType, UserCommand
@@ -527,6 +528,11 @@ def test_the_round_trip_is_measured_if_wanted() -> None:
     assert run.driver.clock_status().path_delay_ns == min(run.driver.round_trips) // 2
     run.wait(5)
     assert run.of(Answer) == []
+
+
+def test_nothing_is_counted_before_anything_comes() -> None:
+    assert not any(dataclasses.asdict(Counters()).values())
+    assert not any(dataclasses.asdict(SequenceCounts()).values())
 
 
 def test_counters_can_be_kept() -> None:

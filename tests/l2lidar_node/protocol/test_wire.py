@@ -41,6 +41,15 @@ OFFSETS_PARAMETERS = {
 }  # fmt: skip
 
 
+def test_commands_of_both_families_have_the_protocols_numbers() -> None:
+    user, factory = wire.UserCommand, wire.Command
+    assert [user.RESET, user.STANDBY, user.VERSION, user.LATENCY] == [1, 2, 3, 4]
+    assert [user.CONFIG_RESET, user.CONFIG_GET, user.AUTO_STANDBY] == [5, 6, 7]
+    assert [factory.PARAM_RESET, factory.PARAM_SAVE, factory.PARAM_GET] == [1, 2, 3]
+    assert [factory.VERSION, factory.STANDBY, factory.LATENCY] == [4, 5, 6]
+    assert factory.CONFIG_RESET == 7
+
+
 def test_frame_sizes_are_the_protocols() -> None:
     assert wire.FRAME_SIZES == SIZES
     assert max(SIZES.values()) <= wire.MAX_FRAME
