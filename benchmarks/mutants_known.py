@@ -144,5 +144,38 @@ REASONS: Final[dict[tuple[str, str], str]] = {
         "l2lidar_node/clock/device_clock.py",
         "self._now = 0  # arrival of the latest packet: 0 -> 1",
     ): "replaced by the first packet, before anything reads it",
+    (
+        "l2lidar_node/clock/host_clock_model.py",
+        "self._before_step = 0  # packets that were still told in the time before a step: 0 -> 1",
+    ): "set to 0 by the first step that is told, before anything counts",
+    (
+        "l2lidar_node/clock/lower_envelope.py",
+        "heights = [(h - h0) - ratio * (u - u0) for u, h in packets]: h - h0 -> h + h0",
+    ): "the lowest height, which is shifted as well, is taken off again",
+    (
+        "l2lidar_node/clock/lower_envelope.py",
+        "self._fitted_u = packets[-1][0]: 0 -> 1",
+    ): "the bounds of the ratio do not widen in the first 100 ms: by 1e-7 of it",
+    (
+        "l2lidar_node/clock/lower_envelope.py",
+        "span = (packets[-1][0] - u0) * line.ratio: 1 -> 2",
+    ): "the span of 16 blocks and more is one block shorter",
+    (
+        "l2lidar_node/clock/lower_envelope.py",
+        "return _SAFETY * error / span if span > 0.0 else 1.0: 0.0 -> 1.0",
+    ): "no span is longer than 0 and shorter than a nanosecond",
+    (
+        "l2lidar_node/clock/schedule.py",
+        "self.in_force = 0 <= since <= _FASTEST * elapsed + _SLACK_NS: 0 -> 1",
+    ): "one nanosecond",
+    (
+        "l2lidar_proc/motion/filter.py",
+        "np.linspace(preintegrated.anchor, knot, tuning.COVARIANCE_STEPS + 1).astype(int): "
+        "tuning.COVARIANCE_STEPS + 1 -> tuning.COVARIANCE_STEPS - 1",
+    ): "a tuned number of steps of the same integral: two less do as well",
+    (
+        "l2lidar_proc/motion/initialization.py",
+        "both = np.zeros((ERRORS, 2)): 2 -> 3",
+    ): "a column of zeros adds nothing to the covariance",
 }
 """By module and change, as ``docs/results/mutants.md`` shows them."""

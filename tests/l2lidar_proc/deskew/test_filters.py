@@ -141,6 +141,8 @@ def test_isolated_does_not_take_the_next_packet_for_a_neighbour() -> None:
     lonely = points((1, 0, 0), (1, 0.001, 0))
     lonely["time"] = (0, 4.639e-3)
     assert kept("isolated", lonely) == []
+    pair = points((5, 0, 0), (5, 0.01, 0))
+    assert kept("isolated", pair, isolated_slots=1, isolated_neighbours=1) == [0, 1]
     assert kept("isolated", lonely[:1]) == []
     with pytest.raises(FilterError, match="time"):
         kept("isolated", lonely[["x", "y", "z"]])

@@ -53,7 +53,9 @@ def run(
 
 @pytest.mark.parametrize("reference", ["start", "middle", "end"])
 def test_a_walk_is_deskewed_at_each_reference(reference: str) -> None:
-    _, done = run(WALK, 6.0, {"reference": reference})
+    pipeline, done = run(WALK, 6.0, {"reference": reference})
+    counts = pipeline.counts
+    assert counts.deskewed == counts.sweeps - counts.still >= len(done) - 12
     for item in done[12:]:
         start = (item.sweep.start - EPOCH) * 1e-9
         share = {"start": 0.0, "middle": 0.5, "end": 1.0}[reference]
@@ -126,6 +128,7 @@ def test_without_imu_sweeps_pass_through_and_say_so() -> None:
     assert item.stamp == sweep.start
     assert Flag.NO_IMU in item.quality.flags
     assert pipeline.counts.passed_on == pipeline.counts.uncovered == 1
+    assert pipeline.counts.deskewed == pipeline.counts.still == 0
     assert item.waited_ns == 30 * MS
 
 

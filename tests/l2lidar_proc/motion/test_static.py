@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2lidar_node.types import HostNs
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.initialization import initial_state
 from l2lidar_proc.motion.static import static_reference
 from tests.l2lidar_proc.motion.analytic import Motion, noisy
 
@@ -63,3 +66,19 @@ def test_too_few_samples_prove_nothing() -> None:
     samples = still((0, 0, 0), 1.0)
     assert static_reference(samples[:99], UNKNOWN, 0.1) is None
     assert not static_reference(samples, UNKNOWN, 0.1).matches(samples[:20])
+
+
+def test_the_first_state_is_level_and_calls_the_excess_over_gravity_bias() -> None:
+    samples = noisy(Motion().imu(0, 1.0, BIAS), 0.001, 0.001, 0.0)
+    tilt = np.radians(20.0)
+    samples["linear_acceleration"] += 9.9 * np.array([np.sin(tilt), 0.0, np.cos(tilt)]) - (
+        samples["linear_acceleration"].mean(axis=0)
+    )
+    found = initial_state(samples, HostNs(int(samples["stamp"][-1])))
+    assert found.at_rest
+    assert found.gravity_trusted
+    force = samples["linear_acceleration"].mean(axis=0)
+    np.testing.assert_allclose(found.state.rotation @ force, (0.0, 0.0, 9.9), atol=1e-9)
+    excess = 1.0 - tuning.STANDARD_GRAVITY / 9.9
+    np.testing.assert_allclose(found.state.accel_bias, excess * force, atol=1e-9)
+    np.testing.assert_allclose(found.state.gyro_bias, BIAS, atol=1e-3)
