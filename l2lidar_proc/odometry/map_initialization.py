@@ -45,14 +45,18 @@ class Trial(NamedTuple):
     last: Alignment | None = None
 
     def fits_better(self, other: Trial) -> bool:
-        """Return whether this trial fits clearly better, and fixes more than another one."""
+        """Return whether this trial fits better than another one, and fixes the place far better.
+
+        At the right velocity surfaces that face along the corridor agree with each other.
+        """
         if self.last is None or other.last is None or not self.last.matched:
             return False
-        one, two = (
-            trial.inlier_ratio / max(trial.residual, 1e-6) for trial in (self.last, other.last)
+        fixed, others = (weak_axis(trial.information)[0] for trial in (self.last, other.last))
+        return (
+            self.last.inlier_ratio > other.last.inlier_ratio
+            and fixed > tuning.INITIAL_FIXED
+            and fixed > tuning.INITIAL_BETTER * others
         )
-        weakest = [weak_axis(trial.information)[0] for trial in (self.last, other.last)]
-        return bool(one > tuning.INITIAL_BETTER * two and weakest[0] > weakest[1])
 
 
 class Begun(NamedTuple):

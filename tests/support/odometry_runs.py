@@ -63,6 +63,9 @@ def record(
     mount: str = "upright",
     unit: str = "perfect",
     calibration: CalibrationFile | None = None,
+    *,
+    speed: float = 0.0,
+    since: float = 0.0,
 ) -> Run:
     """Return a recording of a built-in motion in a built-in scene.
 
@@ -76,15 +79,20 @@ def record(
         As the emulator names it.
     calibration : CalibrationFile, optional
         Used as the driver uses it.
+    speed : float
+        [m/s], 0 = the motion's own.
+    since : float
+        When the recording begins [s].
     """
     physics = assemble(
-        PhysicsConfig(world=scene, motion=motion, seed=seed, mount=mount, unit=unit)
+        PhysicsConfig(world=scene, motion=motion, speed=speed, seed=seed, mount=mount, unit=unit)
     )
     used = None if calibration is None else calibration.corrected
     projector = Projector(wire.PacketType.POINTS_3D)
-    total = int(seconds / physics.scanner.period_s)
+    begin = int(since / physics.scanner.period_s)
+    total = begin + int(seconds / physics.scanner.period_s)
     points, instants, counts, starts, heads = [], [], [], [], []
-    for first in range(0, total, BATCH):
+    for first in range(begin, total, BATCH):
         packets, times = physics.scanner.packets(first, min(BATCH, total - first))
         payloads = [packet.tobytes() for packet in packets]
         batch = projector.points(payloads, times - times[0], used=used)
@@ -93,7 +101,9 @@ def record(
         counts.append(batch.counts)
         starts.append(times)
         heads.append(packets["com_horizontal_angle_start"].astype(np.float64))
-    samples, times = physics.inertial.samples(0, int(seconds * wire.IMU_RATE_HZ))
+    samples, times = physics.inertial.samples(
+        int(since * wire.IMU_RATE_HZ), int(seconds * wire.IMU_RATE_HZ)
+    )
     imu = np.zeros(len(samples), IMU_SAMPLE)
     imu["stamp"] = EPOCH + np.round(times * 1e9).astype(np.int64)
     imu["orientation_wxyz"] = samples["quaternion_wxyz"] / wire.QUATERNION_NORM
