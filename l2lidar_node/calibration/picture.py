@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.calibration import planes as flat, solver
-from l2lidar_node.calibration.model import BIAS, STRETCH
+from l2lidar_node.calibration.model import BIAS, STRETCH, B
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.result import Quality, StillResult
 from l2lidar_node.calibration.solver import Scene
@@ -42,7 +42,9 @@ def save(result: StillResult, path: Path) -> None:
     after = np.tile(result.correction, (groups, 1))
     for number, report in enumerate(result.places):
         after[number, :3] = report.xi, report.beta, report.alpha
-    after[:, [BIAS, STRETCH]] = 0.0
+    after[:, STRETCH] = 0.0
+    for column, name in ((B, "b"), (BIAS, "bias")):
+        after[:, column] = result.stored.get(name, 0.0)
     clouds = [solver.points(scene, correction) for correction in (np.zeros_like(after), after)]
     group, edge = _wall(result, clouds[1])
     figure = Figure(figsize=(11, 9), dpi=80, layout="constrained")
