@@ -38,16 +38,23 @@ _TOPICS: Final = {
     "zstd": "/points/zstd",
     "packets": "/l2lidar_node/packets",
 }
+_PROFILE: Final = Path("config") / "fastdds_wifi.xml"
 _CASES: Final = (
-    ("cloud", "none", "best_effort"),
-    ("cloud", "none", "reliable"),
-    ("zstd", "lossless", "best_effort"),
-    ("zstd", "lossless", "reliable"),
-    ("zstd", "millimeter", "best_effort"),
-    ("zstd", "millimeter", "reliable"),
-    ("packets", "none", "reliable"),
-    ("packets", "none", "best_effort"),
+    ("cloud", "none", "best_effort", False),
+    ("cloud", "none", "reliable", False),
+    ("cloud", "none", "reliable", True),
+    ("zstd", "lossless", "best_effort", False),
+    ("zstd", "lossless", "reliable", False),
+    ("zstd", "lossless", "reliable", True),
+    ("zstd", "millimeter", "best_effort", False),
+    ("zstd", "millimeter", "best_effort", True),
+    ("zstd", "millimeter", "reliable", False),
+    ("zstd", "millimeter", "reliable", True),
+    ("packets", "none", "best_effort", False),
+    ("packets", "none", "reliable", False),
+    ("packets", "none", "reliable", True),
 )
+"""Topic, compressed_clouds, reliability, and whether both ends use the profile."""
 _DEVICES: Final = ("l2robot", "l2desk")
 _RATE: Final = 20e6  # [bit/s]
 _LOSS: Final = 0.02
@@ -136,10 +143,33 @@ def bad_link() -> Iterator[None]:
         yield
 
 
-def arrived(kind: str, compressed: str, reliability: str, seconds: float) -> dict[str, Any]:
+@contextmanager
+def middleware(is_profiled: bool) -> Iterator[dict[str, str]]:
+    """Yield an environment in which Fast DDS uses the network: shared memory knows no namespaces.
+
+    Parameters
+    ----------
+    is_profiled : bool
+        Whether with the profile that is made for such a link.
+    """
+    plain = {**os.environ, "ROS_DOMAIN_ID": "71"}
+    if not is_profiled:
+        yield {**plain, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+        return
+    with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
+        shared = "<transport_id>shared_memory</transport_id>"
+        head, participant, rest = _PROFILE.read_text().partition("<participant ")
+        file.write(head + participant + rest.replace(shared, "", 1))
+        file.flush()
+        names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+        yield {**plain, **dict.fromkeys(names, file.name)}
+
+
+def arrived(
+    kind: str, compressed: str, reliability: str, environment: dict[str, str], seconds: float
+) -> dict[str, Any]:
     """Return what comes to the desk of one topic; see :mod:`benchmarks.wifi_watch`."""
     inside = ("ip", "netns", "exec")
-    environment = {**os.environ, "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", "ROS_DOMAIN_ID": "71"}
     values = {
         "l2_ip": "127.0.0.1",
         "host_ip": "127.0.0.1",
@@ -184,9 +214,10 @@ def arrived(kind: str, compressed: str, reliability: str, seconds: float) -> dic
 
 
 def link_rows(seconds: float, turn_s: float) -> Iterator[tuple[str, ...]]:
-    """Yield a row for each case: topic, setting, reliability, arrived, age, megabits."""
-    for kind, compressed, reliability in _CASES:
-        found = arrived(kind, compressed, reliability, seconds)
+    """Yield a row for each case: topic, setting, reliability, profile, arrived, age, megabits."""
+    for kind, compressed, reliability, is_profiled in _CASES:
+        with middleware(is_profiled) as environment:
+            found = arrived(kind, compressed, reliability, environment, seconds)
         expected = found["seconds"] * (_BATCHES_PER_S if kind == "packets" else 1.0 / turn_s)
         share = min(found["messages"] / expected, 1.0)
         # the stamp of a cloud is its first point's
@@ -196,6 +227,7 @@ def link_rows(seconds: float, turn_s: float) -> Iterator[tuple[str, ...]]:
             _TOPICS[kind],
             compressed if kind == "zstd" else "",
             reliability,
+            _PROFILE.name if is_profiled else "",
             f"{100.0 * share:.0f} %",
             age if kind != "packets" else "",
             f"{8e-6 * found['bytes'] / found['seconds']:.1f}",
@@ -237,6 +269,7 @@ def main() -> int:
                     "topic",
                     "compressed_clouds",
                     "reliability",
+                    "profile",
                     "arrived",
                     "late, median / p95 [s]",
                     "Mbit/s",
@@ -268,7 +301,7 @@ one core of a PC.
 
 Driver and listener under Fast DDS in two network namespaces, with 20 Mbit/s, 2 % loss and 30 ms
 each way between them (`benchmarks/wifi_link.py`), {seconds:.0f} s for each line once the
-first message has come, or after 25 s. *Late* counts from the last point of a cloud.
+first message has come, or after 60 s. *Late* counts from the last point of a cloud.
 
 {link}
 """

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
 import sys
 import time
 from typing import Any
-
-os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"  # shared memory knows no namespaces
 
 import rclpy
 from point_cloud_interfaces.msg import CompressedPointCloud2
@@ -21,7 +18,8 @@ from std_msgs.msg import UInt8MultiArray
 _KINDS = {"cloud": PointCloud2, "zstd": CompressedPointCloud2, "packets": UInt8MultiArray}
 
 
-_FIRST_S = 25.0  # until the virtual L2 and the driver are at work, and found
+_FIRST_S = 60.0  # until the virtual L2 and the driver are at work, and found
+_SMALLEST = 1044  # [B] one packet of points: before them, there is only word of waiting
 
 
 def main() -> int:
@@ -33,6 +31,8 @@ def main() -> int:
     sizes: list[int] = []
 
     def hear(data: bytes) -> None:
+        if len(data) < _SMALLEST:
+            return
         whole, fraction = struct.unpack_from("<iI", data, 4)
         ages.append(time.time() - whole - fraction * 1e-9)
         sizes.append(len(data))

@@ -35,13 +35,15 @@ OURS = 'from l2lidar_node.ros.program import start_rclpy; start_rclpy(["speaker"
 PLAIN = "import rclpy; rclpy.init()"
 
 
-def room(start: str) -> int:
+def room(start: str, profile: Path | None = None) -> int:
     """Return the size of the shared memory that a node has for what it publishes [B]."""
     domain = {
         "ROS_DOMAIN_ID": str(free_ros_domain()),  # not that of this test run
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
     environment = {name: value for name, value in os.environ.items() if name not in NAMES}
+    if profile is not None:
+        environment |= dict.fromkeys(NAMES[:2], str(profile))
     node = subprocess.Popen(
         [sys.executable, "-c", SPEAKER.format(start=start)],
         cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -87,3 +89,11 @@ def test_the_profile_gives_room_for_a_second_of_clouds(monkeypatch: pytest.Monke
     profile = ElementTree.parse(os.environ[NAMES[0]])
     (size,) = (int(item.text or 0) for item in profile.iter() if item.tag.endswith("segment_size"))
     assert size > CLOUDS * CLOUD_BYTES
+
+
+def test_the_profile_for_wifi_keeps_that_room_and_sends_what_fits_into_a_packet() -> None:
+    path = ROOT / "config" / "fastdds_wifi.xml"
+    assert room(PLAIN, path) > CLOUDS * CLOUD_BYTES
+    found = {item.tag.rpartition("}")[2]: item.text for item in ElementTree.parse(path).iter()}
+    assert int(found["maxMessageSize"] or 0) <= 1500 - 28  # headers of IP and UDP
+    assert int(found["nanosec"] or 0) <= 100_000_000
