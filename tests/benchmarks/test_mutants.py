@@ -69,13 +69,20 @@ def test_a_mutant_meets_the_tests_that_call_its_function_its_own_first() -> None
         "tests/test_slow.py::a": Called(4.0, {path: ["Cadence.advance"]}),
         "tests/test_quick.py::b": Called(0.1, {path: ["Cadence.advance"]}),
         "tests/clock/test_cadence.py::c": Called(5.0, {path: ["Cadence.advance"]}),
+        "tests/clock/test_cadence.py::g": Called(2.0, {}),
         "tests/test_other.py::d": Called(0.1, {path: ["Cadence.noise"]}),
         "tests/test_else.py::e": Called(0.1, {"l2lidar_node/clock/schedule.py": ["advance"]}),
         "tests/test_endless.py::f": Called(100.0, {path: ["Cadence.advance"]}),
     }
     assert [test[-1] for test in mutants.tests_for(inside, calls, 10.0)] == ["c", "b", "a"]
     assert [test[-1] for test in mutants.tests_for(inside, calls, 1.0)] == ["c"]
-    assert {test[-1] for test in mutants.tests_for(outside, calls, 10.0)} == {"a", "b", "c", "d"}
+    assert {test[-1] for test in mutants.tests_for(outside, calls, 12.0)} == {
+        "a",
+        "b",
+        "c",
+        "d",
+        "g",
+    }
 
 
 def test_the_page_names_what_lived_and_why() -> None:
