@@ -531,7 +531,7 @@ def test_the_round_trip_is_measured_if_wanted() -> None:
 
 
 def test_nothing_is_counted_before_anything_comes() -> None:
-    assert not any(dataclasses.asdict(Counters()).values())
+    assert not any(dataclasses.asdict(Counters().snapshot()).values())
     assert not any(dataclasses.asdict(SequenceCounts()).values())
 
 
