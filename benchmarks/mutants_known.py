@@ -177,5 +177,9 @@ REASONS: Final[dict[tuple[str, str], str]] = {
         "l2lidar_proc/motion/initialization.py",
         "both = np.zeros((ERRORS, 2)): 2 -> 3",
     ): "a column of zeros adds nothing to the covariance",
+    (
+        "l2lidar_proc/motion/filter.py",
+        "noise = np.array([[(tuning.SPEED_BOUND_SHARE * max_speed) ** 2]]): 2 -> 3",
+    ): "2 % of the bound, beside an excess of several times the bound, is nothing either way",
 }
 """By module and change, as ``docs/results/mutants.md`` shows them."""

@@ -123,6 +123,14 @@ def test_restart_takes_the_next_number_as_the_first() -> None:
     assert order.counts == counted(lost=1, restarts=1)
 
 
+def test_before_the_first_nothing_is_earlier() -> None:
+    order = SequenceOrder[int](8)
+    assert not order.is_earlier(1, 5)
+    order.push(3, 0)
+    assert order.is_earlier(4, 5)
+    assert not order.is_earlier(5, 4)
+
+
 def test_restart_of_one_that_never_ran_is_none() -> None:
     order: SequenceOrder[int] = SequenceOrder(WINDOW)
     assert order.restart() == []
