@@ -20,7 +20,8 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.recording import bag
 from l2lidar_node.settings import build
 from l2lidar_node.types import ImuSample, Sweep
-from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
+from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording.bag import points_of, stamp_of
 from l2lidar_proc.verbs.deskew import deskew_recording
 from l2lidar_proc.verbs.odometry import run_bag

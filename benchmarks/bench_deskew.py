@@ -22,10 +22,12 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
 from l2lidar_node.types import HostNs
-from l2lidar_proc.config import MotionConfig, OdometryConfig, ProcConfig
+from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
+from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.tracker import MotionTracker
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
 from tests.support import odometry_runs
 from tests.support.deskew_scenarios import Recording, Scenario, TrueSweep, record, stamp

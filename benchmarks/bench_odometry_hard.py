@@ -27,7 +27,7 @@ from benchmarks.hard_scenarios import FAMILIES, SHORT, scenario
 from benchmarks.hard_scores import Track, score
 from benchmarks.odometry_plan import Rows
 from benchmarks.results import FOLDER, Target, at_least, at_most, keep
-from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.plain import PlainOdometry
 

@@ -17,7 +17,7 @@ from l2lidar_node.calibration.scale import by_tape
 from l2lidar_node.calibration.still import calibrate
 from l2lidar_node.cli.virtual_places import slide, still_places
 from l2lidar_node.types import Sweep
-from l2lidar_proc.config import ImuConfig
+from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.odometry import imu_calibration
 from tests.support import odometry_runs

@@ -63,7 +63,8 @@ from l2lidar_node.demo.processes import (
 from l2lidar_node.ros.conversions import to_cloud, to_time
 from l2lidar_node.settings import Setting, settings_of
 from l2lidar_node.types import HostNs
-from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
+from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.slam.config import SlamNodeConfig
 from tests.support.cpu import resident_mb
 from tests.support.odometry_runs import Run, record, sweeps

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, HostNs, Sweep
-from l2lidar_proc.config import DeskewConfig, OdometryConfig, ProcConfig
+from l2lidar_proc.deskew.config import DeskewConfig, ProcConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.kiss import PlainKiss
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.plain import PlainOdometry

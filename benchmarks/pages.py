@@ -11,7 +11,8 @@ from typing import Final
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import markdown_table
-from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
+from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.slam.config import SlamNodeConfig
 
 PAGE: Final = Path(__file__).parents[1] / "docs" / "parameters.md"

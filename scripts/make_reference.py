@@ -12,7 +12,8 @@ from pathlib import Path
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import Setting, settings_of
-from l2lidar_proc.config import DeskewNodeConfig, OdometryNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
+from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.slam.config import SlamNodeConfig
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,7 +23,7 @@ from l2lidar_node.config import DriverConfig, FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.ros.parameter_files import parameters_by_node, parameters_for
 from l2lidar_node.settings import build, settings_of
-from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 

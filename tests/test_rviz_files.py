@@ -12,7 +12,8 @@ import yaml
 from l2lidar_node.config import FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.types import POINT
-from l2lidar_proc.config import DeskewTopics, OdometryTopics
+from l2lidar_proc.deskew.config import DeskewTopics
+from l2lidar_proc.odometry.config import OdometryTopics
 from l2lidar_proc.slam.config import SlamTopics
 
 LAYOUTS = Path(__file__).resolve().parent.parent / "rviz"

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc.config import FilterConfig
+from l2lidar_proc.deskew.config import FilterConfig
 
 Points = NDArray[np.void]
 Mask = NDArray[np.bool_]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import F32, F64
-from l2lidar_proc.config import ScanConfig
+from l2lidar_proc.deskew.config import ScanConfig
 
 _STEEP: Final = 0.9  # cosine between x and the vertical from which on z gives the heading
 _MARGIN_M: Final = 0.5  # around the slice: what may move into it while the sensor tilts

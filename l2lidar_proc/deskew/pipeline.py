@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.cloud import without_time
-from l2lidar_proc.config import ProcConfig
 from l2lidar_proc.deskew import filters
+from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.filters import FilterError
 from l2lidar_proc.deskew.organise import organise

@@ -11,7 +11,7 @@ from l2lidar_node import rotations
 from l2lidar_node.calibration.file import CalibrationFileError, load
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64
-from l2lidar_proc.config import ImuConfig
+from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import unmixing
 from l2lidar_proc.motion.imu_buffer import Samples, earlier
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.config import MotionConfig
+from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.preintegration import coverage
 from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory, still_trajectory

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_proc import tuning
-from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion.filter import POSE, InertialState, update_with_information
+from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import (
     Correspondences,
     Source,

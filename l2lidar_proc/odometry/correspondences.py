@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_proc import tuning
-from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
     ERRORS,
@@ -25,6 +24,7 @@ from l2lidar_proc.motion.filter import (
     VELOCITY,
     InertialState,
 )
+from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 F64 = NDArray[np.float64]

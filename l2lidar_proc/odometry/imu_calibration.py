@@ -16,11 +16,12 @@ from l2lidar_node import rotations
 from l2lidar_node.calibration.file import ImuCalibration
 from l2lidar_node.calibration.result import Estimate, Refusal, Verdict
 from l2lidar_node.types import F64, Sweep
-from l2lidar_proc.config import ImuConfig, OdometryConfig
 from l2lidar_proc.motion import gyro_alignment as gyro
+from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import GyroAlignment, GyroError, GyroModel, Turns
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 

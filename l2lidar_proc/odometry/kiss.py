@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig
 
 if TYPE_CHECKING:
     from kiss_icp.config import KISSConfig

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.filter import (
     POSITION,
@@ -22,6 +21,7 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment, align
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import (
     AlignmentQuality,

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry.frame_jump import FrameJump

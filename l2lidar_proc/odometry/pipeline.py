@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_convention import ImuConvention
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.motion.sweep_trajectory import still_trajectory
 from l2lidar_proc.motion.tracker import KnownMotion
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck
 from l2lidar_proc.odometry.odometry import Odometry, Phase

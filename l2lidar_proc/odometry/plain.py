@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry.kiss import LEAST_POINTS, PlainKiss
 

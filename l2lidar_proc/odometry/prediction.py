@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import GYRO_BIAS, VELOCITY, InertialState, Noise
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.static import white_noise
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
 from l2lidar_proc.motion.tracker import turned
+from l2lidar_proc.odometry.config import OdometryConfig
 
 F64 = NDArray[np.float64]
 

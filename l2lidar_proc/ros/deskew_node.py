@@ -25,8 +25,8 @@ from l2lidar_node.ros.program import run
 from l2lidar_node.ros.static_frames import StaticFrames, untied
 from l2lidar_node.types import HostNs, Level, Sweep, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, without_time
-from l2lidar_proc.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew import report
+from l2lidar_proc.deskew.config import AS_INPUT, DeskewNodeConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, carried_over

@@ -29,12 +29,13 @@ from l2lidar_node.ros.static_frames import StaticFrames, untied
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc.cloud import CloudError
-from l2lidar_proc.config import DeskewTopics, OdometryNodeConfig, OdometryTopics
+from l2lidar_proc.deskew.config import DeskewTopics
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline

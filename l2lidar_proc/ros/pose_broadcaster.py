@@ -16,9 +16,9 @@ from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc.config import OdometryTopics
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.config import OdometryTopics
 from l2lidar_proc.odometry.dead_reckoning import DeadReckoning
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.ros import odometry_messages as messages

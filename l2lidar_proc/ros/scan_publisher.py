@@ -12,7 +12,7 @@ from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.ros.static_frames import StaticFrames
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc.config import ScanConfig
+from l2lidar_proc.deskew.config import ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
 from l2lidar_proc.deskew.pipeline import Deskewed
 from l2lidar_proc.motion.tracker import MotionTracker

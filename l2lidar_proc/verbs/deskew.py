@@ -14,9 +14,10 @@ from l2lidar_node.frames import FrameTree
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.types import is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
-from l2lidar_proc.config import DeskewNodeConfig, OdometryConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
 from l2lidar_proc.motion.tracker import carried_over
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError

@@ -87,7 +87,7 @@ def test_an_installed_program_ends_so_too(entry: str) -> None:
 
 def test_importing_the_package_leaves_the_handler_of_others_alone() -> None:
     code = (
-        "import signal, l2lidar_node, l2lidar_proc.config\n"
+        "import signal, l2lidar_node, l2lidar_proc.deskew.config\n"
         "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

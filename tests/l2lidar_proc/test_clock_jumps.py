@@ -9,9 +9,10 @@ import numpy as np
 from hypothesis import example, given, settings, strategies as st
 
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc.config import OdometryConfig, ProcConfig
+from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.motion.tracker import Flag
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, seen
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording

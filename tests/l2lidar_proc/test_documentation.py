@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from l2lidar_node.settings import settings_of
-from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
-from l2lidar_proc.config import ProcConfig
+from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, seen
 

@@ -16,7 +16,7 @@ from l2lidar_node.check.requirements import Finding, worst
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import build, settings_of
 from l2lidar_node.types import Level
-from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
 from tests.l2lidar_node.check.defects import DEFECTS, Defect, damaged
 from tests.l2lidar_node.check.recordings import cloud, copied, good, points_of, stamp_of
 

@@ -5,7 +5,7 @@ import pytest
 
 from l2lidar_node.ros.parameter_files import parameters_by_node, parameters_for, settings_for
 from l2lidar_node.settings import SettingError
-from l2lidar_proc.config import OdometryTopics
+from l2lidar_proc.odometry.config import OdometryTopics
 
 FILE = """
 /**:

@@ -10,8 +10,8 @@ import pytest
 
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import POINT
-from l2lidar_proc.config import FILTERS, FilterConfig
 from l2lidar_proc.deskew import filters
+from l2lidar_proc.deskew.config import FILTERS, FilterConfig
 from l2lidar_proc.deskew.filters import FilterError, slot_time
 
 RNG = np.random.default_rng(8)

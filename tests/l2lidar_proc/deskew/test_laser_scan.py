@@ -9,8 +9,9 @@ from hypothesis import given, strategies as st
 from l2lidar_node import rotations
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, POINT
-from l2lidar_proc.config import MotionConfig, ScanConfig
+from l2lidar_proc.deskew.config import ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation, slice_of
+from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.tracker import MotionTracker
 from tests.l2lidar_proc.motion.analytic import T_CLOUD_IMU, Motion, at
 

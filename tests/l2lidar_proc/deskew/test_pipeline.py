@@ -9,7 +9,7 @@ import pytest
 
 from l2lidar_node.settings import build
 from l2lidar_node.types import POINT, HostNs, Sweep
-from l2lidar_proc.config import ProcConfig
+from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.motion.tracker import Flag
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, noisy, rms, seen, xyz

@@ -12,8 +12,9 @@ from l2lidar_node import rotations
 from l2lidar_node.calibration.file import CalibrationFile, ImuCalibration
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import IMU_SAMPLE
-from l2lidar_proc.config import ImuConfig, MotionConfig, OdometryTopics
+from l2lidar_proc.motion.config import ImuConfig, MotionConfig
 from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.odometry.config import OdometryTopics
 
 IMU = ImuCalibration(
     (0.01, -0.02, 0.03), 0.002, (0.1, 0.0, 0.0), (0.01, 0.0, -0.01), (0.0, 0.002, 0.0)

@@ -13,8 +13,8 @@ from l2lidar_node import rotations
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import HostNs
-from l2lidar_proc.config import MotionConfig
 from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.tracker import Flag, MotionTracker, carried_over
 from tests.l2lidar_proc.motion.analytic import (
     EPOCH,

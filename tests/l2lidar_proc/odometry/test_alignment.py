@@ -7,10 +7,10 @@ import pytest
 
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.odometry.alignment import align
+from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from tests.l2lidar_proc.odometry.odometry_world import drive, errors, recording

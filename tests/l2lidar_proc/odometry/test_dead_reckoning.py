@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
-from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.dead_reckoning import LONGEST_NS, DeadReckoning
 from l2lidar_proc.odometry.odometry import Odometry
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording

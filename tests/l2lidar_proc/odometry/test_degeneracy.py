@@ -8,10 +8,10 @@ import pytest
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.config import SurfaceConfig
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.odometry.alignment import Alignment, align
+from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import (
     Source,
     correspondences,

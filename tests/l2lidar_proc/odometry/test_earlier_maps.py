@@ -7,8 +7,8 @@ import numpy as np
 from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.config import OdometryConfig
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState, with_loose_pose
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, moved
 from l2lidar_proc.odometry.frame_jump import FrameJump
 from l2lidar_proc.odometry.matcher import SweepMatcher

@@ -13,7 +13,7 @@ from l2lidar_node.emulator.unit.inertial import Inertial
 from l2lidar_node.emulator.unit.units import unit
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.types import F64, IMU_SAMPLE
-from l2lidar_proc.config import ImuConfig
+from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck

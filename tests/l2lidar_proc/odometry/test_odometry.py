@@ -11,7 +11,7 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_node.types import POINT, HostNs, Sweep
-from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording

@@ -11,9 +11,9 @@ import pytest
 from l2lidar_node import rotations
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import POINT, HostNs, Sweep
-from l2lidar_proc.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.motion.filter import ERRORS, InertialState
 from l2lidar_proc.odometry.base_frame import BaseFrame
+from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.kiss import thinned_indices
 from l2lidar_proc.odometry.matcher import SweepMatcher

@@ -11,10 +11,10 @@ import pytest
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
 from l2lidar_proc.motion.initialization import initial_state
 from l2lidar_proc.odometry.alignment import align
+from l2lidar_proc.odometry.config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.matcher import SweepMatcher, xyz

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.plain import PlainOdometry
 from tests.l2lidar_proc.odometry.odometry_world import recording

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import POINT
-from l2lidar_proc.config import FilterConfig
 from l2lidar_proc.deskew import filters
+from l2lidar_proc.deskew.config import FilterConfig
 from l2lidar_proc.deskew.organise import organise
 
 FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
-from l2lidar_proc.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive

@@ -13,7 +13,7 @@ rclpy = pytest.importorskip("rclpy")
 from rclpy.parameter import Parameter  # noqa: E402  after importorskip
 
 from l2lidar_node.settings import SettingError, build  # noqa: E402
-from l2lidar_proc.config import OdometryNodeConfig  # noqa: E402
+from l2lidar_proc.odometry.config import OdometryNodeConfig  # noqa: E402
 from tests.l2lidar_proc.odometry.odometry_world import recording  # noqa: E402
 from tests.l2lidar_proc.ros.test_odometry_node import OdometryBench  # noqa: E402
 from tests.support.odometry_runs import sweeps  # noqa: E402

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.settings import build
 from l2lidar_node.types import POINT, HostNs
-from l2lidar_proc.config import DeskewNodeConfig
+from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
 from l2lidar_proc.verbs.deskew import deskew_recording

@@ -10,7 +10,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.types import Sweep
-from l2lidar_proc.config import OdometryNodeConfig
+from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
 from l2lidar_proc.verbs.odometry import run_bag, run_events

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_proc.config import OdometryNodeConfig
+from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.verbs.odometry import OdometryRun, run_bag
 from tests.support.foreign_bags import (
