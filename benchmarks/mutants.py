@@ -386,6 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if before is None or not (before["killed"] or _is_settled(before, calls, stage)):
                 expected = (calls[test].seconds if test in calls else SLOWEST_S for test in tests)
                 todo.append((row, mutant, tests, sum(expected)))
+        todo.sort(key=lambda item: kept.key_of(item[0]) in judged)  # new ones first
         judge(todo, kept, given.jobs, until)
     found = {kept.key_of(row): row for row in kept.read()}
     wanted = [kept.key_of(_row(mutant, [])) for mutant in chosen]
