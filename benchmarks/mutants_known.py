@@ -174,10 +174,6 @@ REASONS: Final[dict[tuple[str, str], str]] = {
         "tuning.COVARIANCE_STEPS + 1 -> tuning.COVARIANCE_STEPS - 1",
     ): "a tuned number of steps of the same integral: two less do as well",
     (
-        "l2lidar_proc/motion/initialization.py",
-        "both = np.zeros((ERRORS, 2)): 2 -> 3",
-    ): "a column of zeros adds nothing to the covariance",
-    (
         "l2lidar_proc/motion/filter.py",
         "noise = np.array([[(tuning.SPEED_BOUND_SHARE * max_speed) ** 2]]): 2 -> 3",
     ): "2 % of the bound, beside an excess of several times the bound, is nothing either way",
