@@ -4,9 +4,8 @@ RUN := .venv/bin/python
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 CORES := $(shell nproc)
-# Tests wait for units and nodes a good part of the time: one process more than there are cores.
-# More than four find too little to do.
-WORKERS := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
+# A process for every core; more than four find too little to do.
+WORKERS := -n logical --maxprocesses 4
 BENCH_ARGS ?=
 
 BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))
