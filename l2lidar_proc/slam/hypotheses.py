@@ -34,12 +34,7 @@ _HOPELESS: Final = 0.16  # contradicted more than this, a place is not followed
 _UNKNOWN: Final = 0.25  # what a look counts that does not overlap, or leads elsewhere
 _LEFT: Final = (np.radians(5.0), 0.5)  # [rad, m] from where the odometry says, it leads elsewhere
 _SAME: Final = (np.radians(4.0), 0.5)  # [rad, m] places closer than this are one
-# A rival has to be contradicted by so much more than the best place, over the looks. Tuned on: the
-# furnished office and the ring of equal doors, six starts each: a turn by 180 degrees differs by
-# 0.013 to 0.044 in the one, by 0.007 at most (0.72 of it) in the other.
 _NOISE: Final = 0.005  # contradicts every place, and more or less by chance
-_ALIKE: Final = 0.6  # ratio of the contradictions above which two places are not told apart
-_EXCESS: Final = 0.012  # difference below which they are not
 _EXCEPTIONS: Final = 4  # one look of so many may speak for the rival
 _WINDOW: Final = Window(1.0, 0.4, np.radians(4.0))  # around a place, searched before it is told
 
@@ -210,7 +205,8 @@ class PlaceHypotheses:
         excess = np.array([rival.against[n] - best.against[n] for n in looks])
         ratio = (best.contradiction + _NOISE) / (rival.contradiction + _NOISE)
         return bool(
-            ratio > self._config.max_second_best or (excess <= 0.0).sum() > len(looks) // 4
+            ratio > self._config.max_second_best
+            or (excess <= 0.0).sum() > len(looks) // _EXCEPTIONS
         )
 
 
