@@ -25,6 +25,13 @@ AHEAD_NS: Final = 2_000_000_000
 Dead reckoning ends 1 s after a sweep, whose message is some 0.3 s old when it comes.
 """
 
+FARTHEST_NS: Final = 10_000_000_000
+"""How far transforms from the odometry frame may be ahead of its newest message [ns].
+
+The IMU carries them on while the sweeps of a busy machine wait. tf2 keeps 10 s; what is farther
+ahead is of another clock.
+"""
+
 _OTHER_PARENT_S: Final = 3.0  # for which one message makes another parent be believed in
 _SAME_TIME_NS: Final = 2_000_000_000  # a stamp that goes back by more begins a new time line
 
@@ -113,11 +120,10 @@ def reach(stamp: HostNs, waited_ns: int, transforms_until: int) -> int:
     waited_ns : int
         How long ago that came.
     transforms_until : int
-        Stamp of the newest transform from the odometry frame to the body, 0 if there is none;
-        one that is much later than the odometry is of another clock.
+        Stamp of the newest transform from the odometry frame to the body, 0 if there is none.
     """
     carried = stamp + min(waited_ns, AHEAD_NS)
-    if transforms_until <= stamp + AHEAD_NS:
+    if transforms_until <= stamp + FARTHEST_NS:
         return max(carried, transforms_until)
     return carried
 

@@ -28,7 +28,7 @@ from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.types import F64, HostNs, is_ros_time
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
-from l2lidar_proc.ros.map_transform import AHEAD_NS, MapTransform
+from l2lidar_proc.ros.map_transform import FARTHEST_NS, MapTransform
 from l2lidar_proc.ros.slam_worker import Answer, SlamWorker, values_of
 from l2lidar_proc.slam.atlas import AtlasError
 from l2lidar_proc.slam.config import SlamNodeConfig
@@ -36,7 +36,7 @@ from l2lidar_proc.slam.nodes import Health, Keyframe, Map, OdometrySweep, SlamSt
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 
 _FARTHEST_M: Final = 1e6  # from the origin; no odometry goes so far
-_LATER_NS: Final = 2 * AHEAD_NS  # than a pose that the transform is stamped, at most
+_LATER_NS: Final = 2 * FARTHEST_NS  # than a pose that the transform is stamped, at most
 _PENDING: Final = 40  # stamps that wait for their other messages
 _SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
 _LEVELS: Final = {

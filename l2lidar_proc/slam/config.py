@@ -156,8 +156,9 @@ class SlamTopics:
         30.0, "rate of the transform and of the pose", unit="Hz", lo=1.0, hi=100.0
     )
     transform_tolerance: float = setting(
-        0.2,
-        "how far ahead of the newest odometry the transform is stamped, as AMCL does",
+        0.5,
+        "how far ahead of the newest odometry the transform is stamped; a correction reaches "
+        "others so much later (AMCL's own default is 1 s)",
         unit="s",
         lo=0.0,
         hi=2.0,

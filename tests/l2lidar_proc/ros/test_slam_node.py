@@ -145,7 +145,7 @@ def test_a_walk_becomes_a_map_that_is_saved_and_shown(
         stamps = [from_time(t.header.stamp) for t in bench.transforms]
         assert len(stamps) > 10
         assert np.all(np.diff(stamps) > 0)
-        assert stamps[0] >= some[0].stamp + 200_000_000  # transform_tolerance
+        assert stamps[0] >= some[0].stamp + 500_000_000  # transform_tolerance
         assert from_time(bench.paths[-1].header.stamp) in {sweep.stamp for sweep in some}
         assert {t.child_frame_id for t in bench.transforms} == {"odom"}
         assert len(bench.maps[-1].data) > 10_000
@@ -225,6 +225,7 @@ def test_the_map_stays_while_it_localizes_and_grows_again_afterwards(
         (0.0, 0.0, 100.0),  # there are none
         (0.1, 100.05, 100.1),
         (0.1, 100.3, 100.3),  # dead reckoning is ahead
+        (0.1, 106.0, 106.0),  # sweeps wait on a busy machine, the IMU carries the pose on
         (5.0, 100.3, 102.0),  # the odometry has stopped
         (0.1, 200.0, 100.1),  # another clock
     ],
