@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 import numpy as np
@@ -35,7 +36,6 @@ from l2lidar_node.demo.processes import Programs, isolate_ros
 from l2lidar_proc.ros.intake import NeverExecuted, waiting
 
 LAYOUTS: Final = Path(__file__).resolve().parent.parent / "rviz"
-SLAM: Final = "l2lidar_proc.ros.slam_node"
 _CACHE_NS: Final = 10 * 10**9  # what tf2's buffer keeps
 _QUEUE: Final = 1000  # of the listener, 20 s of transforms
 _PACKAGES: Final = {
@@ -261,16 +261,16 @@ def main(
     rclpy.init()
     nodes = [chain.DRIVER, chain.COMPANION]
     if find_spec("gtsam"):
-        nodes.append(SLAM)
+        nodes.append(chain.SLAM)
     # LIO-SAM's own nodes are not here.
     asked = [display for display in displays() if not display.topic.startswith("/lio_sam/")]
     watch = LayoutWatch(asked)
     start = TopicWatch([CLOUDS], name="start")
     try:
-        with Programs() as programs:
+        with TemporaryDirectory() as folder, Programs() as programs:
             watch.put_on_robot()
             unit = ["--ready", "--world", world, "--motion", motion]
-            chain.start(programs, unit, None, nodes, robot.BASE_FRAME)
+            chain.start(programs, unit, None, nodes, robot.BASE_FRAME, folder)
             start.until(lambda: len(start.seen(CLOUDS)) > 0, programs, "no clouds came")
             start.spin_with(watch)
             start.watch(seconds)
@@ -291,7 +291,7 @@ def main(
 
 def _comes(display: Display, nodes: list[str]) -> bool:
     """Return whether a display's topic is published while a sensor moves."""
-    return SLAM in nodes or display.layout != "map.rviz"
+    return chain.SLAM in nodes or display.layout != "map.rviz"
 
 
 if __name__ == "__main__":

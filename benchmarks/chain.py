@@ -13,6 +13,7 @@ DRIVER: Final = "l2lidar_node.ros.driver_node"
 DESKEW: Final = "l2lidar_proc.ros.deskew_node"
 ODOMETRY: Final = "l2lidar_proc.ros.odometry_node"
 COMPANION: Final = "l2lidar_proc.ros.companion_node"  # both in one process, as launched
+SLAM: Final = "l2lidar_proc.ros.slam_node"
 
 
 def start(
@@ -21,6 +22,7 @@ def start(
     values: Mapping[str, object] | None = None,
     nodes: Sequence[str] = (DRIVER, COMPANION),
     base_frame: str | None = None,
+    data_dir: str | None = None,
 ) -> dict[str, Program]:
     """Start the nodes that there are and then a unit; return them by name.
 
@@ -35,6 +37,8 @@ def start(
         Modules.
     base_frame : str, optional
         Of the odometry in the companion, for a sensor on a robot.
+    data_dir : str, optional
+        Where slam_node saves its map, if it is among the modules.
     """
     host_port, lidar_port = free_udp_ports(2)
     parameters = {
@@ -45,6 +49,8 @@ def start(
     arguments = {DRIVER: assigned(parameters)}
     if base_frame is not None:
         arguments[COMPANION] = assigned({"odometry_node:base_frame": base_frame})
+    if data_dir is not None:
+        arguments[SLAM] = assigned({"data_dir": data_dir})
     started = {
         module.rpartition(".")[2]: programs.start(module, arguments.get(module, []))
         for module in nodes

@@ -6,6 +6,10 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
+
+DATA_DIR: Final = "~/.ros/l2lidar"
+"""Folder of what services write, where the user names no other."""
 
 
 def free_name(path: Path) -> Path:

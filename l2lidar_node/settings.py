@@ -54,6 +54,8 @@ FILE_NAME: Final = Form(
 )
 """For files inside one folder: anybody in the ROS domain can set such a parameter."""
 
+FOLDER: Final = Form(re.compile(r".*\S.*", re.DOTALL), "a folder", "its path")
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:

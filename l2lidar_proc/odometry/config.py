@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from l2lidar_node.config import LifecycleConfig
-from l2lidar_node.settings import FILE_NAME, FRAME, TOPIC, SettingError, setting
+from l2lidar_node.files import DATA_DIR
+from l2lidar_node.settings import FILE_NAME, FOLDER, FRAME, TOPIC, SettingError, setting
 from l2lidar_proc.motion.config import ImuConfig
 
 
@@ -268,7 +269,7 @@ class DataConfig:
     """Files that services write, all of them in one folder."""
 
     data_dir: str = setting(
-        "~/.ros/l2lidar", "folder for the files of services; nothing is written outside it"
+        DATA_DIR, "folder for the files of services; nothing is written outside it", form=FOLDER
     )
     overwrite: bool = setting(False, "let services replace files that exist")
     map_file: str = setting(
@@ -282,8 +283,6 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         """Check the suffixes, which name the formats."""
-        if not self.data_dir.strip():
-            raise SettingError("parameter 'data_dir': '' is not a folder, expected its path")
         if not self.map_file.endswith((".ply", ".pcd")):
             raise SettingError(
                 f"parameter 'map_file': '{self.map_file}' is not valid; expected .ply or .pcd"

@@ -77,6 +77,7 @@ class SlamWorker:
         self.dropped = self.failures = self.saved_bytes = 0
         self._given = False
         self._writer: AtlasWriter | None = None
+        self._ours: set[Path] = set()  # maps that came from this node or went into it
         self._changed = False
         saved = None
         if config.topics.load_map or self._is_localizing:
@@ -152,6 +153,7 @@ class SlamWorker:
         try:
             folder = self.folder
             if self._writer is None or self._writer.folder != folder:
+                self._keep_foreign(folder)
                 self._writer = AtlasWriter(folder)
             self.saved_bytes = self._writer.save(built)
         except AtlasError as error:
@@ -179,6 +181,8 @@ class SlamWorker:
 
     def reset(self) -> Answer:
         """Begin anew: with an empty map, or in localization mode with the one that was loaded."""
+        if not self._is_localizing and self._map is not None:
+            self._ours.discard(self.folder)  # what was loaded is not to be lost
         self._begin(self._map if self._is_localizing else None)
         return True, "begun anew"
 
@@ -250,8 +254,15 @@ class SlamWorker:
             self._engine.set_pose(x, y, float(np.radians(degrees)))
         self._publish()
 
+    def _keep_foreign(self, folder: Path) -> None:
+        """Give another name to a map that this node neither loaded nor saved."""
+        if folder not in self._ours and (aside := atlas.set_aside(folder)):
+            self._warn(f"the map that was in {folder} is now {aside}")
+        self._ours.add(folder)
+
     def _load(self) -> Map:
         saved, warnings = atlas.load(self.folder)
+        self._ours.add(self.folder)
         for warning in warnings:
             self._warn(warning)
         return saved

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.files import write_whole
+from l2lidar_node.files import free_name, write_whole
 from l2lidar_node.types import HostNs
 from l2lidar_proc.recording.trajectory import STAMPED_POSE
 from l2lidar_proc.slam.nodes import Map, Node
@@ -119,6 +119,25 @@ class AtlasWriter:
         if not (self.folder / name).exists():
             write_whole(self.folder / name, content)
         return name
+
+
+def set_aside(folder: Path) -> Path | None:
+    """Give a saved map another name, ``-1`` added; return where it is now, None if there is none.
+
+    Raises
+    ------
+    AtlasError
+        If the folder cannot be renamed.
+    """
+    if not (folder / MANIFEST).exists():
+        return None
+    aside = free_name(folder)
+    try:
+        folder.rename(aside)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise AtlasError(f"{folder}: the map cannot be renamed to {aside}: {reason}") from None
+    return aside
 
 
 def load(folder: Path) -> tuple[Map, list[str]]:

@@ -6,7 +6,8 @@ import re
 from dataclasses import dataclass, field
 
 from l2lidar_node.config import LifecycleConfig
-from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
+from l2lidar_node.files import DATA_DIR
+from l2lidar_node.settings import FOLDER, FRAME, TOPIC, SettingError, setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,7 +175,11 @@ class SlamTopics:
     map_period_s: float = setting(
         5.0, "time between publications of map and path, 0 = none", unit="s", lo=0.0, hi=3600.0
     )
-    data_dir: str = setting("maps", "folder in which maps are saved and looked for")
+    data_dir: str = setting(
+        DATA_DIR,
+        "folder in which maps are saved and looked for; nothing is written outside it",
+        form=FOLDER,
+    )
     map_name: str = setting("map", "folder of the map within data_dir", live=True)
     load_map: bool = setting(False, "begin with the saved map")
     autosave_s: float = setting(

@@ -33,7 +33,9 @@ from l2lidar_node.types import HostNs  # noqa: E402
 from l2lidar_proc.ros import odometry_messages as messages  # noqa: E402
 from l2lidar_proc.ros.map_transform import Blend, reach  # noqa: E402
 from l2lidar_proc.ros.slam_node import SlamNode, _sweep  # noqa: E402
+from l2lidar_proc.ros.slam_worker import SlamWorker  # noqa: E402
 from l2lidar_proc.slam import atlas, se3  # noqa: E402
+from l2lidar_proc.slam.config import SlamNodeConfig, SlamTopics  # noqa: E402
 from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState  # noqa: E402
 from l2lidar_proc.slam.slam import Slam  # noqa: E402
 from tests.l2lidar_proc.conftest import STEP  # noqa: E402
@@ -320,6 +322,31 @@ def test_an_error_of_the_worker_is_answered_and_counted(
         assert {v.key: v.value for v in said.values}["internal errors"] == "1"
     finally:
         bench.close()
+
+
+@pytest.mark.parametrize("load_map", [False, True])
+def test_a_new_map_takes_the_name_of_an_old_one_but_not_its_place(
+    office: MappingRun, mapped: Slam, tmp_path: Path, load_map: bool
+) -> None:
+    atlas.AtlasWriter(tmp_path / "map").save(mapped.map())
+    topics = SlamTopics(data_dir=str(tmp_path), load_map=load_map)
+    said: list[str] = []
+    worker = SlamWorker(SlamNodeConfig(topics=topics), said.append, lambda keyframe: None)
+    try:
+        for sweep in sweeps_of(office)[:30]:
+            worker._add(sweep)
+        assert worker.save()[0]
+        assert worker.reset()[0]
+        for sweep in sweeps_of(office)[:30]:
+            worker._add(sweep)
+        assert worker.save()[0]  # what it saved itself it replaces
+    finally:
+        worker.close()
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map", "map-1"]
+    assert said == [f"the map that was in {tmp_path}/map is now {tmp_path}/map-1"]
+    assert len(atlas.load(tmp_path / "map")[0].nodes) < len(mapped.nodes)
+    assert len(atlas.load(tmp_path / "map-1")[0].nodes) >= len(mapped.nodes)
 
 
 def test_a_transition_waits_for_the_answers_that_are_under_way(tmp_path: Path) -> None:
