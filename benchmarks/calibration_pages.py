@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.results import Target, machine, replaced
+from benchmarks.results import Target, measured_on, replaced, verdicts
 
 PAGE: Final = Path("docs") / "results" / "calibration.md"
 ODOMETRY: Final = Path("docs") / "odometry.md"
@@ -24,16 +24,16 @@ Row = dict[str, Any]
 
 def write(rows: list[Row], targets: list[Target]) -> Path:
     """Write the page; return its path."""
-    facts = machine()
     parts = [
         _HEAD,
-        _targets(targets),
+        "## Targets",
+        verdicts(targets),
         "## Beams",
         table(rows),
         *_words(rows, "imu", "IMU: what is left, and its deviation"),
         "[Odometry](../odometry.md#units-that-are-not-perfect) and "
         "[deskew](../deskew.md#what-it-achieves) have what calibration is worth to them.",
-        f"Measured with Python {facts['python']}.",
+        measured_on(),
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
@@ -66,16 +66,6 @@ def write_odometry(rows: Iterable[Row], methods: Sequence[str]) -> None:
         lines.append(f"| {name} | {' | '.join(cells)} | {len(mine)} |")
     text = ODOMETRY.read_text(encoding="utf-8")
     ODOMETRY.write_text(replaced(text, "units", "\n".join(lines)), encoding="utf-8")
-
-
-def _targets(targets: list[Target]) -> str:
-    lines = ["## Targets", "", "| Target | Measured | Bound | |", "|---|---|---|---|"]
-    lines += [
-        f"| {item.name.replace('|', chr(92) + '|')} | {item.value:.3g} | {item.bound:.3g} | "
-        f"{'met' if item.met else '**not met**'} |"
-        for item in targets
-    ]
-    return "\n".join(lines)
 
 
 def _words(rows: Iterable[Row], kind: str, title: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.results import Target, machine
+from benchmarks.results import Target, measured_on, table, verdicts
 
 PAGE: Final = Path("docs") / "results" / "clock.md"
 _HEAD: Final = """# Error of the stamps
@@ -48,16 +48,15 @@ def write(rows: list[Row], found: list[Target], loaded: list[Row], under: list[T
     loaded, under
         Every run under load, and the targets of them all.
     """
-    facts = machine()
     parts = [
         _HEAD,
         _ROWS,
         _table(rows),
-        _targets(found),
+        verdicts(found),
         _LOADS,
         _load_table(loaded),
-        _targets(under),
-        f"Computed on {facts['processor']}, Python {facts['python']}.",
+        verdicts(under),
+        measured_on(),
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
@@ -86,7 +85,7 @@ def _table(rows: list[Row]) -> str:
         ]
         for row in rows
     ]
-    return _lines(heads, cells)
+    return table(heads, cells)
 
 
 def _load_table(loaded: list[Row]) -> str:
@@ -99,22 +98,4 @@ def _load_table(loaded: list[Row]) -> str:
         figures = [f"{value:.3f}" for value in most.values()]
         cells.append([name, str(len(mine)), *figures, str(sum(row["held"] for row in mine))])
     heads = ["load", "seeds", "path", "during", "unsaid", "after, p99", "after, max", "held"]
-    return _lines(heads, cells)
-
-
-def _lines(heads: list[str], rows: list[list[str]]) -> str:
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(cells) + " |" for cells in rows])
-
-
-def _targets(targets: list[Target]) -> str:
-    rows = [
-        [
-            target.name,
-            f"{target.value:.4g}",
-            f"{target.bound:g}",
-            "yes" if target.met else "**no**",
-        ]
-        for target in targets
-    ]
-    return _lines(["target", "value", "bound", "met"], rows)
+    return table(heads, cells)

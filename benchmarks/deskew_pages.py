@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks.results import Target, machine, replaced
+from benchmarks.results import Target, machine, replaced, table, verdicts
 from l2lidar_node.types import F64
 
 PAGE: Final = Path("docs") / "deskew.md"
@@ -40,7 +40,7 @@ def write(
     """
     text = PAGE.read_text(encoding="utf-8")
     text = replaced(text, "errors", _errors(rows))
-    text = replaced(text, "targets", _targets(targets))
+    text = replaced(text, "targets", verdicts(targets))
     text = replaced(text, "costs", _costs(costs))
     text = replaced(text, "real", _real(real))
     PAGE.write_text(text, encoding="utf-8")
@@ -50,18 +50,12 @@ def write(
 def write_units(rows: Sequence[dict[str, Any]]) -> None:
     """Replace the table of how thick walls are [mm], by unit and method."""
     methods = [name for name, value in rows[0].items() if isinstance(value, float)]
-    table = _table(
+    walls = table(
         ["walls [mm]", *methods],
         ([row["scenario"], *(f"{row[name]:.1f}" for name in methods)] for row in rows),
     )
     text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(replaced(text, "units", table), encoding="utf-8")
-
-
-def _table(heading: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    lines = [list(heading), *(list(row) for row in rows)]
-    lines.insert(1, ["---", *["---:"] * (len(lines[0]) - 1)])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    PAGE.write_text(replaced(text, "units", walls), encoding="utf-8")
 
 
 def _errors(rows: Sequence[dict[str, Any]]) -> str:
@@ -72,28 +66,18 @@ def _errors(rows: Sequence[dict[str, Any]]) -> str:
         if row["figure"] == "RMS":
             pairs = (f"{row[m]:.1f} / {far[row['scenario']][m]:.1f}" for m in methods)
             lines.append([row["scenario"], *pairs])
-    return _table(["RMS / p95 [mm]", *methods], lines)
-
-
-def _targets(targets: Sequence[Target]) -> str:
-    return _table(
-        ["target", "measured", "bound", ""],
-        (
-            [item.name, f"{item.value:.3g}", f"{item.bound:g}", "met" if item.met else "not met"]
-            for item in targets
-        ),
-    )
+    return table(["RMS / p95 [mm]", *methods], lines)
 
 
 def _costs(costs: dict[str, float]) -> str:
     rows = [[name, f"{value:.2f}"] for name, value in costs.items() if name != "points"]
-    table = _table([f"{costs['points']:.0f} points on one core", "ms"], rows)
-    return f"{table}\n\nMeasured on one core of an {machine()['processor']}, the best of 100."
+    times = table([f"{costs['points']:.0f} points on one core", "ms"], rows)
+    return f"{times}\n\nMeasured on one core of an {machine()['processor']}, the best of 100."
 
 
 def _real(real: Sequence[tuple[str, float, float, float]]) -> str:
     rows = [[n, f"{a:.0f}", f"{b:.1f}", f"{c:.0f}"] for n, a, b, c in real]
-    return _table(["median error [mm]", "raw", "ours", "constant rate and velocity"], rows)
+    return table(["median error [mm]", "raw", "ours", "constant rate and velocity"], rows)
 
 
 def _draw(clouds: dict[str, F64]) -> None:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.results import Target, machine
+from benchmarks.results import Target, measured_on, verdicts
 
 PAGE: Final = Path("docs") / "results" / "odometry_hard.md"
 _OURS: Final = "ours"
@@ -28,15 +28,15 @@ Row = dict[str, Any]
 
 def write(rows: list[Row], targets: list[Target]) -> Path:
     """Write the page; return its path."""
-    facts = machine()
     parts = [
         _HEAD,
         _setting(rows),
         _accuracy(rows),
         _consistency(rows),
-        _targets(targets),
+        "## Targets",
+        verdicts(targets),
         _failures(rows),
-        f"Measured on {facts['processor']}, {facts['cores']} cores, Python {facts['python']}.",
+        measured_on(),
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
@@ -108,14 +108,6 @@ def _consistency(rows: list[Row]) -> str:
             f" | {max(row['sigmas'] for row in found):.1f}"
             f" | {shares[0]:.0f} % | {shares[1]:.0f} % |"
         )
-    return "\n".join(lines)
-
-
-def _targets(targets: list[Target]) -> str:
-    lines = ["## Targets", "", "| Target | Value | Bound | |", "|---|---|---|---|"]
-    for item in targets:
-        mark = "met" if item.met else "**not met**"
-        lines.append(f"| {item.name} | {item.value:.4g} | {item.bound:.4g} | {mark} |")
     return "\n".join(lines)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.results import Target, machine
+from benchmarks.results import Target, measured_on, verdicts
 
 PAGE = Path("docs") / "odometry.md"
 PLOT = Path("docs") / "odometry.png"
@@ -21,7 +21,7 @@ def write(rows: list[Row], targets: list[Target]) -> None:
     text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(BEGIN)
     _, after = rest.split(END)
-    body = "\n\n".join((_table(rows), _targets(targets), f"Measured on {_machine()}."))
+    body = "\n\n".join((_table(rows), verdicts(targets), measured_on()))
     PAGE.write_text(f"{before}{BEGIN}\n{body}\n{END}{after}", encoding="utf-8")
     _draw(rows)
 
@@ -63,19 +63,6 @@ def _mm(metres: float) -> str:
     if not np.isfinite(metres):
         return "lost"
     return f"{1e3 * metres:.1f}" if metres < 0.1 else f"{1e3 * metres:.0f}"
-
-
-def _targets(targets: list[Target]) -> str:
-    lines = ["| Target | Value | Bound | |", "|---|---|---|---|"]
-    for item in targets:
-        mark = "met" if item.met else "**not met**"
-        lines.append(f"| {item.name} | {item.value:.4g} | {item.bound:.4g} | {mark} |")
-    return "\n".join(lines)
-
-
-def _machine() -> str:
-    facts = machine()
-    return f"{facts['processor']}, {facts['cores']} cores, Python {facts['python']}"
 
 
 def _draw(rows: list[Row]) -> None:

@@ -111,34 +111,48 @@ class KeptRows:
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """Return rows with the same keys, at least one, as a table in Markdown."""
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
+    return table(rows[0], (row.values() for row in rows))
+
+
+def table(heading: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return a table in Markdown; in the text of cells a bar is escaped."""
+    heads = list(heading)
+    lines = [heads, ["---"] * len(heads), *rows]
     return "\n".join(
         "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
         for cells in lines
     )
 
 
-def verdicts(targets: Iterable[Target]) -> list[dict[str, Any]]:
-    """Return one row for each target, for :func:`markdown`."""
-    return [
-        {
-            "Target": target.name,
-            "measured": f"{target.value:.4g}",
-            "bound": f"{target.bound:.4g}",
-            "": "met" if target.met else "**not met**",
-        }
-        for target in targets
-    ]
+def verdicts(targets: Iterable[Target]) -> str:
+    """Return a table in Markdown with one row for each target."""
+    return markdown(
+        [
+            {
+                "Target": target.name,
+                "measured": f"{target.value:.4g}",
+                "bound": f"{target.bound:.4g}",
+                "": "met" if target.met else "**not met**",
+            }
+            for target in targets
+        ]
+    )
+
+
+def measured_on() -> str:
+    """Return a sentence about this machine, for the end of a page."""
+    facts = machine()
+    return f"Measured on {facts['processor']}, {facts['cores']} cores, Python {facts['python']}."
 
 
 def show(title: str, rows: list[dict[str, Any]]) -> None:
     """Print rows with the same keys as a table; nothing where there are none."""
     if not rows:
         return
-    table = Table(*rows[0], title=title)
+    shown = Table(*rows[0], title=title)
     for row in rows:
-        table.add_row(*(_text(value) for value in row.values()))
-    Console().print(table)
+        shown.add_row(*(_text(value) for value in row.values()))
+    Console().print(shown)
 
 
 def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable[Target]) -> Path:

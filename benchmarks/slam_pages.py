@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import beta
 
-from benchmarks.results import Target, at_least, at_most, machine, markdown, verdicts
+from benchmarks.results import Target, at_least, at_most, markdown, measured_on, verdicts
 
 Row = dict[str, Any]
 
@@ -208,11 +208,10 @@ def counted(missing: Iterable[Row]) -> str:
 
 def write(rows: list[Row], met: list[Target], missing: list[Row]) -> Path:
     """Write the page; return its path."""
-    facts = machine()
     laps = sum(row["kind"] == "hour" for row in rows)
     parts = [
         _HEAD,
-        _section("Targets", "", verdicts(met)),
+        f"## Targets\n\n{verdicts(met)}",
         _section("Mapping", "", mapping_table(rows)),
         _refused(rows),
         _section("Kidnapped starts", _STARTS, start_table(rows)),
@@ -225,9 +224,7 @@ def write(rows: list[Row], met: list[Target], missing: list[Row]) -> Path:
     ]
     if missing:
         parts.append(f"## Not run\n\nOf the full plan these runs are missing: {counted(missing)}.")
-    parts.append(
-        f"Measured on {facts['processor']}, {facts['cores']} cores, Python {facts['python']}."
-    )
+    parts.append(measured_on())
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
     return PAGE
