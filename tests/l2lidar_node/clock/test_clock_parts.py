@@ -243,7 +243,8 @@ def test_packets_on_no_credible_line_are_left_behind() -> None:
         needed += 1
         model.add(place + needed * 2 * MS, arrival + needed * 4 * MS)
         model.update(place + needed * 2 * MS)
-    assert 100 <= needed <= 1_000
+    # 1.6 s are given up by half: 0.8 s of both kinds are left, and fill up to 1.6 s again
+    assert 195 <= needed <= 205
     assert model.line.ratio == pytest.approx(2.0, rel=1e-6)
 
 
