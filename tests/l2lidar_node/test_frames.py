@@ -64,7 +64,8 @@ def test_mounts_in_a_circle_and_long_chains_have_an_end() -> None:
     for number in range(5000):
         tree.add(f"{number + 1}", f"{number}", np.eye(4))
     assert tree.find("5000", "0") is None
-    assert tree.find("900", "0") is not None
+    assert tree.find("999", "0") is not None  # 1000 frames
+    assert tree.find("1000", "0") is None
 
 
 def test_the_root_is_the_topmost_frame() -> None:

@@ -57,6 +57,27 @@ def test_the_truth_is_within_the_stated_deviations() -> None:
     assert np.sqrt(np.mean(np.square(away))) > 0.4
 
 
+@pytest.mark.parametrize(("pose", "between"), [(1.0, 0.5), (0.0, 1.0)])
+def test_errors_that_neighbors_share_are_told_from_those_of_each_interval(
+    pose: float, between: float
+) -> None:
+    """A bias alone, from many runs: it scatters as the information says it does."""
+    rng = np.random.default_rng(3)
+    count, scale = 120, 1e-3
+    jacobian = np.zeros((count, 3, gyro.PARAMETERS))
+    jacobian[:, :, gyro.BIAS] = -np.eye(3)
+    found, stated = [], []
+    for _ in range(60):
+        poses = pose * rng.standard_normal((count + 1, 3))
+        residual = scale * (np.diff(poses, axis=0) + between * rng.standard_normal((count, 3)))
+        turns = gyro.Turns(residual, jacobian, np.arange(count))
+        normal, right = (item[gyro.BIAS] for item in gyro.information(turns))
+        found.append(np.linalg.solve(normal[:, gyro.BIAS], right))
+        stated.append(np.sqrt(np.diag(np.linalg.inv(normal[:, gyro.BIAS]))))
+    scatter = np.sqrt(np.mean(np.square(found)))
+    assert scatter / np.mean(stated) == pytest.approx(1.0, rel=0.25)
+
+
 def test_turning_about_one_axis_tells_what_it_can() -> None:
     found = gyro.align(*recording(axes=(0.0, 0.0, 1.3), noise=1e-3))
     assert found.sd[2] > np.deg2rad(3.0)  # a turn about that very axis

@@ -66,6 +66,13 @@ def test_a_pose_of_another_time_does_not_end_the_watch() -> None:
     assert convention.reversed
 
 
+def test_poses_that_are_too_coarse_do_not_decide_about_the_sign() -> None:
+    """Their noise bends twice as much as the trot does."""
+    convention, changed = watched("trot", -1.0, noise_m=0.02)
+    assert changed == -1
+    assert not convention.reversed
+
+
 def test_at_rest_nothing_can_be_said_of_the_sign() -> None:
     convention, changed = watched("still", -1.0, noise_m=0.003)
     assert changed == -1

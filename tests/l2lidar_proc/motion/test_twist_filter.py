@@ -54,6 +54,7 @@ def tilt_error(found: TwistFilter, motion: Motion, t: float) -> float:
 def test_rest_gives_bias_gravity_and_stillness() -> None:
     found = follow(noisy(Motion(nod=0.0).imu(0, 4, BIAS)))
     assert np.abs(found.gyro_bias - BIAS).max() < 0.006
+    assert 1e-4 < found.gyro_bias_sigma < 0.006
     assert found.is_static
     assert found.is_trusted
     assert not found.is_faulty
@@ -122,6 +123,32 @@ def test_a_source_that_jumps_is_followed() -> None:
     assert np.linalg.norm(found._state.rotation.T @ found._state.velocity) > 2.0
 
 
+def moved_by(covariance: Any) -> float:
+    """Return by how much of the difference a velocity with a covariance corrects the filter."""
+    walk = Motion(speed=1.0)
+    found = follow(walk.imu(0, 1.5), walk)
+    before = (found._state.rotation.T @ found._state.velocity)[0]
+    assert found.take(at(1.52), (before + 0.2, 0.0, 0.0), "odometry", covariance)
+    found._buffer.push(walk.imu(1.504, 1.524))
+    found.follow()
+    return float((found._state.rotation.T @ found._state.velocity)[0] - before) / 0.2
+
+
+def test_a_velocity_counts_by_its_covariance() -> None:
+    for sigma in (None, 0.0, tuning.TWIST_SIGMA_LEAST, tuning.TWIST_SIGMA):
+        covariance = None if sigma is None else (sigma**2 + 1e-12) * np.eye(3)
+        assert moved_by(covariance) == pytest.approx(1.0, abs=0.01)
+    assert moved_by(4.0 * np.eye(3)) == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_covariance_that_makes_no_sense_counts_as_ordinary() -> None:
+    ordinary = moved_by(None)
+    too_large = 2.0 * tuning.MAX_SPEED**2 * np.eye(3)
+    not_a_number = np.full((3, 3), np.nan)
+    for covariance in (np.zeros((3, 3)), -np.eye(3), not_a_number, np.eye(6), too_large):
+        assert moved_by(covariance) == ordinary
+
+
 def test_a_unit_started_on_its_side_is_caught_and_gravity_not_trusted() -> None:
     samples = noisy(Motion().imu(0, 3, BIAS))
     samples["linear_acceleration"] *= 2.0
@@ -165,6 +192,7 @@ def test_nothing_is_known_before_the_first_samples() -> None:
     found = TwistFilter(ImuBuffer(), np.zeros(3), 0.1)
     found.follow()
     assert not found.gyro_bias.any()
+    assert found.gyro_bias_sigma == tuning.START_GYRO_BIAS_SIGMA[1]
     assert not found.up.any()
     assert not found.is_trusted
     assert not found.knows_velocity(at(0), 10**9)
