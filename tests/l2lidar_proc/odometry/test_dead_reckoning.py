@@ -130,6 +130,28 @@ def test_it_ends_a_second_after_the_latest_sweep(estimate: Any) -> None:
     assert lasted == [True] * 50 + [False] * 10
 
 
+def test_the_covariance_grows_by_what_speed_and_rate_are_uncertain_by(estimate: Any) -> None:
+    """A fifth of a second: the bound for any correlation of place and speed, white rates."""
+    place, turned, speed, rate = 0.01, 0.002, 0.1, 0.03  # standard deviations
+    known = dataclasses.replace(
+        estimate,
+        covariance=np.diag(np.square([place] * 3 + [turned] * 3)),
+        twist_covariance=np.diag(np.square([speed] * 3 + [rate] * 3)),
+    )
+    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning.reset(known)
+    for n in range(10):
+        carried = reckoning.carry(samples(known.stamp + 20_000_000 * n, 5))
+    assert carried.stamp == known.stamp + 200_000_000
+    expected = [place + speed * 0.2] * 3 + [np.sqrt(turned**2 + rate**2 * 0.004 * 0.2)] * 3
+    np.testing.assert_allclose(np.sqrt(np.diag(carried.covariance)), expected, rtol=1e-6)
+
+    still = dataclasses.replace(known, twist_covariance=np.zeros((6, 6)))
+    reckoning.reset(still)
+    carried = reckoning.carry(samples(known.stamp, 5))
+    np.testing.assert_allclose(carried.covariance, known.covariance, atol=1e-12)
+
+
 def test_untrusted_gravity_holds_the_speed(estimate: Any) -> None:
     reckoning = DeadReckoning(np.eye(4))
     reckoning.reset(dataclasses.replace(estimate, gravity=np.zeros(3)))

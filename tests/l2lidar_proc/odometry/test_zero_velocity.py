@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import ERRORS, GYRO_BIAS, POSE, POSITION, VELOCITY, InertialState
+from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive
 from tests.support.build import REAL_L2
 from tests.support.odometry_runs import EPOCH, record, truth
@@ -123,3 +128,123 @@ def test_a_shock_ends_rest_at_once() -> None:
     error = np.abs(way(estimates) - np.linalg.norm(true - true[0], axis=1))
     assert np.linalg.norm(true - true[0], axis=1).max() > 0.5
     assert error.max() < 0.02
+
+
+# ---- the test by itself: what registrations say of an anchor
+
+ORIGIN = InertialState(
+    EPOCH, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.array([0, 0, -9.8])
+)
+
+
+def found_at(
+    seconds: float, error: NDArray[np.float64], claimed: Any = (1.0, 1.0, 1.0)
+) -> Alignment:
+    """Return the registration of a sweep that is off the anchor, known to a millimeter."""
+    deviation = np.zeros(ERRORS)
+    deviation[POSE] = error
+    state = dataclasses.replace(ORIGIN, stamp=HostNs(EPOCH + round(seconds * 1e9)))
+    covariance = 1e-6 * np.eye(ERRORS)
+    nobody = np.empty(0, np.int64), np.empty(0)
+    nothing = np.zeros((ERRORS, ERRORS))
+    return Alignment(
+        state.boxplus(deviation), covariance, nothing, np.diag(claimed), 500, 1.0, 0.0, 3, nobody
+    )
+
+
+def anchored() -> ZeroVelocityTest:
+    tested = ZeroVelocityTest()
+    assert tested.anchored(ORIGIN, resting(0.0, 0.0))
+    return tested
+
+
+def until_released(tested: ZeroVelocityTest, period: float, errors: Any) -> int:
+    """Return how many sweeps the anchor stands."""
+    for number, error in enumerate(errors):
+        if not tested.stays(found_at((number + 1) * period, np.array(error))):
+            return number
+    return len(errors)
+
+
+def test_noise_does_not_end_rest_and_a_drift_of_as_much_does() -> None:
+    rng = np.random.default_rng(2)
+    noise = rng.normal(0.0, [[3e-4] * 3 + [2e-3] * 3], (200, 6))
+    assert until_released(anchored(), 0.23, noise) == 200
+    for axis, rate in ((1, 1.5e-3), (5, 1e-2)):  # [rad/s, m/s]
+        drift = noise.copy()
+        drift[:, axis] += rate * 0.23 * np.arange(200)
+        tested = anchored()
+        lasted = until_released(tested, 0.23, drift)
+        assert 3 <= lasted < 20
+        assert tested.anchor is None
+        assert tested.drifted
+        assert np.abs(tested._drift).argmax() == axis
+        assert tested._drift[axis] == pytest.approx(drift[lasted, axis], rel=0.8)
+
+
+def test_what_half_turns_see_differently_is_averaged_over_the_turn() -> None:
+    """Each half has its own error of a centimeter; together they agree."""
+    halves = np.zeros((100, 6))
+    halves[::2, 3], halves[1::2, 3] = 0.01, -0.01
+    assert until_released(anchored(), 0.115, halves) == 100
+    moved = np.zeros((100, 6))
+    moved[50:, 3] = 0.01
+    assert 100 > until_released(anchored(), 0.115, moved) > 50
+
+
+def test_a_far_deviation_ends_rest_at_once_and_widens_what_is_known() -> None:
+    tested = anchored()
+    error = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.2])
+    assert until_released(tested, 0.23, [np.zeros(6), error]) == 1
+    before = 1e-4 * np.eye(ERRORS)
+    grown = tested.widened(before) - before
+    np.testing.assert_allclose(grown[POSE, POSE], np.outer(error, error), atol=1e-12)
+    speed, rate = (0.2 / tuning.STILL_DRIFT_S) ** 2, (0.02 / tuning.STILL_DRIFT_S) ** 2
+    np.testing.assert_allclose(grown[VELOCITY, VELOCITY], speed * np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(grown[GYRO_BIAS, GYRO_BIAS], rate * np.eye(3), atol=1e-12)
+    assert np.count_nonzero(grown) == 4 + 6
+    tested.clear()
+    np.testing.assert_array_equal(tested.widened(before), before)
+
+
+def test_where_the_scene_fixes_no_place_rest_is_not_claimed() -> None:
+    tested = anchored()
+    share = 0.9 * tuning.DEGENERATE_SHARE
+    assert not tested.stays(found_at(0.23, np.zeros(6), (share, 0.5, 0.5 - share)))
+    assert tested.anchor is None
+    assert not tested.drifted
+
+
+def test_under_test_nothing_but_the_pose_may_differ() -> None:
+    sigma = np.sqrt(np.diag(free_pose()))
+    np.testing.assert_allclose(sigma[POSE], np.repeat(tuning.STILL_REACH, 3))
+    assert sigma[POSE.stop :].max() <= 1e-6
+
+
+def test_rest_is_taken_up_when_poses_and_samples_have_shown_it_for_the_test_time() -> None:
+    quiet, known = resting(2.0, 0.01), 1e-4 * np.eye(ERRORS)
+    rng = np.random.default_rng(3)
+
+    def taken_up(tested: ZeroVelocityTest, speed: float, known: Any, samples: Any) -> float:
+        """Return when a sensor that moves so fast is said to rest [s], 0 if never."""
+        for number in range(60):
+            seconds = 0.23 * number
+            error = np.zeros(ERRORS)
+            error[POSITION] = rng.normal(0.0, 1e-3, 3) + [speed * seconds, 0.0, 0.0]
+            error[VELOCITY] = [speed, 0.0, 0.0]
+            stamp = HostNs(EPOCH + round(seconds * 1e9))
+            state = dataclasses.replace(ORIGIN, stamp=stamp).boxplus(error)
+            if tested.watch(state, known, samples):
+                assert tested.anchor is not None
+                assert not tested.anchor.velocity.any()
+                return seconds
+        return 0.0
+
+    tested = ZeroVelocityTest()
+    first = taken_up(tested, 0.0, known, quiet)
+    assert 2.0 <= first < 2.5
+    assert until_released(tested, 0.23, [[0.0, 0.0, 0.0, 0.0, 0.0, 0.2]]) == 0
+    assert 4.0 <= taken_up(tested, 0.0, known, quiet) < 4.5  # it was wrong: twice as long
+    assert not taken_up(ZeroVelocityTest(), 0.02, known, quiet)  # slow, but it moves on
+    assert not taken_up(ZeroVelocityTest(), 0.0, 0.01 * np.eye(ERRORS), quiet)
+    assert not taken_up(ZeroVelocityTest(), 0.0, known, resting(2.0, 1.0))
