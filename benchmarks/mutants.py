@@ -50,7 +50,7 @@ TESTS: Final = (
     *(f"tests/{folder}" for folder in FOLDERS),
     "tests/l2lidar_node/recording",
     *(f"tests/l2lidar_proc/odometry/test_{name}.py" for name in (
-        "alignment", "base_frame", "dead_reckoning", "degeneracy", "odometry_parts",
+        "alignment", "base_frame", "dead_reckoning", "degeneracy", "matcher", "odometry_parts",
         "zero_velocity",
     )),
     "tests/l2lidar_proc/test_hostile_input.py",

@@ -133,7 +133,13 @@ def test_a_shock_ends_rest_at_once() -> None:
 # ---- the test by itself: what registrations say of an anchor
 
 ORIGIN = InertialState(
-    EPOCH, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.array([0, 0, -9.8])
+    HostNs(EPOCH),
+    np.eye(3),
+    np.zeros(3),
+    np.zeros(3),
+    np.zeros(3),
+    np.zeros(3),
+    np.array([0, 0, -9.8]),
 )
 
 
@@ -230,7 +236,7 @@ def test_rest_is_taken_up_when_poses_and_samples_have_shown_it_for_the_test_time
         for number in range(60):
             seconds = 0.23 * number
             error = np.zeros(ERRORS)
-            error[POSITION] = rng.normal(0.0, 1e-3, 3) + [speed * seconds, 0.0, 0.0]
+            error[POSITION] = rng.normal((speed * seconds, 0.0, 0.0), 1e-3)
             error[VELOCITY] = [speed, 0.0, 0.0]
             stamp = HostNs(EPOCH + round(seconds * 1e9))
             state = dataclasses.replace(ORIGIN, stamp=stamp).boxplus(error)

@@ -1,0 +1,176 @@
+"""Matching with the map from predictions that are good, loose, and without any measured turn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from l2lidar_node import rotations
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc import tuning
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.matcher import Match, SweepMatcher
+from l2lidar_proc.odometry.prediction import Predictor
+from tests.l2lidar_proc.motion.analytic import EPOCH, Motion
+
+TIGHT, LOOSE = (0.005, 0.01), (0.01, 0.25)  # standard deviations [rad, m]
+PLACE = np.array([0.4, -0.3, 0.1])
+
+
+def room(rng: np.random.Generator, count: int) -> F64:
+    """Return points of a room of 8 by 6 by 3 m with a box in a corner, 1 cm of noise."""
+    sizes = np.array([8.0, 6.0, 3.0])
+    points = rng.uniform(0.0, 1.0, (count, 3)) * sizes
+    axis, side = rng.integers(0, 3, count), rng.integers(0, 2, count)
+    points[np.arange(count), axis] = side * sizes[axis]
+    box = rng.uniform(0.0, 1.0, (count // 8, 3)) * (1.5, 1.0, 1.2)
+    axis = rng.integers(0, 3, len(box))
+    box[np.arange(len(box)), axis] = np.array([1.5, 1.0, 1.2])[axis]
+    points = np.vstack((points, box)) - (4.0, 3.0, 1.2)
+    return np.asarray(points + rng.normal(0.0, 0.01, points.shape))
+
+
+def motion(
+    known: tuple[float, float], place: F64, turn: float = 0.0, *, imu: bool = True
+) -> SweepMotion:
+    """Return the motion of a sensor at rest, predicted at a place, turned about z by an angle."""
+    nothing = np.zeros(3)
+    rotation = rotations.matrices(rotations.exp((0.0, 0.0, turn)))
+    gravity = np.array([0.0, 0.0, -9.80665])
+    state = InertialState(EPOCH, rotation, place, nothing, nothing, nothing, gravity)
+    covariance = 1e-6 * np.eye(eskf.ERRORS)
+    covariance[eskf.ROTATION, eskf.ROTATION] = known[0] ** 2 * np.eye(3)
+    covariance[eskf.POSITION, eskf.POSITION] = known[1] ** 2 * np.eye(3)
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    if imu:
+        predictor.imu(Motion().imu(-0.1, 0.4))
+    return predictor.over(state, covariance, (EPOCH, HostNs(EPOCH + 200_000_000)), EPOCH)
+
+
+def source(points: F64) -> Source:
+    return Source(points, np.zeros(len(points)), np.linalg.norm(points, axis=1))
+
+
+def extended(matcher: SweepMatcher, points: F64) -> float:
+    """Add points that are seen from the origin; return the share where there was no map."""
+    cloud = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"])
+    cloud["x"], cloud["y"], cloud["z"] = points.T
+    at = motion(TIGHT, np.zeros(3))
+    return matcher.extend(cloud, at, at.state)
+
+
+@pytest.fixture(scope="module")
+def grown() -> SweepMatcher:
+    """Return a matcher with a map of the room."""
+    rng, matcher = np.random.default_rng(11), SweepMatcher(OdometryConfig(), np.zeros(3))
+    fresh = [extended(matcher, room(rng, 4000)) for _ in range(14)]
+    assert fresh[0] == 1.0
+    assert fresh[-1] < 0.05
+    return matcher
+
+
+@pytest.fixture(scope="module")
+def seen() -> Source:
+    """Return what is seen from PLACE."""
+    return source((room(np.random.default_rng(12), 3000) - PLACE)[::2])
+
+
+def off(match: Match) -> float:
+    """Return how far the place that was found is from PLACE [m]."""
+    assert match.alignment is not None
+    return float(np.linalg.norm(match.alignment.state.position - PLACE))
+
+
+def test_a_good_prediction_is_corrected(grown: SweepMatcher, seen: Source) -> None:
+    found = grown.match(seen, motion(TIGHT, PLACE + 0.015))
+    assert off(found) < 0.005
+    assert not found.uncharted
+    assert found.alignment is not None
+    quality = grown.quality(len(seen.points), found.alignment)
+    assert (quality.points, quality.matched) == (len(seen.points), found.alignment.matched)
+    assert quality.inlier_ratio > 0.98
+    assert quality.matched > 0.9 * quality.points
+    assert 0.2 < quality.degeneracy_ratio <= 1 / 3
+    assert quality.map_cells == len(grown.surfaces) > 5000
+    assert grown.quality(7, None).matched == 0
+
+
+@pytest.mark.parametrize("initial", [False, True])
+@pytest.mark.parametrize(
+    ("error", "turn"),
+    [((0.3, -0.2, 0.0), 0.0), ((0.8, -0.6, 0.2), 0.2), ((1.0, 0.5, 0.0), 0.0)],
+    ids=["half way to a wrong place", "turned", "far"],
+)
+def test_a_loose_prediction_is_not_the_only_place_to_begin_from(
+    grown: SweepMatcher, seen: Source, error: F64, turn: float, initial: bool
+) -> None:
+    """From the first of these the alignment ends a surface off, with four of five inliers."""
+    assert off(grown.match(seen, motion(LOOSE, PLACE + error, turn), initial=initial)) < 0.015
+
+
+def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
+    rng = np.random.default_rng(13)
+    cloud = source(rng.uniform((-3.5, -2.5, -1.0), (3.5, 2.5, 1.5), (1500, 3)))
+    for known in (TIGHT, LOOSE):
+        assert grown.match(cloud, motion(known, PLACE)) == (None, False)
+    few = cloud.some(np.arange(OdometryConfig().min_points - 1))
+    assert grown.match(few, motion(TIGHT, PLACE)) == (None, False)
+
+
+def test_a_map_that_has_only_just_begun_is_uncharted_elsewhere(seen: Source) -> None:
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    assert matcher.match(seen, motion(TIGHT, PLACE)) == (None, False)  # there is no map
+    extended(matcher, room(np.random.default_rng(14), 4000))
+    assert matcher.is_young
+    far = motion(TIGHT, PLACE + 50.0)
+    assert matcher.match(seen, far) == (None, True)
+    assert matcher.match(seen, motion((0.0, 0.5), far.state.position)).uncharted is False
+    matcher.clear()
+    assert not len(matcher.surfaces)
+
+
+def bushes(rng: np.random.Generator, count: int) -> F64:
+    """Return points of leaves that sway by 10 cm: the same each time, no surface anywhere."""
+    leaves = np.random.default_rng(15).uniform((-6.0, -6.0, -1.0), (6.0, 6.0, 2.0), (count, 3))
+    return np.asarray(leaves + rng.normal(0.0, 0.1, leaves.shape))
+
+
+def test_where_nobody_measured_the_turn_and_nothing_is_flat_kiss_icp_is_not_lost() -> None:
+    rng, matcher = np.random.default_rng(16), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, bushes(rng, 3000))
+    leaves = source(bushes(rng, 3000) - PLACE)
+    guess = PLACE + 0.1
+    assert matcher.match(leaves, motion(LOOSE, guess)).alignment is None
+    found = matcher.match(leaves, motion(LOOSE, guess, imu=False))
+    assert off(found) < 0.1
+    assert found.alignment is not None
+    sigma = np.sqrt(np.diag(found.alignment.covariance)[eskf.POSITION])
+    np.testing.assert_allclose(sigma, 1.0 / np.hypot(1.0 / 0.15, 1.0 / LOOSE[1]), rtol=0.05)
+
+
+def test_a_scene_with_strays_lowers_what_is_needed_after_a_loose_prediction() -> None:
+    """A fifth of the points off every surface is usual: so many are believed, not many more."""
+    rng, matcher = np.random.default_rng(17), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, room(rng, 4000))
+
+    def rainy(share: float) -> Source:
+        points = room(rng, 3000)[::2]
+        near = rng.random(len(points)) < share
+        points[near] *= rng.uniform(0.85, 0.95, (len(points), 1))[near]
+        return source(points - PLACE)
+
+    loose = motion(LOOSE, PLACE + 0.01)
+    assert matcher.match(rainy(0.2), loose).alignment is None
+    for _ in range(30):
+        assert off(matcher.match(rainy(0.2), motion(TIGHT, PLACE))) < 0.02
+    usual, sweeps = matcher._inliers
+    assert sweeps == 30
+    assert 0.75 < usual < tuning.INLIER_RATIO[True]
+    assert off(matcher.match(rainy(0.2), loose)) < 0.02
+    assert matcher.match(rainy(0.7), loose).alignment is None
