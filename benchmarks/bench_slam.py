@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -98,10 +99,17 @@ KIDNAPPED: Final = {
 STARTS_A_ROUND: Final = 5
 
 
+@cache
+def scene_of(name: str) -> MappingScene:
+    """Return a scene, which is built once."""
+    return scenes.MAPPING_SCENES[name]()
+
+
+@lru_cache(maxsize=6)
 def recording(name: str, variant: int) -> MappingRun:
     """Return the scans of a walk; the same for all seeds of drift of one variant."""
     item = WALKS[name]
-    scene = scenes.MAPPING_SCENES[item.scene]()
+    scene = scene_of(item.scene)
     truth = walk(scene, item.laps, step=STEP, seed=variant)
     if not item.moved:
         return _scanned(scene, truth, f"{name}-{variant}", variant)
@@ -193,11 +201,11 @@ def _megabytes(built: Map) -> float:
 
 def measure_kidnapped(name: str, outside: bool, seed: int) -> Row:
     """Return the row of one start at an unknown place of a saved map."""
-    scene = scenes.MAPPING_SCENES[KIDNAPPED[name]]()
+    scene = scene_of(KIDNAPPED[name])
     truth = walk(scene, 1.0, step=STEP, seed=0)
     saved = _saved(name, _scanned(scene, truth, f"map-{name}", 0))
     rng = np.random.default_rng(1000 + seed)
-    other = scenes.MAPPING_SCENES["car_park"]() if outside else scene
+    other = scene_of("car_park") if outside else scene
     long = walk(other, 1.0, step=STEP, seed=50 + seed % 2, backwards=bool(seed % 2))
     sweeps = round(SEARCH_M / STEP)
     begin = int(rng.integers(0, len(long) - sweeps))
@@ -246,7 +254,7 @@ def _saved(name: str, run: MappingRun) -> Map:
 
 def measure_hour(laps: int) -> list[Row]:
     """Return a row for each lap of a long run around the office: growth, time, size."""
-    scene = scenes.MAPPING_SCENES["furnished_office"]()
+    scene = scene_of("furnished_office")
     one = walk(scene, 1.0, step=STEP, seed=0)
     run = _scanned(scene, one, "hour", 0)
     truth = np.concatenate([one] * laps)

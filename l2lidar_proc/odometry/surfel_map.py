@@ -166,6 +166,14 @@ class SurfelMap:
         for level in self._levels:
             level.forget(origin, distance, since)
 
+    def flat_cells(self) -> list[tuple[float, I64, F64, F64]]:
+        """Return what :meth:`match` knows of flat places, for each size, fine to coarse.
+
+        Edge of the cells [m]; their places as multiples of it (N, 3); a point of each surface
+        (N, 3) [m]; unit normals (N, 3).
+        """
+        return [level.flat_cells() for level in self._levels]
+
     def points(self) -> F64:
         """Return the middles of the finest level's surfaces [m], shape (N, 3), map frame."""
         return self._levels[0].points()
@@ -322,9 +330,14 @@ class _Level:
         cell = np.floor(points * (1.0 / self._size)).astype(np.int64) + _HALF
         return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])
 
+    def flat_cells(self) -> tuple[float, I64, F64, F64]:
+        flat = self._flat[self._rows]
+        rows = self._rows[flat]
+        normals = self.cells["axes"][:, 0][rows]
+        return self._size, _places(self._keys[flat]), self.cells["mean"][rows], normals
+
     def _middle(self, keys: I64) -> F64:
-        cell = np.stack((keys >> 2 * _BITS, (keys >> _BITS) & _MASK, keys & _MASK), axis=1)
-        return np.asarray((cell - (_HALF - 0.5)) * self._size)
+        return np.asarray((_places(keys) + 0.5) * self._size)
 
     def _find(self, keys: I64) -> I64:
         if not len(self._keys):
@@ -351,6 +364,12 @@ class _Level:
             self.cells = _grown(self.cells, size)
             self._flat, self._narrow = _grown(self._flat, size), _grown(self._narrow, size)
             self._count, self._seen = _grown(self._count, size), _grown(self._seen, size)
+
+
+def _places(keys: I64) -> I64:
+    """Return the places (N, 3) of cells, as multiples of their edge."""
+    cell = np.stack((keys >> 2 * _BITS, (keys >> _BITS) & _MASK, keys & _MASK), axis=1)
+    return cell - _HALF
 
 
 def _grown(rows: NDArray[Any], size: int) -> NDArray[Any]:

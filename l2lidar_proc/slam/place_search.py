@@ -125,9 +125,10 @@ class PlaceSearch:
             Largest number of places of the plan; each is returned once for each storey there.
         """
         structure = self._structure(nodes, poses, among)
+        seen_from = poses[among, :2, 3]
         return [
             planar(peak.x, peak.y, peak.yaw, poses[node][2, 3])
-            for peak in places.anywhere(query.structure, structure, count)
+            for peak in places.anywhere(query.structure, structure, seen_from, _NEAR_M, count)
             for node in _around(peak, poses, among)
         ]
 

@@ -7,7 +7,7 @@ and the verdict from registration.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,45 +94,67 @@ def near(
     return _distinct(found, count)
 
 
-def anywhere(query: F64, target: F64, count: int) -> list[Place]:
-    """Return the best places in all of a map, best first; see :func:`near`."""
+def anywhere(query: F64, target: F64, around: F64, radius: float, count: int) -> list[Place]:
+    """Return the best places in all of a map, best first.
+
+    Parameters
+    ----------
+    query, target : ndarray, shape (N, 2)
+        As :func:`near`.
+    around : ndarray, shape (K, 2)
+        Places that the map was seen from [m], target frame.
+    radius : float
+        Distance from one of these within which the query's origin has to be [m].
+    count : int
+        Largest number of places.
+    """
     if min(len(query), len(target)) < _FEWEST:
         return []
-    yaws = np.arange(_GLOBAL_YAWS) * (2.0 * np.pi / _GLOBAL_YAWS)
-    return _distinct(_correlated(query, target, yaws, _GLOBAL_CELL_M), count)
-
-
-def _correlated(query: F64, target: F64, yaws: NDArray[Any], cell: float) -> list[Place]:
-    """Return the places with the highest correlation at each yaw."""
-    reach = float(np.linalg.norm(query, axis=1).max()) + cell
-    low = target.min(axis=0) - reach
-    size = np.ceil((target.max(axis=0) + reach - low) / cell).astype(int) + 2
-    shape = tuple(fft.next_fast_len(int(n) + int(2 * reach / cell) + 2, real=True) for n in size)
+    cell = _GLOBAL_CELL_M
+    low = np.minimum(target.min(axis=0), around.min(axis=0) - radius) - cell
+    high = np.maximum(target.max(axis=0), around.max(axis=0) + radius) + cell
+    # what leaves the map on one side must not come back on the other
+    beyond = float(np.linalg.norm(query, axis=1).max()) + 2.0 * cell
+    shape = tuple(
+        fft.next_fast_len(int(np.ceil(extent / cell)), real=True)
+        for extent in (high - low + beyond).tolist()
+    )
     image = np.zeros(shape, np.float32)
     index = np.floor((target - low) / cell).astype(int)
     image[index[:, 0], index[:, 1]] = 1.0
     beside = ndimage.maximum_filter(image, size=3)
     spectrum = fft.rfft2(np.maximum(image, np.float32(_BESIDE) * beside))
-    # what correlation at an offset means: the query's origin in the target's frame
-    axes = [low[i] + reach + np.arange(int(size[i])) * cell for i in range(2)]
+    allowed = _cells_around((around - low) / cell, radius / cell, shape)
     found: list[Place] = []
-    for yaw in yaws:
-        turned = np.unique(np.floor(_turned(query, yaw) / cell + 0.5), axis=0) * cell
+    for yaw in np.arange(_GLOBAL_YAWS // 2) * (2.0 * np.pi / _GLOBAL_YAWS):
         part = np.zeros(shape, np.float32)
-        at = np.floor((turned + reach) / cell + 0.5).astype(int)
-        part[at[:, 0], at[:, 1]] = 1.0
-        score = fft.irfft2(spectrum * np.conj(fft.rfft2(part)), shape)
-        score = score[: int(size[0]), : int(size[1])] / len(turned)
-        score = score.ravel()
-        best = np.argpartition(-score, min(_PER_YAW, len(score) - 1))[:_PER_YAW]
-        rows, columns = np.divmod(best, int(size[1]))
-        found += [
+        at = np.floor(_turned(query, yaw) / cell + 0.5).astype(int)
+        part[at[:, 0], at[:, 1]] = 1.0  # about the corner: negative indices are the far sides
+        own = fft.rfft2(part)
+        # half a turn more conjugates the spectrum
+        for heading, product in ((yaw, spectrum * np.conj(own)), (yaw + np.pi, spectrum * own)):
+            score = fft.irfft2(product, shape).ravel()[allowed] / part.sum()
+            best = np.argpartition(-score, min(_PER_YAW, len(score) - 1))[:_PER_YAW]
+            rows, columns = np.divmod(allowed[best], shape[1])
             # a cell's middle on a cell's middle: the origins are half a cell apart
-            Place(float(axes[0][i] + cell / 2), float(axes[1][j] + cell / 2), float(yaw), float(s))
-            for i, j, s in zip(rows, columns, score[best], strict=True)
-            if s > 0.0
-        ]
-    return found
+            x, y = low[0] + (rows + 0.5) * cell, low[1] + (columns + 0.5) * cell
+            found += [
+                Place(float(x[n]), float(y[n]), float(heading), float(score[k]))
+                for n, k in enumerate(best)
+                if score[k] > 0.0
+            ]
+    return _distinct(found, count)
+
+
+def _cells_around(places: F64, radius: float, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return the cells within a radius of places (K, 2), both in cells, as flat indices."""
+    steps = np.arange(-int(radius), int(radius) + 1)
+    dx, dy = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    inside = np.hypot(dx, dy) <= radius
+    cells = np.floor(places).astype(int)
+    rows = (cells[:, :1] + dx[inside]).ravel()
+    columns = (cells[:, 1:] + dy[inside]).ravel()
+    return np.unique(rows * shape[1] + columns)
 
 
 def _distinct(places: list[Place], count: int) -> list[Place]:

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from l2lidar_node import rotations
+
 F64 = NDArray[np.float64]
 
 TURN: Final = slice(0, 3)
@@ -31,6 +33,9 @@ def inverse(transform: F64) -> F64:
 def error(measured: F64, predicted: F64) -> F64:
     """Return ``predicted boxminus measured`` to first order in the translation, shape (..., 6)."""
     delta = inverse(measured) @ predicted
+    if delta.ndim == 2:
+        turn = rotations.log(rotations.from_matrix(delta[:3, :3]))
+        return np.concatenate((turn, delta[:3, 3]))
     turn = Rotation.from_matrix(delta[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
     return np.concatenate((turn.reshape(*delta.shape[:-2], 3), delta[..., :3, 3]), axis=-1)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.slam.se3 import error, magnitude, transformed
+from l2lidar_proc.slam.surface_grid import BITS, SurfaceGrid, cell_keys
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -35,17 +37,18 @@ _SURFACE_POINTS: Final = 6
 _SURFACE_THICKNESS: Final = 0.035
 _LYING: Final = 0.7  # cosine: surfaces flatter than 45 degrees are floors and ceilings
 _SPREAD_M: Final = 0.3  # distance between the points that are registered
-_FREE_CELL_M: Final = 0.3
-_FREE_STEP_M: Final = 0.3
+_FREE_CELL_M: Final = 0.3  # and the way between the points of a ray that are looked at
 _FREE_SHORT_M: Final = 0.5  # a ray frees no space this close before its end
 _FREE_RAYS: Final = 4000
+_OPEN_CELL_M: Final = 0.15
+_OPEN_M: Final = (0.25, 2.0)  # before the end of a ray
+_OPEN_RAYS: Final = 8000
 _VIEW_STEP_M: Final = 0.5  # way between viewpoints
 _MOST_VIEWS: Final = 255
 _STILL: Final = (0.05, np.radians(4.0))  # [m, rad] moved less than this, a place is seen enough
 _STILL_SWEEPS: Final = 3  # after so many sweeps from there
 _COMPACT: Final = 200_000  # points after which an open submap is thinned
-_BITS: Final = 21
-_HALF: Final = 1 << (_BITS - 1)
+_HALF: Final = 1 << (BITS - 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +161,7 @@ class SubmapView:
     ----------
     points : ndarray, shape (N, 3)
         [m], submap frame.
-    surfaces : SurfelMap
+    surfaces : SurfaceGrid
     tree : cKDTree
         Of the points.
     structure : ndarray, shape (M, 2)
@@ -170,22 +173,43 @@ class SubmapView:
     """
 
     def __init__(self, submap: Submap) -> None:
+        self._submap = submap
         self.points = submap.xyz
-        self.surfaces = SurfelMap(
+        surfaces = SurfelMap(
             _SURFACES, thickness=_SURFACE_THICKNESS, least=_SURFACE_POINTS, capacity=10_000
         )
-        self.surfaces.add(self.points)
+        surfaces.add(self.points)
+        self.surfaces = SurfaceGrid(surfaces)
         self.tree = cKDTree(self.points)
         self.structure = structure_of(self.points)
         self._free = _free_cells(submap)
         self.source = _spread(self.points)
         self.is_upright = np.ones(len(self.source), np.bool_)
-        on = self.surfaces.match(self.source)
-        self.is_upright[on.index] = np.abs(on.normals[:, 2]) < _LYING
+        index, normals, _ = self.surfaces.match(self.source)
+        self.is_upright[index] = np.abs(normals[:, 2]) < _LYING
 
     def is_free(self, points: F64) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie where rays of the submap passed, shape (N,)."""
         return _contained(voxel_keys(points, _FREE_CELL_M), self._free)
+
+    def is_open(self, points: F64) -> NDArray[np.bool_]:
+        """Return which points (N, 3) rays passed on their last two meters, shape (N,).
+
+        Finer than :meth:`is_free`, and up to the surfaces: whoever asks has to see to it that
+        they are not on one.
+        """
+        return _contained(voxel_keys(points, _OPEN_CELL_M), self._open)
+
+    @cached_property
+    def _open(self) -> I64:
+        chosen = self._submap.points[:: max(-(-len(self._submap.points) // _OPEN_RAYS), 1)]
+        ends = chosen["xyz"] * STEP_M
+        way = self._submap.views[chosen["view"]] - ends
+        length = np.linalg.norm(way, axis=1)
+        back = np.arange(*_OPEN_M, _OPEN_CELL_M)
+        ray, step = np.nonzero(length[:, None] > back)
+        ahead = way / np.maximum(length, 1e-9)[:, None]
+        return _distinct(voxel_keys(ends[ray] + ahead[ray] * back[step][:, None], _OPEN_CELL_M))
 
 
 class ViewCache:
@@ -194,10 +218,10 @@ class ViewCache:
     Parameters
     ----------
     capacity : int
-        Views to keep: some 5 MB each.
+        Views to keep: some 2 MB each.
     """
 
-    def __init__(self, capacity: int = 24) -> None:
+    def __init__(self, capacity: int = 48) -> None:
         self._capacity = capacity
         self._views: OrderedDict[int, SubmapView] = OrderedDict()
 
@@ -214,18 +238,17 @@ class ViewCache:
 
 def voxel_keys(points: F64, edge: float) -> I64:
     """Return one integer for the voxel of each point (N, 3), shape (N,)."""
-    cell = np.floor(points * (1.0 / edge)).astype(np.int64) + _HALF
-    return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])
+    return cell_keys(np.floor(points * (1.0 / edge)).astype(np.int64))
 
 
 def structure_of(points: F64) -> F64:
     """Return the middles (M, 2) [m] of cells with points (N, 3) at several heights."""
     cells = _distinct(voxel_keys(points, STRUCTURE_CELL_M))
-    columns = cells >> _BITS  # the height is in the lowest bits
+    columns = cells >> BITS  # the height is in the lowest bits
     first = np.flatnonzero(np.r_[True, columns[1:] != columns[:-1]]) if len(cells) else cells
     count = np.diff(np.r_[first, len(cells)])
     tall = columns[first[count >= _STRUCTURE_HEIGHTS]]
-    cell = np.stack((tall >> _BITS, tall & (2 * _HALF - 1)), axis=1) - _HALF
+    cell = np.stack((tall >> BITS, tall & (2 * _HALF - 1)), axis=1) - _HALF
     return np.asarray((cell + 0.5) * STRUCTURE_CELL_M)
 
 
@@ -239,22 +262,28 @@ def _spread(points: F64) -> F64:
 def _free_cells(submap: Submap) -> I64:
     """Return the sorted keys of the cells that rays passed and no surface is next to."""
     chosen = submap.points[:: max(-(-len(submap.points) // _FREE_RAYS), 1)]
-    ends = chosen["xyz"] * STEP_M
-    origins = submap.views[chosen["view"]].astype(np.float64)
-    way = ends - origins
-    length = np.linalg.norm(way, axis=1)
-    steps = np.maximum((length - _FREE_SHORT_M) / _FREE_STEP_M, 0.0).astype(np.int64)
-    ray = np.repeat(np.arange(len(ends)), steps)
-    along = (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)) * _FREE_STEP_M
-    passed = origins[ray] + way[ray] * (along / np.maximum(length[ray], 1e-9))[:, None]
-    free = _distinct(voxel_keys(passed, _FREE_CELL_M))
-    occupied = _distinct(voxel_keys(submap.xyz, _FREE_CELL_M))
-    shift = np.arange(-1, 2)
-    around = (
-        (shift[:, None, None] << 2 * _BITS) + (shift[None, :, None] << _BITS) + shift[None, None]
-    )
-    beside = _distinct((occupied[:, None] + around.reshape(1, -1)).ravel())
-    return free[~_contained(free, beside)]
+    occupied = np.floor(submap.xyz * (1.0 / _FREE_CELL_M)).astype(np.int64)
+    ends = chosen["xyz"] * (STEP_M / _FREE_CELL_M)
+    origins = submap.views[chosen["view"]].astype(np.float64) * (1.0 / _FREE_CELL_M)
+    length = np.linalg.norm(ends - origins, axis=1)
+    ahead = (ends - origins) / np.maximum(length, 1e-9)[:, None]
+    steps = np.maximum(length - _FREE_SHORT_M / _FREE_CELL_M, 0.0).astype(np.int64)
+    along = np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)
+    # marks in a box around all of it: to sort the keys of all cells takes several times as long
+    corners = np.concatenate((origins, occupied))
+    low = np.floor(corners.min(axis=0, initial=0.0)).astype(np.int64) - 1
+    size = np.ceil(corners.max(axis=0, initial=0.0)).astype(np.int64) + 3 - low
+    pitch = np.array((size[1] * size[2], size[2], 1))
+    passed = np.zeros(len(along), np.int64)
+    for axis in range(3):
+        place = np.repeat(origins[:, axis] - low[axis], steps)
+        place += np.repeat(ahead[:, axis], steps) * along
+        passed += place.astype(np.int64) * pitch[axis]
+    free = np.zeros(int(size.prod()), np.bool_)
+    free[passed] = True
+    beside = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    free[(((occupied - low) @ pitch)[:, None] + beside @ pitch).ravel()] = False
+    return cell_keys(np.stack(np.unravel_index(np.flatnonzero(free), size), axis=1) + low)
 
 
 def _distinct(keys: I64) -> I64:

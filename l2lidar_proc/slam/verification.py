@@ -36,6 +36,9 @@ _REACH_M: Final = (0.8, 0.2)  # farthest point from its plane in the first step,
 _SCALE_M: Final = 0.06  # distance at which a point loses three quarters of its weight
 _NEAR_M: Final = 0.10  # a point this near a surface lies on it
 _TOUCH_M: Final = 0.13  # or this near a point, for what is not flat: one voxel and a bit
+_CLEAR_M: Final = 0.25  # a point this far from all others is in front of a surface, if not on it
+_THING_M: Final = 0.45  # points of one thing are this close; they are spread at 0.3 m
+_THING_POINTS: Final = 4  # of which there are so many around each
 _POINTS: Final = (400, 1500)  # registered from every start, and to finish the best
 _STEPS: Final = (8, 12)
 _DONE: Final = 2e-4
@@ -181,16 +184,20 @@ class Comparison:
     T_target_query : ndarray, shape (4, 4)
     fit, reverse : Fit
         Of the query in the target, and of the target in the query.
+    obstructed : float
+        Part of the points that make up things where the other one saw none, the way round that
+        has more.
     """
 
     T_target_query: F64
     fit: Fit
     reverse: Fit
+    obstructed: float = 0.0
 
     @property
     def contradiction(self) -> float:
-        """Part of the points that lie on no surface of the other submap, mean of both ways."""
-        return 1.0 - 0.5 * (self.fit.agreement + self.reverse.agreement)
+        """Part of the points that lie on no surface of the other submap, and of things."""
+        return 1.0 - 0.5 * (self.fit.agreement + self.reverse.agreement) + self.obstructed
 
 
 def compare(query: SubmapView, target: SubmapView, guess: F64) -> Comparison | None:
@@ -208,8 +215,16 @@ def compare(query: SubmapView, target: SubmapView, guess: F64) -> Comparison | N
     rough = fit_of(query, target, pose, _POINTS[0])
     if rough.agreement < _HOPELESS:
         return Comparison(pose, rough, rough)
-    fit = fit_of(query, target, pose, _POINTS[1])
-    return Comparison(pose, fit, fit_of(target, query, inverse(pose), _POINTS[1]))
+    back = inverse(pose)
+    return Comparison(
+        pose,
+        fit_of(query, target, pose, _POINTS[1]),
+        fit_of(target, query, back, _POINTS[1]),
+        max(
+            obstructions(query, target, pose, _POINTS[1]),
+            obstructions(target, query, back, _POINTS[1]),
+        ),
+    )
 
 
 def likeness(rival: float, best: float) -> float:
@@ -219,16 +234,8 @@ def likeness(rival: float, best: float) -> float:
 
 def fit_of(query: SubmapView, target: SubmapView, pose: F64, count: int) -> Fit:
     """Return how well the first so many points of a submap fit another one at a pose."""
-    source, upright = query.source[:count], query.is_upright[:count]
-    points = transformed(pose, source)
-    found = target.surfaces.match(points)
-    met = np.zeros(len(points), np.bool_)
-    met[found.index] = True
-    on = np.zeros(len(points), np.bool_)
-    on[found.index] = np.abs(found.distances) < _NEAR_M
-    distance, _ = target.tree.query(points, distance_upper_bound=_TOUCH_M)
-    on |= np.isfinite(distance)
-    free = target.is_free(points) & ~on
+    upright = query.is_upright[:count]
+    on, met, free, _, _ = _marked(query, target, pose, count)
     known = on | met | free
     if not known.any():
         return Fit(0.0, 0.0, 1.0)
@@ -238,6 +245,39 @@ def fit_of(query: SubmapView, target: SubmapView, pose: F64, count: int) -> Fit:
         agreement = min(agreement, float(on[standing].mean()))
         seen_through = max(seen_through, float(free[standing].mean()))
     return Fit(float(known.mean()), agreement, seen_through)
+
+
+def obstructions(query: SubmapView, target: SubmapView, pose: F64, count: int) -> float:
+    """Return the part of a submap's points that make up things where another one saw none.
+
+    Single points are in the way everywhere: on edges, and where the poses of a submap are bent.
+    What counts is several of them side by side: a cupboard that is not there.
+    """
+    on, _, _, points, distance = _marked(query, target, pose, count)
+    off = np.flatnonzero(~on)
+    points = points[off[(distance > _CLEAR_M) & target.is_open(points[off])]]
+    beside = ((points[:, None] - points) ** 2).sum(axis=2) < _THING_M**2
+    return float((beside.sum(axis=1) >= _THING_POINTS).sum() / max(len(on), 1))
+
+
+def _marked(
+    query: SubmapView, target: SubmapView, pose: F64, count: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], F64, F64]:
+    """Return of the first so many points of a submap what they are at a pose in another one.
+
+    Which lie on it, which in cells of its surfaces, which where it saw through; the points in its
+    frame; and of those not on it the distance from its nearest point, inf beyond ``_CLEAR_M``.
+    """
+    points = transformed(pose, query.source[:count])
+    index, _, distances = target.surfaces.match(points)
+    met = np.zeros(len(points), np.bool_)
+    met[index] = True
+    on = np.zeros(len(points), np.bool_)
+    on[index] = np.abs(distances) < _NEAR_M
+    off = np.flatnonzero(~on)
+    distance, _ = target.tree.query(points[off], distance_upper_bound=_CLEAR_M)
+    on[off] = distance < _TOUCH_M
+    return on, met, target.is_free(points) & ~on, points, distance[distance >= _TOUCH_M]
 
 
 def _starts(query: SubmapView, target: SubmapView, guess: F64, window: Window) -> list[F64]:
@@ -265,13 +305,13 @@ def _registered(source: F64, target: SubmapView, start: F64, steps: int) -> tupl
     """Return pose and information (6, 6) of points on surfaces; no information if few meet any."""
     pose, information = start, None
     for step in range(steps):
-        found = target.surfaces.match(transformed(pose, source))
+        index, normals, distances = target.surfaces.match(transformed(pose, source))
         reach = max(_REACH_M[0] * 0.6**step, _REACH_M[1])
-        near = np.abs(found.distances) < reach
-        if np.count_nonzero(near) < min(_FEWEST, len(source) // 4):
+        near = np.flatnonzero(np.abs(distances) < reach)
+        if len(near) < min(_FEWEST, len(source) // 4):
             return pose, None
-        points, distances = source[found.index[near]], found.distances[near]
-        normals = found.normals[near] @ pose[:3, :3]
+        points, distances = source[index[near]], distances[near]
+        normals = normals[near] @ pose[:3, :3]
         scale = max(_SCALE_M, 0.4 * reach)
         weights = 1.0 / (1.0 + (distances / scale) ** 2) ** 2
         h = np.concatenate((rotations.cross(points, normals), normals), axis=1)

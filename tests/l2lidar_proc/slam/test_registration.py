@@ -5,12 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.slam import places, se3
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.places import Place
 from l2lidar_proc.slam.se3 import F64, SHIFT
 from l2lidar_proc.slam.submap import STEP_M, Submap, SubmapBuilder, SubmapView
-from l2lidar_proc.slam.verification import REASONS, Match, Window, likeness, verify
+from l2lidar_proc.slam.surface_grid import SurfaceGrid
+from l2lidar_proc.slam.verification import (
+    REASONS,
+    Match,
+    Window,
+    likeness,
+    obstructions,
+    verify,
+)
 from tests.support.mapping_runs import MappingRun
 
 NARROW = Window(0.6, 0.3, np.radians(3.0))
@@ -75,6 +84,43 @@ def test_space_that_rays_passed_is_free_and_walls_are_not(office: MappingRun) ->
     assert view.is_free(view.points).mean() < 0.01
 
 
+def test_the_grid_gives_the_surfaces_that_the_map_gives(office: MappingRun) -> None:
+    _, submap = submap_of(office, 0, 10)
+    grown = SurfelMap((0.3, 0.6, 1.2), thickness=0.035, least=6)
+    grown.add(submap.xyz)
+    rng = np.random.default_rng(3)
+    low, high = submap.xyz.min(axis=0) - 1.0, submap.xyz.max(axis=0) + 1.0
+    points = np.concatenate((submap.xyz, rng.uniform(low, high, (5000, 3))))
+
+    index, normals, distances = SurfaceGrid(grown).match(points)
+
+    expected = grown.match(points)
+    order = np.argsort(expected.index)
+    np.testing.assert_array_equal(index, expected.index[order])
+    np.testing.assert_array_equal(normals, expected.normals[order])
+    np.testing.assert_allclose(distances, expected.distances[order], atol=1e-9)
+
+
+def test_a_cupboard_that_was_not_there_obstructs_and_one_place_seen_twice_does_not(
+    office: MappingRun,
+) -> None:
+    lap = round(len(office.truth) / 1.35)
+    first, target = submap_of(office, 10, 20)
+    second, query = submap_of(office, lap + 11, lap + 21)
+    pose = se3.inverse(first) @ second
+    x, z = (axis.ravel() for axis in np.meshgrid(np.arange(-1, 1, 0.1), np.arange(-0.8, 0.8, 0.1)))
+    front = np.column_stack((x, np.full(len(x), 0.7), z))  # the wall is 1.1 m beside the way
+    placed = se3.transformed(se3.inverse(second) @ office.truth[lap + 16], front)
+    cupboard = np.zeros(len(placed), query.points.dtype)
+    cupboard["xyz"] = np.rint(placed / STEP_M)
+    changed = Submap(np.concatenate((query.points, cupboard)), query.views)
+    before, after, old = SubmapView(query), SubmapView(changed), SubmapView(target)
+
+    assert obstructions(before, old, pose, 3000) == 0.0
+    assert obstructions(after, old, pose, 3000) > 10 / len(after.source)
+    assert obstructions(old, after, se3.inverse(pose), 3000) == 0.0
+
+
 @pytest.mark.parametrize(("x", "y", "yaw"), [(0.9, -0.4, 0.1), (-1.4, 1.2, -0.05)])
 def test_a_turned_and_shifted_plan_is_found_again(
     office: MappingRun, x: float, y: float, yaw: float
@@ -85,7 +131,7 @@ def test_a_turned_and_shifted_plan_is_found_again(
     query = se3.transformed(back, np.column_stack((target, np.zeros(len(target)))))[:, :2]
 
     near = places.near(query, target, Place(0.0, 0.0, 0.0, 0.0), 2.0, 0.2, 4)[0]
-    anywhere = places.anywhere(query, target, 4)[0]
+    anywhere = places.anywhere(query, target, np.zeros((1, 2)), 5.0, 4)[0]
 
     for found, reach in ((near, 0.3), (anywhere, 0.6)):
         assert np.hypot(found.x - x, found.y - y) < reach
