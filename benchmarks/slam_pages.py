@@ -57,6 +57,7 @@ def is_found(row: Row) -> bool:
 def targets(rows: list[Row]) -> Iterator[Target]:
     """Yield the targets that these rows can tell about."""
     mapping = [row for row in rows if row["kind"] == "mapping"]
+    hour = [row for row in rows if row["kind"] == "hour"]
     street = [r for r in mapping if r["scene"] == "street" and r["drift_percent"] == 0.5]
     if street:
         ratio = max(row["ate_m"] / row["odometry_ate_m"] for row in street)
@@ -81,6 +82,9 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         loops = sum(row["loops"] for row in mapping)
         yield at_most(f"wrong loops of {loops}, all scenes", wrong, 0.0)
         yield at_most("cores, largest of any walk", max(r["cores"] for r in mapping), 0.3)
+        solves = [r["solve_s"] for r in (*mapping, *hour) if "solve_s" in r]
+        if solves:
+            yield at_most("optimization of the whole graph, s of processor", max(solves), 0.5)
         yield at_most("longest step, s of processor", max(r["longest_s"] for r in mapping), 5.0)
         yield at_most("map, MB per km, largest", max(r["mb_per_km"] for r in mapping), 60.0)
     starts = [r for r in rows if r["kind"] == "kidnapped"]
@@ -94,8 +98,13 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         yield at_most(f"wrong announcements, of {len(starts)} starts", wrong, 0.0)
         bound = upper_bound(int(wrong), len(starts))
         yield at_most("their rate, 95 % upper bound", bound, 0.03)
-    hour = [row for row in rows if row["kind"] == "hour"]
+        cores = max(row["cores"] for row in starts)
+        yield at_most("cores while searching and keeping the place, largest", cores, 0.3)
     if len(hour) > 2:
+        cores = max(row["cores"] for row in hour)
+        yield at_most("cores of the long run, largest of a lap", cores, 0.3)
+        peak = hour[-1]["rss_mb"] / hour[1]["rss_mb"]
+        yield at_most("its peak memory by that of the second lap", peak, 1.25)
         grown = (hour[-1]["megabytes"] - hour[1]["megabytes"]) / (
             (hour[-1]["way_m"] - hour[1]["way_m"]) / 1000.0
         )

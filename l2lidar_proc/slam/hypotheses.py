@@ -37,6 +37,7 @@ _UNKNOWN: Final = 0.25  # what a look counts that does not overlap, or leads els
 _LEFT: Final = (np.radians(5.0), 0.5)  # [rad, m] from where the odometry says, it leads elsewhere
 _SAME: Final = (np.radians(4.0), 0.5)  # [rad, m] places closer than this are one
 _NOISE: Final = 0.005  # contradicts every place, and more or less by chance
+_OBSTRUCTED: Final = 0.02  # more things than this, and it is another place; 0.002 to 0.04 in those
 _NO_THING: Final = 0.002  # of a place is obstructed by chance: 0.0003 at most in our scenes
 _EXCEPTIONS: Final = 4  # one look of so many may speak for the rival
 _WINDOW: Final = Window(1.0, 0.4, np.radians(4.0))  # around a place, searched before it is told
@@ -198,6 +199,8 @@ class PlaceHypotheses:
         best, *rivals = self._places
         if sum(best.verified[n] for n in best.against) < _FEWEST or not best.verified[look.number]:
             return "too few looks"
+        if best.obstruction > _OBSTRUCTED:
+            return "obstructed"
         if any(self._is_rival(best, rival) for rival in rivals):
             return "ambiguous"
         here = best.T_map_odom @ look.origin
