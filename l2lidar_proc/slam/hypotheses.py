@@ -126,7 +126,7 @@ class PlaceHypotheses:
         for place in self._places:
             place.against = {n: c for n, c in place.against.items() if n >= oldest}
             self._judge(place, look, poses, among, carry=True)
-        if not self._places or len(self._looks) <= _FEWEST or self._number % 2:
+        if len(self._looks) <= _FEWEST or self._number % 2:
             self._find_more(look, nodes, poses, among)
         self._sort_out(origin)
         return self._decided(look, poses, among)

@@ -152,9 +152,9 @@ def _cells_around(places: F64, radius: float, shape: tuple[int, ...]) -> NDArray
     dx, dy = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
     inside = np.hypot(dx, dy) <= radius
     cells = np.floor(places).astype(int)
-    rows = (cells[:, :1] + dx[inside]).ravel()
-    columns = (cells[:, 1:] + dy[inside]).ravel()
-    return np.unique(rows * shape[1] + columns)
+    mask = np.zeros(shape, np.bool_)
+    mask[cells[:, :1] + dx[inside], cells[:, 1:] + dy[inside]] = True
+    return np.flatnonzero(mask)
 
 
 def _distinct(places: list[Place], count: int) -> list[Place]:
