@@ -23,7 +23,7 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc.recording.trajectory import STAMPED_POSE
 from l2lidar_proc.slam.nodes import Map, Node
 from l2lidar_proc.slam.pose_graph import EDGE
-from l2lidar_proc.slam.submap import SUBMAP_POINT, Submap
+from l2lidar_proc.slam.submap import REACH_M, SUBMAP_POINT, Submap
 
 MANIFEST: Final = "atlas.json"
 VERSION: Final = 1
@@ -219,7 +219,8 @@ def _submap_of(folder: Path, name: str) -> Submap:
     arrays = _read(folder, name, ("points", "views"))
     points, views = arrays["points"], arrays["views"]
     sound = points.dtype == SUBMAP_POINT and points.ndim == 1 and len(points)
-    sound = sound and views.ndim == 2 and views.shape[1] == 3 and np.isfinite(views).all()
+    sound = sound and views.ndim == 2 and views.shape[1] == 3
+    sound = sound and bool((np.abs(views) <= REACH_M).all())
     if not sound or int(points["view"].max()) >= len(views):
         raise AtlasError(f"{folder / name} does not hold a submap")
     return Submap(points, views.astype(np.float32))

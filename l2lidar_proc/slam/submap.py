@@ -25,6 +25,9 @@ I64 = NDArray[np.int64]
 STEP_M: Final = 0.002
 """Resolution of the stored points [m]."""
 
+REACH_M: Final = (2**15 - 1) * STEP_M
+"""Largest coordinate of a point or viewpoint [m]."""
+
 SUBMAP_POINT: Final = np.dtype([("xyz", "<i2", (3,)), ("view", "u1")])
 """Place in steps of :data:`STEP_M` in the submap's frame, and which viewpoint saw it."""
 
@@ -112,11 +115,13 @@ class SubmapBuilder:
         else:
             self._seen_from, self._sweeps_here = T_submap_body, 1
         place = T_submap_body[:3, 3]
+        reach = min(self._max_range, REACH_M - float(np.abs(place).max()) - 1.0)
+        if reach <= 0.0:
+            return
         far = not self._views or np.linalg.norm(place - self._views[-1]) > _VIEW_STEP_M
         if far and len(self._views) < _MOST_VIEWS:
             self._views.append(place.copy())
-        reach = min(self._max_range, (2**15 - 1) * STEP_M - float(np.abs(place).max()) - 1.0)
-        near = (points**2).sum(axis=1) < max(reach, 0.0) ** 2
+        near = (points**2).sum(axis=1) < reach**2
         placed = transformed(T_submap_body, points[near])
         view = np.full(len(placed), len(self._views) - 1, np.uint8)
         self._parts.append((placed, np.ones(len(placed)), view))

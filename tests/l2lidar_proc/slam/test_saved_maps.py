@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.localization import Localizer
 from l2lidar_proc.slam.nodes import SlamState
 from l2lidar_proc.slam.slam import Slam
+from l2lidar_proc.slam.submap import Submap
 from tests.l2lidar_proc.conftest import STEP
 from tests.support.mapping_runs import MappingRun, drifting, scan, walk
 
@@ -80,18 +82,25 @@ def test_whatever_is_cut_off_while_saving_the_map_before_is_whole(
 
 
 def test_a_damaged_submap_is_left_out_with_a_warning(mapped: Slam, tmp_path: Path) -> None:
-    AtlasWriter(tmp_path).save(mapped.map())
+    built = mapped.map()
+    far = next(i for i, node in enumerate(built.nodes) if node.submap is not None)
+    submap = built.nodes[far].submap
+    assert submap is not None
+    beyond = Submap(submap.points, submap.views + np.float32(1e9))  # of a terabyte of free space
+    built.nodes[far] = dataclasses.replace(built.nodes[far], submap=beyond)
+    AtlasWriter(tmp_path).save(built)
     body = json.loads((tmp_path / atlas.MANIFEST).read_text())["map"]
-    number, name = next((i, name) for i, name in enumerate(body["submaps"]) if name)
+    number, name = next((i, n) for i, n in enumerate(body["submaps"]) if n and i != far)
     content = bytearray((tmp_path / name).read_bytes())
     content[len(content) // 2] ^= 0x40
     (tmp_path / name).write_bytes(bytes(content))
 
     loaded, warnings = atlas.load(tmp_path)
 
-    assert len(warnings) == 1
-    assert f"submap {number} is left out" in warnings[0]
-    assert loaded.nodes[number].submap is None
+    assert len(warnings) == 2
+    for left_out, warning in zip((far, number), warnings, strict=True):
+        assert f"submap {left_out} is left out" in warning
+        assert loaded.nodes[left_out].submap is None
     assert len(loaded.nodes) == len(mapped.nodes)
 
 
