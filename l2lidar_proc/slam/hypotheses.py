@@ -52,22 +52,29 @@ class _Look:
     query: SubmapView
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Verdict:
+    """What a look says of a place: contradiction, things in the way if looked for, verified."""
+
+    contradiction: float = _UNKNOWN
+    obstructed: float | None = None
+    is_verified: bool = False
+
+
 @dataclass(slots=True, eq=False)
 class _Place:
-    """A place: ``T_map_odom``, and by look what contradicts it, by things, and if verified."""
+    """A place: ``T_map_odom``, and what the looks say of it, by number."""
 
     T_map_odom: F64
-    against: dict[int, float] = field(default_factory=dict)
-    obstructed: dict[int, float] = field(default_factory=dict)
-    verified: dict[int, bool] = field(default_factory=dict)
+    verdicts: dict[int, _Verdict] = field(default_factory=dict)
 
     @property
     def contradiction(self) -> float:
-        return float(np.mean(list(self.against.values())))
+        return float(np.mean([verdict.contradiction for verdict in self.verdicts.values()]))
 
     @property
     def obstruction(self) -> float:
-        seen = [self.obstructed[n] for n in self.against if n in self.obstructed]
+        seen = [v.obstructed for v in self.verdicts.values() if v.obstructed is not None]
         return float(np.mean(seen)) if seen else 0.0
 
 
@@ -124,7 +131,7 @@ class PlaceHypotheses:
         self._looks.append(look)
         oldest = self._looks[0].number
         for place in self._places:
-            place.against = {n: c for n, c in place.against.items() if n >= oldest}
+            place.verdicts = {n: v for n, v in place.verdicts.items() if n >= oldest}
             self._judge(place, look, poses, among, carry=True)
         if len(self._looks) <= _FEWEST or self._number % 2:
             self._find_more(look, nodes, poses, among)
@@ -138,7 +145,7 @@ class PlaceHypotheses:
     ) -> Comparison | None:
         """Hold a place against a look; ``carry`` moves it to where the look fits best."""
         predicted = place.T_map_odom @ look.origin
-        place.against[look.number], place.verified[look.number] = _UNKNOWN, False
+        place.verdicts[look.number] = _Verdict()
         node = nearest(predicted, poses, among)
         if node is None:
             return None
@@ -149,11 +156,12 @@ class PlaceHypotheses:
         fits, config = (found.fit, found.reverse), self._config
         if min(fit.overlap for fit in fits) < config.min_overlap:
             return None
-        place.against[look.number] = min(found.contradiction, _UNKNOWN)
-        place.obstructed[look.number] = found.obstructed
-        place.verified[look.number] = (
+        is_verified = (
             min(fit.agreement for fit in fits) >= config.min_agreement
             and max(fit.free for fit in fits) <= config.max_free_space
+        )
+        place.verdicts[look.number] = _Verdict(
+            min(found.contradiction, _UNKNOWN), found.obstructed, is_verified
         )
         if carry:
             place.T_map_odom = poses[node] @ found.T_target_query @ inverse(look.origin)
@@ -197,7 +205,8 @@ class PlaceHypotheses:
         if not self._places:
             return "no fit"
         best, *rivals = self._places
-        if sum(best.verified[n] for n in best.against) < _FEWEST or not best.verified[look.number]:
+        verified = sum(verdict.is_verified for verdict in best.verdicts.values())
+        if verified < _FEWEST or not best.verdicts[look.number].is_verified:
             return "too few looks"
         if best.obstruction > _OBSTRUCTED:
             return "obstructed"
@@ -216,8 +225,10 @@ class PlaceHypotheses:
         """Return whether the looks do not tell two places apart."""
         if _ratio(best.obstruction, rival.obstruction, _NO_THING) < self._config.max_second_best:
             return False
-        looks = sorted(best.against)
-        excess = np.array([rival.against[n] - best.against[n] for n in looks])
+        looks = sorted(best.verdicts)
+        excess = np.array(
+            [rival.verdicts[n].contradiction - best.verdicts[n].contradiction for n in looks]
+        )
         ratio = _ratio(best.contradiction, rival.contradiction, _NOISE)
         return bool(
             ratio > self._config.max_second_best

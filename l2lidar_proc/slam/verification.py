@@ -184,20 +184,21 @@ class Comparison:
     T_target_query : ndarray, shape (4, 4)
     fit, reverse : Fit
         Of the query in the target, and of the target in the query.
-    obstructed : float
+    obstructed : float or None
         Part of the points that make up things where the other one saw none, the way round that
-        has more.
+        has more; None where they fit too badly to look.
     """
 
     T_target_query: F64
     fit: Fit
     reverse: Fit
-    obstructed: float = 0.0
+    obstructed: float | None = None
 
     @property
     def contradiction(self) -> float:
         """Part of the points that lie on no surface of the other submap, and of things."""
-        return 1.0 - 0.5 * (self.fit.agreement + self.reverse.agreement) + self.obstructed
+        apart = 1.0 - 0.5 * (self.fit.agreement + self.reverse.agreement)
+        return apart + (self.obstructed or 0.0)
 
 
 def compare(query: SubmapView, target: SubmapView, guess: F64) -> Comparison | None:
