@@ -97,15 +97,30 @@ def creeping(path: Path, velocity: tuple[float, float, float], rate: float) -> s
     return str(path)
 
 
+def vibrating(samples: NDArray[np.void], amplitude: float) -> NDArray[np.void]:
+    """Return samples of an IMU that three lines of so many m/s^2 each shake, and the gyro less."""
+    samples = samples.copy()
+    seconds = (samples["stamp"] - EPOCH) * 1e-9
+    for frequency in (37.0, 71.0, 113.0):
+        phase = 2.0 * np.pi * (frequency * seconds[:, None] + np.array([0.1, 0.4, 0.8]))
+        samples["linear_acceleration"] += amplitude * np.sin(phase)
+        samples["angular_velocity"] += 0.05 * amplitude * np.sin(phase + 1.0)
+    return samples
+
+
 @pytest.mark.parametrize(
-    ("velocity", "rate"),
-    [((0.012, -0.009, 0.0), 0.0), ((0.0, 0.0, 0.01), 0.0), ((0.0, 0.0, 0.0), np.radians(1.0))],
+    ("velocity", "rate", "vibration"),
+    [
+        ((0.012, -0.009, 0.0), 0.0, 0.0),
+        ((0.0, 0.0, 0.01), 0.0, 0.65),
+        ((0.0, 0.0, 0.0), np.radians(1.0), 0.0),
+    ],
 )
 def test_a_sensor_that_creeps_is_followed_and_its_rests_stay(
-    tmp_path: Path, velocity: Any, rate: Any
+    tmp_path: Path, velocity: Any, rate: Any, vibration: float
 ) -> None:
     run = record("room", creeping(tmp_path / "creep.tum", velocity, rate), 1, RESTED + 10.0)
-    estimates = drive(run)
+    estimates = drive(run, imu=vibrating(run.imu, vibration))
     stamps = np.array([one.stamp for one in estimates])
     true, _ = truth(run, stamps)
     error = np.abs(way(estimates) - np.linalg.norm(true - true[0], axis=1))
