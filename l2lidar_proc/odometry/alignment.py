@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import POSE, InertialState, update_with_information
+from l2lidar_proc.motion.filter import (
+    POSE,
+    POSITION,
+    InertialState,
+    update_with_information,
+)
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import (
     Correspondences,
     Source,
+    Support,
     correspondences,
     pose_jacobian,
     residual_jacobian,
@@ -43,8 +49,11 @@ class Alignment:
     residual : float
         Weighted root mean square of their distances [m].
     steps : int
-    support : tuple of ndarray
-        Numbers of the sweeps that opened the surfaces met, and the share of the weight of each.
+    support : Support
+        Of all surfaces met.
+    weakly : tuple of ndarray and Support, optional
+        Direction of the place (3,), map axes, that the points fix far less than others, and the
+        support of the surfaces that fix it; None if there is none.
     """
 
     state: InertialState
@@ -55,7 +64,8 @@ class Alignment:
     inlier_ratio: float
     residual: float
     steps: int
-    support: tuple[NDArray[np.int64], F64]
+    support: Support
+    weakly: tuple[F64, Support] | None = None
 
 
 def align(
@@ -135,6 +145,10 @@ def _updated(
     state, posterior = update_with_information(
         prior, covariance, at, information, -(weighted.T @ found.distances)
     )
+    strength, axes = np.linalg.eigh(information[POSITION, POSITION])
+    weakly = None
+    if strength[0] < tuning.WEAK_SHARE * strength[-1]:
+        weakly = axes[:, 0], found.support_along(pose[:, 3:] @ axes[:, 0])
     return Alignment(
         state,
         posterior,
@@ -145,6 +159,7 @@ def _updated(
         found.residual,
         steps,
         found.support,
+        weakly,
     )
 
 

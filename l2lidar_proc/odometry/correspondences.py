@@ -30,6 +30,9 @@ from l2lidar_proc.odometry.surfel_map import SurfelMap
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
+Support = tuple[I64, F64]
+"""Numbers of sweeps (N,), ascending, and the share of the weight that each has (N,)."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
@@ -77,7 +80,9 @@ class Correspondences:
     weights : ndarray, shape (M,)
         Robust weight by variance [1/m^2].
     born : ndarray, shape (M,)
-        Number of the sweep that opened the surface.
+        Number of the sweep that was the first at the surface's place.
+    opened : ndarray, shape (M,)
+        Number of the sweep that opened the surface itself.
     met : int
         Points at known surfaces, near or not.
     """
@@ -91,6 +96,7 @@ class Correspondences:
     scales: F64
     weights: F64
     born: I64
+    opened: I64
     met: int
 
     @property
@@ -105,11 +111,28 @@ class Correspondences:
         return float(np.sqrt((self.weights * self.distances**2).sum() / total))
 
     @property
-    def support(self) -> tuple[I64, F64]:
-        """Numbers of the sweeps that opened the surfaces, and the share of the weight of each."""
-        born, place = np.unique(self.born, return_inverse=True)
-        total = max(float(self.weights.sum()), 1e-12)
-        return born, np.bincount(place, self.weights) / total
+    def support(self) -> Support:
+        """Sweeps that were the first where the surfaces are, and their shares of the weight."""
+        return _support(self.born, self.weights)
+
+    def support_along(self, levers: F64) -> Support:
+        """Return the sweeps that opened the surfaces which hold a direction.
+
+        A niche in a wall that was seen from afar long before is as well known along the wall as
+        the pose of the sweep that saw into it first.
+
+        Parameters
+        ----------
+        levers : ndarray, shape (M,)
+            Derivatives of the residuals along the direction.
+        """
+        return _support(self.opened, self.weights * levers**2)
+
+
+def _support(sweeps: I64, weights: F64) -> Support:
+    numbers, place = np.unique(sweeps, return_inverse=True)
+    total = max(float(weights.sum()), 1e-12)
+    return numbers, np.bincount(place, weights, len(numbers)) / total
 
 
 def correspondences(
@@ -152,6 +175,7 @@ def correspondences(
         scales,
         robust_weights(distances, scales) / variances,
         found.born[near],
+        found.opened[near],
         len(near),
     )
 

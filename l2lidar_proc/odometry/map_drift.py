@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import skew
+from l2lidar_proc.odometry.correspondences import Support
 
 F64 = NDArray[np.float64]
 
@@ -35,23 +36,53 @@ class MapDrift:
         self._way, self._before = 0.0, np.zeros(3)
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
 
-    def meet(self, support: tuple[NDArray[np.int64], F64]) -> None:
+    def meet(
+        self,
+        support: Support,
+        place: F64 | None = None,
+        weakly: tuple[F64, Support] | None = None,
+    ) -> None:
         """Take the surfaces that hold the latest sweep.
 
         Parameters
         ----------
-        support : tuple of ndarray
-            Numbers of the sweeps that opened them (N,), and their shares of the weight (N,).
+        support : Support
+            All of them.
+        place : ndarray, shape (3,), optional
+            Of the sensor, map frame [m]; needed with what follows.
+        weakly : tuple of ndarray and Support, optional
+            A direction (3,), unit, map axes, that few of them hold, and the support of these. The
+            others, however old, say nothing about it.
         """
         sweeps, shares = support
-        if len(sweeps) and self._known:
-            rows = np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
-            self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
-            self._behind = float(shares @ self._ways[rows])
+        if not len(sweeps) or not self._known:
+            return
+        rows = self._rows(sweeps)
+        self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
+        self._behind = float(shares @ self._ways[rows])
+        if place is None or weakly is None:
+            return
+        weakest, (sweeps, shares) = weakly
+        holding = np.tensordot(shares, self._history[self._rows(sweeps)].astype(np.float64), 1)
+        along = np.zeros((6, 6))
+        along[:3, :3] = np.outer(weakest, weakest)
+        self._combine(place, self._current, holding, along)
 
-    def meet_partly(
-        self, support: tuple[NDArray[np.int64], F64], place: F64, free: F64, ways: F64
-    ) -> None:
+    def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
+
+    def _combine(self, place: F64, most: F64, some: F64, along: F64) -> F64:
+        """Let the error be ``some`` along a projection (6, 6) of a place, else ``most``.
+
+        Return what it is there.
+        """
+        moved, back = _carried(place), _carried(-place)
+        across = np.eye(6) - along
+        there = across @ moved @ most @ moved.T @ across + along @ moved @ some @ moved.T @ along
+        self._current = back @ there @ back.T
+        return np.asarray(there)
+
+    def meet_partly(self, support: Support, place: F64, free: F64, ways: F64) -> None:
         """Take surfaces that leave some directions free: along these nothing is held.
 
         What is registered along them is where the sensor is relative to what the last sweeps put
@@ -59,7 +90,7 @@ class MapDrift:
 
         Parameters
         ----------
-        support : tuple of ndarray
+        support : Support
             As in :meth:`meet`.
         place : ndarray, shape (3,)
             Of the sensor, map frame [m].
@@ -68,13 +99,11 @@ class MapDrift:
         ways : ndarray, shape (K,)
             By how much the place may have run away along each since the sweep before, 1 sigma [m].
         """
-        moved = _carried(place)
-        before = moved @ self._current @ moved.T
+        before = self._current
         self.meet(support)
         along = np.zeros((6, 6))
         along[:3, :3] = free @ free.T
-        across = np.eye(6) - along
-        now = across @ moved @ self._current @ moved.T @ across + along @ before @ along
+        now = self._combine(place, self._current, before, along)
         for direction, way in zip(free.T, ways.tolist(), strict=True):
             sigma = float(np.sqrt(max(direction @ now[:3, :3] @ direction, 0.0)))
             now[:3, :3] += (2.0 * sigma + way) * way * np.outer(direction, direction)

@@ -217,7 +217,7 @@ class SweepMatcher:
         """
         free = unobserved_directions(found.information[POSITION, POSITION])
         if not free.size:
-            self.drift.meet(found.support)
+            self.drift.meet(found.support, found.state.position, found.weakly)
             return
         speeds = np.einsum("ik,ij,jk->k", free, found.covariance[VELOCITY, VELOCITY], free)
         self.drift.meet_partly(

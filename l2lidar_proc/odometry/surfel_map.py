@@ -30,7 +30,8 @@ CELL: Final = np.dtype(
         ("axes", "<f8", (3, 3)),  # rows: the normal, then the two axes of the surface; unit
         ("spread", "<f8", (3,)),  # [m^2] variance along each of the axes, ascending
         ("sweeps", "<f8"),  # in which points came
-        ("born", "<i8"),  # number of the sweep whose points opened it
+        ("born", "<i8"),  # number of the sweep that was the first at its place
+        ("opened", "<i8"),  # number of the sweep whose points opened it
         ("fitted", "<f8"),  # count when mean, axes and spread were computed
         ("flat", "?"),
         ("narrow", "<i1"),  # axes of a cell that is not flat along which its points lie close
@@ -62,7 +63,9 @@ class Matches:
     scatter : ndarray, shape (M,)
         Variance of the map's points about the plane where they are no flat surface, else 0 [m^2].
     born : ndarray, shape (M,)
-        Number of the sweep that opened the surface's cell.
+        Number of the sweep that was the first at the surface's place, of the coarsest size.
+    opened : ndarray, shape (M,)
+        Number of the sweep that opened the surface's own cell.
     """
 
     index: I64
@@ -71,6 +74,7 @@ class Matches:
     variances: F64
     scatter: F64
     born: I64
+    opened: I64
 
 
 class SurfelMap:
@@ -122,10 +126,10 @@ class SurfelMap:
         # the coarsest level tells what is new: finer ones open cells in known walls as well
         *finer, coarsest = self._levels
         fresh = float(coarsest.unknown(points).mean())
-        coarsest.add(points, np.full(len(points), sweep))
+        coarsest.add(points, np.full(len(points), sweep), sweep)
         born = coarsest.born_at(points)
         for level in finer:
-            level.add(points, born)
+            level.add(points, born, sweep)
         for level in self._levels:
             level.see(points, sweep)
         return fresh
@@ -194,6 +198,7 @@ def _distances(points: F64, index: I64, cells: NDArray[np.void], axis: int) -> M
         spread[:, axis] * reach / cells["count"],
         scatter,
         cells["born"],
+        cells["opened"],
     )
 
 
@@ -251,7 +256,7 @@ class _Level:
         """Return the number of the sweep that opened the cell of each point; all have one."""
         return np.asarray(self.cells["born"][self._find(self._key(points))])
 
-    def add(self, points: F64, born: I64) -> None:
+    def add(self, points: F64, born: I64, sweep: int) -> None:
         every = self._key(points)
         rows = self._find(every)
         opened = (rows < 0) | (self._count[rows] < self._capacity)
@@ -261,6 +266,7 @@ class _Level:
         rows = self._rows_of(keys)
         new = rows >= known
         self.cells["born"][rows[new]] = born[opened][first[new]]
+        self.cells["opened"][rows[new]] = sweep
         middles = self._middle(keys)
         offsets = points - middles[inverse]
         bins = len(keys)

@@ -76,6 +76,26 @@ def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
     np.testing.assert_array_equal(drift.at(np.zeros(3)), np.zeros((6, 6)))
 
 
+def test_along_a_direction_that_few_surfaces_hold_only_these_count() -> None:
+    """Walls seen from afar long ago do not tell how far along them a niche is."""
+    drift = MapDrift()
+    along, place = np.array([0.6, 0.8, 0.0]), np.array([4.0, 2.0, 0.0])
+    across = np.array([-0.8, 0.6, 0.0])
+    later = 10 * tuning.DRIFT_GROUP
+    drift.record(0, ZERO, SURE)
+    drift.meet(held_by(0))
+    drift.record(later, place, np.diag([0.04, 0.04, 0.04, 1e-6, 1e-6, 1e-6]))
+    drift.meet(held_by(0), place, (along, held_by(later)))
+    added = (drift.at(place) - unit_alone(place))[:3, :3]
+    assert along @ added @ along == pytest.approx(0.04, abs=1e-3)
+    assert across @ added @ across < 1e-3
+    # the niche was there from the beginning
+    drift.meet(held_by(0, later), place, (along, held_by(0)))
+    added = (drift.at(place) - unit_alone(place))[:3, :3]
+    assert along @ added @ along < 1e-3
+    assert across @ added @ across == pytest.approx(0.02, abs=1e-3)
+
+
 def test_along_a_direction_that_nothing_holds_the_errors_of_a_velocity_add_up() -> None:
     drift = MapDrift()
     free = np.array([[0.6], [0.8], [0.0]])
