@@ -72,7 +72,8 @@ START_POSE_SIGMA: Final = 1e-4  # [m, rad] the first pose defines the map frame
 START_VELOCITY_SIGMA: Final = (0.02, 1.0)  # [m/s]
 START_GYRO_BIAS_SIGMA: Final = (0.01, 0.05)  # [rad/s]
 START_ACCEL_BIAS_SIGMA: Final = (0.02, 0.15)  # [m/s^2]
-START_GRAVITY_SIGMA: Final = ((0.01, 0.01, 0.01), (0.7, 0.7, 0.1))  # [m/s^2] x, y, z of the map
+START_GRAVITY_SIGMA: Final = ((0.01, 0.01, 0.01), (0.7, 0.7, 0.01))  # [m/s^2] x, y, z of the map
+GRAVITY_SIZE_SIGMA: Final = 0.01  # [m/s^2] of its size, which is known to 0.1 %
 ACCEL_BIAS_SIGMA: Final = 0.15  # [m/s^2] of units; source: IMUs of this class
 
 # ---- motion of a sweep without odometry (deskew)
@@ -98,6 +99,8 @@ TWIST_STEP_NS: Final = 10_000_000  # [ns] faster sources are thinned to this
 TWIST_NIS: Final = 50.0  # of 3 components; beyond it the velocity of the filter is dropped
 TWIST_STILL_SPEED: Final = 0.1  # [m/s] at a higher one the IMU cannot claim rest
 MAX_SPEED: Final = 1000.0  # [m/s] a faster velocity is refused
+# Derived: half a turn (0.115 s) away that is 12 mm, as much as the range noise
+DESKEW_SPEED_SIGMA: Final = 0.1  # [m/s] a velocity known worse than that is not trusted
 TRUSTED_ACCELERATION: Final = 0.6  # [m/s^2] largest uncertainty with which forces are integrated
 
 # ---- odometry: prediction
@@ -148,6 +151,26 @@ UNIT_WAY_SHARE: Final = 0.002  # of the way, around and back. Tuned on: as MAP_W
 UNIT_TURN: Final = 0.005  # [rad] each axis
 UNIT_SHIFT: Final = 0.006  # [m] each axis
 UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
+# The map bends where it grows, so the vertical where it began is not quite that of its other end.
+# Tuned on: corridors with narrow views, where 0.01 m/s^2 (0.06 degrees) made 1 to 5 m.
+MAP_BEND: Final = 0.0008  # [rad/sqrt(m)] of the way
+
+# ---- odometry: innovation consistency
+
+NIS_WINDOW_NS: Final = 3_000_000_000  # [ns] over which innovations are judged
+NIS_LEAST: Final = 5  # alignments, before that nothing is said
+NIS_SEEN: Final = (
+    0.05  # share of its variance that an alignment takes from a direction it measures
+)
+# 3 s of turns measure 60 and more components. Derived: their mean exceeds 2 in one of 1e5 windows
+NIS_SUSPECT: Final = 2.0
+NIS_CHANCE: Final = 3.8  # mean of 3 components that chance exceeds in one of 100 windows
+NIS_SPEED_FLOOR: Final = 0.03  # [m/s] of corrections in a window that never count
+NIS_MOST: Final = 25.0  # by which variances are raised at most
+# Zero-rate and zero-g levels of MEMS sensors; source: data sheets of the ICM-20948 (0.09 rad/s,
+# 0.5 m/s^2) and of the BMI160 (0.05 rad/s, 0.4 m/s^2). Twice that is no bias any more.
+MOST_GYRO_BIAS: Final = 0.2  # [rad/s]
+MOST_ACCEL_BIAS: Final = 1.0  # [m/s^2]
 
 # ---- odometry: matching. Tuned on: loose predictions after gaps and blockages in all scenes
 

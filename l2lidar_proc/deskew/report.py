@@ -44,6 +44,7 @@ def of_sweep(quality: Quality, waited_ns: int) -> Report:
         "translation [m]": f"{quality.translation_m:.3f}",
         "velocity source": quality.velocity_source or "none",
         "velocity age [ms]": f"{quality.velocity_age_ns * 1e-6:.0f}",
+        "velocity uncertainty [m/s]": f"{quality.velocity_sigma:.3f}",
         "gyro bias [rad/s]": " ".join(f"{axis:.4f}" for axis in quality.bias),
         "at rest": str(quality.is_still).lower(),
         "gravity trusted": str(quality.is_gravity_trusted).lower(),

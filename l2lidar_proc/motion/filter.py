@@ -477,6 +477,38 @@ def bound_speed(
     return dataclasses.replace(found.state, velocity=velocity), widened
 
 
+def with_gravity_of_known_size(state: InertialState, covariance: F64) -> tuple[InertialState, F64]:
+    """Return state and covariance with a gravity whose size is that of the earth again.
+
+    Only its direction has to be found. Where corrections have changed the size by more than it is
+    uncertain by, the size counts as measured; what is tied to it, as the bias along the vertical,
+    is corrected with it.
+
+    Parameters
+    ----------
+    state : InertialState
+        Without gravity, as for an accelerometer that is not trusted, it is returned as it is.
+    covariance : ndarray, shape (18, 18)
+    """
+    size = float(np.linalg.norm(state.gravity))
+    excess = size - tuning.STANDARD_GRAVITY
+    if size == 0.0 or abs(excess) <= tuning.GRAVITY_SIZE_SIGMA:
+        return state, covariance
+    jacobian = np.zeros((1, ERRORS))
+    jacobian[0, GRAVITY] = state.gravity / size
+    noise = np.array([[tuning.GRAVITY_SIZE_SIGMA**2]])
+    found = update(state, covariance, np.array([-excess]), jacobian, noise)
+    return found.state, found.covariance
+
+
+def biases_are_plausible(state: InertialState) -> bool:
+    """Return whether no bias is larger than that of any sensor of this kind."""
+    return bool(
+        np.abs(state.gyro_bias).max() <= tuning.MOST_GYRO_BIAS
+        and np.abs(state.accel_bias).max() <= tuning.MOST_ACCEL_BIAS
+    )
+
+
 # ---- changes of what is known
 
 
@@ -506,6 +538,22 @@ def with_loose_pose(state: InertialState, covariance: F64, more: F64) -> F64:
     out = covariance.copy()
     out[POSE, :] = out[:, POSE] = 0.0
     out[POSE, POSE] = pose
+    return out
+
+
+def with_leaning_gravity(state: InertialState, covariance: F64, variance: float) -> F64:
+    """Return a covariance (18, 18) in which the direction of gravity is less certain.
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    variance : float
+        What is added, of the turn about either horizontal axis [rad^2].
+    """
+    out = covariance.copy()
+    lever = skew(state.gravity)
+    out[GRAVITY, GRAVITY] += variance * lever @ lever.T
     return out
 
 

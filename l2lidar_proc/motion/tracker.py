@@ -29,6 +29,7 @@ class Flag(Enum):
     NO_VELOCITY = "no velocity is known, so rotation only"
     ACCELEROMETER_FAULT = "the size of gravity is wrong, as after a start on the side"
     CLOCK_JUMP = "the clock jumped while the sweep waited"
+    UNTRUSTED_VELOCITY = "the odometry does not trust its velocity, so points may be smeared"
     PREDICTED_VELOCITY = "the odometry did not align the sweep, so its velocity is a prediction"
     FILTER_LEFT_OUT = "a filter could not work on these points, so its chain was left out"
 
@@ -49,6 +50,9 @@ class Quality:
         Where the velocity came from, empty without one.
     velocity_age_ns : int
         From the newest velocity used to the end of the sweep; 0 where it reaches that far.
+    velocity_sigma : float
+        Standard deviation of the velocity along its least certain direction, where an odometry in
+        the same process gave it [m/s]; half a turn away a point is off by a tenth of it.
     bias : tuple of float
         Of the gyro [rad/s], IMU axes.
     is_still : bool
@@ -68,6 +72,7 @@ class Quality:
     is_still: bool
     is_gravity_trusted: bool
     flags: tuple[Flag, ...]
+    velocity_sigma: float = 0.0
 
 
 _LONGEST_MOTION_NS: Final = 2_000_000_000  # between two sweeps that follow each other
@@ -81,10 +86,16 @@ class KnownMotion(NamedTuple):
     trajectory : SweepTrajectory
     is_aligned : bool
         The sweep itself was aligned; otherwise its motion is predicted.
+    speed_sigma : float
+        Standard deviation of the velocity along its least certain direction [m/s].
+    is_trusted : bool
+        The odometry stands by its estimate.
     """
 
     trajectory: SweepTrajectory
     is_aligned: bool
+    speed_sigma: float = 0.0
+    is_trusted: bool = True
 
 
 class MotionTracker:
@@ -245,6 +256,8 @@ class MotionTracker:
         flags = tuple(Flag.IMU_GAP if flag is Flag.NO_IMU else flag for flag in flags)
         if not known.is_aligned:
             flags = (*flags, Flag.PREDICTED_VELOCITY)
+        if not known.is_trusted or known.speed_sigma > tuning.DESKEW_SPEED_SIGMA:
+            flags = (*flags, Flag.UNTRUSTED_VELOCITY)
         turned_by, moved_by = known.trajectory.between(start, end)
         quality = self._quality(
             covered,
@@ -255,7 +268,7 @@ class MotionTracker:
             still=known.trajectory.is_still,
             flags=flags,
         )
-        return replace(quality, velocity_source="odometry")
+        return replace(quality, velocity_source="odometry", velocity_sigma=known.speed_sigma)
 
     def _is_still(self, start: HostNs, end: HostNs) -> bool:
         speed = self.filter.speed_near(end, self._config.velocity_max_age_ms * 1_000_000)

@@ -24,7 +24,7 @@ class Status(Enum):
     SPARSE = "too few points"
     UNMATCHED = "too few points meet the map"
     DEGENERATE = "the scene does not fix the pose in every direction"
-    SUSPECT = "faster than max_speed: the velocity is bounded, its covariance widened"
+    SUSPECT = "contradicts max_speed, the IMU or the sweeps before: the covariance is widened"
     IMU_GAP = "IMU samples are missing within the span of this estimate"
     NO_IMU = "no IMU sample at all: steady motion is assumed"
     GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"
@@ -36,6 +36,9 @@ class Status(Enum):
 
 CUTS: Final = frozenset({Status.LOST, Status.RESTARTED, Status.RETURNED})
 """What cuts a trajectory: across such an estimate the motion is not known."""
+
+DOUBTFUL: Final = frozenset({Status.SUSPECT, Status.LOST, Status.RESTARTED})
+"""With these the velocity is not to be trusted, whatever its covariance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +57,20 @@ class AlignmentQuality:
         Root mean square of their distances to it, outliers weighed down.
     degeneracy_ratio : float
         Share of the points that speak for the least observed direction, 0 to 1/3.
+    weakest : tuple of float
+        The least observed direction, unit, map axes; zeros where no sweep was aligned.
     kiss_threshold_m : float
         How far predictions have lately been off, as KISS-ICP sees it.
     map_cells : int
         Cells in the map of surfaces.
+    nis : float
+        Normalized innovation squared of the alignments of the last seconds, mean for each degree
+        of freedom: 1 where predictions are as good as their covariance says; 0 at rest.
+    velocity_nis : float
+        Likewise of the sum of what they corrected of the velocity: large where accelerometer and
+        alignments contradict each other for seconds.
+    excess : float
+        By how much the variances of pose and velocity were raised for that, at least 1.
     """
 
     points: int = 0
@@ -65,8 +78,12 @@ class AlignmentQuality:
     inlier_ratio: float = 0.0
     residual_m: float = 0.0
     degeneracy_ratio: float = 0.0
+    weakest: tuple[float, float, float] = (0.0, 0.0, 0.0)
     kiss_threshold_m: float = 0.0
     map_cells: int = 0
+    nis: float = 0.0
+    velocity_nis: float = 0.0
+    excess: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +136,21 @@ class OdometryEstimate:
         return dataclasses.replace(self, points=points[:0], status=(Status.REFUSED,))
 
     @property
+    def tilt(self) -> float:
+        """Angle between the z axis of the map and the vertical as measured since [rad].
+
+        It is what the map was begun with: level at rest, in motion off by some degrees. Not a
+        number as long as gravity is not trusted.
+        """
+        size = float(np.linalg.norm(self.gravity))
+        return float(np.arccos(np.clip(-self.gravity[2] / size, -1.0, 1.0))) if size else np.nan
+
+    @property
+    def speed_sigma(self) -> float:
+        """Standard deviation of the velocity along its least certain direction [m/s]."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.twist_covariance[:3, :3])[-1]))
+
+    @property
     def is_aligned(self) -> bool:
         """Whether the sweep was aligned with the map."""
         return not {Status.PREDICTED, Status.REFUSED} & set(self.status)
@@ -128,6 +160,12 @@ def degeneracy_ratio(information: F64) -> float:
     """Return the share of some information (3, 3) that its least observed direction has."""
     strength = np.linalg.eigvalsh(information)
     return float(strength[0] / max(float(strength.sum()), 1e-12))
+
+
+def weakest_direction(information: F64) -> tuple[float, float, float]:
+    """Return the direction, unit, of which some information (3, 3) says least."""
+    x, y, z = np.linalg.eigh(information)[1][:, 0].tolist()
+    return x, y, z
 
 
 def unobserved_directions(information: F64) -> F64:

@@ -27,6 +27,7 @@ from l2lidar_proc.odometry.estimate import (
     AlignmentQuality,
     degeneracy_ratio,
     unobserved_directions,
+    weakest_direction,
 )
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.map_drift import MapDrift
@@ -237,6 +238,7 @@ class SweepMatcher:
             inlier_ratio=found.inlier_ratio,
             residual_m=found.residual,
             degeneracy_ratio=degeneracy_ratio(found.information[POSITION, POSITION]),
+            weakest=weakest_direction(found.information[POSITION, POSITION]),
         )
 
     def _needed_inliers(self, strict: bool) -> float:

@@ -14,7 +14,9 @@ from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.consistency import InnovationTest
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
 from l2lidar_proc.odometry.frame_jump import FrameJump
@@ -81,6 +83,7 @@ class Odometry:
         self.matcher = SweepMatcher(self.config, self._lever)
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()
+        self._innovations = InnovationTest()
         self._initializer = self._new_initializer()
         self._first_sweeps: list[Sweep] = []  # of a rest that may still turn out to be none
         self._unmatched_ns = 0
@@ -140,7 +143,7 @@ class Odometry:
             return None
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
         nothing, noise = self._last.points[:0], self.config.inertial.gyro_noise
-        quality = AlignmentQuality()
+        quality = AlignmentQuality(excess=self._last.quality.excess)
         return estimate_of(
             motion,
             self._lever,
@@ -197,13 +200,17 @@ class Odometry:
             self._note_unmatched(sweep, len(source.points), status)
             posterior = predicted.state, predicted.covariance
         else:
-            self._note_aligned(sweep, found.state, found.covariance)
+            self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
         lasted = (predicted.state.stamp - state.stamp) * 1e-9
         posterior = eskf.apply_zero_velocity_prior(*posterior, lasted)
+        posterior = eskf.with_gravity_of_known_size(*posterior)
+        way = float(np.linalg.norm(posterior[0].position - state.position))
+        lean = way * tuning.MAP_BEND**2
+        posterior = posterior[0], eskf.with_leaning_gravity(*posterior, lean)
         bounded = eskf.bound_speed(*posterior, self.config.max_speed)
-        if bounded[0] is not posterior[0]:
+        if bounded[0] is not posterior[0] or self._is_suspect(predicted):
             status.append(Status.SUSPECT)
         motion = predicted.with_state(*bounded)
         if self._unmatched_ns >= tuning.LOST_NS:
@@ -215,12 +222,27 @@ class Odometry:
             found, motion, guess = back.alignment, self._return(back, motion), motion.state
             status.append(Status.RETURNED)
         self._keep(motion)
-        quality = self.matcher.quality(len(source.points), found)
+        quality = self._consistency(self.matcher.quality(len(source.points), found))
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None or uncharted or Status.LOST in status:
             fresh = self.matcher.extend(estimate.points, motion, guess)
             self._anchor_anew(fresh)
         return estimate
+
+    def _is_suspect(self, motion: SweepMotion) -> bool:
+        """Return whether the latest sweeps contradict the IMU, or the biases any sensor's."""
+        if self._innovations.contradicts:
+            return True
+        # without a gyro its bias stands for the change of the rate
+        return not (motion.imu.missing.all() or eskf.biases_are_plausible(motion.state))
+
+    def _consistency(self, quality: AlignmentQuality) -> AlignmentQuality:
+        """Return the quality of an alignment with what the innovations of late say."""
+        found = self._innovations
+        self._predictor.excess = found.excess
+        return dataclasses.replace(
+            quality, nis=found.nis, velocity_nis=found.velocity_nis, excess=found.excess
+        )
 
     def _anchor_anew(self, fresh: float) -> None:
         """Measure places from now on relative to what has just become map, by its share.
@@ -242,12 +264,21 @@ class Odometry:
         self._unmatched_ns += 0 if few else sweep.end - sweep.start
         self._zero_velocity.clear()
 
-    def _note_aligned(self, sweep: Sweep, state: InertialState, covariance: F64) -> None:
+    def _note_aligned(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> None:
         """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
+        state, covariance = found.state, found.covariance
+        self._innovations.take(predicted.state, predicted.covariance, state, covariance)
         self._unmatched_ns = 0
         samples = self._predictor.samples(sweep.end - tuning.STILL_TEST_NS, sweep.end)
         rests = self._zero_velocity.watch(state, covariance, samples)
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
+        if rests:
+            self._forget_innovations()
+
+    def _forget_innovations(self) -> None:
+        """Judge only what comes from now on."""
+        self._innovations.clear()
+        self._predictor.excess = 1.0
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map at the predicted pose; keep the one before, it may be seen again."""
@@ -262,6 +293,7 @@ class Odometry:
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
         self._unmatched_ns = 0
+        self._forget_innovations()
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
 
@@ -280,6 +312,7 @@ class Odometry:
         self._initializer = self._new_initializer()
         self.matcher.meet(back.alignment, 0.0)
         self._zero_velocity.clear()
+        self._forget_innovations()
         self._unmatched_ns = 0
         self.phase = Phase.TRACKING
         return motion.with_state(back.alignment.state, back.alignment.covariance)
@@ -366,6 +399,7 @@ class Odometry:
         self._jump = self._jump.unseen(self._belief[0])
         self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
         self._zero_velocity.clear()
+        self._forget_innovations()
         if self.phase is Phase.STATIONARY:
             self._leave_rest()
 

@@ -16,7 +16,7 @@ from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.motion.sweep_trajectory import still_trajectory
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.estimate import DOUBTFUL, OdometryEstimate, Status
 from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.plain import PlainOdometry
@@ -133,7 +133,12 @@ class OdometryPipeline:
             found = KnownMotion(still_trajectory(sweep.start, sweep.end), True)
         else:
             lever = odometry.T_cloud_imu[:3, 3]
-            found = KnownMotion(odometry.motion.trajectory(lever), last.is_aligned)
+            found = KnownMotion(
+                odometry.motion.trajectory(lever),
+                last.is_aligned,
+                last.speed_sigma,
+                not DOUBTFUL & set(last.status),
+            )
         self._motions[(sweep.start, sweep.end)] = found
         while len(self._motions) > _MOTIONS:
             del self._motions[next(iter(self._motions))]

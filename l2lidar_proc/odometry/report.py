@@ -59,7 +59,7 @@ def estimate_of(
     drift : MapDrift
         What the map's own place, and its own error, add to the covariance.
     """
-    state, p = motion.state, motion.covariance
+    state, p = motion.state, quality.excess * motion.covariance
     if quality.matched and quality.degeneracy_ratio < tuning.DEGENERATE_SHARE:
         status = (*status, Status.DEGENERATE)
     pose = np.zeros((6, 18))

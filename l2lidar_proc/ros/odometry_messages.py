@@ -45,19 +45,44 @@ def set_unknown(message: Odometry) -> None:
     message.twist.covariance = unknown
 
 
-def odometry_status(estimate: OdometryEstimate, base_frame: str) -> DiagnosticArray:
+def odometry_status(
+    estimate: OdometryEstimate, base_frame: str, T_map_base: F64, now: int
+) -> DiagnosticArray:
     """Return what is remarkable about an estimate, with the estimate's stamp.
 
-    The message is ``ALIGNED``, or the names of :class:`Status` that apply, comma-separated.
+    The message is ``ALIGNED``, or the names of :class:`Status` that apply, comma-separated; the
+    values are explained in docs/slam.md.
+
+    Parameters
+    ----------
+    estimate : OdometryEstimate
+    base_frame : str
+    T_map_base : ndarray, shape (4, 4)
+        Base coordinates to the odometry's own ones.
+    now : int
+        [ns]
     """
     lost = {Status.LOST, Status.RESTARTED} & set(estimate.status)
     level = DiagnosticStatus.WARN if estimate.status else DiagnosticStatus.OK
     quality = estimate.quality
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    degenerate = np.zeros(3)
+    if Status.DEGENERATE in estimate.status:
+        degenerate = T_map_base[:3, :3].T @ quality.weakest
     values = {
         "matched": quality.matched,
         "inlier_ratio": f"{quality.inlier_ratio:.4f}",
         "residual_m": f"{quality.residual_m:.4f}",
         "degeneracy_ratio": f"{quality.degeneracy_ratio:.4f}",
+        "degenerate_direction": " ".join(f"{axis + 0.0:.3f}" for axis in degenerate),
+        "position_sigma_m": f"{sigma[:3].max():.4f}",
+        "attitude_sigma_rad": f"{sigma[3:].max():.5f}",
+        "speed_sigma_m_s": f"{estimate.speed_sigma:.4f}",
+        "nis": f"{quality.nis:.3f}",
+        "velocity_nis": f"{quality.velocity_nis:.3f}",
+        "variance_excess": f"{quality.excess:.2f}",
+        "tilt_rad": f"{estimate.tilt:.5f}",
+        "age_s": f"{(now - estimate.stamp) * 1e-9:.3f}",
     }
     message = DiagnosticArray()
     message.header.stamp = to_time(estimate.stamp)

@@ -311,7 +311,14 @@ class OdometryNode(ManagedNode):
         if topics.covariance_when_lost and CUTS & set(estimate.status):
             messages.set_unknown(message)
         self._odometry.publish(message)
-        self._status.publish(messages.odometry_status(estimate, self._base_name))
+        self._status.publish(
+            messages.odometry_status(
+                estimate,
+                self._base_name,
+                estimate.T_map_lidar @ self._base.T_lidar_base,
+                self.get_clock().now().nanoseconds,
+            )
+        )
         self._poses.sweep(estimate, self._base)
         self._extend_path(motion.T_odom_base, estimate)
         if self._registered.get_subscription_count():

@@ -25,6 +25,7 @@ def quality(*flags: Flag, still: bool = False) -> Quality:
         ((), Level.OK),
         ((Flag.NO_VELOCITY,), Level.WARN),
         ((Flag.IMU_GAP,), Level.WARN),
+        ((Flag.UNTRUSTED_VELOCITY,), Level.WARN),
         ((Flag.NO_IMU,), Level.ERROR),
         ((Flag.NO_VELOCITY, Flag.ACCELEROMETER_FAULT), Level.ERROR),
     ],

@@ -128,6 +128,46 @@ def test_the_prior_touches_only_a_velocity_that_is_hardly_known() -> None:
     assert covariance[6, 6] == pytest.approx(0.5)
 
 
+def test_the_size_of_gravity_comes_back_and_the_bias_with_it() -> None:
+    down = np.array([0.02, -0.01, -9.80])
+    state = dataclasses.replace(some_state(), gravity=down)
+    covariance = 1e-4 * np.eye(eskf.ERRORS)
+    assert eskf.with_gravity_of_known_size(state, covariance)[0] is state  # within 0.1 %
+    nothing = dataclasses.replace(state, gravity=np.zeros(3))
+    assert eskf.with_gravity_of_known_size(nothing, covariance)[0] is nothing
+    # 1 % of gravity and a bias along it have been taken for each other
+    state = dataclasses.replace(state, gravity=1.01 * down)
+    along = np.zeros((eskf.ERRORS, 1))
+    along[eskf.GRAVITY, 0] = down / 9.8
+    along[eskf.ACCEL_BIAS, 0] = state.rotation.T @ down / 9.8
+    found, after = eskf.with_gravity_of_known_size(state, covariance + 0.1**2 * along @ along.T)
+    assert np.linalg.norm(found.gravity) == pytest.approx(9.80665, abs=0.01)
+    np.testing.assert_allclose(np.cross(found.gravity, down), 0.0, atol=0.02)
+    moved = found.accel_bias - state.accel_bias
+    np.testing.assert_allclose(state.rotation @ moved, found.gravity - state.gravity, atol=0.01)
+    assert np.trace(after) < np.trace(covariance + 0.1**2 * along @ along.T)
+
+
+def test_a_leaning_map_makes_the_vertical_less_certain_not_its_size() -> None:
+    state = dataclasses.replace(some_state(), gravity=np.array([0.0, 0.0, -9.8]))
+    before = 1e-6 * np.eye(eskf.ERRORS)
+    added = eskf.with_leaning_gravity(state, before, 0.01**2) - before
+    np.testing.assert_allclose(
+        added[eskf.GRAVITY, eskf.GRAVITY], np.diag([0.098**2, 0.098**2, 0.0]), atol=1e-12
+    )
+    added[eskf.GRAVITY, eskf.GRAVITY] = 0.0
+    assert not added.any()
+
+
+def test_biases_that_no_sensor_has_are_told() -> None:
+    state = dataclasses.replace(some_state(), gyro_bias=np.zeros(3), accel_bias=np.zeros(3))
+    assert eskf.biases_are_plausible(state)
+    fast = dataclasses.replace(state, gyro_bias=np.array([0.0, 0.25, 0.0]))
+    assert not eskf.biases_are_plausible(fast)
+    heavy = dataclasses.replace(state, accel_bias=np.array([0.0, 0.0, -1.1]))
+    assert not eskf.biases_are_plausible(heavy)
+
+
 def test_a_speed_above_the_bound_comes_back_with_what_it_led_to() -> None:
     state = dataclasses.replace(some_state(), velocity=np.array([6.0, 8.0, 0.0]))
     covariance = 0.01 * np.eye(eskf.ERRORS)

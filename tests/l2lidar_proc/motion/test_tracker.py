@@ -15,7 +15,7 @@ from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import HostNs
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.config import MotionConfig
-from l2lidar_proc.motion.tracker import Flag, MotionTracker, carried_over
+from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, carried_over
 from tests.l2lidar_proc.motion.analytic import (
     EPOCH,
     T_CLOUD_IMU,
@@ -57,6 +57,16 @@ def test_a_walk_with_a_velocity_from_before_the_sweep() -> None:
     assert quality.imu_gap_ns == 4_000_000
     assert quality.is_gravity_trusted
     assert not quality.is_still
+    for sigma, is_trusted, flags in (
+        (0.03, True, ()),
+        (0.3, True, (Flag.UNTRUSTED_VELOCITY,)),
+        (0.03, False, (Flag.UNTRUSTED_VELOCITY,)),
+    ):
+        known = KnownMotion(trajectory, True, sigma, is_trusted)
+        found, told = tracker.trajectory(at(START), at(END), known)
+        assert found is trajectory
+        assert told.flags == flags
+        assert told.velocity_sigma == sigma
 
 
 def test_the_accelerometer_makes_the_difference() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -46,7 +47,13 @@ def drive(
     return feed(odometry, run, list(sweeps(run, cut)), imu)
 
 
-def errors(run: Run, estimates: list[OdometryEstimate]) -> NDArray[np.float64]:
+@lru_cache(maxsize=4)
+def driven(scene: str, motion: str) -> tuple[OdometryEstimate, ...]:
+    """Return the estimates of a recording with default settings and full turns."""
+    return tuple(drive(recording(scene, motion)))
+
+
+def errors(run: Run, estimates: Sequence[OdometryEstimate]) -> NDArray[np.float64]:
     """Return distances from the truth after a rigid alignment [m], shape (N,)."""
     found = np.array([item.T_map_lidar[:3, 3] for item in estimates])
     true, _ = truth(run, np.array([item.stamp for item in estimates]))

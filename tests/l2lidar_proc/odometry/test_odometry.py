@@ -14,8 +14,15 @@ from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry
-from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
-from tests.support.odometry_runs import sweeps, truth
+from tests.l2lidar_proc.odometry.odometry_world import (
+    T_CLOUD_IMU,
+    drive,
+    driven,
+    errors,
+    feed,
+    recording,
+)
+from tests.support.odometry_runs import record, sweeps, truth
 
 
 @pytest.mark.parametrize(
@@ -24,7 +31,7 @@ from tests.support.odometry_runs import sweeps, truth
 )
 def test_error_is_a_few_millimetres(scene: str, motion: str, cut: str) -> None:
     run = recording(scene, motion)
-    estimates = drive(run, cut)
+    estimates = drive(run, cut) if cut != "turn" else driven(scene, motion)
     found = errors(run, estimates)
     assert np.sqrt((found**2).mean()) < 0.006
     assert found.max() < 0.02
@@ -35,7 +42,7 @@ def test_error_is_a_few_millimetres(scene: str, motion: str, cut: str) -> None:
 def test_every_sweep_has_its_estimate_at_its_middle() -> None:
     run = recording("room", "walk")
     some = list(sweeps(run, "turn"))
-    estimates = drive(run)
+    estimates = driven("room", "walk")
     assert [item.stamp for item in estimates] == [(one.start + one.end) // 2 for one in some]
 
 
@@ -50,7 +57,7 @@ def test_other_references_are_stamped_and_met(reference: str) -> None:
 
 def test_covariance_and_twist_are_those_of_the_errors() -> None:
     run = recording("room", "walk")
-    estimates = drive(run)[8:]
+    estimates = driven("room", "walk")[8:]
     found = errors(run, estimates)
     sigma = np.array([np.sqrt(np.trace(item.covariance[:3, :3])) for item in estimates])
     assert 0.2 < np.sqrt((found**2 / sigma**2).mean()) < 3.0
@@ -68,16 +75,32 @@ def sweep_epoch(run: Any) -> Any:
 
 
 def test_biases_and_up_are_found() -> None:
-    run = recording("room", "walk")
-    last = drive(run)[-1]
+    last = driven("room", "walk")[-1]
     assert np.abs(last.gyro_bias - [0.01, -0.02, 0.015]).max() < 0.01
     assert np.linalg.norm(last.gravity) == pytest.approx(9.80665, abs=0.1)
     assert last.gravity[2] < -9.7
 
 
+def test_the_vertical_of_a_map_begun_in_motion_is_found() -> None:
+    run = record("room", "drone", 2, 10.4, since=5.0)
+    estimates = drive(run)
+    _, turns = truth(run, np.array([item.stamp for item in estimates]))
+
+    def off(index: int, vertical: Any) -> float:
+        """Return how far a direction in the map is from the vertical [deg]."""
+        true = estimates[index].T_map_lidar[:3, :3] @ rotations.matrices(turns[index])[2]
+        return float(np.degrees(np.arccos(true @ vertical / np.linalg.norm(vertical))))
+
+    assert off(0, [0.0, 0.0, 1.0]) > 1.0  # what it was taken for
+    last = estimates[-1]
+    assert off(-1, -last.gravity) < 0.5
+    assert np.degrees(last.tilt) == pytest.approx(off(-1, [0.0, 0.0, 1.0]), abs=0.5)
+    assert np.linalg.norm(last.gravity) == pytest.approx(9.80665, abs=0.02)
+
+
 def test_the_cloud_is_the_one_of_the_stamp() -> None:
     run = recording("room", "walk")
-    estimates = drive(run)
+    estimates = driven("room", "walk")
     position, quaternion = truth(run, np.array([estimates[-1].stamp]))
     first, q0 = truth(run, np.array([estimates[5].stamp]))
     points = {}

@@ -342,6 +342,14 @@ def test_back_ends_get_deskewed_clouds_and_the_status_of_each_pose(bench: Any) -
     assert [from_time(m.header.stamp) for m in statuses] == stamps
     assert {m.header.frame_id for m in clouds} == {FRAME}
     assert statuses[-1].status[0].message == "ALIGNED"
+    values = {item.key: item.value for item in statuses[-1].status[0].values}
+    sigma = np.sqrt(np.asarray(bench.poses[-1].pose.covariance).reshape(6, 6).diagonal())
+    assert float(values["position_sigma_m"]) == pytest.approx(sigma[:3].max(), abs=1e-4)
+    assert float(values["variance_excess"]) == 1.0
+    assert 0.0 <= float(values["nis"]) < 2.0
+    assert float(values["tilt_rad"]) < 0.02
+    assert values["degenerate_direction"] == "0.000 0.000 0.000"
+    assert float(values["age_s"]) > 1e6  # the recording is of 2023
     pose = matrix(bench.poses[-1].pose.pose)
     body, world = from_cloud(clouds[-1]), from_cloud(bench.registered[-1])
     moved = np.stack([body[axis] for axis in "xyz"], axis=1) @ pose[:3, :3].T + pose[:3, 3]
