@@ -56,6 +56,7 @@ TESTS: Final = (
     "tests/l2lidar_proc/test_hostile_input.py",
     "tests/l2lidar_node/test_frames.py",
     "tests/l2lidar_node/test_rotations.py",
+    "tests/test_reference.py",
 )  # fmt: skip
 SLOWEST_S: Final = 30.0
 """A test that takes longer [CPU s] is left to the gate."""
