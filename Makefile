@@ -3,6 +3,8 @@
 RUN := .venv/bin/python
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+# Containers often forbid bytecode: every program would compile all that it imports at each start.
+unexport PYTHONDONTWRITEBYTECODE
 CORES := $(shell nproc)
 # A process for every core; more than four find too little to do.
 WORKERS := -n logical --maxprocesses 4

@@ -1,5 +1,6 @@
 """What the set-up says where it cannot go on, with parts of the machine replaced."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -53,6 +54,23 @@ def run(project: Path, *command: str, **environment: str) -> subprocess.Complete
         text=True,
         check=False,
     )
+
+
+def test_programs_that_are_started_keep_what_they_have_compiled(tmp_path: Path) -> None:
+    """Also where the environment forbids it, in what make runs and in what tests start."""
+    makefile = tmp_path / "Makefile"
+    asked = 'print("forbidden" if __import__("sys").dont_write_bytecode else "kept")'
+    makefile.write_text(f"include {ROOT / 'Makefile'}\nasked:\n\t@{sys.executable} -c '{asked}'\n")
+    said = subprocess.run(
+        ["make", "-f", str(makefile), "asked"],
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert said.stdout.strip() == "kept"
+    said = subprocess.run(
+        [sys.executable, "-c", asked], capture_output=True, text=True, check=True
+    )
+    assert said.stdout.strip() == "kept"
 
 
 def test_a_machine_without_wheels_is_told_to_install_ros(project: Path) -> None:
