@@ -90,7 +90,7 @@ def occupancy(built: Map, cell: float = 0.05) -> tuple[NDArray[np.uint8], tuple[
         If the map is empty, or too large for the cells.
     """
     occupied: list[F64] = []
-    freed: list[F64] = []
+    rays: list[tuple[F64, F64]] = []
     for node, pose in zip(built.nodes, built.poses, strict=True):
         if node.submap is None:
             continue
@@ -101,29 +101,40 @@ def occupancy(built: Map, cell: float = 0.05) -> tuple[NDArray[np.uint8], tuple[
         points, origins = points[band], origins[band]
         occupied.append(transformed(pose, points)[:, :2])
         some = slice(None, None, max(len(points) // _RAYS, 1))
-        starts, ends = transformed(pose, origins[some]), transformed(pose, points[some])
-        way = (ends - starts)[:, :2]
-        length = np.linalg.norm(way, axis=1)
-        steps = np.maximum((length - 2.0 * cell) / cell, 0.0).astype(np.int64)
-        ray = np.repeat(np.arange(len(ends)), steps)
-        along = (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)) * cell
-        passed = starts[ray, :2] + way[ray] * (along / np.maximum(length[ray], 1e-9))[:, None]
-        freed.append(np.unique(np.floor(passed / cell), axis=0) * cell + 0.5 * cell)
+        ends = transformed(pose, points[some])[:, :2]
+        rays.append((transformed(pose, origins[some])[:, :2], ends))
     if not occupied or not sum(map(len, occupied)):
         raise ValueError("the map has no points at the sensor's height")
-    walls, free = np.concatenate(occupied), np.concatenate(freed)
-    low = np.floor(walls.min(axis=0) / cell) * cell
+    walls = np.concatenate(occupied)
+    first = np.floor(walls.min(axis=0) / cell)
+    low = first * cell
     size = np.ceil((walls.max(axis=0) - low) / cell).astype(int) + 1
     if int(size[0]) * int(size[1]) > _LARGEST_IMAGE:
         raise ValueError(
             f"the map needs {size[0]} x {size[1]} cells of {cell} m; take larger ones"
         )
     image = np.full((int(size[1]), int(size[0])), _UNKNOWN, np.uint8)
-    for places, value in ((free, _FREE), (walls, _OCCUPIED)):
-        index = np.floor((places - low) / cell).astype(int)
+
+    def mark(places: F64, value: int) -> None:
+        index = (np.floor(places / cell) - first).astype(int)
         index = index[((index >= 0) & (index < size)).all(axis=1)]
         image[index[:, 1], index[:, 0]] = value
+
+    for starts, ends in rays:
+        mark(_passed(starts, ends, cell), _FREE)
+    mark(walls, _OCCUPIED)
     return image[::-1], (float(low[0]), float(low[1]))
+
+
+def _passed(starts: F64, ends: F64, cell: float) -> F64:
+    """Return places (M, 2) that rays (N, 2) pass, a cell apart, but for the last two."""
+    way = ends - starts
+    length = np.linalg.norm(way, axis=1)
+    steps = np.maximum((length - 2.0 * cell) / cell, 0.0).astype(np.int64)
+    ray = np.repeat(np.arange(len(ends)), steps)
+    along = (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)) * cell
+    passed = starts[ray] + way[ray] * (along / np.maximum(length[ray], 1e-9))[:, None]
+    return np.asarray(passed)
 
 
 def _write_g2o(built: Map, target: Path) -> list[Path]:
