@@ -115,6 +115,7 @@ def still(
     """
     if emulator is not None and captures:
         raise UsageError("--emulator measures by itself; leave the captures out")
+    known = files.existing(output)
     firmware = ""
     if emulator is not None:
         gathered = _virtual(emulator, seconds, min(places, 4), quiet=json_)
@@ -122,6 +123,9 @@ def still(
         gathered, firmware = _captured(captures, again or [])
     else:
         gathered, firmware = _live(network, places, seconds, keep, _Guide(yes or json_, json_))
+    if known is not None:
+        for place in gathered:
+            files.check_identity(place, known, output)
     say("estimating ...") if not json_ else None
     try:
         result = calibrate(gathered, keep_alpha)

@@ -100,6 +100,12 @@ def test_a_file_of_another_unit_is_not_overwritten(
     assert done.code == 1
     assert "format is 7" in done.err
     assert output.read_text() == "format: 7\n"
+    other = CalibrationFile(bytes(32), {"xi_angle": 0.001})
+    other.save(tmp_path / "other.yaml")
+    done = run("calibrate", "still", str(captures[1]), "-o", str(tmp_path / "other.yaml"))
+    assert done.code == 1
+    assert "is of another unit" in done.err
+    assert "estimating" not in done.out  # nobody waits for what is not written
 
 
 def test_a_virtual_unit_must_be_known(run: Run) -> None:
