@@ -18,13 +18,13 @@ SHORT = [
     case for case in SINGLE if "2D" in case.name or "host" in case.name or "reboot" in case.name
 ]
 INPUTS = {
-    "wire": 100_000,
-    "driver": 5_000,
-    "pcap": 3_000,
-    "cloud": 10_000,
-    "message": 3_000,
-    "yaml": 400,
-    "tum": 400,
+    "wire": 30_000,
+    "driver": 2_000,
+    "pcap": 1_000,
+    "cloud": 3_000,
+    "message": 1_000,
+    "yaml": 200,
+    "tum": 200,
 }
 
 

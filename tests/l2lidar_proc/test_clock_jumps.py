@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 from typing import Any
 
@@ -81,7 +82,7 @@ class Deskewing:
         self.out += self.pipeline.poll(now + 1_000_000_000)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(jumps, who_jumps, st.integers(2, 6))
 @example(86_400_000_000_000, "both", 5)
 @example(YEAR_NS, "one cloud", 5)
@@ -100,7 +101,10 @@ def test_deskew_goes_on_after_any_jump(by: Any, who: Any, when: Any) -> None:
     assert deskewing.out[-1].quality.velocity_source, (by, who, when)
 
 
-ROOM = list(sweeps(recording("room", "walk"), "turn"))
+ROOM = [
+    dataclasses.replace(sweep, points=sweep.points[::2])
+    for sweep in sweeps(recording("room", "walk"), "turn")
+]
 IMU = recording("room", "walk").imu
 
 
@@ -115,7 +119,7 @@ IMU = recording("room", "walk").imu
 def test_odometry_goes_on_after_any_jump(by: Any, who: Any) -> None:
     when, pipeline, first, poses = 6, OdometryPipeline(OdometryConfig(), T_CLOUD_IMU), 0, []
     with memory.at_most(MOST_BYTES):
-        for number, sweep in enumerate(ROOM[:18]):
+        for number, sweep in enumerate(ROOM[:14]):
             last = int(np.searchsorted(IMU["stamp"], sweep.end)) + 1
             cloud_by, imu_by = offsets(who, by, number, when)
             samples = IMU[first:last].copy()
@@ -127,7 +131,7 @@ def test_odometry_goes_on_after_any_jump(by: Any, who: Any) -> None:
             first = last
             pipeline.sweep(moved(sweep, cloud_by), number * 200_000_000)
             poses += [(number, item) for item in pipeline.poll(number * 200_000_000 + 10**9)]
-    assert [number for number, _ in poses][-4:] == [14, 15, 16, 17], (by, who)
+    assert [number for number, _ in poses][-4:] == [10, 11, 12, 13], (by, who)
     for _, item in poses:
         assert np.isfinite(item.T_map_lidar).all()
         assert np.linalg.norm(item.T_map_lidar[:3, 3]) < 20.0, (by, who)

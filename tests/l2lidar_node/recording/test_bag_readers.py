@@ -68,9 +68,9 @@ def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     return path
 
 
-@pytest.mark.parametrize("chosen", [(), ("--topic", "/points")], ids=["guessed", "named"])
-def test_kiss_icp_reads_every_cloud(bag: Any, chosen: Any, tmp_path: Path) -> None:
+def test_kiss_icp_reads_every_cloud(bag: Any, tmp_path: Path) -> None:
     # its own reader of single files fails on every MCAP, its reader of bags takes files as well
+    chosen = ("--topic", "/points") if bag.suffix else ()  # else it guesses
     run("kiss_icp_pipeline", "--dataloader", "rosbag", *chosen, bag, cwd=tmp_path)
     (poses,) = tmp_path.glob("results/*-*/*_poses_tum.txt")
     found = np.loadtxt(poses)
@@ -139,8 +139,6 @@ def test_evo_reads_odometry_out_of_a_bag(name: str, tmp_path: Path) -> None:
     (written,) = tmp_path.glob("*.tum")
     found = np.loadtxt(written)
     np.testing.assert_allclose(found[:, 1:4], positions, atol=1e-6)
-    said = run("evo_ape", "tum", written.name, written.name, "--align", cwd=tmp_path)
-    assert float(re.findall(r"rmse\s+([\d.]+)", said)[0]) < 1e-6
 
 
 @pytest.mark.parametrize("bag", ["run.mcap"], indirect=True)  # the other is read above

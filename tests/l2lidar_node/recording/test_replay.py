@@ -43,10 +43,14 @@ FAULTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(
     ("settings", "faults"),
-    [*((name, "rough") for name in SETTINGS), *(("periodic", name) for name in FAULTS)],
+    [
+        *((name, "rough") for name in SETTINGS),
+        *(("periodic", name) for name in FAULTS if name != "rough"),
+    ],
 )
 def test_replay_is_the_live_run_bit_for_bit(settings: Any, faults: Any) -> None:
-    config, live, tap = live_run(4.0, settings=SETTINGS[settings], faults=FAULTS[faults])
+    seconds = 4.0 if faults in ("silences", "reboot") else 2.5
+    config, live, tap = live_run(seconds, settings=SETTINGS[settings], faults=FAULTS[faults])
     replayed = list(events(Recording(tap.stream), config))
     assert any(isinstance(event, Sweep) for event in live)
     assert essence(replayed) == essence(live)
@@ -55,7 +59,7 @@ def test_replay_is_the_live_run_bit_for_bit(settings: Any, faults: Any) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_a_busy_host_makes_no_difference(seed: Any) -> None:
     config, live, tap = live_run(
-        6.0,
+        4.0,
         settings=SETTINGS["periodic"],
         faults=FAULTS["silences"],
         busy=0.02,
@@ -156,11 +160,12 @@ def test_slewing_of_the_host_clock_is_told_when_it_changes_and_replayed() -> Non
 
 @pytest.mark.parametrize("late", [1.0, 5.0])
 def test_packets_that_stay_late_are_stamped_as_measured(late: float) -> None:
-    config, live, tap = live_run(12.0, late=[(2.0, 5.0, late)], settings={"imu_adjust": False})
+    seconds = 7.0 + late
+    config, live, tap = live_run(seconds, late=[(2.0, 5.0, late)], settings={"imu_adjust": False})
 
     stamps = [event.stamp for event in live if isinstance(event, ImuSample)]
     assert stamps[0] < EPOCH_NS + 2_000_000_000
-    assert stamps[-1] > EPOCH_NS + 11_900_000_000
+    assert stamps[-1] > EPOCH_NS + round((seconds - 0.1) * 1e9)
     assert all(3_990_000 < after - before < 4_010_000 for before, after in pairwise(stamps))
     kinds = [event.kind for event in live if isinstance(event, ClockEvent)]
     assert kinds == [ClockEventKind.LOCKED]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,14 @@ from tests.support.odometry_runs import sweeps
 STEP = 5  # samples, 20 ms
 
 
-def track(run: Any, most: int = 40) -> Iterator[Any]:
-    """Yield dead reckoning, extrapolation and the extrapolation after the sweep, of each sweep."""
+@cache
+def track(world: str, motion: str) -> list[tuple[Any, Any, Any]]:
+    """Return dead reckoning, extrapolation and the extrapolation after the sweep, of each."""
+    found, run = [], recording(world, motion)
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
     reckoning = DeadReckoning(T_CLOUD_IMU)
     first = 0
-    for sweep in list(sweeps(run, "turn"))[:most]:
+    for sweep in sweeps(run, "turn"):
         last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
         for begin in range(first, last, STEP):
             samples = run.imu[begin : min(begin + STEP, last)]
@@ -36,8 +38,9 @@ def track(run: Any, most: int = 40) -> Iterator[Any]:
         corrected = odometry.extrapolated(newest)
         if carried is not None:
             assert carried.stamp == full.stamp == corrected.stamp == newest
-            yield carried, full, corrected
+            found.append((carried, full, corrected))
         reckoning.reset(corrected)
+    return found
 
 
 def turned_by(one: Any, other: Any) -> Any:
@@ -47,7 +50,7 @@ def turned_by(one: Any, other: Any) -> Any:
 
 @pytest.mark.parametrize(("world", "motion"), [("room", "trot"), ("yard", "drone")])
 def test_it_is_as_good_as_every_sample_by_itself(world: str, motion: str) -> None:
-    found = list(track(recording(world, motion)))
+    found = track(world, motion)
     assert len(found) >= 15
     for carried, full, _ in found:
         apart = carried.T_map_lidar[:3, 3] - full.T_map_lidar[:3, 3]
@@ -67,7 +70,7 @@ def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(
         [
             np.abs(corrected.T_map_lidar[:3, 3] - carried.T_map_lidar[:3, 3])
             / np.sqrt(np.diag(carried.covariance)[:3])
-            for carried, _, corrected in track(recording(world, motion))
+            for carried, _, corrected in track(world, motion)
         ]
     )
     assert len(corrections) >= 15
@@ -76,8 +79,7 @@ def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(
 
 @pytest.fixture(scope="module")
 def estimate() -> Any:
-    *_, (carried, _, _) = track(recording("room", "walk"), most=8)
-    return carried
+    return track("room", "walk")[5][0]
 
 
 def samples(start: Any, count: Any, **fields: Any) -> Any:
