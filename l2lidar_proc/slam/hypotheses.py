@@ -18,10 +18,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_proc.slam import places
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.nodes import Node
 from l2lidar_proc.slam.place_search import Found, PlaceSearch, nearest
-from l2lidar_proc.slam.se3 import error, inverse, magnitude
+from l2lidar_proc.slam.se3 import error, inverse, magnitude, planar, yaw_of
 from l2lidar_proc.slam.submap import SubmapView
 from l2lidar_proc.slam.verification import Comparison, Window, compare, verify
 
@@ -32,6 +33,9 @@ _FEWEST: Final = 3  # before a place may be announced
 _PEAKS: Final = 16  # of the plan that are compared
 _RAISED: Final = 4  # of these are also tried at other heights, if none fits
 _HEIGHTS_M: Final = (0.4, -0.4, 0.8, -0.8)
+_REFINED: Final = 3  # places around which is looked more closely, if none is verified
+_PEAKS_BESIDE: Final = 6
+_BESIDE: Final = (np.radians(5.0), 3.0)  # [rad, m]
 _HOPELESS: Final = 0.16  # contradicted more than this, a place is not followed
 _UNKNOWN: Final = 0.25  # what a look counts that does not overlap, or leads elsewhere
 _LEFT: Final = (np.radians(5.0), 0.5)  # [rad, m] from where the odometry says, it leads elsewhere
@@ -175,20 +179,52 @@ class PlaceHypotheses:
         raised = [start.copy() for start in starts[:_RAISED] for _ in _HEIGHTS_M]
         for start, height in zip(raised, _HEIGHTS_M * _RAISED, strict=False):
             start[2, 3] += height
-        for some in (starts, raised):
-            for start in some:
-                if any(not _apart(p.T_map_odom @ look.origin, start, _SAME) for p in self._places):
-                    continue
-                place = _Place(start @ inverse(look.origin))
-                self._judge(place, look, poses, among, carry=True)
-                for old in reversed(list(self._looks)[:-1]):
-                    if place.contradiction > _HOPELESS:
-                        break
-                    self._judge(place, old, poses, among, carry=False)
-                if place.contradiction <= _HOPELESS:
-                    self._places.append(place)
-            if self._places:
-                return
+        self._follow(starts, look, poses, among)
+        if not self._places:
+            self._follow(raised, look, poses, among)
+        if not any(place.verdicts[look.number].is_verified for place in self._places):
+            self._follow(self._beside(look, poses, among), look, poses, among)
+
+    def _follow(
+        self, starts: list[F64], look: _Look, poses: F64, among: NDArray[np.int64]
+    ) -> None:
+        """Add the places (4, 4) of a look that nothing speaks against."""
+        for start in starts:
+            if any(not _apart(p.T_map_odom @ look.origin, start, _SAME) for p in self._places):
+                continue
+            place = _Place(start @ inverse(look.origin))
+            self._judge(place, look, poses, among, carry=True)
+            for old in reversed(list(self._looks)[:-1]):
+                if place.contradiction > _HOPELESS:
+                    break
+                self._judge(place, old, poses, among, carry=False)
+            if place.contradiction <= _HOPELESS:
+                self._places.append(place)
+
+    def _beside(self, look: _Look, poses: F64, among: NDArray[np.int64]) -> list[F64]:
+        """Return what the finer plan shows around the likeliest places, none of which fits well.
+
+        Along a street the coarse one may be meters off, and registration stays there.
+        """
+        found = []
+        likely = sorted(self._places, key=lambda one: one.verdicts[look.number].contradiction)
+        for place in likely[:_REFINED]:
+            here = place.T_map_odom @ look.origin
+            node = nearest(here, poses, among)
+            if node is None:
+                continue
+            guess = inverse(poses[node]) @ here
+            x, y, z = guess[:3, 3].tolist()
+            peaks = places.near(
+                look.query.structure,
+                self._search.view_of(node).structure,
+                places.Place(x, y, yaw_of(guess), 0.0),
+                _BESIDE[1],
+                _BESIDE[0],
+                _PEAKS_BESIDE,
+            )
+            found += [poses[node] @ planar(peak.x, peak.y, peak.yaw, z) for peak in peaks]
+        return found
 
     def _sort_out(self, origin: F64) -> None:
         """Drop places that are contradicted, and the worse of two that have become one."""

@@ -45,6 +45,7 @@ _GATE: Final = 22.5  # chi2 of 6 degrees of freedom, 99.9 %
 _SHARE: Final = 0.1  # of a sweep's covariance: two seconds of bad sweeps add it once
 _BENT: Final = (np.radians(0.1), 0.02)  # [rad, m] a saved map is not exact either
 _GIVEN: Final = (np.radians(15.0), 1.0)  # [rad, m] of a pose that a person gives
+_UNIQUE_M: Final = 0.3  # a second place that far off would have been told: "ambiguous"
 _JUMP: Final = np.radians(5.0)
 _FEWEST_SWEEPS: Final = 3
 
@@ -317,7 +318,7 @@ class Localizer:
             return
         self.T_map_odom = found.T_map_query @ inverse(origin)
         ad = adjoint(_only_turn(found.T_map_query))
-        self.covariance = ad @ found.match.covariance @ ad.T
+        self.covariance = bounded(ad @ found.match.covariance @ ad.T, _UNIQUE_M)
         self.covariance += np.diag(np.repeat(np.square(_BENT), 3))
         self._confirmed_at, self._looks = self._way, []
         self.state = SlamState.LOCALIZED
@@ -327,6 +328,17 @@ class Localizer:
         submap = self._map.nodes[number].submap
         assert submap is not None
         return self._views.of(number, submap)
+
+
+def bounded(covariance: F64, sigma: float) -> F64:
+    """Return a covariance (6, 6) of which each direction of the translation is known to so much.
+
+    Along a street few points speak for a direction, and registration leaves it open; that no
+    other place along it fits says how far off it may be.
+    """
+    information = np.linalg.inv(covariance)
+    information[SHIFT, SHIFT] += np.eye(3) / sigma**2
+    return np.asarray(np.linalg.inv(information))
 
 
 def _same(one: Look, other: Look, at: F64) -> bool:

@@ -14,7 +14,7 @@ from l2lidar_node.emulator.world.mapping_scenes import furnished_office, street_
 from l2lidar_proc.slam import atlas, export, se3
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
 from l2lidar_proc.slam.config import SlamConfig
-from l2lidar_proc.slam.localization import Localizer
+from l2lidar_proc.slam.localization import Localizer, bounded
 from l2lidar_proc.slam.nodes import SlamState
 from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.slam.submap import Submap
@@ -211,6 +211,17 @@ def off_by(pose: Any, run: MappingRun, number: int, mapped: Slam) -> float:
 
 def furnished_walk_start() -> Any:
     return se3.leveled(walk(furnished_office(), 0.1, step=STEP)[0])
+
+
+def test_a_direction_that_registration_leaves_open_is_bounded_and_the_others_stay() -> None:
+    along = se3.exp((0.0, 0.0, 0.6, 0.0, 0.0, 0.0))
+    ad = se3.adjoint(along)
+    open_ahead = ad @ np.diag((1e-6, 1e-6, 1e-6, 900.0, 1e-4, 1e-4)) @ ad.T
+
+    found = se3.adjoint(se3.inverse(along)) @ bounded(open_ahead, 0.3) @ ad
+
+    np.testing.assert_allclose(np.diag(found)[3:], (0.09, 1e-4, 1e-4), rtol=2e-3)
+    np.testing.assert_allclose(np.diag(found)[:3], 1e-6, rtol=1e-3)
 
 
 def test_a_start_outside_the_map_announces_nothing(mapped: Slam) -> None:
