@@ -138,7 +138,7 @@ def _updated(
     """Return the posterior of correspondences found from a state."""
     pose = pose_jacobian(found, at.rotation)
     if weak is not None:
-        pose = weak.reduced(pose)
+        pose = weak.reduced(pose, found.is_settled)
     h = residual_jacobian(pose, found.times, at.rotation)
     weighted = h * found.weights[:, None]
     information = weighted.T @ h

@@ -85,6 +85,8 @@ class Correspondences:
         Number of the sweep that opened the surface itself.
     met : int
         Points at known surfaces, near or not.
+    latest : int
+        Number of the sweep that was added to the map last.
     """
 
     index: I64
@@ -98,6 +100,7 @@ class Correspondences:
     born: I64
     opened: I64
     met: int
+    latest: int
 
     @property
     def inlier_ratio(self) -> float:
@@ -114,6 +117,12 @@ class Correspondences:
     def support(self) -> Support:
         """Sweeps that were the first where the surfaces are, and their shares of the weight."""
         return _support(self.born, self.weights)
+
+    @property
+    def is_settled(self) -> NDArray[np.bool_]:
+        """Which surfaces are in the map for some sweeps already, shape (M,)."""
+        age = min(tuning.WEAK_AGE, self.latest // 2)  # a young map has no old ones
+        return np.asarray(self.latest - self.opened >= age)
 
     def support_along(self, levers: F64) -> Support:
         """Return the sweeps that opened the surfaces which hold a direction.
@@ -177,6 +186,7 @@ def correspondences(
         found.born[near],
         found.opened[near],
         len(near),
+        surfaces.latest,
     )
 
 

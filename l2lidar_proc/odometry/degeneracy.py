@@ -6,7 +6,8 @@ seen, add up to a few percent of the strongest direction. They agree with every 
 wall, so the pose stays where it was predicted, and velocity, biases and gravity are learned from
 that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
-* only surfaces that face it count, as in X-ICP (Tuna et al. 2024);
+* only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
+  them for some sweeps: the rim of what has just been seen moves along with the view;
 * these are put to the test. The sweep is moved both ways along the direction and matched again:
   what the residuals pull back, by what they should if the surfaces were there, is the share of the
   information that is real. The rest is the noise of the gradient.
@@ -48,15 +49,18 @@ class WeakDirections:
     axes: F64
     shares: F64
 
-    def reduced(self, pose: F64) -> F64:
+    def reduced(self, pose: F64, is_settled: NDArray[np.bool_]) -> F64:
         """Return derivatives (M, 6) by turn and place, of residuals that claim no more than so.
+
+        ``is_settled`` (M,) tells whose surfaces are no longer new.
 
         A residual of which the share f is real measures 1/f times as coarsely: information falls
         by f^2 and the gradient by f, so that where it is zero stays.
         """
         scaled = pose * self.scale
         along = scaled @ self.axes
-        lost = along * np.where(np.abs(along) > tuning.WEAK_FACING, 1.0 - self.shares, 1.0)
+        facing = (np.abs(along) > tuning.WEAK_FACING) & is_settled[:, None]
+        lost = along * np.where(facing, 1.0 - self.shares, 1.0)
         return np.asarray((scaled - lost @ self.axes.T) / self.scale)
 
 
@@ -95,7 +99,7 @@ def _real_share(
 
     ``levers`` (M,) are the derivatives of the residuals along it.
     """
-    facing = np.flatnonzero(np.abs(levers) > tuning.WEAK_FACING)
+    facing = np.flatnonzero((np.abs(levers) > tuning.WEAK_FACING) & found.is_settled)
     if not len(facing):
         return 0.0
     some = np.unique(found.index[facing])
@@ -112,7 +116,8 @@ def _real_share(
         moved = state.boxplus(move)
         there = match_again(moved, some)
         along = pose_jacobian(there, moved.rotation) @ axis
-        pulls = there.weights * along * there.distances * (np.abs(along) > tuning.WEAK_FACING)
+        pulls = there.weights * along * there.distances
+        pulls = pulls[(np.abs(along) > tuning.WEAK_FACING) & there.is_settled]
         pulled += step * float(pulls.sum())
         noise += step**2 * float((pulls**2).sum())
     if claimed <= 0.0:

@@ -90,6 +90,11 @@ class SurfelMap:
         Points a surface needs.
     capacity : int
         Points after which a cell changes no more, so that the map does not follow later errors.
+
+    Attributes
+    ----------
+    latest : int
+        Number of the sweep that was added last.
     """
 
     def __init__(
@@ -101,6 +106,7 @@ class SurfelMap:
         capacity: int = 400,
     ) -> None:
         self._levels = [_Level(size, thickness, least, capacity) for size in sizes]
+        self.latest = 0
 
     def __len__(self) -> int:
         """Return the number of cells of all sizes."""
@@ -110,6 +116,7 @@ class SurfelMap:
         """Forget everything."""
         for level in self._levels:
             level.clear()
+        self.latest = 0
 
     def add(self, points: F64, sweep: int = 0) -> float:
         """Add points, and return the share of them in places where there were none before.
@@ -123,6 +130,7 @@ class SurfelMap:
         """
         if not len(points):
             return 0.0
+        self.latest = sweep
         # the coarsest level tells what is new: finer ones open cells in known walls as well
         *finer, coarsest = self._levels
         fresh = float(coarsest.unknown(points).mean())
