@@ -169,6 +169,10 @@ REASONS: Final[dict[tuple[str, str], str]] = {
         "self.in_force = 0 <= since <= _FASTEST * elapsed + _SLACK_NS: 0 -> 1",
     ): "one nanosecond",
     (
+        "l2lidar_node/driver/sweep.py",
+        'period = 2 * math.pi if self._config.cut == "turn" else math.pi: 2 -> 3',
+    ): "angles are below one turn, so their multiples of either period are 0",
+    (
         "l2lidar_proc/motion/filter.py",
         "np.linspace(preintegrated.anchor, knot, tuning.COVARIANCE_STEPS + 1).astype(int): "
         "tuning.COVARIANCE_STEPS + 1 -> tuning.COVARIANCE_STEPS - 1",

@@ -105,6 +105,13 @@ def test_voxel_keeps_the_first_point_of_every_cube() -> None:
     assert kept("voxel", points((1e5, -1e5, 1e5), (-1e5, 1e5, -1e5)), voxel_size=0.01) == [0, 1]
 
 
+@pytest.mark.parametrize("sizes", [(2, 30, 3), (30, 3, 2), (3, 2, 30)])
+def test_no_two_voxels_of_a_long_cloud_are_taken_for_one(sizes: tuple[int, int, int]) -> None:
+    grid = np.stack(np.meshgrid(*map(np.arange, sizes), indexing="ij"), axis=-1).reshape(-1, 3)
+    cloud = points(*(0.5 + grid - (1.0, 2.0, 0.0)).tolist())
+    assert kept("voxel", cloud, voxel_size=1.0) == list(range(len(grid)))
+
+
 def wall_with_dust() -> np.ndarray:
     """Return four packets that look along a wall 3 m away, with three specks of dust before it."""
     slot = np.arange(0, 300)

@@ -10,7 +10,7 @@ import pytest
 from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.initialization import initial_state
-from l2lidar_proc.motion.static import static_reference
+from l2lidar_proc.motion.static import gravity_is_plausible, may_be_static, static_reference
 from tests.l2lidar_proc.motion.analytic import Motion, noisy
 
 LEVELS = {"quiet": (0.0, 0.0, 0.0), "usual": (0.03, 0.03, 0.06), "rough": (0.1, 0.2, 0.1)}
@@ -34,6 +34,19 @@ def test_a_still_sensor_is_found_at_rest_with_its_bias(level: Any) -> None:
     biases = np.array([rest.rate for rest in found])
     assert np.abs(biases.mean(axis=0) - BIAS).max() < 0.05 * (level[0] + level[1]) + 1e-6
     assert np.abs(biases - BIAS).max() < 0.25 * (level[0] + level[1]) + 1e-6
+
+
+def test_too_few_samples_say_nothing(level: Any) -> None:
+    samples = still(level, 2.0)
+    rest = static_reference(samples[:250], UNKNOWN, 0.1)
+    assert rest.matches(samples[250:310])
+    for few in (samples[:0], samples[:1], samples[: tuning.STATIC_BLOCK - 1]):
+        assert not rest.matches(few)
+        assert static_reference(few, UNKNOWN, 0.1) is None
+    assert may_be_static(samples)
+    assert not may_be_static(samples[:1])
+    assert not gravity_is_plausible(samples[:0], at_rest=True)
+    assert not gravity_is_plausible(samples[:0], at_rest=False)
 
 
 def test_it_is_still_still_in_every_head_turn(level: Any) -> None:
