@@ -95,7 +95,7 @@ def imus(draw: st.DrawFn) -> Any:
     )
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(
     st.lists(clouds() | typical_clouds(), max_size=4),
     st.lists(imus(), max_size=6),

@@ -422,7 +422,7 @@ def test_next_is_when_the_next_datagram_leaves() -> None:
         assert [time for time, _ in bench.device.advance(due)] == [due]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.binary(max_size=300), max_size=10))
 def test_garbage_never_hurts(pieces: Any) -> None:
     inbox = Inbox()

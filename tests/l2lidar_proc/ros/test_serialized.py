@@ -67,7 +67,7 @@ def test_a_cloud_is_what_was_sent(layout: str) -> None:
     assert found.frame == "l2lidar_link"
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_damaged_messages_are_errors_or_left_out(data: st.DataObject) -> None:
     points, _ = seen(Motion(), 0.0, 0.2, 0.0, count=20)
