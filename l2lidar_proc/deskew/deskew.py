@@ -42,15 +42,23 @@ def deskew(
     if not len(points) or trajectory.is_still:
         return points
     moved = points.copy()
-    for name, coordinate in zip("xyz", _moved(points, start, trajectory, reference), strict=True):
+    for name, coordinate in zip(
+        "xyz", coordinates(points, start, trajectory, reference), strict=True
+    ):
         moved[name] = coordinate
     return moved
 
 
-def _moved(
+def coordinates(
     points: NDArray[np.void], start: HostNs, trajectory: SweepTrajectory, reference: HostNs
 ) -> tuple[F32, F32, F32]:
-    """Return x, y and z at the reference, each of shape (N,)."""
+    """Return x, y and z in the cloud frame of one instant [m], each of shape (N,).
+
+    Parameters are those of :func:`deskew`.
+    """
+    x, y, z = (np.ascontiguousarray(points[name], dtype=np.float32) for name in "xyz")
+    if not len(points) or trajectory.is_still:
+        return x, y, z
     times = np.ascontiguousarray(points["time"])
     knots = ((trajectory.stamps - start) * 1e-9).astype(np.float32)
     cuts = np.searchsorted(times, knots[1:-1])
@@ -67,7 +75,6 @@ def _moved(
     sine = np.float32(1.0) - square * np.float32(1.0 / 6.0)
     cosine = np.float32(0.5) - square * np.float32(1.0 / 24.0)
 
-    x, y, z = (np.ascontiguousarray(points[name], dtype=np.float32) for name in "xyz")
     cx, cy, cz = ay * z - az * y, az * x - ax * z, ax * y - ay * x
     tx = x + sine * cx + cosine * (ay * cz - az * cy)
     ty = y + sine * cy + cosine * (az * cx - ax * cz)

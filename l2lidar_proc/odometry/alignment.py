@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,11 @@ from l2lidar_proc.odometry.correspondences import (
     Source,
     Support,
     correspondences,
+    correspondences_of,
     pose_jacobian,
     residual_jacobian,
 )
-from l2lidar_proc.odometry.degeneracy import WeakDirections, weak_directions
+from l2lidar_proc.odometry.degeneracy import Views, WeakDirections, weak_directions
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 F64 = NDArray[np.float64]
@@ -96,45 +98,76 @@ def align(
         Where to begin instead of the prior.
     """
     at = prior if start is None else start
-    result, weak = None, None
+    step, weak = None, None
     last = config.iterations - 1
-    for step in range(config.iterations + tuning.WEAK_STEPS):
+    for number in range(config.iterations + tuning.WEAK_STEPS):
         reach = max(
-            tuning.FIRST_REACH_M * 0.5**step, tuning.LAST_REACH_SCALES * config.outlier_scale
+            tuning.FIRST_REACH_M * 0.5**number, tuning.LAST_REACH_SCALES * config.outlier_scale
         )
         found = correspondences(prior, at, source, surfaces, config, reach)
         if len(found.index) < least:
-            return result
-        result = _updated(prior, covariance, at, found, weak, step + 1)
-        done = _is_small(result.state.boxminus(at)) or step >= last
+            break
+        step = _step(prior, covariance, at, found, weak, number + 1)
+        done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
 
-            def match_again(
-                moved: InertialState, some: NDArray[np.int64], reach: float = reach
-            ) -> Correspondences:
-                return correspondences(prior, moved, source.some(some), surfaces, config, reach)
+            def match_again(views: Views, reach: float = reach) -> list[Correspondences]:
+                seen = [(moved, source.some(some)) for moved, some in views]
+                return correspondences_of(seen, prior, surfaces, config, reach)
 
             weak = weak_directions(at, found, match_again)
             if weak is None:
-                return result
-            before = result.state
-            result = _updated(prior, covariance, at, found, weak, step + 1)
-            done = _is_small(result.state.boxminus(before))
-            last = step + tuning.WEAK_STEPS
+                break
+            before = step.state
+            step = _step(prior, covariance, at, found, weak, number + 1)
+            done = _is_small(step.state.boxminus(before))
+            last = number + tuning.WEAK_STEPS
         if done:
-            return result
-        at = result.state
-    return result
+            break
+        at = step.state
+    return None if step is None else step.alignment
 
 
-def _updated(
+class _Step(NamedTuple):
+    """One iteration: the correspondences, and the posterior that follows from them."""
+
+    state: InertialState
+    covariance: F64
+    information: F64
+    normals: F64  # derivatives (M, 3) of the residuals by the place
+    found: Correspondences
+    number: int
+
+    @property
+    def alignment(self) -> Alignment:
+        """What is reported where this is the last one."""
+        found = self.found
+        strength, axes = np.linalg.eigh(self.information[POSITION, POSITION])
+        weakly = None
+        if strength[0] < tuning.WEAK_SHARE * strength[-1]:
+            weakly = axes[:, 0], found.support_along(self.normals @ axes[:, 0])
+        return Alignment(
+            self.state,
+            self.covariance,
+            self.information,
+            (found.normals * found.weights[:, None]).T @ found.normals,
+            len(found.index),
+            found.inlier_ratio,
+            found.residual,
+            self.number,
+            found.support,
+            weakly,
+        )
+
+
+def _step(
     prior: InertialState,
     covariance: F64,
     at: InertialState,
     found: Correspondences,
     weak: WeakDirections | None,
-    steps: int,
-) -> Alignment:
+    number: int,
+) -> _Step:
     """Return the posterior of correspondences found from a state."""
     pose = pose_jacobian(found, at.rotation)
     if weak is not None:
@@ -145,22 +178,7 @@ def _updated(
     state, posterior = update_with_information(
         prior, covariance, at, information, -(weighted.T @ found.distances)
     )
-    strength, axes = np.linalg.eigh(information[POSITION, POSITION])
-    weakly = None
-    if strength[0] < tuning.WEAK_SHARE * strength[-1]:
-        weakly = axes[:, 0], found.support_along(pose[:, 3:] @ axes[:, 0])
-    return Alignment(
-        state,
-        posterior,
-        information,
-        (found.normals * found.weights[:, None]).T @ found.normals,
-        len(found.index),
-        found.inlier_ratio,
-        found.residual,
-        steps,
-        found.support,
-        weakly,
-    )
+    return _Step(state, posterior, information, pose[:, 3:], found, number)
 
 
 def _is_small(change: F64) -> bool:

@@ -7,6 +7,7 @@ linearly in dt: so a sweep corrects the motion within itself as well as its plac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,6 +103,24 @@ class Correspondences:
     met: int
     latest: int
 
+    def part(self, first: int, last: int, met: int) -> Correspondences:
+        """Return those of the points from one index to another, counted from the first."""
+        some = (self.index >= first) & (self.index < last)
+        return Correspondences(
+            self.index[some] - first,
+            self.points[some],
+            self.times[some],
+            self.normals[some],
+            self.distances[some],
+            self.variances[some],
+            self.scales[some],
+            self.weights[some],
+            self.born[some],
+            self.opened[some],
+            met,
+            self.latest,
+        )
+
     @property
     def inlier_ratio(self) -> float:
         """Share of the points at known surfaces that are near them, 0 to 1."""
@@ -166,28 +185,76 @@ def correspondences(
     reach : float
         Largest distance [m]; more where a surface is thick.
     """
-    points = _deskewed_again(source, state.boxminus(prior), prior.rotation)
-    found = surfaces.match(points @ state.rotation.T + state.position, narrow=True)
-    scales = np.sqrt(config.outlier_scale**2 + found.scatter)
-    near = np.abs(found.distances) < np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
-    index, distances, scales = found.index[near], found.distances[near], scales[near]
-    far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * source.ranges[index]
-    surface = found.variances[near] + tuning.SCATTER_SHARED * found.scatter[near]
+    return correspondences_of([(state, source)], prior, surfaces, config, reach)[0]
+
+
+def correspondences_of(
+    views: Sequence[tuple[InertialState, Source]],
+    prior: InertialState,
+    surfaces: SurfelMap,
+    config: SurfaceConfig,
+    reach: float,
+) -> list[Correspondences]:
+    """Return the points near a surface of several states and sources, which costs less at once.
+
+    Parameters
+    ----------
+    views : sequence of tuple
+    prior, surfaces, config, reach
+        As for :func:`correspondences`, of all.
+    """
+    if not views:
+        return []
+    deskewed = [
+        _deskewed_again(source, state.boxminus(prior), prior.rotation) for state, source in views
+    ]
+    seen = [
+        points @ state.rotation.T + state.position
+        for points, (state, _) in zip(deskewed, views, strict=True)
+    ]
+    sizes = [len(points) for points in seen]
+    matches = surfaces.match(_joined(seen), narrow=True, sizes=sizes)
+    points, times, ranges = (
+        _joined(items)
+        for items in (
+            deskewed,
+            [source.times for _, source in views],
+            [source.ranges for _, source in views],
+        )
+    )
+    scales = np.sqrt(config.outlier_scale**2 + matches.scatter)
+    near = np.abs(matches.distances) < np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
+    index, distances, scales = matches.index[near], matches.distances[near], scales[near]
+    far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * ranges[index]
+    surface = matches.variances[near] + tuning.SCATTER_SHARED * matches.scatter[near]
     variances = config.point_noise**2 + far**2 + surface
-    return Correspondences(
+    found = Correspondences(
         index,
         points[index],
-        source.times[index],
-        found.normals[near],
+        times[index],
+        matches.normals[near],
         distances,
         variances,
         scales,
         robust_weights(distances, scales) / variances,
-        found.born[near],
-        found.opened[near],
+        matches.born[near],
+        matches.opened[near],
         len(near),
         surfaces.latest,
     )
+    if len(views) == 1:
+        return [found]
+    edges = np.cumsum([0, *sizes])
+    met = np.diff(np.searchsorted(np.sort(matches.index), edges))
+    return [
+        found.part(int(first), int(last), int(count))
+        for first, last, count in zip(edges[:-1], edges[1:], met, strict=True)
+    ]
+
+
+def _joined(parts: list[F64]) -> F64:
+    """Return arrays one after the other, a single one as it is."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def pose_jacobian(found: Correspondences, rotation: F64) -> F64:

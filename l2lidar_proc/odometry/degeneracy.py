@@ -15,8 +15,9 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,14 @@ from l2lidar_proc.odometry.correspondences import Correspondences, pose_jacobian
 
 F64 = NDArray[np.float64]
 
-MatchAgain = Callable[[InertialState, NDArray[np.int64]], Correspondences]
-"""Correspondences of some of the source's points, seen from another state."""
+Views = Sequence[tuple[InertialState, NDArray[np.int64]]]
+"""States, and which of the source's points are seen from each."""
+
+MatchAgain = Callable[[Views], list[Correspondences]]
+"""Gives the correspondences of each view."""
+
+
+_STEPS: Final = (tuning.WEAK_STEP, -tuning.WEAK_STEP)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,41 +93,52 @@ def weak_directions(
     if not weak.any():
         return None
     axes = axes[:, weak]
-    shares = np.array(
-        [_real_share(state, found, scaled @ axis, scale * axis, match_again) for axis in axes.T]
-    )
+    trials = [_Trial(state, found, scaled @ axis, scale * axis) for axis in axes.T]
+    there = iter(match_again([view for trial in trials for view in trial.views]))
+    shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
     return WeakDirections(scale, axes, shares)
 
 
-def _real_share(
-    state: InertialState, found: Correspondences, levers: F64, axis: F64, match_again: MatchAgain
-) -> float:
-    """Return how much of the information about a direction (6,) [rad, m] moved points confirm.
+class _Trial:
+    """A sweep moved both ways along a direction (6,) of the pose [rad, m].
 
     ``levers`` (M,) are the derivatives of the residuals along it.
     """
-    facing = np.flatnonzero((np.abs(levers) > tuning.WEAK_FACING) & found.is_settled)
-    if not len(facing):
-        return 0.0
-    some = np.unique(found.index[facing])
-    levers, distances = levers[facing], found.distances[facing]
-    scales, variances = found.scales[facing], found.variances[facing]
-    move = np.zeros(ERRORS)
-    claimed = pulled = noise = 0.0
-    for step in (tuning.WEAK_STEP, -tuning.WEAK_STEP):
-        expected = distances + step * levers
-        claimed += step * float(
-            (robust_weights(expected, scales) / variances * levers * expected).sum()
-        )
-        move[POSE] = step * axis
-        moved = state.boxplus(move)
-        there = match_again(moved, some)
-        along = pose_jacobian(there, moved.rotation) @ axis
-        pulls = there.weights * along * there.distances
-        pulls = pulls[(np.abs(along) > tuning.WEAK_FACING) & there.is_settled]
-        pulled += step * float(pulls.sum())
-        noise += step**2 * float((pulls**2).sum())
-    if claimed <= 0.0:
-        return 0.0
-    share = (pulled - tuning.WEAK_SIGMAS * np.sqrt(noise)) / claimed
-    return float(np.clip(share, 0.0, 1.0))
+
+    def __init__(
+        self, state: InertialState, found: Correspondences, levers: F64, axis: F64
+    ) -> None:
+        self._axis = axis
+        facing = np.flatnonzero((np.abs(levers) > tuning.WEAK_FACING) & found.is_settled)
+        self._facing = levers[facing], found.distances[facing], found.scales[facing]
+        self._variances = found.variances[facing]
+        self._some = np.unique(found.index[facing])
+        move = np.zeros(ERRORS)
+        self._moved = []
+        for step in _STEPS if len(facing) else ():
+            move[POSE] = step * axis
+            self._moved.append(state.boxplus(move))
+
+    @property
+    def views(self) -> Views:
+        """What is to be matched: nothing where no surface faces the direction."""
+        return [(moved, self._some) for moved in self._moved]
+
+    def real_share(self, there: list[Correspondences]) -> float:
+        """Return how much of the information about the direction the moved points confirm."""
+        levers, distances, scales = self._facing
+        claimed = pulled = noise = 0.0
+        for step, moved, seen in zip(_STEPS, self._moved, there, strict=bool(there)):
+            expected = distances + step * levers
+            claimed += step * float(
+                (robust_weights(expected, scales) / self._variances * levers * expected).sum()
+            )
+            along = pose_jacobian(seen, moved.rotation) @ self._axis
+            pulls = seen.weights * along * seen.distances
+            pulls = pulls[(np.abs(along) > tuning.WEAK_FACING) & seen.is_settled]
+            pulled += step * float(pulls.sum())
+            noise += step**2 * float((pulls**2).sum())
+        if claimed <= 0.0:
+            return 0.0
+        share = (pulled - tuning.WEAK_SIGMAS * np.sqrt(noise)) / claimed
+        return float(np.clip(share, 0.0, 1.0))

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-# odd multipliers of Fibonacci hashing and of splitmix64 (Steele et al. 2014)
-_ODD = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
-_SHIFT = np.uint64(7)
+_BITS = 21  # of a voxel's number along an axis, so that three fit
+_MASK = (1 << _BITS) - 1
 
 LEAST_POINTS = 10  # kiss_icp aborts below 2; below this there is nothing to register
 
@@ -150,15 +149,21 @@ class PlainKiss:
 def thinned_indices(points: F64, size: float) -> NDArray[np.intp]:
     """Return which points (N, 3) KISS-ICP's voxelization keeps: one in each voxel of a size [m].
 
-    KISS-ICP returns the points themselves, not their indices: they are found again by all three
-    coordinates. Of equal points one is named, once.
+    KISS-ICP returns the points themselves, not their indices: these are the first of each voxel.
     """
     if len(points) < LEAST_POINTS:
         return np.arange(len(points))
-    every, kept = _hashes(points), _hashes(_thinned(points, size))
-    order = np.argsort(every, kind="stable")
-    place = np.searchsorted(every, kept, sorter=order)
-    return np.unique(order[np.minimum(place, len(points) - 1)])
+    keys = _voxels(points, size)
+    # neighbors in a scan line mostly share a voxel: only the first of them can be the first
+    runs = np.flatnonzero(np.diff(keys, prepend=keys[0] - 1))
+    _, first = np.unique(keys[runs], return_index=True)
+    return np.sort(runs[first])
+
+
+def _voxels(points: F64, size: float) -> NDArray[np.int64]:
+    """Return a number for the voxel of each point (N, 3), as KISS-ICP divides space."""
+    x, y, z = np.floor(points.T / size).astype(np.int64) & _MASK
+    return np.asarray(x << 2 * _BITS | y << _BITS | z)
 
 
 def _thinned(points: F64, size: float) -> F64:
@@ -166,10 +171,3 @@ def _thinned(points: F64, size: float) -> F64:
     from kiss_icp.voxelization import voxel_down_sample
 
     return np.asarray(voxel_down_sample(points, size))
-
-
-def _hashes(points: F64) -> NDArray[np.uint64]:
-    """Return a number for each point (N, 3) that differs wherever a bit of it does."""
-    words = np.ascontiguousarray(points).view(np.uint64)
-    mixed = words * _ODD
-    return np.asarray(mixed[:, 0] ^ (mixed[:, 1] >> _SHIFT) ^ ((mixed[:, 2] >> _SHIFT) * _ODD[0]))

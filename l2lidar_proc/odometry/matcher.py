@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.deskew.deskew import deskew
+from l2lidar_proc.deskew.deskew import coordinates, deskew
 from l2lidar_proc.motion.filter import (
     POSITION,
     ROTATION,
@@ -114,7 +114,9 @@ class SweepMatcher:
 
     def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
         """Return the points to align, deskewed along a predicted motion."""
-        points = xyz(self.deskewed(sweep, motion))
+        trajectory, reference = motion.trajectory(self.lever), motion.state.stamp
+        moved = coordinates(sweep.points, sweep.start, trajectory, reference)
+        points = np.stack(moved, axis=1).astype(np.float64)
         chosen = thinned_indices(points, self.config.surfaces.source_voxel)
         chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
         offset = (sweep.start - motion.state.stamp) * 1e-9

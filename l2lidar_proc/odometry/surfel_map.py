@@ -8,8 +8,7 @@ across the directions in which they are few: less sharply, by their scatter.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_proc import tuning
+from l2lidar_proc.odometry.cell_index import CellIndex
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 CELL: Final = np.dtype(
     [
+        ("key", "<i8"),
         ("count", "<f8"),
         ("sum", "<f8", (3,)),  # [m] of the points' offsets from the cell's middle
         ("products", "<f8", (6,)),  # [m^2] of the offsets: xx xy xz yy yz zz
@@ -32,16 +33,18 @@ CELL: Final = np.dtype(
         ("sweeps", "<f8"),  # in which points came
         ("born", "<i8"),  # number of the sweep that was the first at its place
         ("opened", "<i8"),  # number of the sweep whose points opened it
+        ("seen", "<i8"),  # number of the latest sweep with points in it
         ("fitted", "<f8"),  # count when mean, axes and spread were computed
-        ("flat", "?"),
-        ("narrow", "<i1"),  # axes of a cell that is not flat along which its points lie close
     ],
-    align=True,
 )
 """What is known about a cell."""
 
+_FLAT: Final = 3
+"""Kind of a flat cell; that of others is the number of axes along which their points lie close."""
+
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_BITS: Final = 21
+# A key is the number of the level and of the cell along x, y and z.
+_BITS: Final = 19
 _MASK: Final = (1 << _BITS) - 1
 _HALF: Final = 1 << (_BITS - 1)
 
@@ -105,18 +108,28 @@ class SurfelMap:
         least: int = 8,
         capacity: int = 400,
     ) -> None:
-        self._levels = [_Level(size, thickness, least, capacity) for size in sizes]
+        self._sizes = np.array(sizes, dtype=np.float64)
+        self._thickness = thickness
+        self._least = least
+        self._capacity = capacity
         self.latest = 0
+        self._index = CellIndex()
+        # row 0 is that of all places without a cell
+        self._cells: NDArray[np.void] = np.zeros(1, CELL)
+        self._kind: NDArray[np.int8] = np.zeros(1, np.int8)  # by row, apart: quickly looked up
 
     def __len__(self) -> int:
         """Return the number of cells of all sizes."""
-        return sum(len(level) for level in self._levels)
+        return len(self._index)
 
     def clear(self) -> None:
         """Forget everything."""
-        for level in self._levels:
-            level.clear()
+        used = len(self) + 1
         self.latest = 0
+        self._index.clear()
+        # the arrays stay for the next map: memory freed and asked for again comes back in pieces
+        self._cells[:used] = np.zeros(1, CELL)
+        self._kind[:used] = 0
 
     def add(self, points: F64, sweep: int = 0) -> float:
         """Add points, and return the share of them in places where there were none before.
@@ -131,18 +144,76 @@ class SurfelMap:
         if not len(points):
             return 0.0
         self.latest = sweep
-        # the coarsest level tells what is new: finer ones open cells in known walls as well
-        *finer, coarsest = self._levels
-        fresh = float(coarsest.unknown(points).mean())
-        coarsest.add(points, np.full(len(points), sweep), sweep)
-        born = coarsest.born_at(points)
-        for level in finer:
-            level.add(points, born, sweep)
-        for level in self._levels:
-            level.see(points, sweep)
+        keys = self._keys(points).ravel()
+        # neighbors in a scan line mostly share a cell: look up runs of equal keys
+        begins = np.flatnonzero(np.diff(keys, prepend=-1))
+        lengths = np.diff(begins, append=len(keys))
+        distinct, cell = np.unique(keys[begins], return_inverse=True)
+        rows = self._index.find(distinct)
+        new = rows == 0
+        rows[new] = self._open(distinct[new])
+        fresh = self._note_sweep(rows, new, cell, begins, lengths, len(points), sweep)
+        self._extend(points, rows, distinct, cell, lengths)
         return fresh
 
-    def match(self, points: F64, *, narrow: bool = False) -> Matches:
+    def _note_sweep(
+        self,
+        rows: I64,
+        new: NDArray[np.bool_],
+        cell: I64,
+        begins: I64,
+        lengths: I64,
+        points: int,
+        sweep: int,
+    ) -> float:
+        """Note who opened the new cells (C,) among some, and who has seen all of these last.
+
+        The coarsest level tells what is new, finer ones open cells in known walls as well: such a
+        place is as old as the coarsest cell around it. Return the share of points in new places.
+
+        Parameters
+        ----------
+        rows, new : ndarray, shape (C,)
+        cell : ndarray, shape (R,)
+            Which of the cells each run of points is in.
+        begins, lengths : ndarray, shape (R,)
+            Of the runs, level after level.
+        points, sweep : int
+        """
+        self._cells["seen"][rows] = sweep
+        coarsest = begins >= (len(self._sizes) - 1) * points
+        fresh = float(lengths[coarsest & new[cell]].sum()) / points
+        self._cells["born"][rows[new]] = self._cells["opened"][rows[new]] = sweep
+        if fresh < 1.0 and new.any():
+            first = np.empty(len(rows), np.int64)
+            first[cell[::-1]] = begins[::-1] % points  # the first of its points is written last
+            around = np.repeat(rows[cell[coarsest]], lengths[coarsest])
+            self._cells["born"][rows[new]] = self._cells["born"][around[first[new]]]
+        return fresh
+
+    def _extend(self, points: F64, rows: I64, keys: I64, cell: I64, lengths: I64) -> None:
+        """Add points (N, 3) to the sums of their cells (C,), as far as these still change."""
+        known = self._cells["count"][rows]
+        changing = known < self._capacity
+        rows, keys = rows[changing], keys[changing]
+        bins = len(rows)
+        count = np.bincount(cell, lengths, len(changing))[changing]
+        number = np.cumsum(changing) - 1  # of the cells that change
+        taken = np.flatnonzero(np.repeat(changing[cell], lengths))
+        number = np.repeat(number[cell], lengths)[taken]
+        middles = self._middles(keys)
+        offsets = points[taken % len(points)] - middles[number]
+        x, y, z = np.ascontiguousarray(offsets.T)
+        total = np.stack([np.bincount(number, axis, bins) for axis in (x, y, z)], axis=1)
+        products = np.stack([np.bincount(number, a * b, bins) for a, b in _pairs(x, y, z)], axis=1)
+        cells = self._cells
+        cells["count"][rows] = known[changing] + count
+        cells["sweeps"][rows] += 1.0
+        cells["sum"][rows] += total
+        cells["products"][rows] += products
+        self._fit(rows, middles)
+
+    def match(self, points: F64, *, narrow: bool = False, sizes: Sequence[int] = ()) -> Matches:
         """Return the surface of every point that has one: the finest at its place.
 
         Parameters
@@ -153,30 +224,45 @@ class SurfelMap:
             Points without a flat surface get the narrow directions of the finest cell that has
             any, one or two matches each; but not where most points have one: there the others are
             edges, and scan lines of the map's first sweeps.
+        sizes : sequence of int
+            Points of each of several sweeps that lie one after the other; what most points have
+            is asked for each by itself.
         """
-        found: list[Matches] = []
-        left = np.arange(len(points))
-        for level in self._levels:
-            cell = level.flat_at(points[left])
-            known = cell >= 0
-            found.append(_distances(points, left[known], level.cells[cell[known]], 0))
-            left = left[~known]
-        narrow &= len(left) > tuning.EDGE_SHARE * len(points)
-        for level in self._levels if narrow else ():
-            cell = level.narrow_at(points[left])
-            known = cell >= 0
-            cells = level.cells[cell[known]]
-            found.append(_distances(points, left[known], cells, 0))
-            both = cells["narrow"] > 1
-            found.append(_distances(points, left[known][both], cells[both], 1))
-            left = left[~known]
-        columns = zip(*map(_columns, found), strict=True)
-        return Matches(*(np.concatenate(column) for column in columns))
+        # nearly all points have a surface in the finest level
+        finest = self._rows(points, slice(1))
+        is_flat = self._kind[finest] == _FLAT
+        left = np.flatnonzero(~is_flat[0])
+        coarser = self._rows(points[left], slice(1, None))
+        found = [(finest[is_flat], np.flatnonzero(is_flat), 0)]
+        found += [(*item, 0) for item in _taken(coarser, self._kind[coarser] == _FLAT, left)]
+        if narrow:
+            kind = self._kind[coarser]
+            bare = _edges(left[~(kind == _FLAT).any(axis=0)], sizes or [len(points)])
+            rows = self._rows(points[bare], slice(None))
+            for row, index in _taken(rows, self._kind[rows] > 0, bare):
+                both = self._kind[row] > 1
+                found += [(row, index, 0), (row[both], index[both], 1)]
+        rows_found, indices, axes = zip(*found, strict=True)
+        axis = np.repeat(axes, [len(some) for some in indices])
+        row = np.concatenate(rows_found)
+        return _matches(points, np.concatenate(indices), self._cells[row], axis, self._kind[row])
+
+    def _rows(self, points: F64, levels: slice) -> I64:
+        """Return the rows of the cells of some levels that points (N, 3) lie in, (L, N)."""
+        keys = self._keys(points, levels)
+        return self._index.find(keys.ravel()).reshape(keys.shape)
 
     def forget(self, origin: F64, distance: float, since: int = 0) -> None:
         """Drop cells farther than a distance [m] from a place (3,), or not seen since a sweep."""
-        for level in self._levels:
-            level.forget(origin, distance, since)
+        cells = self._cells[1 : len(self) + 1]
+        kept = ((self._middles(cells["key"]) - origin) ** 2).sum(axis=1) <= distance * distance
+        kept &= cells["seen"] >= since
+        if kept.all():
+            return
+        rows = np.concatenate(([0], 1 + np.flatnonzero(kept)))
+        self._cells, self._kind = self._cells[rows], self._kind[rows]
+        self._index.clear()
+        self._index.insert(self._cells["key"][1:].copy(), np.arange(1, len(rows)))
 
     def flat_cells(self) -> list[tuple[float, I64, F64, F64]]:
         """Return what :meth:`match` knows of flat places, for each size, fine to coarse.
@@ -184,206 +270,133 @@ class SurfelMap:
         Edge of the cells [m]; their places as multiples of it (N, 3); a point of each surface
         (N, 3) [m]; unit normals (N, 3).
         """
-        return [level.flat_cells() for level in self._levels]
+        order = np.argsort(self._cells["key"][1 : len(self) + 1]) + 1
+        flat = order[self._kind[order] == _FLAT]
+        cells = self._cells[flat]
+        level = cells["key"] >> 3 * _BITS
+        places, means, normals = _places(cells["key"]), cells["mean"], cells["axes"][:, 0]
+        return [
+            (size, places[level == number], means[level == number], normals[level == number])
+            for number, size in enumerate(self._sizes.tolist())
+        ]
 
-    def points(self) -> F64:
-        """Return the middles of the finest level's surfaces [m], shape (N, 3), map frame."""
-        return self._levels[0].points()
-
-
-def _distances(points: F64, index: I64, cells: NDArray[np.void], axis: int) -> Matches:
-    """Return how far some points are from the middles of their cells along an axis of these."""
-    offset = points[index] - cells["mean"]
-    along = np.einsum("nij,nj->ni", cells["axes"], offset)
-    spread = cells["spread"]
-    # a plane fitted to n points is worst known far from their middle
-    reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
-    scatter = np.where(cells["flat"], 0.0, spread[:, axis])
-    return Matches(
-        index,
-        cells["axes"][:, axis],
-        along[:, axis],
-        spread[:, axis] * reach / cells["count"],
-        scatter,
-        cells["born"],
-        cells["opened"],
-    )
-
-
-def _columns(found: Matches) -> tuple[NDArray[np.generic], ...]:
-    return tuple(getattr(found, item.name) for item in dataclasses.fields(found))
-
-
-class _Level:
-    """Cells of one size: rows of ``cells``, found through a sorted array of keys."""
-
-    def __init__(self, size: float, thickness: float, least: int, capacity: int) -> None:
-        self._size = size
-        self._thickness = thickness
-        self._least = least
-        self._capacity = capacity
-        self._keys: I64 = np.empty(0, np.int64)
-        self._rows: I64 = np.empty(0, np.int64)
-        self.cells: NDArray[np.void] = np.zeros(1, CELL)
-        # by row, compact copies for look-ups
-        self._flat: NDArray[np.bool_] = np.zeros(1, np.bool_)
-        self._narrow: NDArray[np.bool_] = np.zeros(1, np.bool_)
-        self._count: I64 = np.zeros(1, np.int64)
-        self._seen: I64 = np.zeros(1, np.int64)  # number of the latest sweep with points in it
-
-    def clear(self) -> None:
-        used = len(self._keys)
-        self._keys, self._rows = np.empty(0, np.int64), np.empty(0, np.int64)
-        # the arrays stay for the next map: memory freed and asked for again comes back in pieces
-        self.cells[:used] = np.zeros(1, CELL)
-        self._flat[:used] = self._narrow[:used] = False
-        self._count[:used] = 0
-
-    def __len__(self) -> int:
-        return len(self._keys)
-
-    def flat_at(self, points: F64) -> I64:
-        """Return the row of the flat cell each point lies in, -1 where there is none."""
-        return self._rows_at(points, self._flat)
-
-    def narrow_at(self, points: F64) -> I64:
-        """Return the row of the narrow cell each point lies in, -1 where there is none."""
-        return self._rows_at(points, self._narrow)
-
-    def _rows_at(self, points: F64, wanted: NDArray[np.bool_]) -> I64:
-        rows = self._find(self._key(points))
-        known = rows >= 0
-        rows[known] = np.where(wanted[rows[known]], rows[known], -1)
+    def _open(self, keys: I64) -> I64:
+        """Return the rows of new cells."""
+        first = len(self) + 1
+        rows = np.arange(first, first + len(keys))
+        self._index.insert(keys, rows)
+        if first + len(keys) > len(self._cells):
+            size = max(first + len(keys), 2 * len(self._cells))
+            self._cells, self._kind = _grown(self._cells, size), _grown(self._kind, size)
+        self._cells["key"][rows] = keys
         return rows
 
-    def unknown(self, points: F64) -> NDArray[np.bool_]:
-        """Return which points lie in no cell yet."""
-        return np.asarray(self._find(self._key(points)) < 0)
-
-    def born_at(self, points: F64) -> I64:
-        """Return the number of the sweep that opened the cell of each point; all have one."""
-        return np.asarray(self.cells["born"][self._find(self._key(points))])
-
-    def add(self, points: F64, born: I64, sweep: int) -> None:
-        every = self._key(points)
-        rows = self._find(every)
-        opened = (rows < 0) | (self._count[rows] < self._capacity)
-        points = points[opened]
-        keys, first, inverse = np.unique(every[opened], return_index=True, return_inverse=True)
-        known = len(self._keys)
-        rows = self._rows_of(keys)
-        new = rows >= known
-        self.cells["born"][rows[new]] = born[opened][first[new]]
-        self.cells["opened"][rows[new]] = sweep
-        middles = self._middle(keys)
-        offsets = points - middles[inverse]
-        bins = len(keys)
-        count = np.bincount(inverse, minlength=bins)
-        total = np.stack([np.bincount(inverse, axis, bins) for axis in offsets.T], axis=1)
-        products = np.stack(
-            [np.bincount(inverse, offsets[:, i] * offsets[:, j], bins) for i, j in _PAIRS], axis=1
-        )
-        self._count[rows] += count
-        self.cells["count"][rows] = self._count[rows]
-        self.cells["sweeps"][rows] += 1.0
-        self.cells["sum"][rows] += total
-        self.cells["products"][rows] += products
-        self._fit(rows, middles)
-
-    def see(self, points: F64, sweep: int) -> None:
-        """Note that a sweep had points in their cells, which all exist."""
-        self._seen[self._find(self._key(points))] = sweep
-
-    def forget(self, origin: F64, distance: float, since: int) -> None:
-        kept = ((self._middle(self._keys) - origin) ** 2).sum(axis=1) <= distance * distance
-        kept &= self._seen[self._rows] >= since
-        if kept.all():
-            return
-        rows = self._rows[kept]
-        self._keys, self._rows = self._keys[kept], np.arange(len(rows))
-        self.cells, self._flat = self.cells[rows].copy(), self._flat[rows]
-        self._count, self._narrow = self._count[rows], self._narrow[rows]
-        self._seen = self._seen[rows]
-        self._reserve(1)
-
-    def points(self) -> F64:
-        used = self.cells[: len(self._keys)]
-        return np.asarray(used["mean"][used["flat"]])
-
     def _fit(self, rows: I64, middles: F64) -> None:
-        count = self._count[rows]
-        enough = (count >= self._least) & (
-            count >= tuning.REFIT_GROWTH * self.cells["fitted"][rows]
-        )
-        rows, middles = rows[enough], middles[enough]
+        """Fit planes to cells (C,) that have grown, their middles (C, 3) given."""
+        cells = self._cells
+        count = cells["count"][rows]
+        enough = (count >= self._least) & (count >= tuning.REFIT_GROWTH * cells["fitted"][rows])
+        rows, middles, count = rows[enough], middles[enough], count[enough]
         if not len(rows):
             return
-        count = self.cells["count"][rows][:, None]
-        mean = self.cells["sum"][rows] / count
-        products = self.cells["products"][rows] / count
+        mean = cells["sum"][rows] / count[:, None]
+        products = cells["products"][rows] / count[:, None]
         covariance = np.empty((len(rows), 3, 3))
         for column, (i, j) in enumerate(_PAIRS):
             covariance[:, i, j] = products[:, column] - mean[:, i] * mean[:, j]
             covariance[:, j, i] = covariance[:, i, j]
         spread, axes = np.linalg.eigh(covariance)
         spread = np.maximum(spread, 1e-8)
-        wide = np.maximum(tuning.ELONGATED * spread[:, 0], (tuning.FLAT_WIDTH * self._size) ** 2)
+        size = self._sizes[cells["key"][rows] >> 3 * _BITS]
+        wide = np.maximum(tuning.ELONGATED * spread[:, 0], (tuning.FLAT_WIDTH * size) ** 2)
         flat = (spread[:, 0] < self._thickness**2) & (spread[:, 1] > wide)
-        self.cells["mean"][rows] = mean + middles
-        self.cells["axes"][rows] = np.swapaxes(axes, 1, 2)
-        self.cells["spread"][rows] = spread
-        self.cells["flat"][rows] = flat
-        self._flat[rows] = flat
-        close = spread[:, :2] < (tuning.NARROW * self._size) ** 2
-        close &= (self.cells["sweeps"][rows] >= tuning.NARROW_SWEEPS)[:, None] & ~flat[:, None]
-        self.cells["narrow"][rows] = close.sum(axis=1)
-        self._narrow[rows] = close[:, 0]
-        self.cells["fitted"][rows] = count[:, 0]
+        cells["mean"][rows] = mean + middles
+        cells["axes"][rows] = np.swapaxes(axes, 1, 2)
+        cells["spread"][rows] = spread
+        cells["fitted"][rows] = count
+        close = spread[:, :2] < (tuning.NARROW * size[:, None]) ** 2
+        close &= (cells["sweeps"][rows] >= tuning.NARROW_SWEEPS)[:, None]
+        self._kind[rows] = np.where(flat, _FLAT, close.sum(axis=1))
 
-    def _key(self, points: F64) -> I64:
-        cell = np.floor(points * (1.0 / self._size)).astype(np.int64) + _HALF
-        return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])
+    def _keys(self, points: F64, levels: slice = slice(None)) -> I64:
+        """Return the keys of the cells that points (N, 3) lie in, level by level, (L, N)."""
+        numbers = range(len(self._sizes))[levels]
+        keys = np.empty((len(numbers), len(points)), np.int64)
+        axes = np.ascontiguousarray(points.T)
+        for level, key in zip(numbers, keys, strict=True):
+            x, y, z = (
+                np.floor(axes * (1.0 / self._sizes[level])).astype(np.int64) + _HALF
+            ) & _MASK
+            np.left_shift(x, _BITS, out=key)
+            key |= y
+            key <<= _BITS
+            key |= z
+            key |= level << 3 * _BITS
+        return keys
 
-    def flat_cells(self) -> tuple[float, I64, F64, F64]:
-        flat = self._flat[self._rows]
-        rows = self._rows[flat]
-        normals = self.cells["axes"][:, 0][rows]
-        return self._size, _places(self._keys[flat]), self.cells["mean"][rows], normals
-
-    def _middle(self, keys: I64) -> F64:
-        return np.asarray((_places(keys) + 0.5) * self._size)
-
-    def _find(self, keys: I64) -> I64:
-        if not len(self._keys):
-            return np.full(len(keys), -1)
-        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        return np.where(self._keys[place] == keys, self._rows[place], -1)
-
-    def _rows_of(self, keys: I64) -> I64:
-        """Return the row of each key (ascending, unique), making rows for new ones."""
-        rows = self._find(keys)
-        new = np.flatnonzero(rows < 0)
-        if len(new):
-            first = len(self._keys)
-            rows[new] = np.arange(first, first + len(new))
-            place = np.searchsorted(self._keys, keys[new])
-            self._keys = np.insert(self._keys, place, keys[new])
-            self._rows = np.insert(self._rows, place, rows[new])
-            self._reserve(first + len(new))
-        return rows
-
-    def _reserve(self, count: int) -> None:
-        if count > len(self.cells):
-            size = max(count, 2 * len(self.cells))
-            self.cells = _grown(self.cells, size)
-            self._flat, self._narrow = _grown(self._flat, size), _grown(self._narrow, size)
-            self._count, self._seen = _grown(self._count, size), _grown(self._seen, size)
+    def _middles(self, keys: I64) -> F64:
+        """Return the middles of cells [m], shape (C, 3)."""
+        return np.asarray((_places(keys) + 0.5) * self._sizes[keys >> 3 * _BITS][:, None])
 
 
 def _places(keys: I64) -> I64:
     """Return the places (N, 3) of cells, as multiples of their edge."""
-    cell = np.stack((keys >> 2 * _BITS, (keys >> _BITS) & _MASK, keys & _MASK), axis=1)
-    return cell - _HALF
+    cell = np.stack((keys >> 2 * _BITS, keys >> _BITS, keys), axis=1) & _MASK
+    return np.asarray(cell - _HALF)
+
+
+def _pairs(x: F64, y: F64, z: F64) -> Iterator[tuple[F64, F64]]:
+    """Yield the factors of the products, in their order in a cell."""
+    axes = x, y, z
+    return ((axes[i], axes[j]) for i, j in _PAIRS)
+
+
+def _edges(bare: I64, sizes: Sequence[int]) -> I64:
+    """Return the points without a flat surface (N,) of those sweeps in which they are many."""
+    ends = np.cumsum(sizes)
+    places = np.searchsorted(bare, [0, *ends.tolist()])
+    parts = zip(places[:-1].tolist(), places[1:].tolist(), sizes, strict=True)
+    return np.concatenate(
+        [
+            bare[first : last if last - first > tuning.EDGE_SHARE * size else first]
+            for first, last, size in parts
+        ]
+    )
+
+
+def _taken(rows: I64, wanted: NDArray[np.bool_], index: I64) -> Iterator[tuple[I64, I64]]:
+    """Yield, level by level, the first wanted of the rows (L, N) of points, and these points.
+
+    ``index`` (N,) names the points.
+    """
+    free = np.ones(len(index), np.bool_)
+    for row, fits in zip(rows, wanted, strict=True):
+        here = np.flatnonzero(fits & free)
+        free[here] = False
+        yield row[here], index[here]
+
+
+def _matches(
+    points: F64, index: I64, cells: NDArray[np.void], axis: I64, kind: NDArray[np.int8]
+) -> Matches:
+    """Return how far some points are from the middles of their cells (M,) along axes (M,)."""
+    offset = points[index] - cells["mean"]
+    axes = cells["axes"]
+    along = np.einsum("nij,nj->ni", axes, offset)
+    spread = cells["spread"]
+    # a plane fitted to n points is worst known far from their middle
+    reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
+    each = np.arange(len(index))
+    across = spread[each, axis]
+    return Matches(
+        index,
+        axes[each, axis],
+        along[each, axis],
+        across * reach / cells["count"],
+        np.where(kind == _FLAT, 0.0, across),
+        cells["born"],
+        cells["opened"],
+    )
 
 
 def _grown(rows: NDArray[Any], size: int) -> NDArray[Any]:

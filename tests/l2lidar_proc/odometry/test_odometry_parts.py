@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kiss_icp.voxelization import voxel_down_sample
 
 from l2lidar_node import rotations
 from l2lidar_node.settings import SettingError, build
@@ -176,6 +177,14 @@ def test_thinning_keeps_one_point_per_voxel_and_says_which() -> None:
     assert len(set(kept.tolist())) == len(kept)
     cells = {tuple(cell) for cell in np.floor(points / 0.5).astype(int).tolist()}
     assert len(kept) == len(cells)
+
+
+def test_thinning_keeps_the_points_that_kiss_icp_keeps() -> None:
+    points = np.random.default_rng(RNG_SEED).uniform(-9.0, 9.0, (5000, 3))
+    points = np.concatenate((points, points[::3] + 0.01))
+    kept = points[thinned_indices(points, 0.4)]
+    expected = np.asarray(voxel_down_sample(points, 0.4))
+    assert {tuple(point) for point in kept.tolist()} == {tuple(p) for p in expected.tolist()}
 
 
 def test_thinning_of_a_wall_at_one_x_names_every_point_it_keeps() -> None:
