@@ -41,8 +41,8 @@ _UNKNOWN: Final = 0.25  # what a look counts that does not overlap, or leads els
 _LEFT: Final = (np.radians(5.0), 0.5)  # [rad, m] from where the odometry says, it leads elsewhere
 _SAME: Final = (np.radians(4.0), 0.5)  # [rad, m] places closer than this are one
 _NOISE: Final = 0.005  # contradicts every place, and more or less by chance
-_OBSTRUCTED: Final = 0.02  # more things than this, and it is another place; 0.002 to 0.04 in those
-_NO_THING: Final = 0.002  # of a place is obstructed by chance: 0.0003 at most in our scenes
+_OBSTRUCTED: Final = 0.02  # more things than this, and it is another place
+_NO_THING: Final = 0.008  # of a place is obstructed by chance, where rooms are equal
 _EXCEPTIONS: Final = 4  # one look of so many may speak for the rival
 _WINDOW: Final = Window(1.0, 0.4, np.radians(4.0))  # around a place, searched before it is told
 
