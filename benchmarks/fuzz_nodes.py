@@ -191,6 +191,7 @@ class Fuzzer:
         self.hostile = HostileMessages(self.rng)
         self.sent = 0
         self.errors: list[str] = []
+        self.said: dict[str, str] = {}  # the latest diagnostics of a node, by its name
         self.good: GoodData | None = None
         self.back: dict[str, Back] = {}
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -253,6 +254,8 @@ class Fuzzer:
         return self.good
 
     def _diagnosed(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.said[status.name.partition(":")[0]] = status.message[:300]
         self.errors += [
             f"{status.name}: {status.message}"[:300]
             for status in message.status
@@ -485,7 +488,10 @@ class Campaign:
             pass  # a starved node has not done it yet; what is set twice does no harm
         self.spin(0.5)  # so that DDS has found what is new
         waiting = self._good_data(self.back if attacks else self.calm)
-        self.stuck += [f"{name} does not publish in round {self.rounds}" for name in waiting]
+        self.stuck += [
+            f"{name} does not publish in round {self.rounds}: {self.fuzzer.said.get(name, '')!r}"
+            for name in waiting
+        ]
 
     def _await(self, answers: list[Future]) -> bool:
         """Wait until all services have answered; return whether they have in time.
@@ -525,9 +531,8 @@ class Outcome:
 
     Attributes
     ----------
-    growth_mb : dict
-        By program: memory gained in the second half of the rounds. In the first one parameters
-        have modules imported that nobody needed before, some 70 MB.
+    sizes_mb : dict
+        By program: memory after each calm round, which leaves every node with a new map.
     ended : str
         What the program said that ended by itself, empty if none did.
     foreign_load : float
@@ -535,9 +540,17 @@ class Outcome:
     """
 
     campaign: Campaign
-    growth_mb: dict[str, float]
+    sizes_mb: dict[str, list[float]]
     ended: str
     foreign_load: float
+
+    @property
+    def growth_mb(self) -> dict[str, float]:
+        """Memory gained in the second half of the calm rounds, by program.
+
+        In the first half parameters have modules imported that nobody needed before, some 70 MB.
+        """
+        return {name: some[-1] - some[len(some) // 2] for name, some in self.sizes_mb.items()}
 
 
 def fuzz(seconds: float, seed: int, attacks: int) -> Outcome:
@@ -558,16 +571,17 @@ def fuzz(seconds: float, seed: int, attacks: int) -> Outcome:
             load.begin()
             deadline = time.monotonic() + seconds
             while time.monotonic() < deadline or campaign.rounds < _CALM_EVERY:
-                campaign.round(0 if campaign.rounds % _CALM_EVERY == 0 else attacks)
-                for name, pid in pids.items():
-                    sizes.setdefault(name, []).append(resident_mb(pid))
+                is_calm = campaign.rounds % _CALM_EVERY == 0
+                campaign.round(0 if is_calm else attacks)
+                if is_calm:
+                    for name, pid in pids.items():
+                        sizes.setdefault(name, []).append(resident_mb(pid))
         except ProgramError as error:
             ended = str(error)
         foreign = load.share()
     fuzzer.node.destroy_node()
     rclpy.shutdown()
-    growth = {name: some[-1] - some[len(some) // 2] for name, some in sizes.items()}
-    return Outcome(campaign, growth, ended, foreign)
+    return Outcome(campaign, sizes, ended, foreign)
 
 
 class ForeignLoad:
@@ -617,18 +631,18 @@ class ForeignLoad:
 
 def report(outcome: Outcome) -> tuple[list[dict[str, Any]], list[Target]]:
     """Return a row for every node, and the targets."""
-    campaign = outcome.campaign
+    campaign, growth_mb = outcome.campaign, outcome.growth_mb
     is_idle = outcome.foreign_load < _IDLE
     rows: list[dict[str, Any]] = []
     targets = [
         at_most("programs that ended", int(bool(outcome.ended)), 0),
         at_most("nodes that were stuck", len(campaign.stuck), 0),
         at_most("internal errors", len(campaign.fuzzer.errors), 0),
-        at_most("growth of a program (MB)", max(outcome.growth_mb.values(), default=0.0), 20.0),
+        at_most("growth of a program (MB)", max(growth_mb.values(), default=0.0), 20.0),
     ]
     for name in NODES:
         back, calm = campaign.back[name] or [_NEVER], campaign.calm[name] or [_NEVER]
-        program = name if name in outcome.growth_mb else "companion_node"
+        program = name if name in growth_mb else "companion_node"
         rows.append({
             "node": name,
             "rounds": len(campaign.back[name]),
@@ -637,7 +651,7 @@ def report(outcome: Outcome) -> tuple[list[dict[str, Any]], list[Target]]:
             "wall (s), median": round(float(np.median([item.wall_s for item in back])), 2),
             "worst": round(_worst(back, "wall_s"), 2),
             "calm, worst": round(_worst(calm, "wall_s"), 2),
-            "growth (MB)": round(outcome.growth_mb.get(program, 0.0), 1),
+            "growth (MB)": round(growth_mb.get(program, 0.0), 1),
         })  # fmt: skip
         for kind in ("data_s", "wall_s") if is_idle else ("data_s",):
             late = _worst(back, kind) - _worst(calm, kind)
@@ -666,6 +680,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for text in sorted(set(campaign.fuzzer.errors + campaign.stuck)):
         print(text, file=sys.stderr)
     rows, targets = report(outcome)
+    for name, sizes in outcome.sizes_mb.items():
+        print(f"memory of {name} [MB]: {', '.join(f'{size:.0f}' for size in sizes)}")
     publish("fuzz_nodes", "Hostile neighbors", rows, targets)
     print(
         f"{campaign.rounds} rounds, {campaign.fuzzer.sent} hostile messages and calls, "
