@@ -35,7 +35,7 @@ from l2lidar_proc.slam.config import SlamNodeConfig
 from l2lidar_proc.slam.nodes import Health, Keyframe, Map, OdometrySweep, SlamState, health_of
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 
-_FARTHEST_M: Final = 1e6  # from the origin; no odometry goes so far
+_FARTHEST_M: Final = 1e6  # from the origin; no robot goes so far
 _LATER_NS: Final = 2 * FARTHEST_NS  # than a pose that the transform is stamped, at most
 _PENDING: Final = 40  # stamps that wait for their other messages
 _SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
@@ -229,8 +229,9 @@ class SlamNode(ManagedNode):
             )
             return
         matrix = messages.matrix(message.pose.pose)
-        if not np.isfinite(matrix).all():
-            self.get_logger().warning("initial pose ignored: it is not finite")
+        problem = _pose_problem(matrix)
+        if problem:
+            self.get_logger().warning(f"initial pose ignored: {problem}")
             return
         x, y = matrix[:2, 3].tolist()
         yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
@@ -385,12 +386,19 @@ def _problem(stamp: HostNs, pose: F64, odometry: Odometry) -> str:
     # the transform is stamped a little later
     if not (is_ros_time(stamp) and is_ros_time(stamp + _LATER_NS)):
         return f"its stamp, {stamp / 1e9:.0f} s, is out of range"
+    if problem := _pose_problem(pose):
+        return problem
+    if not np.isfinite(odometry.pose.covariance).all():
+        return "the covariance of the pose is not finite"
+    return ""
+
+
+def _pose_problem(pose: F64) -> str:
+    """Return why a pose (4, 4) cannot be used, empty if it can."""
     if not np.isfinite(pose).all():
         return "the pose is not finite"
     if np.abs(pose[:3, 3]).max() > _FARTHEST_M:
         return f"the pose is more than {_FARTHEST_M / 1e3:.0f} km from the origin"
-    if not np.isfinite(odometry.pose.covariance).all():
-        return "the covariance of the pose is not finite"
     return ""
 
 
