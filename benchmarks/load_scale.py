@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -29,24 +30,40 @@ _BUFFER: Final = NetworkConfig().receive_buffer_bytes
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
 
 
-def by_length(seconds: float) -> list[tuple[int, float]]:
-    """Return point packets per CPU second, datagram to sweep, for sweeps of so many packets."""
+def by_length(
+    seconds: float, lengths: Sequence[int] = LENGTHS, rounds: int = 1
+) -> list[dict[int, float]]:
+    """Return point packets per CPU second, datagram to sweep, for sweeps of so many packets.
+
+    Parameters
+    ----------
+    seconds : float
+        Of the sensor's packets.
+    lengths : sequence of int
+    rounds : int
+        How often each length has its turn; one dict for each.
+    """
     unit = DeviceConfig(
         power=PowerConfig(boot_scale=0.0),
         identity=IdentityConfig(work_mode=int(wire.WorkMode.IMU_OFF)),
     )
     device = VirtualL2(unit, PatternScanner(), StillInertial(), power_on_ns=_EPOCH_NS)
     sent = device.advance(_EPOCH_NS + round(seconds * 1e9))
-    found = []
-    for length in LENGTHS:
-        values = {"imu_adjust": False, "aggregateNframes": length, "enable_l2_host_sync": False}
-        driver = Driver(build(DriverConfig, values))
-        begin = time.process_time()
-        for arrival, data in sent:
-            driver.receive(data, HostNs(arrival))
-        driver.flush()
-        found.append((length, len(sent) / (time.process_time() - begin)))
-    return found
+    return [
+        {length: len(sent) / _received_s(sent, length) for length in lengths}
+        for _ in range(rounds)
+    ]
+
+
+def _received_s(sent: Sequence[tuple[int, bytes]], length: int) -> float:
+    """Return the CPU time that datagrams take in sweeps of so many packets [s]."""
+    values = {"imu_adjust": False, "aggregateNframes": length, "enable_l2_host_sync": False}
+    driver = Driver(build(DriverConfig, values))
+    begin = time.process_time()
+    for arrival, data in sent:
+        driver.receive(data, HostNs(arrival))
+    driver.flush()
+    return time.process_time() - begin
 
 
 def crowd(
