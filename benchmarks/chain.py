@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final
 
 from l2lidar_node.demo.processes import Program, Programs, assigned, free_udp_ports
@@ -23,6 +24,7 @@ def start(
     nodes: Sequence[str] = (DRIVER, COMPANION),
     base_frame: str | None = None,
     data_dir: str | None = None,
+    folder: Path | None = None,
 ) -> dict[str, Program]:
     """Start the nodes that there are and then a unit; return them by name.
 
@@ -39,6 +41,8 @@ def start(
         Of the odometry in the companion, for a sensor on a robot.
     data_dir : str, optional
         Where slam_node saves its map, if it is among the modules.
+    folder : Path, optional
+        Another checkout, whose nodes are to run; the unit is always this one's.
     """
     host_port, lidar_port = free_udp_ports(2)
     parameters = {
@@ -52,7 +56,7 @@ def start(
     if data_dir is not None:
         arguments[SLAM] = assigned({"data_dir": data_dir})
     started = {
-        module.rpartition(".")[2]: programs.start(module, arguments.get(module, []))
+        module.rpartition(".")[2]: programs.start(module, arguments.get(module, []), folder)
         for module in nodes
         if find_spec(module)
     }

@@ -42,6 +42,8 @@ class Program:
     ----------
     module : str
     arguments : list of str
+    folder : Path, optional
+        Where it runs, and where Python looks for the module first: another checkout's program.
 
     Attributes
     ----------
@@ -49,7 +51,7 @@ class Program:
         The last ones that it wrote.
     """
 
-    def __init__(self, module: str, arguments: list[str]) -> None:
+    def __init__(self, module: str, arguments: list[str], folder: Path | None = None) -> None:
         self.module = module
         self._ended: tuple[int, str] | None = None
         self._process = subprocess.Popen(
@@ -58,6 +60,7 @@ class Program:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
+            cwd=folder,
         )
         # A pipe that nobody reads fills up, and the program stops at its next word.
         self.lines: deque[str] = deque(maxlen=_LINES)
@@ -120,10 +123,10 @@ class Programs:
         """Stop all programs."""
         self._stack.close()
 
-    def start(self, module: str, arguments: list[str]) -> Program:
-        """Start a program that is stopped with the others."""
+    def start(self, module: str, arguments: list[str], folder: Path | None = None) -> Program:
+        """Start a program that is stopped with the others; see :class:`Program`."""
         with held():
-            program = Program(module, arguments)
+            program = Program(module, arguments, folder)
             self._running.append(program)
             self._stack.callback(program.stop)
         return program
