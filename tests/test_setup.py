@@ -62,7 +62,7 @@ def test_programs_that_are_started_keep_what_they_have_compiled(tmp_path: Path) 
     asked = 'print("forbidden" if __import__("sys").dont_write_bytecode else "kept")'
     makefile.write_text(f"include {ROOT / 'Makefile'}\nasked:\n\t@{sys.executable} -c '{asked}'\n")
     said = subprocess.run(
-        ["make", "-f", str(makefile), "asked"],
+        ["make", "--no-print-directory", "-f", str(makefile), "asked"],
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
         cwd=ROOT, capture_output=True, text=True, check=True,
     )  # fmt: skip

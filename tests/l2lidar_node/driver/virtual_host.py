@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -181,7 +181,7 @@ def live_run(
     return config, events, tap
 
 
-def essence(events: Sequence[Event]) -> list[object]:
+def essence(events: Iterable[Event]) -> list[object]:
     """Return sweeps and samples in a form that compares equal when every bit is."""
     return [
         (event.start, event.end, event.packets, event.missing, event.points.tobytes())
