@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from typing import Any
 
@@ -43,8 +45,16 @@ class ViewerNode(Node):
 def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
     """Show topics until interrupted or for some seconds; return how many messages were shown.
 
-    rclpy has to be initialised.
+    rclpy has to be initialised, without handlers of signals.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After SIGINT, between two messages: rclpy turns one that is raised while it converts a
+        message into a RuntimeError.
     """
+    interrupted = threading.Event()
+    before = signal.signal(signal.SIGINT, lambda number, frame: interrupted.set())
     viewer = Viewer(rerun)
     node = ViewerNode(viewer, topics)
     executor = SingleThreadedExecutor()
@@ -53,6 +63,9 @@ def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
     try:
         while executor.context.ok() and (end is None or time.monotonic() < end):
             executor.spin_once(timeout_sec=0.1)
+            if interrupted.is_set():
+                raise KeyboardInterrupt
     finally:
         node.destroy_node()
+        signal.signal(signal.SIGINT, before)
     return viewer.messages

@@ -75,12 +75,11 @@ def test_arrivals_are_the_kernels_and_ascend(device: socket.socket) -> None:
         before = time.time_ns()
         for _ in range(3):
             device.sendto(b"x", (HOST, link.port))
-        after = time.time_ns()
         time.sleep(0.05)  # read late: the stamps must not be those of the reading
+        read = time.time_ns()
         arrivals = [item.arrival for item in receive(link, 3)]
     assert arrivals == sorted(arrivals)
-    assert before - 1_000_000 <= arrivals[0]
-    assert arrivals[-1] <= after + 40_000_000
+    assert before - 1_000_000 <= arrivals[0] < read
 
 
 def test_other_senders_are_counted_and_dropped(device: socket.socket) -> None:
