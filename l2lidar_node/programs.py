@@ -98,10 +98,11 @@ def interruptible(main: Callable[[], int | None]) -> int:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Have SIGINT and SIGTERM wait while a process is started, here and in the new process.
+    """Have SIGINT and SIGTERM wait: while a process is started, or where none may be raised.
 
-    There they wait until it begins with :func:`end_by_signal` or ignores them. So it is either
-    known to this one or was never started, and Python itself begins undisturbed.
+    In a new process they wait until it begins with :func:`end_by_signal` or ignores them. So it is
+    either known to this one or was never started, and Python itself begins undisturbed. rclpy
+    turns an interrupt that is raised while it converts a message into a RuntimeError.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     _interruption.is_held = True  # a thread that does not block them may get them

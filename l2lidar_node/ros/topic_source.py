@@ -16,6 +16,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.check.observation import Gathering, Observation, Qos, SourceError, Topics, choose
+from l2lidar_node.programs import held
 from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 
 _DISCOVERY_S: Final = 6.0
@@ -86,7 +87,8 @@ def _found(node: Node, asked: Topics, needs_imu: bool) -> Topics:
         else:
             if topics.imu or not needs_imu or is_late:
                 return topics
-        rclpy.spin_once(node, timeout_sec=_LOOK_S)
+        with held():
+            rclpy.spin_once(node, timeout_sec=_LOOK_S)
 
 
 class _Ear:
@@ -112,14 +114,16 @@ class _Ear:
         left = seconds
         while left > 0:
             begun = time.monotonic()
-            self._executor.spin_once(timeout_sec=min(left, _LOOK_S))
+            with held():
+                self._executor.spin_once(timeout_sec=min(left, _LOOK_S))
             left -= min(time.monotonic() - begun, 2 * _LOOK_S)
         # What came by now still waits where this program is slow, more samples than clouds.
         self._end_ns = time.time_ns()
         idle = 0
         while idle < _IDLE:
             before = self._handled
-            self._executor.spin_once(timeout_sec=0.0)
+            with held():
+                self._executor.spin_once(timeout_sec=0.0)
             idle = 0 if self._handled > before else idle + 1
 
     def _timed(self, take: Callable[[Any, int], None]) -> Callable[[Any, Any], None]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from typing import Any
 
@@ -14,6 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu, PointCloud2
 
+from l2lidar_node.programs import held
 from l2lidar_node.viewing import ROLES, Viewer
 
 
@@ -46,15 +45,7 @@ def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
     """Show topics until interrupted or for some seconds; return how many messages were shown.
 
     rclpy has to be initialised, without handlers of signals.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After SIGINT, between two messages: rclpy turns one that is raised while it converts a
-        message into a RuntimeError.
     """
-    interrupted = threading.Event()
-    before = signal.signal(signal.SIGINT, lambda number, frame: interrupted.set())
     viewer = Viewer(rerun)
     node = ViewerNode(viewer, topics)
     executor = SingleThreadedExecutor()
@@ -62,10 +53,8 @@ def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
     end = None if seconds is None else time.monotonic() + seconds
     try:
         while executor.context.ok() and (end is None or time.monotonic() < end):
-            executor.spin_once(timeout_sec=0.1)
-            if interrupted.is_set():
-                raise KeyboardInterrupt
+            with held():
+                executor.spin_once(timeout_sec=0.1)
     finally:
         node.destroy_node()
-        signal.signal(signal.SIGINT, before)
     return viewer.messages
