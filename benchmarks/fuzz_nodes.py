@@ -60,6 +60,7 @@ from l2lidar_node.demo.processes import (
     free_udp_ports,
     isolate_ros,
 )
+from l2lidar_node.programs import held
 from l2lidar_node.ros.conversions import to_cloud, to_time
 from l2lidar_node.settings import Setting, settings_of
 from l2lidar_node.types import HostNs
@@ -471,7 +472,8 @@ class Campaign:
         """Let messages come for a while; raise ProgramError if a program has ended."""
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0.0:
-            rclpy.spin_once(self.fuzzer.node, timeout_sec=min(left, 0.02))
+            with held():
+                rclpy.spin_once(self.fuzzer.node, timeout_sec=min(left, 0.02))
         self.programs.check()
 
     def round(self, attacks: int) -> None:

@@ -18,6 +18,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 
 from l2lidar_node.demo.processes import Programs
+from l2lidar_node.programs import held
 
 _START_S: Final = 60.0  # until programs are at work, on a busy machine
 _STAMP: Final = struct.Struct("<iI")
@@ -67,7 +68,8 @@ class TopicWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no t
         """Handle what arrives for a while."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
-            self._executor.spin_once(min(left, 0.1))
+            with held():
+                self._executor.spin_once(min(left, 0.1))
 
     def until(self, condition: Callable[[], bool], programs: Programs, otherwise: str) -> None:
         """Handle what arrives until a condition holds, while programs run.

@@ -19,6 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node.programs import held
 from l2lidar_node.recording.bag import BagFile
 from l2lidar_node.ros.conversions import from_cloud, from_time
 
@@ -112,7 +113,8 @@ class Observer(Node):
     def watch(self, until: float) -> None:
         """Handle what arrives until a monotonic time [s]."""
         while (left := until - time.monotonic()) > 0:
-            rclpy.spin_once(self, timeout_sec=min(left, 0.1))
+            with held():
+                rclpy.spin_once(self, timeout_sec=min(left, 0.1))
 
     def _cloud(self, message: PointCloud2) -> None:
         self.clouds.add(from_time(message.header.stamp), message.header.frame_id)
