@@ -236,6 +236,13 @@ class OdometryTopics(ImuConfig):
     imu_wait_ms: int = setting(
         50, "longest wait for IMU samples that cover the end of a sweep", unit="ms", lo=0, hi=1000
     )
+    max_skipped: int = setting(
+        3,
+        "most sweeps in a row that the IMU carries, not aligned, while two or more clouds wait; "
+        "0 aligns every sweep, however far the poses fall behind",
+        lo=0,
+        hi=10,
+    )
     imu_rate: float = setting(
         50.0,
         "rate of IMU-propagated odometry and TF; 0 gives TF once per sweep",

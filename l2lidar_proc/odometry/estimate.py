@@ -23,6 +23,7 @@ class Status(Enum):
     PREDICTED = "not aligned with the map: the pose is predicted"
     SPARSE = "too few points"
     UNMATCHED = "too few points meet the map"
+    SKIPPED = "not aligned, to catch up: clouds come faster than they can be aligned"
     DEGENERATE = "the scene does not fix the pose in every direction"
     SUSPECT = "contradicts max_speed, the IMU or the sweeps before: the covariance is widened"
     IMU_GAP = "IMU samples are missing within the span of this estimate"

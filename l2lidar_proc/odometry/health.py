@@ -82,6 +82,9 @@ def judged(
     if not since:
         return WARN, "no clouds", values
     is_warned = bool(last.status or finding)
-    level = ERROR if untied or _SERIOUS & set(last.status) else WARN if is_warned else OK
+    remarks = set(last.status)
+    if Status.SKIPPED in remarks:  # the next one that is aligned makes up for it
+        remarks -= {Status.PREDICTED}
+    level = ERROR if untied or _SERIOUS & remarks else WARN if is_warned else OK
     words = [status.value for status in last.status] or ["aligned"]
     return level, "; ".join([*words, *filter(None, (finding, untied))]), values

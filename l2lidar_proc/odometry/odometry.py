@@ -100,7 +100,7 @@ class Odometry:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
         self._predictor.imu(samples)
 
-    def register(self, sweep: Sweep) -> list[OdometryEstimate]:
+    def register(self, sweep: Sweep, *, may_skip: bool = False) -> list[OdometryEstimate]:
         """Return where the sensor was at the references of sweeps, oldest first.
 
         The first sweeps are held until they can be solved together (then their estimates come at
@@ -110,6 +110,9 @@ class Odometry:
         ----------
         sweep : Sweep
             Any layout of points with x, y, z and time; IMU samples up to its end should have come.
+        may_skip : bool
+            There is no time to align it: where the IMU has no gap, it alone may carry the pose
+            through it.
         """
         status: list[Status] = []
         if self._last is not None:
@@ -122,6 +125,10 @@ class Odometry:
         sweep = cropped(sweep, self.config.min_range, self.config.max_range)
         if self.phase is Phase.INITIALIZING:
             return self._initialize(sweep)
+        if may_skip and not status:
+            skipped = self._skip(sweep)
+            if skipped is not None:
+                return [skipped]
         if self.phase is Phase.STATIONARY:
             held = self._hold(sweep, status)
             if held is not None:
@@ -203,16 +210,7 @@ class Odometry:
             self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
-        lasted = (predicted.state.stamp - state.stamp) * 1e-9
-        posterior = eskf.apply_zero_velocity_prior(*posterior, lasted)
-        posterior = eskf.with_gravity_of_known_size(*posterior)
-        way = float(np.linalg.norm(posterior[0].position - state.position))
-        lean = way * tuning.MAP_BEND**2
-        posterior = posterior[0], eskf.with_leaning_gravity(*posterior, lean)
-        bounded = eskf.bound_speed(*posterior, self.config.max_speed)
-        if bounded[0] is not posterior[0] or self._is_suspect(predicted):
-            status.append(Status.SUSPECT)
-        motion = predicted.with_state(*bounded)
+        motion = self._constrained(predicted, *posterior, status)
         if self._unmatched_ns >= tuning.LOST_NS:
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
@@ -228,6 +226,40 @@ class Odometry:
             fresh = self.matcher.extend(estimate.points, motion, guess)
             self._anchor_anew(fresh)
         return estimate
+
+    def _constrained(
+        self, predicted: SweepMotion, after: InertialState, covariance: F64, status: list[Status]
+    ) -> SweepMotion:
+        """Return the motion with the state after a sweep, held to what physics allows."""
+        assert self._belief is not None
+        before = self._belief[0]
+        lasted = (predicted.state.stamp - before.stamp) * 1e-9
+        posterior = eskf.apply_zero_velocity_prior(after, covariance, lasted)
+        posterior = eskf.with_gravity_of_known_size(*posterior)
+        way = float(np.linalg.norm(posterior[0].position - before.position))
+        lean = way * tuning.MAP_BEND**2
+        posterior = posterior[0], eskf.with_leaning_gravity(*posterior, lean)
+        bounded = eskf.bound_speed(*posterior, self.config.max_speed)
+        if bounded[0] is not posterior[0] or self._is_suspect(predicted):
+            status.append(Status.SUSPECT)
+        return predicted.with_state(*bounded)
+
+    def _skip(self, sweep: Sweep) -> OdometryEstimate | None:
+        """Carry the pose through a sweep by the IMU alone, if it can; the map stays as it is."""
+        assert self._belief is not None
+        state, covariance = self._belief
+        predicted = self._predictor.over_sweep(sweep, state, covariance)
+        if gaps_in(predicted):
+            return None
+        status = [Status.PREDICTED, Status.SKIPPED]
+        if self._is_at_rest(sweep):
+            rested = self._predictor.static_update(state, covariance, predicted.state.stamp)
+            motion = predicted.at_rest(*rested)
+        else:
+            motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
+        self._keep(motion)
+        quality = self._consistency(self.matcher.quality(len(sweep.points), None))
+        return self._estimate(sweep, motion, status, quality)
 
     def _is_suspect(self, motion: SweepMotion) -> bool:
         """Return whether the latest sweeps contradict the IMU, or the biases any sensor's."""
@@ -321,9 +353,7 @@ class Odometry:
 
     def _hold(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Hold the pose; return None if IMU or sweep show motion, then the sweep is tracked."""
-        samples = self._predictor.samples(sweep.end - tuning.STILL_IMU_NS, sweep.end)
-        if not self._zero_velocity.holds(samples):
-            self._leave_rest()
+        if not self._is_at_rest(sweep):
             return None
         assert self._belief is not None
         state, covariance = self._belief
@@ -331,8 +361,6 @@ class Odometry:
         trial = predicted.at_rest(state, free_pose())
         source = self.matcher.source(sweep, trial)
         found, _ = self.matcher.match(source, trial)
-        if self._first_sweeps:
-            self._first_sweeps.append(sweep)
         status = [*status, *gaps_in(predicted)]
         if found is None:
             self._zero_velocity.clear()
@@ -355,6 +383,18 @@ class Odometry:
         )
         self.matcher.extend(estimate.points, still, still.state)
         return estimate
+
+    def _is_at_rest(self, sweep: Sweep) -> bool:
+        """Return whether the sensor was at rest before a sweep and the IMU does not object."""
+        if self.phase is not Phase.STATIONARY:
+            return False
+        samples = self._predictor.samples(sweep.end - tuning.STILL_IMU_NS, sweep.end)
+        if not self._zero_velocity.holds(samples):
+            self._leave_rest()
+            return False
+        if self._first_sweeps:
+            self._first_sweeps.append(sweep)
+        return True
 
     def _leave_rest(self) -> None:
         self._first_sweeps = []

@@ -24,6 +24,7 @@ from l2lidar_proc.recording.trajectory import Trajectory
 
 _MS: Final = 1_000_000
 _MOTIONS: Final = 32  # sweeps whose motion is remembered
+_BACKLOG: Final = 2  # clouds that wait: one may, while the one before is aligned
 
 
 class OdometryPipeline:
@@ -41,6 +42,8 @@ class OdometryPipeline:
         What is known of the IMU beside its place.
     accelerometer : bool
         False: the accelerometer is watched, for its sign, but not used.
+    max_skipped : int
+        Most sweeps in a row that are not aligned while two or more clouds wait.
 
     Attributes
     ----------
@@ -68,8 +71,10 @@ class OdometryPipeline:
         extrinsics: ImuExtrinsics | None = None,
         *,
         accelerometer: bool = True,
+        max_skipped: int = 0,
     ) -> None:
         self._config = config
+        self._max_skipped = max_skipped
         self._uses_accelerometer = accelerometer
         self._wait_ns = imu_wait_ms * _MS if config.mode == "inertial" else 0
         self._newest_imu: HostNs | None = None
@@ -112,6 +117,8 @@ class OdometryPipeline:
         self.trajectory = Trajectory()
         self._motions: dict[tuple[HostNs, HostNs], KnownMotion] = {}
         self.sweeps = 0
+        self._backlog = 0
+        self._skipped = 0  # in a row
         self.counts: Counter[Status] = Counter()
         odometry = self.odometry
         mount = odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
@@ -171,16 +178,25 @@ class OdometryPipeline:
         if len(samples):
             self._newest_imu = HostNs(int(samples["stamp"][-1]))
 
-    def sweep(self, sweep: Sweep, now: int) -> None:
-        """Take a sweep that arrives at ``now`` [ns]."""
+    def sweep(self, sweep: Sweep, now: int, backlog: int = 0) -> None:
+        """Take a sweep that arrives at ``now`` [ns].
+
+        Parameters
+        ----------
+        sweep : Sweep
+        now : int
+        backlog : int
+            How many more clouds have come already.
+        """
         self.sweeps += 1
+        self._backlog = backlog
         self._sequencer.push(sweep, now)
 
     def poll(self, now: int) -> list[OdometryEstimate]:
         """Return the estimates that are due by ``now`` [ns], in order."""
         estimates: list[OdometryEstimate] = []
         for release in self._sequencer.release(self._newest_imu, now):
-            registered = self.odometry.register(release.sweep)
+            registered = self._registered(release.sweep)
             self._remember(release.sweep, registered)
             for estimate in registered:
                 self.counts.update(estimate.status)
@@ -191,6 +207,17 @@ class OdometryPipeline:
                 estimates.append(estimate)
                 self._watch(estimate)
         return estimates
+
+    def _registered(self, sweep: Sweep) -> list[OdometryEstimate]:
+        """Register a sweep, or let it pass where too many others wait."""
+        odometry = self.odometry
+        if isinstance(odometry, PlainOdometry):
+            return odometry.register(sweep)
+        may_skip = self._backlog >= _BACKLOG and self._skipped < self._max_skipped
+        registered = odometry.register(sweep, may_skip=may_skip)
+        is_skipped = any(Status.SKIPPED in estimate.status for estimate in registered)
+        self._skipped = self._skipped + 1 if is_skipped else 0
+        return registered
 
     def _watch(self, estimate: OdometryEstimate) -> None:
         """Check the IMU against a pose; begin again where its accelerometer points backwards."""

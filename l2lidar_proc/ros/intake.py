@@ -30,6 +30,7 @@ from l2lidar_proc.ros.serialized import Cloud, ImuBatch
 # A node that is held up for some seconds catches up at once: better late than a hole in the map.
 CLOUD_DEPTH: Final = 30
 IMU_DEPTH: Final = 2000
+_AHEAD: Final = 4  # clouds that are taken out of their queue at once, to know how many wait
 
 SLOW_LOOK_S: Final = 0.05
 """Between looks into the IMU's queue where nobody is in a hurry."""
@@ -48,10 +49,13 @@ class OneCloud:
     Attributes
     ----------
     cloud : Cloud
+    backlog : int
+        How many later clouds have come already, counted up to 3.
     """
 
-    def __init__(self, cloud: Cloud) -> None:
+    def __init__(self, cloud: Cloud, backlog: int = 0) -> None:
         self.cloud = cloud
+        self.backlog = backlog
         self._sweeps: dict[str, Sweep | CloudError] = {}
 
     def sweep(self, unit: str = "auto", *, snapshots: bool = False) -> Sweep:
@@ -160,6 +164,7 @@ class SensorIntake:
         self._period_s = period_s
         self._queue = threading.Lock()  # held while the IMU's messages are taken
         self._taken: deque[ImuBatch] = deque(maxlen=IMU_DEPTH)  # and not handed out yet
+        self._clouds: deque[bytes] = deque()  # messages that wait
         self._fast: dict[Listener, Callable[..., None]] = {}
         self._thread: tuple[threading.Thread, threading.Event] | None = None
         self._listeners: list[Listener] = []
@@ -220,6 +225,7 @@ class SensorIntake:
             with self._queue:
                 self._open = None
             self._taken.clear()
+            self._clouds.clear()
             node.destroy_timer(opened.soon)
             node.destroy_timer(opened.look)
             node.destroy_subscription(opened.clouds)
@@ -291,28 +297,39 @@ class SensorIntake:
             self._thread = None
 
     def look(self) -> None:
-        """Hand out the IMU samples, and let the listeners publish what is finished."""
+        """Hand out what has come, and let the listeners publish what is finished."""
         self.drain()
+        if self._clouds:
+            self._hand_out(self._clouds.popleft())
         for feed in self._feeds:
             feed.advance()
         if self._open is None:
             return
-        if any(listener.is_waiting for listener in self._listeners):
+        if self._clouds or any(listener.is_waiting for listener in self._listeners):
             self._open.soon.reset()
         else:
             self._open.soon.cancel()
 
     def _cloud(self, message: bytes) -> None:
-        self.drain()
+        """Take a cloud and all that wait behind it, and handle the first.
+
+        Listeners are told how many wait. The others are handled one by one, so that services and
+        timers get their turn between two of them.
+        """
+        self._clouds.append(message)
+        if self._open is not None:
+            self._clouds.extend(waiting(self._open.clouds, _AHEAD - len(self._clouds)))
+        self.look()
+
+    def _hand_out(self, message: bytes) -> None:
         try:
-            item = OneCloud(serialized.cloud(message))
+            item = OneCloud(serialized.cloud(message), len(self._clouds))
         except ValueError as error:
             for feed in self._feeds:
                 feed.refusal(error)
             return
         for feed in self._feeds:
             feed.cloud(item)
-        self.look()
 
 
 def waiting(subscription: Subscription, limit: int) -> Iterator[Any]:

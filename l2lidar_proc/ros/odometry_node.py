@@ -79,7 +79,11 @@ class OdometryNode(ManagedNode):
         config = self._settings.value
         topics = config.topics
         self._pipeline = OdometryPipeline(
-            config.odometry, topics.T_cloud_imu, topics.imu_wait_ms, ImuExtrinsics.of(topics)
+            config.odometry,
+            topics.T_cloud_imu,
+            topics.imu_wait_ms,
+            ImuExtrinsics.of(topics),
+            max_skipped=topics.max_skipped,
         )
         if self._pipeline.extrinsics.problem:
             self.get_logger().warning(self._pipeline.extrinsics.problem)
@@ -238,7 +242,7 @@ class OdometryNode(ManagedNode):
         self._inputs.sweep(sweep)
         # Whoever shows the deskewed cloud needs the transform up to its end, and needs it first.
         self._poses.catch_up()
-        self.pipeline.sweep(sweep, time.monotonic_ns())
+        self.pipeline.sweep(sweep, time.monotonic_ns(), item.backlog)
 
     def refuse_cloud(self, error: ValueError) -> None:
         """Count a cloud that cannot be used."""
@@ -296,8 +300,11 @@ class OdometryNode(ManagedNode):
 
     def advance(self) -> None:
         """Publish what is finished."""
-        for estimate in self.pipeline.poll(time.monotonic_ns()):
+        estimates = self.pipeline.poll(time.monotonic_ns())
+        for estimate in estimates:
             self._publish(estimate)
+        if estimates:
+            self._go_on_from_here()
 
     @property
     def _base_name(self) -> str:
@@ -329,7 +336,6 @@ class OdometryNode(ManagedNode):
             T_base_lidar = rotations.inverse(self._base.T_lidar_base)
             points = messages.moved(estimate.points, T_base_lidar)
             self._deskewed.publish(to_cloud(points, stamp, self._base_name))
-        self._go_on_from_here()
 
     def _extend_path(self, pose: F64, estimate: OdometryEstimate) -> None:
         topics = self._settings.value.topics

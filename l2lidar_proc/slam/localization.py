@@ -174,7 +174,8 @@ class Localizer:
         if self.T_map_odom is None:
             return
         extra = np.zeros((6, 6))
-        if sweep.health is not Health.GOOD and np.isfinite(sweep.covariance).all():
+        is_sure = sweep.health in (Health.GOOD, Health.SKIPPED)
+        if not is_sure and np.isfinite(sweep.covariance).all():
             extra[TURN, TURN] = sweep.covariance[3:, 3:]
             extra[SHIFT, SHIFT] = sweep.covariance[:3, :3]
         # a little at each sweep: as much as an edge of the whole step would have

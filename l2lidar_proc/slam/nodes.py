@@ -40,6 +40,7 @@ class Health(Enum):
 
     GOOD = "aligned"
     DEGENERATE = "aligned, but the scene does not fix the pose in every direction"
+    SKIPPED = "not aligned for want of time: the IMU carries the pose between two that are"
     PREDICTED = "not aligned: the pose is predicted"
     CUT = "the motion since the sweep before is unknown"
 
@@ -96,6 +97,8 @@ def health_of(names: Iterable[str]) -> Health:
     remarks = set(names)
     if remarks & {status.name for status in CUTS}:
         return Health.CUT
+    if "SKIPPED" in remarks:
+        return Health.SKIPPED
     if "PREDICTED" in remarks:
         return Health.PREDICTED
     return Health.DEGENERATE if "DEGENERATE" in remarks else Health.GOOD
@@ -116,7 +119,8 @@ class Node:
     sweeps : ndarray of STAMPED_POSE
         ``T_node_body`` of each sweep.
     usable : bool
-        Whether all sweeps were aligned and well fixed: otherwise it closes no loop.
+        Whether all sweeps but the skipped ones were aligned and well fixed: otherwise it closes
+        no loop.
     way : float
         Of the odometry at its beginning [m].
     """
@@ -261,6 +265,7 @@ class OpenNode:
         self._sweeps.append(sweep.stamp, T_node_body)
         if sweep.health is Health.GOOD:
             self._builder.add(T_node_body, sweep.points)
+        if sweep.health in (Health.GOOD, Health.SKIPPED):
             return
         self._usable = False
         turned = np.zeros((6, 6))

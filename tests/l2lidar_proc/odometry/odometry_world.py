@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -26,17 +26,21 @@ def recording(scene: str, motion: str, seconds: float = 6.0) -> Run:
 
 
 def feed(
-    odometry: Odometry, run: Run, some: list[Sweep], imu: NDArray[np.void] | None = None
+    odometry: Odometry,
+    run: Run,
+    some: list[Sweep],
+    imu: NDArray[np.void] | None = None,
+    may_skip: Callable[[int], bool] = lambda number: False,
 ) -> list[OdometryEstimate]:
     """Give the odometry sweeps and, before each, the samples up to its end."""
     imu = run.imu if imu is None else imu
     out: list[OdometryEstimate] = []
     first = 0
-    for sweep in some:
+    for number, sweep in enumerate(some):
         last = int(np.searchsorted(imu["stamp"], sweep.end)) + 1
         odometry.imu(imu[first:last])
         first = last
-        out += odometry.register(sweep)
+        out += odometry.register(sweep, may_skip=may_skip(number))
     return out
 
 

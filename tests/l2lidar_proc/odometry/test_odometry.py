@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from itertools import pairwise
 from typing import Any
 
@@ -11,9 +12,11 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
-from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from tests.l2lidar_proc.odometry.odometry_world import (
     T_CLOUD_IMU,
     drive,
@@ -164,6 +167,82 @@ def test_blocked_sensor_is_predicted_with_growing_covariance() -> None:
     assert traces[-1] > 4.0 * traces[0]
     assert estimates[-1].is_aligned
     assert errors(run, estimates).max() < 0.05
+
+
+def test_skipped_sweeps_are_carried_by_the_imu() -> None:
+    """Three of four: a computer that is four times too slow."""
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some, may_skip=lambda number: number > 8 and number % 4 > 0)
+    assert [item.stamp for item in estimates] == [(one.start + one.end) // 2 for one in some]
+    for number, item in enumerate(estimates):
+        skipped = number > 8 and number % 4 > 0
+        assert (Status.SKIPPED in item.status) == (Status.PREDICTED in item.status) == skipped
+    found = errors(run, estimates)
+    sigma = np.array([np.sqrt(np.trace(item.covariance[:3, :3])) for item in estimates])
+    assert found.max() < 0.03
+    assert (found < 3.0 * sigma).all()
+    traces = [np.trace(item.covariance[:3, :3]) for item in estimates[12:16]]
+    assert all(later > earlier for earlier, later in pairwise(traces))
+
+
+def test_a_sensor_at_rest_stays_there_while_sweeps_are_skipped() -> None:
+    run = recording("room", "still", 3.0)
+    some = list(sweeps(run, "turn"))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some, may_skip=lambda number: number % 4 > 0)
+    assert sum(Status.SKIPPED in item.status for item in estimates) > len(some) // 2
+    assert odometry.phase is Phase.STATIONARY
+    way = np.array([item.T_map_lidar[:3, 3] for item in estimates])
+    assert np.abs(way - way[0]).max() < 0.008
+
+
+def test_what_the_imu_cannot_carry_is_not_skipped() -> None:
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:14]
+    seconds = (run.imu["stamp"] - sweep_epoch(run)) * 1e-9
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some, run.imu[seconds < 2.0], may_skip=lambda number: True)
+    without = [
+        item
+        for item, one in zip(estimates, some, strict=True)
+        if one.end > 2.1e9 + sweep_epoch(run)
+    ]
+    assert len(without) > 3
+    assert not any(Status.SKIPPED in item.status for item in without)
+
+
+def test_only_a_backlog_makes_a_pipeline_skip_and_never_many_in_a_row() -> None:
+    run = recording("room", "walk")
+    for backlog, most, expected in (
+        (1, 3, "0000"),
+        (2, 0, "0000"),
+        (2, 3, "1110"),
+        (9, 1, "1010"),
+    ):
+        pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU, max_skipped=most)
+        first, skipped = 0, []
+        for sweep in list(sweeps(run, "turn"))[:12]:
+            last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+            pipeline.imu(run.imu[first:last])
+            first = last
+            pipeline.sweep(sweep, sweep.end, backlog)
+            skipped += [Status.SKIPPED in item.status for item in pipeline.poll(sweep.end)]
+        begun = skipped.index(True) if "1" in expected else 4
+        assert begun < 8
+        assert "".join("01"[one] for one in skipped[begun : begun + 4]) == expected
+
+
+def test_a_skipped_sweep_is_a_warning_and_a_blocked_sensor_an_error() -> None:
+    last = driven("room", "walk")[-1]
+    for status, expected in (
+        ((Status.PREDICTED, Status.SKIPPED), health.WARN),
+        ((Status.PREDICTED, Status.SPARSE), health.ERROR),
+        ((), health.OK),
+    ):
+        one = dataclasses.replace(last, status=status)
+        assert health.judged(one, 9, 4, Counter(), Counter())[0] == expected
 
 
 def test_dropped_sweeps_are_survived() -> None:

@@ -248,7 +248,7 @@ def test_transforms_go_on_while_a_sweep_is_registered(bench: OdometryBench) -> N
     later = run.imu[first : first + 100]  # as many as 0.4 s of work let come
     stamps: list[int] = []
 
-    def slow(sweep: Sweep) -> list[OdometryEstimate]:
+    def slow(sweep: Sweep, *, may_skip: bool) -> list[OdometryEstimate]:
         for sample in later:
             bench.send_sample(sample)
         deadline = time.monotonic() + 60.0
@@ -257,7 +257,7 @@ def test_transforms_go_on_while_a_sweep_is_registered(bench: OdometryBench) -> N
             for message in waiting(heard, 100):
                 stamps.extend(from_time(item.header.stamp) for item in message.transforms)
         odometry.register = register
-        return register(sweep)
+        return register(sweep, may_skip=may_skip)
 
     odometry.register = slow
     bench.send(run, some[-1:])

@@ -50,7 +50,7 @@ def test_an_error_that_nobody_foresaw_is_reported_and_survived(
 ) -> None:
     pipeline = odometry.node._pipeline
     real = pipeline.sweep
-    monkeypatch.setattr(pipeline, "sweep", lambda sweep, now: 1 / 0)
+    monkeypatch.setattr(pipeline, "sweep", lambda sweep, now, backlog: 1 / 0)
     sweep = next(iter(sweeps(recording("room", "walk"), "turn")))
     odometry.send_cloud(sweep.points, sweep.start)
     told = "internal error, begun again: ZeroDivisionError"

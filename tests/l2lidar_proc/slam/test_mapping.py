@@ -221,6 +221,22 @@ def test_degenerate_and_predicted_sweeps_close_nothing(office: MappingRun) -> No
     assert not any(node.usable for node in slam.nodes)
 
 
+def test_a_skipped_sweep_adds_nothing_and_spoils_nothing(office: MappingRun) -> None:
+    slam, whole = Slam(SlamConfig()), Slam(SlamConfig())
+    for number, sweep in enumerate(office.sweeps(drifting(office.truth, 0.0, 0, STEP))):
+        health = Health.GOOD if number % 2 else Health.SKIPPED
+        slam.add(dataclasses.replace(sweep, health=health))
+        whole.add(sweep)
+        if len(slam.nodes) == 3:
+            break
+    assert all(node.is_comparable for node in slam.nodes)
+    for node, other in zip(slam.nodes, whole.nodes, strict=True):
+        assert node.submap is not None
+        assert other.submap is not None
+        assert len(node.sweeps) == len(other.sweeps)
+        assert len(node.submap) < len(other.submap)
+
+
 def test_after_a_cut_the_place_is_lost_until_the_map_knows_it_again(office: MappingRun) -> None:
     pytest.importorskip("gtsam")
     slam = Slam(SlamConfig())
