@@ -351,7 +351,11 @@ class Fuzzer:
     # ---- good
 
     def restore(self) -> list[Future]:
-        """Activate every node, set every live parameter to its default, start the unit."""
+        """Activate every node, set every live parameter to its default, start the unit.
+
+        The SLAM node begins a new map: somebody may have had it load another one and search it,
+        and while it searches it rightly publishes no pose.
+        """
         answers = []
         for name, items in self._live.items():
             answers += self.transitions(name, _TO_ACTIVE)
@@ -363,6 +367,7 @@ class Fuzzer:
                 if item.default != ()
             ]
             answers.append(self._send_parameters(name, values))
+        answers.append(self._triggers["slam_node", "reset"].call_async(Trigger.Request()))
         item = TransformStamped(child_frame_id=IMU_FRAME)
         item.header.frame_id = CLOUD_FRAME
         item.transform.rotation.w = 1.0
