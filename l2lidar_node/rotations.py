@@ -5,6 +5,8 @@ A quaternion ``q_a_b`` takes vectors of frame b to frame a, like the matrix of t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -89,6 +91,30 @@ def matrices(q_wxyz: ArrayLike) -> F64:
         2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
     )  # fmt: skip
     return entries.reshape(*entries.shape[:-1], 3, 3)
+
+
+def matrix_exp(rotation_vector: F64) -> F64:
+    """Return the matrix of one rotation vector [rad], (3, 3), by Rodrigues' formula.
+
+    For one vector it takes a tenth of the time of ``matrices(exp(...))``.
+    """
+    x, y, z = rotation_vector.tolist()
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    if angle < 1e-4:  # where the quotients lose digits the series has them all
+        sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    else:
+        sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
+    xy, xz, yz = cosine * x * y, cosine * x * z, cosine * y * z
+    x2, y2, z2 = cosine * x * x, cosine * y * y, cosine * z * z
+    x, y, z = sine * x, sine * y, sine * z
+    return np.array(
+        (
+            (1.0 - y2 - z2, xy - z, xz + y),
+            (xy + z, 1.0 - x2 - z2, yz - x),
+            (xz - y, yz + x, 1.0 - x2 - y2),
+        )
+    )
 
 
 def from_matrix(matrix: ArrayLike) -> F64:

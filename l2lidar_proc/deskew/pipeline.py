@@ -110,6 +110,7 @@ class Pipeline:
         self.counts = PipelineCounts()
         self.problems = ""
         self.odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
+        self._is_known = False  # the motion of the latest sweep, by the odometry
         self.configure(config)
 
     def mount(self, T_cloud_imu: F64) -> bool:
@@ -139,14 +140,19 @@ class Pipeline:
     def imu(self, samples: Samples) -> None:
         """Take IMU samples, shape (N,), in any order and state."""
         samples = self.extrinsics.corrected(samples)
-        if self.tracker.imu(samples):
+        if self.tracker.imu(samples, is_needed=not self._is_known):
             self._jumped()
             self._sequencer.jump()
 
     def velocity(
         self, stamp: HostNs, velocity: ArrayLike, source: str, covariance: F64 | None = None
     ) -> bool:
-        """Take a velocity; see :meth:`l2lidar_proc.motion.tracker.MotionTracker.velocity`."""
+        """Take a velocity; see :meth:`l2lidar_proc.motion.tracker.MotionTracker.velocity`.
+
+        While an odometry in the same process knows the motion none is needed.
+        """
+        if self._is_known:
+            return False
         return self.tracker.velocity(stamp, velocity, source, covariance)
 
     def sweep(self, sweep: Sweep, now: int) -> None:
@@ -176,6 +182,7 @@ class Pipeline:
     def _process(self, release: Release) -> Deskewed:
         sweep = release.sweep
         known = self.odometry_motion(sweep) if self.odometry_motion is not None else None
+        self._is_known = known is not None
         trajectory, quality = self.tracker.trajectory(sweep.start, sweep.end, known)
         if release.reason is Reason.CLOCK_JUMP:
             quality = replace(quality, flags=(*quality.flags, Flag.CLOCK_JUMP))

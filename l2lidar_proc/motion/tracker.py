@@ -146,14 +146,23 @@ class MotionTracker:
         self.buffer.clear()
         self.filter.reset()
 
-    def imu(self, samples: Samples) -> bool:
-        """Take IMU samples in any order and state; return whether the clock jumped with them."""
+    def imu(self, samples: Samples, *, is_needed: bool = True) -> bool:
+        """Take IMU samples in any order and state; return whether the clock jumped with them.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (N,), dtype IMU_SAMPLE
+        is_needed : bool
+            False where an odometry knows the motion: then the filter follows once a second, which
+            is enough to go on from when the odometry ends.
+        """
         jumps = self.buffer.counts.jumps
         self.buffer.push(turned(samples, self._T_cloud_imu[:3, :3]))
         jumped = self.buffer.counts.jumps > jumps
         if jumped:
             self.filter.reset()
-        self.filter.follow()
+        if is_needed or self.filter.behind_ns >= tuning.TRACKER_REST_NS:
+            self.filter.follow()
         return jumped
 
     def velocity(
@@ -194,6 +203,8 @@ class MotionTracker:
         known : KnownMotion, optional
             Motion of this very sweep; it takes the place of everything known here.
         """
+        if known is None:
+            self.filter.follow()
         covered, gap = coverage(self.buffer.samples["stamp"], start, end)
         flags = self._flags(start, end, gap)
         if known is not None:

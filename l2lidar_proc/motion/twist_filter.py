@@ -196,6 +196,15 @@ class TwistFilter:
         newest = self._buffer.newest
         return None if newest is None else newest + tuning.TWIST_AHEAD_NS
 
+    @property
+    def behind_ns(self) -> int:
+        """How far the newest sample is ahead of those that were followed."""
+        newest = self._buffer.newest
+        if newest is None:
+            return 0
+        first = int(self._buffer.samples["stamp"][0])
+        return newest - (self._stepped if self._stepped is not None else first)
+
     def follow(self) -> None:
         """Follow the samples that have come into the buffer."""
         newest = self._buffer.newest

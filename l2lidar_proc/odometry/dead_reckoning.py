@@ -34,23 +34,40 @@ class DeadReckoning:
     ----------
     T_cloud_imu : ndarray, shape (4, 4)
         IMU coordinates to cloud coordinates.
+
+    Attributes
+    ----------
+    stamp : HostNs
+        Instant of the latest pose.
     """
 
     def __init__(self, T_cloud_imu: F64) -> None:
-        self._turn: F64 = T_cloud_imu[:3, :3]
+        self._turn: F64 = T_cloud_imu[:3, :3].T
         self._lever: F64 = T_cloud_imu[:3, 3]
         self._anchor: OdometryEstimate | None = None
-        self._latest: OdometryEstimate | None = None
-        self._sample: tuple[HostNs, F64, F64] | None = None  # that the latest state belongs to
+        self.stamp = HostNs(0)
+        self._rotation: F64 = np.eye(3)  # cloud axes to map axes
+        self._place: F64 = np.zeros(3)  # of the IMU, map axes
+        self._velocity: F64 = np.zeros(3)  # of the IMU, map axes
+        self._rate: F64 = np.zeros(3)  # cloud axes
+        self._sample: tuple[HostNs, F64, F64] | None = None  # that the state belongs to
 
     def reset(self, estimate: OdometryEstimate | None) -> None:
         """Go on from an estimate at the newest sample, or from none."""
-        self._anchor = self._latest = estimate
-        if estimate is not None and self._sample is not None and self._sample[0] != estimate.stamp:
+        self._anchor = estimate
+        if estimate is None:
+            return
+        if self._sample is not None and self._sample[0] != estimate.stamp:
             self._sample = None
+        self.stamp = estimate.stamp
+        self._rotation = estimate.T_map_lidar[:3, :3]
+        self._place = estimate.T_map_lidar[:3, 3] + self._rotation @ self._lever
+        swing = rotations.cross(estimate.angular_velocity, self._lever)
+        self._velocity = self._rotation @ (estimate.velocity + swing)
+        self._rate = estimate.angular_velocity
 
-    def carry(self, samples: Samples) -> OdometryEstimate | None:
-        """Return the estimate at the last of some samples.
+    def carry(self, samples: Samples) -> F64 | None:
+        """Return the pose of the cloud frame in the map, (4, 4), at the last of some samples.
 
         Parameters
         ----------
@@ -60,72 +77,82 @@ class DeadReckoning:
 
         Returns
         -------
-        OdometryEstimate or None
-            Without points. None without an estimate to begin with, after a gap between samples,
-            and :data:`LONGEST_NS` after the latest sweep.
+        ndarray or None
+            None without an estimate to begin with, after a gap between samples, and
+            :data:`LONGEST_NS` after the latest sweep.
         """
         stamps, rates, forces = self._usable(samples)
         if not len(stamps):
             return None
         before, self._sample = self._sample, (HostNs(int(stamps[-1])), rates[-1], forces[-1])
-        latest, anchor = self._latest, self._anchor
-        if latest is None or anchor is None:
+        anchor = self._anchor
+        if anchor is None:
             return None
-        if before is None or before[0] != latest.stamp:
-            before = (latest.stamp, rates[0], forces[0])
-        stamps = np.concatenate(([before[0]], stamps))
-        steps = np.diff(stamps)
+        if before is None or before[0] != self.stamp:
+            before = (self.stamp, rates[0], forces[0])
+        steps = np.diff(stamps, prepend=before[0])
         if stamps[-1] - anchor.stamp > LONGEST_NS or steps.max() > _MAX_GAP_NS:
-            self._anchor = self._latest = None
+            self._anchor = None
             return None
         weights = steps / float(steps.sum())
-        rate = _mean(np.vstack((before[1], rates)), weights) - latest.gyro_bias
-        force = _mean(np.vstack((before[2], forces)), weights) - latest.accel_bias
-        self._latest = self._moved(latest, anchor, HostNs(int(stamps[-1])), rate, force)
-        return self._latest
+        rate = _mean(np.vstack((before[1], rates)), weights) - anchor.gyro_bias
+        force = _mean(np.vstack((before[2], forces)), weights) - anchor.accel_bias
+        self._move(HostNs(int(stamps[-1])), rate, force, anchor.gravity)
+        pose = np.eye(4)
+        pose[:3, :3] = self._rotation
+        pose[:3, 3] = self._place - self._rotation @ self._lever
+        return pose
+
+    @property
+    def estimate(self) -> OdometryEstimate:
+        """The estimate at the last sample that was carried to, without points.
+
+        Raises
+        ------
+        ValueError
+            If there is none to carry on from.
+        """
+        if self._anchor is None:
+            raise ValueError("no estimate to carry on from")
+        rotation = self._rotation
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, self._place - rotation @ self._lever
+        return dataclasses.replace(
+            self._anchor,
+            stamp=self.stamp,
+            T_map_lidar=pose,
+            covariance=_grown(self._anchor, rotation, (self.stamp - self._anchor.stamp) * 1e-9),
+            velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
+            angular_velocity=self._rate,
+        )
 
     def _usable(self, samples: Samples) -> tuple[NDArray[np.int64], F64, F64]:
         rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
         stamps = samples["stamp"]
         after = self._sample[0] if self._sample is not None else np.iinfo(np.int64).min
-        if self._latest is not None:
-            after = max(after, self._latest.stamp)
-        newest = np.maximum.accumulate(np.concatenate(([after], stamps)))[:-1]
-        kept = (stamps > newest) & np.isfinite(rates).all(1) & np.isfinite(forces).all(1)
-        turn = self._turn.T
-        return stamps[kept], rates[kept] @ turn, forces[kept] @ turn
-
-    def _moved(
-        self,
-        latest: OdometryEstimate,
-        anchor: OdometryEstimate,
-        stamp: HostNs,
-        rate: F64,
-        force: F64,
-    ) -> OdometryEstimate:
-        """Return an estimate a step later, from the mean rate and force [rad/s, m/s^2]."""
-        dt = (stamp - latest.stamp) * 1e-9
-        rotation = latest.T_map_lidar[:3, :3]
-        middle = rotation @ rotations.matrices(rotations.exp(0.5 * dt * rate))
-        turned = rotation @ rotations.matrices(rotations.exp(dt * rate))
-        # Without trusted gravity the force says nothing, and the speed is held.
-        acceleration = middle @ force + latest.gravity if latest.gravity.any() else np.zeros(3)
-        swing = rotations.cross(latest.angular_velocity, self._lever)
-        velocity = rotation @ (latest.velocity + swing)
-        imu = latest.T_map_lidar[:3, 3] + rotation @ self._lever
-        imu = imu + dt * velocity + 0.5 * dt * dt * acceleration
-        velocity = velocity + dt * acceleration
-        pose = np.eye(4)
-        pose[:3, :3] = turned
-        pose[:3, 3] = imu - turned @ self._lever
-        return dataclasses.replace(
-            latest,
-            stamp=stamp,
-            T_map_lidar=pose,
-            covariance=_grown(anchor, turned, (stamp - anchor.stamp) * 1e-9),
-            velocity=turned.T @ velocity - rotations.cross(rate, self._lever),
-            angular_velocity=rate,
+        if self._anchor is not None:
+            after = max(after, self.stamp)
+        before = np.concatenate(([after], stamps))[: len(stamps)]
+        is_sound = (
+            (stamps > before).all() and np.isfinite(rates).all() and np.isfinite(forces).all()
         )
+        if not is_sound:
+            newest = np.maximum.accumulate(before)
+            kept = (stamps > newest) & np.isfinite(rates).all(1) & np.isfinite(forces).all(1)
+            stamps, rates, forces = stamps[kept], rates[kept], forces[kept]
+        return stamps, rates @ self._turn, forces @ self._turn
+
+    def _move(self, stamp: HostNs, rate: F64, force: F64, gravity: F64) -> None:
+        """Carry the state on by a step with its mean rate and force [rad/s, m/s^2]."""
+        dt = (stamp - self.stamp) * 1e-9
+        half = rotations.matrix_exp(0.5 * dt * rate)
+        middle = self._rotation @ half
+        # Without trusted gravity the force says nothing, and the speed is held.
+        acceleration = middle @ force + gravity if gravity.any() else np.zeros(3)
+        self._place = self._place + dt * self._velocity + 0.5 * dt * dt * acceleration
+        self._velocity = self._velocity + dt * acceleration
+        self._rotation = middle @ half
+        self.stamp, self._rate = stamp, rate
 
 
 def _grown(anchor: OdometryEstimate, rotation: F64, seconds: float) -> F64:

@@ -147,13 +147,14 @@ class PoseBroadcaster:
     def _reckon(self, samples: Samples) -> None:
         """Publish the pose at the last of some samples (N,)."""
         self._reckoned_ns = int(samples["stamp"][-1])
-        estimate = self._reckoning.carry(samples)
-        if estimate is None:
+        pose = self._reckoning.carry(samples)
+        if pose is None:
             return
-        motion = self._base.motion(estimate)
-        self._send(motion.T_odom_base, estimate.stamp)
+        self._send(self._base.pose(pose), self._reckoning.stamp)
         if self._fast.get_subscription_count():
             odom = self._topics().odom_frame
+            estimate = self._reckoning.estimate
+            motion = self._base.motion(estimate)
             message = messages.odometry(motion, estimate.stamp, odom, self._base_name())
             self._fast.publish(message)
 

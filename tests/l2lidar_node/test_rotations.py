@@ -34,6 +34,12 @@ def test_exp_and_log_agree_with_scipy_and_with_each_other() -> None:
     np.testing.assert_allclose(rotations.log(-q), rotations.log(q), atol=1e-12)
 
 
+def test_the_matrix_of_one_vector_is_that_of_many() -> None:
+    for vector in (*VECTORS, *(1e-5 * VECTORS), *(1e-3 * VECTORS), np.zeros(3)):
+        expected = rotations.matrices(rotations.exp(vector))
+        np.testing.assert_allclose(rotations.matrix_exp(vector), expected, atol=1e-15)
+
+
 def test_products_rotations_and_matrices_agree_with_scipy() -> None:
     a, b = rotations.exp(VECTORS), rotations.exp(VECTORS[::-1])
     v = RNG.normal(size=(50, 3))

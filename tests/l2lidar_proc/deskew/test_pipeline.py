@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from l2lidar_node.settings import build
 from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
-from l2lidar_proc.motion.tracker import Flag
+from l2lidar_proc.motion.sweep_trajectory import still_trajectory
+from l2lidar_proc.motion.tracker import Flag, KnownMotion
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, noisy, rms, seen, xyz
 
 WALK = Motion(turn=1.0, nod=0.1, speed=1.0)
@@ -27,10 +29,16 @@ def sweep_at(motion: Motion, start: float, length: float = LENGTH) -> Sweep:
 
 
 def run(
-    motion: Motion, seconds: float, values: Any = None, samples: Any = None, velocity: bool = True
+    motion: Motion,
+    seconds: float,
+    values: Any = None,
+    samples: Any = None,
+    velocity: bool = True,
+    odometry: Callable[[Sweep], KnownMotion | None] | None = None,
 ) -> Any:
     """Return what comes out of a recording of ``seconds``, fed in order of time."""
     pipeline = Pipeline(build(ProcConfig, values or {}))
+    pipeline.odometry_motion = odometry
     samples = noisy(motion.imu(0, seconds), 0, 0, 0) if samples is None else samples
     done = []
     starts = np.arange(0.0, seconds - LENGTH, LENGTH)
@@ -64,6 +72,28 @@ def test_a_walk_is_deskewed_at_each_reference(reference: str) -> None:
         assert rms(xyz(item.points) - truth) < 0.01
         assert "time" not in (item.points.dtype.names or ())
         assert item.waited_ns <= 20 * MS
+
+
+def test_the_filter_takes_over_where_the_odometry_ends() -> None:
+    """Until then it follows once a second and takes no velocity: the odometry knows better."""
+    ends, known = 3.0, []
+
+    def odometry(sweep: Sweep) -> KnownMotion | None:
+        if sweep.start >= at(ends):
+            return None
+        known.append(sweep)
+        return KnownMotion(still_trajectory(sweep.start, sweep.end), True)
+
+    _, done = run(WALK, 6.0, odometry=odometry)
+    assert len(known) == 14
+    for item in done[:14]:
+        assert (xyz(item.points) == xyz(item.sweep.points)).all()
+    sources = [item.quality.velocity_source for item in done[14:]]
+    assert set(sources[1:]) == {"odometry"}
+    for item in done[17:]:
+        start = (item.sweep.start - EPOCH) * 1e-9
+        _, truth = seen(WALK, start, start + LENGTH, start, count=3000)
+        assert rms(xyz(item.points) - truth) < 0.015
 
 
 def test_a_still_sensor_comes_out_bit_for_bit() -> None:
