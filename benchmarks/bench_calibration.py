@@ -13,10 +13,11 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import statistics
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -25,15 +26,19 @@ import numpy as np
 from PIL import Image
 from scipy.linalg import polar
 
-from benchmarks import (
-    bench_odometry,
-    calibrated_unit,
-    calibration_pages,
-    odometry_methods,
-    real_l2,
+from benchmarks import bench_odometry, calibration_units, odometry_methods
+from benchmarks.odometry_methods import Task
+from benchmarks.results import (
+    FOLDER,
+    Target,
+    at_least,
+    at_most,
+    keep,
+    measured_on,
+    publish,
+    replaced,
+    verdicts,
 )
-from benchmarks.odometry_plan import Task
-from benchmarks.results import FOLDER, Target, at_least, at_most, keep, publish
 from l2lidar_node import rotations
 from l2lidar_node.calibration import picture, report
 from l2lidar_node.calibration.observation import Place
@@ -130,7 +135,7 @@ def main() -> int:
     kept = Kept()
     if not given.resume:
         kept.clear()
-        calibrated_unit.forget()
+        calibration_units.forget()
     cases = [
         Case(name, seed)
         for name in given.only or CASES
@@ -148,7 +153,9 @@ def main() -> int:
     done = kept.read()
     found = [item for case in cases for item in done.get(case, [])]
     for path in given.capture:
-        place = real_l2.place(path, 0) if path.suffix == ".npy" else capture_place(path)[0]
+        place = (
+            calibration_units.place(path, 0) if path.suffix == ".npy" else capture_place(path)[0]
+        )
         found.append(_row(path.name, 0, calibrate([place]), None))
     rows = [item for item in found if not isinstance(item, Target)]
     targets = [item for item in found if isinstance(item, Target)]
@@ -162,8 +169,8 @@ def main() -> int:
     if given.docs:
         draw()
     if given.page:
-        calibration_pages.write(rows, targets)
-        calibration_pages.write_odometry(rows, METHODS)
+        write(rows, targets)
+        write_odometry(rows, METHODS)
     return 0 if all(target.met for target in targets) and not left else 1
 
 
@@ -254,7 +261,7 @@ def draw() -> None:
     )
     for place in _real_places()[:1]:
         picture.save(calibrate([place]), folder / f"{place.name}_calibrated.png")
-    run = odometry_runs.record("room", "shake", 0, _TURNING_S, unit=calibrated_unit.TYPICAL)
+    run = odometry_runs.record("room", "shake", 0, _TURNING_S, unit=calibration_units.TYPICAL)
     result = imu_calibration.calibrate(list(odometry_runs.sweeps(run, "turn")), run.imu)
     turns = folder / "calibration_turns.png"
     picture.save_turns(over_time(result.before), over_time(result.alignment.turns), turns)
@@ -344,11 +351,11 @@ def real(seed: int) -> Iterator[Row | Target]:
 
 def _real_places() -> list[Place]:
     """Return the captures that are at hand; none where there are none."""
-    if not real_l2.FOLDER.exists():
+    if not calibration_units.REAL_FOLDER.exists():
         return []
     return [
-        real_l2.place(real_l2.FOLDER / f"{name}.npy", number)
-        for number, name in enumerate(real_l2.CAPTURES)
+        calibration_units.place(calibration_units.REAL_FOLDER / f"{name}.npy", number)
+        for number, name in enumerate(calibration_units.CAPTURES)
     ]
 
 
@@ -470,6 +477,109 @@ def _empty(name: str, seed: int) -> Row:
     others = ("side", "thick before", "thick after", "gap before", "gap after", "corrected",
               "refused")  # fmt: skip
     return {"case": name, "seed": seed, **dict.fromkeys([*parts, *others], "")}
+
+
+PAGE: Final = Path("docs") / "results" / "calibration.md"
+ODOMETRY: Final = Path("docs") / "odometry.md"
+_HEAD: Final = """# Calibration of units
+
+Written by `make bench-calibration BENCH_ARGS="--page"`; [calibration](../calibration.md) says what
+the parameters are. Of virtual units the tables hold what is left of an error, estimate minus
+truth; of real ones what was found. The figure after +- is the stated deviation. Thickness is the
+median over flat patches, gap the distance of the two halves of a turn on them.
+"""
+
+
+def write(rows: list[Row], targets: list[Target]) -> Path:
+    """Write the page; return its path."""
+    parts = [
+        _HEAD,
+        "## Targets",
+        verdicts(targets),
+        "## Beams",
+        table(rows),
+        *_words(rows, "imu", "IMU: what is left, and its deviation"),
+        "[Odometry](../odometry.md#units-that-are-not-perfect) and "
+        "[deskew](../deskew.md#what-it-achieves) have what calibration is worth to them.",
+        measured_on(),
+    ]
+    PAGE.parent.mkdir(parents=True, exist_ok=True)
+    PAGE.write_text("\n\n".join(part.strip("\n") for part in parts) + "\n", encoding="utf-8")
+    return PAGE
+
+
+def write_odometry(rows: Iterable[Row], methods: Sequence[str]) -> None:
+    """Replace the table of units in the page of the odometry.
+
+    Parameters
+    ----------
+    rows : iterable of dict
+        ATE [mm] of each run by method.
+    methods : sequence of str
+    """
+    runs: dict[str, list[Row]] = {}
+    for row in rows:
+        if row["case"].startswith("odometry: "):
+            runs.setdefault(row["case"].removeprefix("odometry: "), []).append(row)
+    if not runs:
+        return
+    lines = [f"| ATE, median / largest [mm] | {' | '.join(methods)} | runs |"]
+    lines.append("|---|" + "---|" * (len(methods) + 1))
+    for name, mine in runs.items():
+        cells = [
+            f"{statistics.median(row[key] for row in mine):.1f} / "
+            f"{max(row[key] for row in mine):.1f}"
+            for key in methods
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} | {len(mine)} |")
+    text = ODOMETRY.read_text(encoding="utf-8")
+    ODOMETRY.write_text(replaced(text, "units", "\n".join(lines)), encoding="utf-8")
+
+
+def _words(rows: Iterable[Row], kind: str, title: str) -> list[str]:
+    """Return a section of what is told in words."""
+    lines = [
+        f"- {row['case']}, seed {row['seed']}: {row['refused'] or row['corrected']}"
+        for row in rows
+        if row["case"].startswith(kind)
+    ]
+    return [f"## {title}", "\n".join(lines)] if lines else []
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Return the table of what was found about beams."""
+    lines = [
+        "| Case | Seed | xi [deg] | beta [deg] | alpha [deg] | b [mm] | bias [mm] | "
+        "Thickness [mm] | Gap [mm] | Corrected, or why not |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        if row["case"].startswith(("imu", "odometry")):
+            continue
+        figures = [_figure(row, name) for name in ("xi", "beta", "alpha", "b", "bias")]
+        cells = [
+            row["case"],
+            str(row["seed"]),
+            *figures,
+            _pair(row, "thick"),
+            _pair(row, "gap"),
+            f"refused: {row['refused']}" if row["refused"] else row["corrected"] or "nothing",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _figure(row: Row, name: str) -> str:
+    if row[name] == "":
+        return "not known"
+    digits = 3 if name in ("xi", "beta", "alpha") else 2 if name == "b" else 1
+    return f"{row[name]:+.{digits}f} +- {row[f'{name} sd']:.{digits}f}"
+
+
+def _pair(row: Row, name: str) -> str:
+    if row[f"{name} before"] == "":
+        return ""
+    return f"{row[f'{name} before']:.1f} to {row[f'{name} after']:.1f}"
 
 
 if __name__ == "__main__":

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import chain, cost_rounds, reference_load
+from benchmarks.chain import CLOUDS, DESKEWED, ODOMETRY
 from benchmarks.cost_rounds import NOW, THEN_NODES, Chain, Round
 from benchmarks.results import Target, at_most, markdown, publish, replaced, verdicts
-from benchmarks.topic_watch import CLOUDS, DESKEWED, ODOMETRY
 from l2lidar_node.demo.processes import isolate_ros
 
 PAGE: Final = Path("docs") / "results" / "cost.md"
@@ -174,8 +174,8 @@ def starts(folder: Path) -> tuple[list[Row], list[Target]]:
     """Return how long the command line and the nodes take to begin."""
     nodes = (
         ("driver_node", chain.DRIVER, "/points"),
-        ("deskew_node", chain.DESKEW, "/points_deskewed"),
-        ("odometry_node", chain.ODOMETRY, "/odometry"),
+        ("deskew_node", chain.DESKEW_NODE, "/points_deskewed"),
+        ("odometry_node", chain.ODOMETRY_NODE, "/odometry"),
         ("companion_node", chain.COMPANION, "/odometry"),
     )
     asked: list[tuple[str, Callable[[], tuple[float, float]]]] = [

@@ -8,20 +8,32 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from kiss_icp.pybind import kiss_icp_pybind
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks import calibrated_unit, deskew_pages, deskew_real
-from benchmarks.results import Target, at_least, at_most, publish
+from benchmarks import calibration_units, deskew_rounds
+from benchmarks.results import (
+    Target,
+    at_least,
+    at_most,
+    machine,
+    publish,
+    replaced,
+    table,
+    verdicts,
+)
 from l2lidar_node import rotations
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
@@ -32,8 +44,6 @@ from l2lidar_proc.odometry.odometry import Odometry
 from tests.support import odometry_runs
 from tests.support.deskew_scenarios import Recording, Scenario, TrueSweep, record, stamp
 from tests.support.odometry_runs import Run
-
-F64 = NDArray[np.float64]
 
 METHODS: Final = (
     "none",
@@ -85,7 +95,7 @@ def main() -> None:
         rows = walls()
         publish("deskew_units", "Thickness of walls in deskewed sweeps, mm", rows, _thin(rows))
         if arguments.docs:
-            deskew_pages.write_units(rows)
+            write_units(rows)
         return
     shown = {}
     for scenario in SCENARIOS:
@@ -100,19 +110,19 @@ def main() -> None:
     targets = [*_targets(rows), *_cost_targets(costs), *_thin(of_units)]
     targets.append(at_most("sweeps of a still sensor that changed", changed, 0))
     if not arguments.no_node:
-        from benchmarks.deskew_latency import latency_ms
+        from benchmarks.deskew_rounds import latency_ms
 
         milliseconds = latency_ms()
         targets.append(at_most("sweep end to published cloud, p99, ms", milliseconds, 15.0))
-    real = deskew_real.newer_college()
+    real = deskew_rounds.newer_college()
     targets += [at_most(f"{name}, median, mm", after, bound) for name, _, after, bound in real]
     rows += of_units
     publish("deskew", "RMS and 95th percentile of the error of deskewed points, mm", rows, targets)
     for name, value in costs.items():
         print(f"{name}: {value:.2f}")
     if arguments.docs:
-        deskew_pages.write(rows, targets, costs, real, shown["walk 1.2 m/s"])
-        deskew_pages.write_units(of_units)
+        write(rows, targets, costs, real, shown["walk 1.2 m/s"])
+        write_units(of_units)
 
 
 def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]]:
@@ -205,10 +215,10 @@ def walls() -> list[dict[str, Any]]:
     rows = []
     for name, unit, file in (
         ("perfect unit", "perfect", None),
-        ("typical unit", calibrated_unit.TYPICAL, None),
-        ("typical unit calibrated", calibrated_unit.TYPICAL, calibrated_unit.calibrated()),
+        ("typical unit", calibration_units.TYPICAL, None),
+        ("typical unit calibrated", calibration_units.TYPICAL, calibration_units.calibrated()),
     ):
-        run = calibrated_unit.recorded("room", "walk", 0, _WALLS_S, unit, file)
+        run = calibration_units.recorded("room", "walk", 0, _WALLS_S, unit, file)
         row: dict[str, Any] = {"scenario": name, "figure": "wall", **dict.fromkeys(METHODS, "")}
         for method, found in _thicknesses(run).items():
             row[method] = round(1e3 * float(np.median(found)), 2)
@@ -348,6 +358,92 @@ def _changed_bits(recording: Recording) -> int:
 
 def _xyz(points: NDArray[np.void]) -> F64:
     return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+
+
+PAGE: Final = Path("docs") / "deskew.md"
+PICTURE: Final = Path("docs") / "deskew.png"
+
+
+def write(
+    rows: Sequence[dict[str, Any]],
+    targets: Sequence[Target],
+    costs: dict[str, float],
+    real: Sequence[tuple[str, float, float, float]],
+    clouds: dict[str, F64],
+) -> None:
+    """Replace tables and picture.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        RMS and p95 of each scenario: error of every method [mm].
+    targets : sequence of Target
+    costs : dict of float
+        [ms] by what was timed.
+    real : sequence
+        Name, error before and after, bound [mm] of real scans.
+    clouds : dict of ndarray, shape (N, 3)
+        One sweep as different methods leave it, and the truth.
+    """
+    text = PAGE.read_text(encoding="utf-8")
+    text = replaced(text, "errors", _errors(rows))
+    text = replaced(text, "targets", verdicts(targets))
+    text = replaced(text, "costs", _costs(costs))
+    text = replaced(text, "real", _real(real))
+    PAGE.write_text(text, encoding="utf-8")
+    _draw(clouds)
+
+
+def write_units(rows: Sequence[dict[str, Any]]) -> None:
+    """Replace the table of how thick walls are [mm], by unit and method."""
+    methods = [name for name, value in rows[0].items() if isinstance(value, float)]
+    walls = table(
+        ["walls [mm]", *methods],
+        ([row["scenario"], *(f"{row[name]:.1f}" for name in methods)] for row in rows),
+    )
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replaced(text, "units", walls), encoding="utf-8")
+
+
+def _errors(rows: Sequence[dict[str, Any]]) -> str:
+    methods = [name for name in rows[0] if name not in ("scenario", "figure")]
+    far = {row["scenario"]: row for row in rows if row["figure"] == "p95"}
+    lines = []
+    for row in rows:
+        if row["figure"] == "RMS":
+            pairs = (f"{row[m]:.1f} / {far[row['scenario']][m]:.1f}" for m in methods)
+            lines.append([row["scenario"], *pairs])
+    return table(["RMS / p95 [mm]", *methods], lines)
+
+
+def _costs(costs: dict[str, float]) -> str:
+    rows = [[name, f"{value:.2f}"] for name, value in costs.items() if name != "points"]
+    times = table([f"{costs['points']:.0f} points on one core", "ms"], rows)
+    return f"{times}\n\nMeasured on one core of an {machine()['processor']}, the best of 100."
+
+
+def _real(real: Sequence[tuple[str, float, float, float]]) -> str:
+    rows = [[n, f"{a:.0f}", f"{b:.1f}", f"{c:.0f}"] for n, a, b, c in real]
+    return table(["median error [mm]", "raw", "ours", "constant rate and velocity"], rows)
+
+
+def _draw(clouds: dict[str, F64]) -> None:
+    shown = {"as measured": "none", "gyro only": "gyro only", "with odometry": "odometry"}
+    figure = Figure(figsize=(11, 4.2), dpi=85, layout="constrained")
+    FigureCanvasAgg(figure)
+    truth = clouds["truth"]
+    inside = (truth[:, 2] > -0.3) & (truth[:, 2] < 1.6)
+    for place, (title, method) in enumerate(shown.items(), start=1):
+        plan = figure.add_subplot(1, 3, place)
+        error = 1e3 * np.linalg.norm(clouds[method] - truth, axis=1)[inside]
+        x, y, _ = clouds[method][inside].T
+        plan.scatter(truth[inside, 0], truth[inside, 1], s=3.0, c="0.75", linewidths=0)
+        dots = plan.scatter(x, y, s=3.0, c=error, cmap="turbo", vmin=0, vmax=400, linewidths=0)
+        plan.set_aspect("equal")
+        plan.set_title(f"{title}: RMS {np.sqrt((error**2).mean()):.1f} mm", fontsize=10)
+        plan.tick_params(labelsize=7)
+    figure.colorbar(dots, ax=figure.axes, label="error [mm]", shrink=0.8)
+    figure.savefig(PICTURE)
 
 
 if __name__ == "__main__":

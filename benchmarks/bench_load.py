@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import rclpy
 
-from benchmarks import load_chain, load_node, load_scale
+from benchmarks import load_chain, load_scale
 from benchmarks.reference_load import (
     Relative,
     checksums_per_cpu_s,
@@ -215,7 +215,7 @@ def main() -> int:
         f"{node['clouds']:.2f} clouds/s, {node['imu']:.1f} IMU samples/s received",
     )  # fmt: skip
     row("driver node, memory", node["memory"], "MB")
-    alone = load_node.measured(seconds)
+    alone = load_chain.measure_node(seconds)
     p50, p99 = np.percentile(alone.latencies_ms, (50, 99))
     row(
         "driver alone: last packet sent -> cloud received, p50", p50, "ms",
@@ -239,7 +239,7 @@ def _in_reference(found: Relative, load: str) -> str:
 
 
 def _chain_rows(row: Row, seconds: float, world: str) -> list[Target]:
-    cost = load_chain.measured(seconds, world)
+    cost = load_chain.measure_chain(seconds, world)
     for name, share in cost.shares.items():
         row(f"chain: {name}", 100 * share, "% of a core", f"{cost.memory_mb[name]:.0f} MB")
     for topic, values in cost.latencies_ms.items():

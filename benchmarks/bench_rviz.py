@@ -29,8 +29,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
 from benchmarks import chain
+from benchmarks.chain import CLOUDS, TopicWatch
 from benchmarks.results import at_least, publish
-from benchmarks.topic_watch import CLOUDS, TopicWatch
 from l2lidar_node.demo import robot
 from l2lidar_node.demo.processes import Programs, isolate_ros
 from l2lidar_proc.ros.intake import NeverExecuted, waiting

@@ -120,7 +120,7 @@ def bad_link() -> Iterator[None]:
                 _run("ip", "netns", "add", name)
                 undo.callback(subprocess.run, ("ip", "netns", "del", name), check=False)
             link = subprocess.Popen(
-                [sys.executable, "-m", "benchmarks.wifi_link",
+                [sys.executable, "-m", "benchmarks.wifi_link", "link",
                  str(_RATE), str(_LOSS), str(_DELAY_S), *ends],
                 stdout=subprocess.PIPE, text=True,
             )  # fmt: skip
@@ -168,7 +168,7 @@ def middleware(is_profiled: bool) -> Iterator[dict[str, str]]:
 def arrived(
     kind: str, compressed: str, reliability: str, environment: dict[str, str], seconds: float
 ) -> dict[str, Any]:
-    """Return what comes to the desk of one topic; see :mod:`benchmarks.wifi_watch`."""
+    """Return what comes to the desk of one topic; see :mod:`benchmarks.wifi_link`."""
     inside = ("ip", "netns", "exec")
     values = {
         "l2_ip": "127.0.0.1",
@@ -186,7 +186,7 @@ def arrived(
             ("l2lidar_node.ros.driver_node", assigned(values)),
         )
     ]
-    watch = [*inside, _NAMES[1], sys.executable, "-m", "benchmarks.wifi_watch"]
+    watch = [*inside, _NAMES[1], sys.executable, "-m", "benchmarks.wifi_link", "watch"]
     with ExitStack() as undo:
         running = []
         for words in robot:

@@ -19,7 +19,7 @@ import rclpy
 from numpy.typing import NDArray
 
 from benchmarks import chain
-from benchmarks.topic_watch import CLOUDS, DESKEWED, ODOMETRY, TopicWatch
+from benchmarks.chain import CLOUDS, DESKEWED, ODOMETRY, TopicWatch
 from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64
@@ -52,7 +52,7 @@ class Chain:
     nodes: tuple[str, ...]
 
 
-THEN_NODES: Final = (chain.DRIVER, chain.DESKEW, chain.ODOMETRY)
+THEN_NODES: Final = (chain.DRIVER, chain.DESKEW_NODE, chain.ODOMETRY_NODE)
 NOW: Final = Chain("now", ROOT, (chain.DRIVER, chain.COMPANION))
 
 

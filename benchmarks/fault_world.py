@@ -2,6 +2,10 @@
 
 Every case runs a virtual L2 and a driver in processes of their own, joined by UDP sockets, in
 real time, and is judged by what the unit wrote down about every packet.
+
+The driver, without ROS, is this module: ``python -m benchmarks.fault_world OUT [name=value ...]``
+runs until it is interrupted, then writes ``OUT.npy`` (see :data:`NOTE`) and ``OUT.json``. Until
+then ``OUT.now`` says how far it is.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,10 +25,87 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
+from l2lidar_node.clock import ClockEvent
+from l2lidar_node.config import DriverConfig
 from l2lidar_node.demo.processes import free_udp_ports
+from l2lidar_node.driver.driver import Driver, Event, Silence
 from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.files import write_whole
+from l2lidar_node.recording.recording import Recorder
+from l2lidar_node.settings import build
+from l2lidar_node.transport.session import Session
+from l2lidar_node.transport.udp import TransportError, UdpTransport
+from l2lidar_node.types import ImuSample, Sweep
+from tests.support.clock_rig import RecordingClock
+
+NOTE: Final = np.dtype(
+    [("type", "<u2"), ("seq", "<u4"), ("stamp", "<i8"), ("arrival", "<i8"), ("published", "<i8")]
+)
+"""One packet that came to the clock, in order: published 0 where it got no stamp."""
+
+
+def main() -> int:
+    """Run until SIGINT; return 1 where the socket cannot be had."""
+    out = Path(sys.argv[1])
+    values = dict(part.split("=", 1) for part in sys.argv[2:])
+    config = build(DriverConfig, {name: yaml.safe_load(text) for name, text in values.items()})
+    said: list[str] = []
+    recorder = None
+    if config.files.record_file:
+        recorder = Recorder(Path(config.files.record_file), config.network, said.append)
+    try:
+        transport = UdpTransport(config.network)
+    except TransportError as error:
+        print(error.strerror, flush=True)
+        return 1
+    driver = Driver(config)
+    clock = driver._clock = RecordingClock(config.clock)
+    last = {ImuSample: 0, Sweep: 0}
+    backwards = 0
+    slowest_s = 0.0
+
+    def handle(event: Event) -> None:
+        nonlocal backwards, slowest_s
+        if isinstance(event, ImuSample | Sweep):
+            stamp = event.stamp if isinstance(event, ImuSample) else event.start
+            backwards += stamp <= last[type(event)]
+            last[type(event)] = stamp
+        if isinstance(event, Sweep):
+            slowest_s = max(slowest_s, (time.time_ns() - event.end) / 1e9)
+        elif isinstance(event, ClockEvent):
+            said.append(event.text)
+        elif isinstance(event, Silence):
+            said.append("silence")
+
+    session = Session(driver, transport, handle, recorder)
+    stopping = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: stopping.set())
+    session.start()
+    print("listening", flush=True)
+    while not stopping.wait(0.2) and not session.failure:
+        now = {"foreign": transport.foreign, "samples": driver.counters.samples, "said": said}
+        write_whole(out.with_suffix(".now"), json.dumps(now).encode())
+    session.stop()
+    notes = [(kind, seq, stamp, at, answer) for kind, seq, stamp, at, _, _, answer in clock.notes]
+    np.save(out.with_suffix(".npy"), np.array(notes, NOTE))
+    facts = {
+        "failure": repr(session.failure) if session.failure else "",
+        "backwards": backwards,
+        "foreign": transport.foreign,
+        "kernel_drops": transport.kernel_drops,
+        "slowest_s": slowest_s,
+        "sweeps": driver.counters.sweeps,
+        "lost": sum(counts.lost for counts in driver.counters.sequence.values()),
+        "late": sum(counts.late for counts in driver.counters.sequence.values()),
+        "said": said,
+        "recorded_octets": recorder.octets if recorder else 0,
+    }
+    out.with_suffix(".json").write_text(json.dumps(facts))
+    return 0
+
 
 _DEADLINE_S: Final = 120.0
 _PRIVILEGED_PORT: Final = 81
@@ -102,7 +184,7 @@ class World:
         }  # fmt: skip
         arguments = [f"{key}={value}" for key, value in settings.items()]
         return self._start(
-            "benchmarks.fault_host", str(self.folder / name), *arguments,
+            "benchmarks.fault_world", str(self.folder / name), *arguments,
             limit=limit, powerless=powerless,
         )  # fmt: skip
 
@@ -348,3 +430,7 @@ def run(case: Callable[[World], Finding]) -> Finding:
             return case(world)
         finally:
             world.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

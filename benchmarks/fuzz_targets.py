@@ -16,8 +16,8 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks import fuzz_clouds as clouds
-from benchmarks.fuzz_mutator import sealed
+from benchmarks import fuzz_inputs as clouds
+from benchmarks.fuzz_inputs import sealed
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.protocol import wire

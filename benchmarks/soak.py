@@ -22,16 +22,8 @@ from numpy.typing import NDArray
 from rclpy.signals import SignalHandlerOptions
 
 from benchmarks import chain, interrupts
+from benchmarks.chain import CLOUDS, DESKEWED, IMU, ODOMETRY, TopicWatch, backward_steps, missing
 from benchmarks.results import Target, at_most, keep, publish
-from benchmarks.topic_watch import (
-    CLOUDS,
-    DESKEWED,
-    IMU,
-    ODOMETRY,
-    TopicWatch,
-    backward_steps,
-    missing,
-)
 from l2lidar_node.demo.processes import Program, Programs, isolate_ros
 from l2lidar_node.programs import interruptible
 from l2lidar_node.protocol import wire

@@ -1,7 +1,8 @@
-"""A bad link between two network namespaces: limits the rate, delays, and loses, both ways.
+"""A bad link between two network namespaces, and who counts what arrives at its end.
 
 What ``tc netem`` does in kernels that have it, for those that have not: a process that holds a TUN
-device in each namespace and passes packets on in its own time.
+device in each namespace and passes packets on in its own time (``python -m benchmarks.wifi_link
+link ...``). The watch (``watch ...``) counts what arrives on a topic, and prints it as JSON.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import heapq
+import json
 import os
 import random
 import selectors
@@ -16,7 +18,14 @@ import struct
 import sys
 import time
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import rclpy
+from point_cloud_interfaces.msg import CompressedPointCloud2
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
 
 _TUNSETIFF: Final = 0x400454CA
 _IFF_TUN: Final = 0x0001
@@ -98,7 +107,7 @@ class Direction:
         return self._waiting[0][0] - now if self._waiting else 1.0
 
 
-def main() -> int:
+def _run_link() -> int:
     """Run until killed: RATE LOSS DELAY_S NAMESPACE DEVICE NAMESPACE DEVICE."""
     rate, loss, delay_s = map(float, sys.argv[1:4])
     ends = [open_tun(*sys.argv[at : at + 2]) for at in (4, 6)]
@@ -115,6 +124,68 @@ def main() -> int:
             pause = min(way.give(now) for way in ways)
             for key, _ in selector.select(max(pause, 0.0)):
                 key.data.take(time.monotonic())
+
+
+_KINDS = {"cloud": PointCloud2, "zstd": CompressedPointCloud2, "packets": UInt8MultiArray}
+
+
+_FIRST_S = 60.0  # until the virtual L2 and the driver are at work, and found
+_SMALLEST = 1044  # [B] one packet of points: before them, there is only word of waiting
+
+
+def _watch() -> int:
+    """Listen: TOPIC TYPE RELIABILITY SECONDS; return the exit code."""
+    topic, kind, reliability, seconds = sys.argv[1:]
+    rclpy.init(args=[])
+    node = rclpy.create_node("wifi_watch")
+    ages: list[float] = []
+    sizes: list[int] = []
+
+    def hear(data: bytes) -> None:
+        if len(data) < _SMALLEST:
+            return
+        whole, fraction = struct.unpack_from("<iI", data, 4)
+        ages.append(time.time() - whole - fraction * 1e-9)
+        sizes.append(len(data))
+
+    reliable = reliability == "reliable"
+    node.create_subscription(
+        _KINDS[kind],
+        topic,
+        hear,
+        QoSProfile(
+            depth=20,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.VOLATILE,
+        ),
+        raw=True,
+    )
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    deadline = time.monotonic() + _FIRST_S
+    while not sizes and time.monotonic() < deadline:  # over a bad link it may never come
+        executor.spin_once(timeout_sec=0.1)
+    ages.clear()
+    sizes.clear()
+    begun = time.monotonic()
+    while time.monotonic() < begun + float(seconds):
+        executor.spin_once(timeout_sec=0.1)
+    found: dict[str, Any] = {
+        "seconds": time.monotonic() - begun,
+        "messages": len(sizes),
+        "bytes": sum(sizes),
+        "ages_s": ages,
+    }
+    print(json.dumps(found))
+    node.destroy_node()
+    rclpy.shutdown()
+    return 0
+
+
+def main() -> int:
+    """Be the link or the watch."""
+    role = sys.argv.pop(1)
+    return _run_link() if role == "link" else _watch()
 
 
 if __name__ == "__main__":

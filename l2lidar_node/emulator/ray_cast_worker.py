@@ -49,7 +49,7 @@ class RayCastWorker:
     ------
     ValueError
         For a scene, motion or file that cannot be used; the message names it.
-    StudioError
+    RayCastError
         If reading the world killed the process.
     """
 

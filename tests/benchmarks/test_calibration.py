@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import bench_calibration, calibrated_unit, calibration_pages
+from benchmarks import bench_calibration, calibration_units
 from benchmarks.bench_calibration import Case, Kept
 from benchmarks.results import at_most
 from l2lidar_node.calibration.file import CalibrationFile, ImuCalibration, load
@@ -66,9 +66,9 @@ def test_one_unit_that_is_off_shows_in_the_targets() -> None:
 def test_the_page_has_a_line_for_every_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(calibration_pages, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(bench_calibration, "PAGE", tmp_path / "page.md")
     rows = [row("perfect", 0, bias=""), row("imu", 1, corrected="rotation x +0.01 deg")]
-    text = calibration_pages.write(rows, [at_most("worst |xi|", 2.0, 1.0)]).read_text()
+    text = bench_calibration.write(rows, [at_most("worst |xi|", 2.0, 1.0)]).read_text()
     assert "| perfect | 0 | +0.001 +- 0.010 |" in text
     assert "not known" in text
     assert "- imu, seed 1: rotation x +0.01 deg" in text
@@ -80,7 +80,7 @@ def test_the_odometry_of_units_is_judged_and_shown_by_its_medians(
 ) -> None:
     page = tmp_path / "odometry.md"
     page.write_text("before\n<!-- units: generated -->\nold\n<!-- /units -->\nafter\n")
-    monkeypatch.setattr(calibration_pages, "ODOMETRY", page)
+    monkeypatch.setattr(bench_calibration, "ODOMETRY", page)
     methods = bench_calibration.METHODS
     rows = [
         row("odometry: yard, walk", seed, **dict(zip(methods, values, strict=True)))
@@ -89,7 +89,7 @@ def test_the_odometry_of_units_is_judged_and_shown_by_its_medians(
     (target,) = bench_calibration.odometry_targets(rows)
     assert target.value == pytest.approx(1.7 / 1.2)
     assert target.met
-    calibration_pages.write_odometry(rows, methods)
+    bench_calibration.write_odometry(rows, methods)
     line = "| yard, walk | 1.2 / 2.0 | 8.0 / 9.0 | 1.7 / 2.0 | 3 |"
     assert page.read_text().splitlines()[2:] == [
         "| ATE, median / largest [mm] | " + " | ".join(methods) + " | runs |",
@@ -98,7 +98,7 @@ def test_the_odometry_of_units_is_judged_and_shown_by_its_medians(
         "<!-- /units -->",
         "after",
     ]
-    calibration_pages.write_odometry([], methods)
+    bench_calibration.write_odometry([], methods)
     assert line in page.read_text()
 
 
@@ -106,8 +106,8 @@ def test_a_calibrated_recording_is_that_of_an_imu_as_drawn(tmp_path: Path) -> No
     path = tmp_path / "unit.yaml"
     imu = ImuCalibration((0.0, 0.0, 0.2), 0.002)
     CalibrationFile(bytes(32), {}, {}, imu).save(path)
-    plain = calibrated_unit.recorded("box", "spin", 0, 1.0, "perfect", None)
-    turned = calibrated_unit.recorded("box", "spin", 0, 1.0, "perfect", load(path))
+    plain = calibration_units.recorded("box", "spin", 0, 1.0, "perfect", None)
+    turned = calibration_units.recorded("box", "spin", 0, 1.0, "perfect", load(path))
     assert (plain.imu["stamp"] - turned.imu["stamp"] == 2_000_000).all()
     x, y = plain.imu["linear_acceleration"][:, 0], plain.imu["linear_acceleration"][:, 1]
     expected = np.cos(0.2) * x - np.sin(0.2) * y

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import load_node, load_scale, load_sender
+from benchmarks import load_chain, load_scale
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import ImuPacket, PointPacket, decode
@@ -23,7 +23,7 @@ def test_the_latency_of_a_cloud_counts_from_its_own_last_packet() -> None:
     stamps = begun[first] + rng.integers(-300_000, 2_300_000, 5)  # the first slots have no return
     took = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     arrivals = sent[np.minimum(first + 37, 399)] + np.round(took * 1e6).astype(np.int64)
-    found = load_node._latencies_ms(np.stack([stamps, arrivals], axis=1), sent)
+    found = load_chain._node_latencies_ms(np.stack([stamps, arrivals], axis=1), sent)
     np.testing.assert_allclose(found, took[:4], atol=1e-6)  # the last cloud is not complete
 
 
@@ -31,7 +31,7 @@ def test_the_latency_of_a_cloud_counts_from_its_own_last_packet() -> None:
 @pytest.mark.parametrize("kind", [PacketType.POINTS_3D, PacketType.IMU])
 def test_the_sender_sends_what_a_faster_unit_would(kind: PacketType, rate: float) -> None:
     framer = Framer()
-    sent = list(load_sender._packets(kind, rate, 10.0 / rate))
+    sent = list(load_scale._packets(kind, rate, 10.0 / rate))
     packets = [
         decode(item) for _, data in sent for item in framer.feed(data) if isinstance(item, Frame)
     ]

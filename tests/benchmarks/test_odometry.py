@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import bench_odometry, odometry_methods, odometry_pages, odometry_referee
-from benchmarks.odometry_methods import OURS, PLAIN, REFEREES, Found
-from benchmarks.odometry_plan import SLOW, Plan, Rows
+from benchmarks import bench_odometry, odometry_methods, odometry_referee
+from benchmarks.odometry_methods import OURS, PLAIN, REFEREES, SLOW, Found, Plan, Rows
 from l2lidar_node import rotations
 from l2lidar_node.clouds.fields import rings
 from tests.support import odometry_runs
@@ -166,11 +165,11 @@ def test_the_page_tells_of_runs_that_are_lost_and_of_targets_not_met(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page, plot = tmp_path / "odometry.md", tmp_path / "odometry.png"
-    page.write_text(f"before\n{odometry_pages.BEGIN}\nold\n{odometry_pages.END}\nafter\n")
-    monkeypatch.setattr(odometry_pages, "PAGE", page)
-    monkeypatch.setattr(odometry_pages, "PLOT", plot)
+    page.write_text(f"before\n{bench_odometry.BEGIN}\nold\n{bench_odometry.END}\nafter\n")
+    monkeypatch.setattr(bench_odometry, "PAGE", page)
+    monkeypatch.setattr(bench_odometry, "PLOT", plot)
     rows = [row(), row(ate=0.201, seed=1), row("ct_icp", math.inf)]
-    odometry_pages.write(rows, list(bench_odometry.targets(rows)))
+    bench_odometry.write(rows, list(bench_odometry.targets(rows)))
     text = page.read_text()
     assert text.startswith("before\n")
     assert text.endswith("after\n")

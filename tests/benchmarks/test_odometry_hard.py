@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import bench_odometry_hard, hard_pages, hard_recordings
+from benchmarks import bench_odometry_hard, hard_recordings
 from benchmarks.hard_recordings import EPOCH, Recording, recording
 from benchmarks.hard_scenarios import FAMILIES, SCENES, SHORT, prepare, scenario
 from benchmarks.hard_scores import Track, errors, score, sequence
@@ -160,7 +160,7 @@ def test_every_scenario_can_be_prepared_and_a_campaign_visits_all() -> None:
 def test_the_page_tells_of_every_scene_and_failure(
     given: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hard_pages, "PAGE", tmp_path / "results" / "page.md")
+    monkeypatch.setattr(bench_odometry_hard, "PAGE", tmp_path / "results" / "page.md")
     track = true_track(given)
     poses = track.poses.copy()
     poses[:, 0, 3] += np.linspace(0.0, 0.9, len(poses))
@@ -172,7 +172,7 @@ def test_the_page_tells_of_every_scene_and_failure(
     ]
     reached = list(bench_odometry_hard.targets(rows))
     assert not all(target.met for target in reached)
-    text = hard_pages.write(rows, reached).read_text()
+    text = bench_odometry_hard.write(rows, reached).read_text()
     assert "| calm |" in text
     assert "| hard, 0 |" in text
     assert "gave up, 1 of 1" in text

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks import fault_world, faults, interrupts, load_scale
-from benchmarks.fuzz_campaign import campaign
+from benchmarks.fuzz import campaign
 from l2lidar_node.emulator.physics import PhysicsConfig
 from l2lidar_node.emulator.ray_cast_worker import RayCastError, RayCastWorker
 from tests.support.fault_runs import SINGLE, FaultCase, random_case, run

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import real_l2
+from benchmarks import calibration_units
 from l2lidar_node.calibration import still
 from l2lidar_node.calibration.observation import GYRO, Gathering, Place
 from l2lidar_node.calibration.result import Verdict
@@ -161,11 +161,13 @@ def test_a_place_without_points_is_an_error() -> None:
         gathering.place()
 
 
-@pytest.mark.skipif(not real_l2.FOLDER.exists(), reason="the recordings are not here")
+@pytest.mark.skipif(
+    not calibration_units.REAL_FOLDER.exists(), reason="the recordings are not here"
+)
 def test_real_captures() -> None:
     both = [
-        real_l2.place(real_l2.FOLDER / f"{name}.npy", number)
-        for number, name in enumerate(real_l2.CAPTURES)
+        calibration_units.place(calibration_units.REAL_FOLDER / f"{name}.npy", number)
+        for number, name in enumerate(calibration_units.CAPTURES)
     ]
     result = calibrate(thinned(both))
     for report in result.places:
