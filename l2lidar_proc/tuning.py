@@ -186,6 +186,11 @@ USUAL_BLEND: Final = 0.1  # share of each newer sweep in what is usual
 USUAL_LEAST: Final = 0.75  # inliers needed whatever is usual
 OVERLAP: Final = (0.0, 0.25)  # likewise, share of the points that must meet the map
 MATCHED: Final = (0, 50)  # and how many: a few fit in many places
+# A place farther from the predicted one than the robust kernel reaches has to be fixed, along the
+# way there, by so many points. Tuned on: camera looking into rooms (4 at wrong places, 11 to 30 at
+# the right one)
+FAR_MOVE: Final = 0.1  # [m]
+FAR_POINTS: Final = 10.0
 MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
 YOUNG_SWEEPS: Final = 12  # in a map before a sweep without surfaces around is remarkable
 KISS_SIGMA: Final = (0.03, 0.15)  # [rad, m] of KISS-ICP's registration on its own

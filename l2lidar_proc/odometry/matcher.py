@@ -148,17 +148,21 @@ class SweepMatcher:
         loose = sigma > tuning.LOOSE_POSITION or rotation_is_loose(motion.covariance)
         young = self.is_young
         strict = loose and not initial and not young
-        needed = self._needed_inliers(strict)
         found = self._align(source, motion, motion.state)
-        if not loose or (strict and _believable(found, source, strict, needed)):
-            if _believable(found, source, strict, needed):
-                return self._believed(found)
-            return Match(None, young and not loose and found is None)
+        is_good = self._is_believable(found, source, motion, strict)
+        if is_good and (strict or not loose):
+            return self._believed(found)
+        if not loose:
+            return Match(None, young and found is None)
         starts = [self._registered(source, motion.state)]
         if strict:
             starts += pose_hypotheses(motion.state, motion.covariance, source, self.surfaces)
         others = [found, *(self._align(source, motion, start) for start in starts)]
-        good = [other for other in others if other and _believable(other, source, strict, needed)]
+        good = [
+            other
+            for other in others
+            if other and self._is_believable(other, source, motion, strict)
+        ]
         best = max(good, key=lambda other: other.inlier_ratio * other.matched, default=None)
         if best is None and motion.imu.missing.all():
             # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
@@ -243,6 +247,31 @@ class SweepMatcher:
             weakest=weakest_direction(found.information[POSITION, POSITION]),
         )
 
+    def _is_believable(
+        self, found: Alignment | None, source: Source, motion: SweepMotion, strict: bool
+    ) -> bool:
+        """Return whether the result of an alignment fits the map as wrong ones do not."""
+        return (
+            found is not None
+            and found.inlier_ratio >= self._needed_inliers(strict)
+            and found.matched
+            >= max(tuning.OVERLAP[strict] * len(source.points), tuning.MATCHED[strict])
+            and not (strict and self._is_far_fetched(found, motion))
+        )
+
+    def _is_far_fetched(self, found: Alignment, motion: SweepMotion) -> bool:
+        """Return whether a place far from the predicted one rests on a few points.
+
+        A handful of points that face a direction find a surface somewhere along it, if the
+        prediction leaves enough room; the others agree with every place along it.
+        """
+        move = found.state.position - motion.state.position
+        far = float(np.linalg.norm(move))
+        if far < tuning.FAR_MOVE:
+            return False
+        points = self.config.surfaces.point_noise**2 * found.information[POSITION, POSITION]
+        return float(move @ points @ move) < tuning.FAR_POINTS * far**2
+
     def _needed_inliers(self, strict: bool) -> float:
         """Return the inlier ratio that a result needs.
 
@@ -314,15 +343,6 @@ def pose_covariance(motion: SweepMotion) -> F64:
 def xyz(points: NDArray[np.void]) -> F64:
     """Return the coordinates of structured points (N,) as float64, shape (N, 3)."""
     return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
-
-
-def _believable(found: Alignment | None, source: Source, strict: bool, inliers: float) -> bool:
-    return (
-        found is not None
-        and found.inlier_ratio >= inliers
-        and found.matched
-        >= max(tuning.OVERLAP[strict] * len(source.points), tuning.MATCHED[strict])
-    )
 
 
 def _pose(state: InertialState) -> F64:

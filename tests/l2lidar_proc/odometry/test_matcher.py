@@ -112,6 +112,21 @@ def test_a_loose_prediction_is_not_the_only_place_to_begin_from(
     assert off(grown.match(seen, motion(LOOSE, PLACE + error, turn), initial=initial)) < 0.015
 
 
+@pytest.mark.parametrize("count", [5, 8, 20])
+def test_a_few_points_do_not_move_a_loose_prediction_far(grown: SweepMatcher, count: int) -> None:
+    """A floor fits everywhere along itself, and a few points find a wall somewhere."""
+    rng = np.random.default_rng(18)
+    floor = rng.uniform((-1.5, -1.0, -1.2), (1.5, 2.0, -1.2), (90, 3))
+    wall = rng.uniform((4.0, -1.0, 0.0), (4.0, 2.0, 1.0), (count, 3))
+    cloud = source(np.vstack((floor, wall)) - PLACE)
+    found = grown.match(cloud, motion(LOOSE, PLACE - (0.2, 0.0, 0.0))).alignment
+    place = None if found is None else float(found.state.position[0] - PLACE[0])
+    if count > tuning.FAR_POINTS:
+        assert place == pytest.approx(0.0, abs=0.01)
+    else:
+        assert place is None or place == pytest.approx(-0.2, abs=0.01)
+
+
 def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
     rng = np.random.default_rng(13)
     cloud = source(rng.uniform((-3.5, -2.5, -1.0), (3.5, 2.5, 1.5), (1500, 3)))
