@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -17,6 +18,8 @@ _OUTGOING: Final = 4  # of a cooked capture's packet types
 _INCOMING: Final = 0
 _MAC: Final = b"\x02\x00"  # locally administered, the IPv4 address follows
 _MAX_PAYLOAD: Final = 65_507
+_CHECKSUM: Final = struct.Struct(">H")
+_SUMMED: Final = struct.Struct("<H")  # dpkt sums words of this order up
 
 
 class Endpoint(NamedTuple):
@@ -126,23 +129,32 @@ class CaptureWriter:
         """
         if len(datagram.data) > _MAX_PAYLOAD:
             raise ValueError(f"{len(datagram.data)} bytes do not fit a UDP datagram")
-        source, destination = (
-            bytes(map(int, end.ip.split("."))) for end in (datagram.source, datagram.destination)
-        )
-        udp = dpkt.udp.UDP(
-            sport=datagram.source.port,
-            dport=datagram.destination.port,
-            ulen=8 + len(datagram.data),
-            data=datagram.data,
-        )
-        network = dpkt.ip.IP(src=source, dst=destination, p=dpkt.ip.IP_PROTO_UDP, data=udp)
-        frame = dpkt.ethernet.Ethernet(
-            src=_MAC + source,
-            dst=_MAC + destination,
-            type=dpkt.ethernet.ETH_TYPE_IP,
-            data=network,
-        )
-        self._packets.write(datagram.time, bytes(frame))
+        headers, so_far = _headers(datagram.source, datagram.destination, len(datagram.data))
+        checksum = dpkt.in_cksum_done(dpkt.in_cksum_add(so_far, datagram.data))
+        frame = headers + _CHECKSUM.pack(checksum or 0xFFFF) + datagram.data
+        self._packets.write(datagram.time, frame)
+
+
+@lru_cache(maxsize=256)
+def _headers(source: Endpoint, destination: Endpoint, size: int) -> tuple[bytes, int]:
+    """Return the headers of a datagram, made once for each of the few sizes that there are.
+
+    Returns
+    -------
+    bytes
+        All but the UDP checksum, which is the last field.
+    int
+        What that checksum covers apart from the content, summed up.
+    """
+    ends = [bytes(map(int, end.ip.split("."))) for end in (source, destination)]
+    udp = dpkt.udp.UDP(sport=source.port, dport=destination.port, ulen=8 + size, data=bytes(size))
+    network = dpkt.ip.IP(src=ends[0], dst=ends[1], p=dpkt.ip.IP_PROTO_UDP, data=udp)
+    frame = dpkt.ethernet.Ethernet(
+        src=_MAC + ends[0], dst=_MAC + ends[1], type=dpkt.ethernet.ETH_TYPE_IP, data=network
+    )
+    headers = bytes(frame)[: len(frame) - size]
+    (checksum,) = _SUMMED.unpack(headers[-2:])
+    return headers[:-2], ~checksum & 0xFFFF
 
 
 _Dissected = tuple[Any, bool | None]
