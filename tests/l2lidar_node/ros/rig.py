@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import pytest
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import uninstall_signal_handlers
 
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.demo.processes import Program, Programs, assigned, free_udp_ports
+from l2lidar_node.ros import driver_node
 
 TIMEOUT_S = 120.0  # generous: only a failure waits that long
 _ASK_AGAIN_S = 10.0
@@ -99,6 +103,21 @@ def open_rig() -> Iterator[Rig]:
     finally:
         observer.destroy_node()
         rclpy.try_shutdown()
+
+
+def refused(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    """Run the driver's program in this process, which it has to leave at once.
+
+    Returns its exit code and what it said on the standard error output.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        code = driver_node.main(["l2lidar_node", *arguments])
+    finally:
+        uninstall_signal_handlers()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return code, capfd.readouterr().err
 
 
 def publishers(node: Node, topic: str) -> list[Any]:

@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool
 
 from l2lidar_node.demo.processes import assigned, free_udp_ports
 from l2lidar_node.ros.conversions import from_cloud
-from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig
+from tests.l2lidar_node.ros.rig import TIMEOUT_S, Rig, open_rig, refused
 from tests.support.build import PERIOD_NS, REAL_L2, frames_3d, points_3d, real_capture
 
 pytestmark = pytest.mark.ros
@@ -57,45 +57,50 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
     ],
 )
 def test_a_wrong_parameter_ends_the_start_with_one_message(
-    assignment: str, words: tuple[str, ...]
+    assignment: str, words: tuple[str, ...], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    result = _run("--ros-args", "-p", assignment)
-    assert result.returncode == 2
-    assert "Traceback" not in result.stderr
+    code, said = refused(capfd, "--ros-args", "-p", assignment)
+    assert code == 2
     for word in words:
-        assert word in result.stderr
+        assert word in said
 
 
 def test_help_is_given() -> None:
     result = _run("--help")
     assert (result.returncode, result.stderr) == (0, "")
     assert "usage: l2lidar_node" in result.stdout
-    assert _run("--ros-args", "--help").returncode == 2
 
 
-def test_a_missing_or_broken_parameter_file_is_named(tmp_path: Path) -> None:
+def test_a_missing_or_broken_parameter_file_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     missing = _run("--params-file", str(tmp_path / "nowhere.yaml"))
     assert missing.returncode == 2
     assert "nowhere.yaml" in missing.stderr
+    assert "Traceback" not in missing.stderr
     broken = tmp_path / "broken.yaml"
     broken.write_text("l2lidar_node: [1, 2\n")
-    result = _run("--ros-args", "--params-file", str(broken))
-    assert result.returncode == 2
-    assert "broken.yaml" in result.stderr
-    assert "Traceback" not in result.stderr
+    code, said = refused(capfd, "--ros-args", "--params-file", str(broken))
+    assert code == 2
+    assert "broken.yaml" in said
+    code, said = refused(capfd, "--ros-args", "--help")
+    assert (code, "--help" in said) == (2, True)
 
 
-def test_a_port_in_use_and_a_foreign_address_are_explained() -> None:
+def test_a_port_in_use_and_a_foreign_address_are_explained(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
         busy = _run(*assigned({**LOOPBACK, "host_port": port}))
     assert busy.returncode == 1
     assert f"host_port {port} is in use" in busy.stderr
-    foreign = _run(*assigned({**LOOPBACK, "host_ip": "203.0.113.9"}))
-    assert foreign.returncode == 1
-    assert "203.0.113.9" in foreign.stderr
-    assert "not an address of this machine" in foreign.stderr
+    assert "Traceback" not in busy.stderr
+    code, said = refused(capfd, *assigned({**LOOPBACK, "host_ip": "203.0.113.9"}))
+    assert code == 1
+    assert "203.0.113.9" in said
+    assert "not an address of this machine" in said
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

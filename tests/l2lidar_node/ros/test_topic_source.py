@@ -31,7 +31,7 @@ def rig() -> Iterator[Rig]:
 def results(rig: Rig) -> dict[str, tuple[int, dict[str, Any]]]:
     """Exit code and JSON of a check for each consumer, all at the same time."""
     running = {
-        consumer: check("/points", "--for", consumer, "--seconds", "3", "--json")
+        consumer: check("/points", "--for", consumer, "--seconds", "2", "--json")
         for consumer in CONSUMERS
     }
     results = {}
