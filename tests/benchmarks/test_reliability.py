@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,11 @@ from l2lidar_node.emulator.physics import PhysicsConfig
 from l2lidar_node.emulator.ray_cast_worker import RayCastError, RayCastWorker
 from tests.support.fault_runs import SINGLE, FaultCase, random_case, run
 
+# What the driver's own tests of faults do not go through with a truth for every point.
 SHORT = [
-    case for case in SINGLE if "2D" in case.name or "host" in case.name or "reboot" in case.name
+    case
+    for case in SINGLE
+    if re.search(r"split.*2D|reboot twice|reboot, 2D|host clock [^+]|host clock \+1 h", case.name)
 ]
 INPUTS = {
     "wire": 30_000,
@@ -35,7 +39,7 @@ def test_nothing_wrong_is_published_and_nothing_good_lost(case: FaultCase) -> No
     assert verdict.used > 0.5 * (verdict.sent - verdict.destroyed)
 
 
-@pytest.mark.parametrize("number", range(500, 508))
+@pytest.mark.parametrize("number", range(500, 504))
 def test_random_combinations_of_faults(number: int) -> None:
     verdict = run(random_case(number, 8.0), number)
     assert faults.is_right(verdict), verdict

@@ -116,7 +116,8 @@ def outcome(
 ) -> Outcome:
     key = (request.param, int(mode))
     if key not in outcomes:
-        outcomes[key] = Outcome(CASES[request.param], mode)
+        seconds = 3.0 if request.param in CONTENT else 1.8
+        outcomes[key] = Outcome(CASES[request.param], mode, seconds)
     return outcomes[key]
 
 

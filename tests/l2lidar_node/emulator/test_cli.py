@@ -10,7 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,28 @@ def run(*options: str) -> tuple[int, str, str]:
     process = started(*options)
     out, err = process.communicate(timeout=LIMIT_S)
     return process.returncode, out, err
+
+
+Invoke = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def invoke(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Invoke:
+    """Run the command line in this process, which spares a second of imports."""
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    def run_here(*options: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["l2lidar_emulator", *options])
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        with pytest.raises(SystemExit) as leaving:
+            main()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        assert isinstance(leaving.value.code, int)
+        return leaving.value.code, *capfd.readouterr()
+
+    return run_here
 
 
 def port_of(item: socket.socket) -> str:
@@ -198,18 +220,10 @@ def test_a_killed_measuring_process_is_one_message(host: socket.socket) -> None:
     ],
 )
 def test_a_wrong_option_is_named_with_what_would_be_right(
-    options: Any, words: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    options: Any, words: Any, invoke: Invoke
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr(sys, "argv", ["l2lidar_emulator", "--lidar-port", "0", *options])
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with pytest.raises(SystemExit) as leaving:
-        main()
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    out, err = capfd.readouterr()
-    assert leaving.value.code == 2, err
-    assert out == ""
+    code, out, err = invoke("--lidar-port", "0", *options)
+    assert (code, out) == (2, ""), err
     text = " ".join(err.replace("│", " ").split())
     for word in words:
         assert word in text
@@ -225,8 +239,8 @@ def test_a_world_without_what_casts_rays_is_one_message() -> None:
     ]
 
 
-def test_a_port_in_use_is_one_message(host: socket.socket) -> None:
-    code, out, err = run("--world", "pattern", "--lidar-port", port_of(host))
+def test_a_port_in_use_is_one_message(host: socket.socket, invoke: Invoke) -> None:
+    code, out, err = invoke("--world", "pattern", "--lidar-port", port_of(host))
     assert (code, out) == (1, "")
     assert err.splitlines() == [
         f"l2lidar_emulator: cannot listen on 127.0.0.1:{port_of(host)}: Address already in use"
@@ -241,8 +255,8 @@ def test_a_folder_that_cannot_be_written_is_one_message(tmp_path: Path) -> None:
     assert "truth: Not a directory" in err
 
 
-def test_help_shows_every_setting_once() -> None:
-    code, out, _ = run("--help")
+def test_help_shows_every_setting_once(invoke: Invoke) -> None:
+    code, out, _ = invoke("--help")
     assert code == 0
     text = out.split()
     for kind in (DeviceConfig, PhysicsConfig):
@@ -253,7 +267,9 @@ def test_help_shows_every_setting_once() -> None:
         assert f"─ {heading} ─" in out
 
 
-def test_what_the_unit_stores_outlives_it(host: socket.socket, tmp_path: Path) -> None:
+def test_what_the_unit_stores_outlives_it(
+    host: socket.socket, tmp_path: Path, invoke: Invoke
+) -> None:
     file = tmp_path / "flash.json"
     process = started(*QUICK, "--host-port", port_of(host), "--flash", str(file))
     ask(host, lidar_of(process), command(2002, int(WorkMode.IMU_OFF)))
@@ -261,7 +277,7 @@ def test_what_the_unit_stores_outlives_it(host: socket.socket, tmp_path: Path) -
     _, err = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, err) == (0, "")
     assert Flash.from_json(file.read_text()).work_mode == WorkMode.IMU_OFF
-    code, out, _ = run(*QUICK, "--flash", str(file), "--duration", "1", "--speed", "20")
+    code, out, _ = invoke(*QUICK, "--flash", str(file), "--duration", "1", "--speed", "20")
     assert code == 0
     assert "work mode 4" in out
     assert "IMU," not in out.splitlines()[2]
@@ -348,8 +364,10 @@ def test_the_truth_of_a_run(host: socket.socket, tmp_path: Path) -> None:
     assert poses.dtype == tum.POSE
 
 
-def test_asking_for_points_that_were_never_measured_says_so(tmp_path: Path) -> None:
-    code, _, err = run(*QUICK, "--duration", "0.2", "--truth", str(tmp_path))
+def test_asking_for_points_that_were_never_measured_says_so(
+    tmp_path: Path, invoke: Invoke
+) -> None:
+    code, _, err = invoke(*QUICK, "--duration", "0.2", "--truth", str(tmp_path))
     assert code == 0, err
     with pytest.raises(KeyError, match="no points of packet 3"):
         Results(tmp_path).points(np.array([3]), WorkMode(0))

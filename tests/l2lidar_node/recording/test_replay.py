@@ -45,7 +45,7 @@ FAULTS: dict[str, dict[str, Any]] = {
     ("settings", "faults"),
     [
         *((name, "rough") for name in SETTINGS),
-        *(("periodic", name) for name in FAULTS if name != "rough"),
+        *(("periodic", name) for name in FAULTS if name not in ("none", "rough")),
     ],
 )
 def test_replay_is_the_live_run_bit_for_bit(settings: Any, faults: Any) -> None:
@@ -56,14 +56,12 @@ def test_replay_is_the_live_run_bit_for_bit(settings: Any, faults: Any) -> None:
     assert essence(replayed) == essence(live)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_busy_host_makes_no_difference(seed: Any) -> None:
+def test_a_busy_host_makes_no_difference() -> None:
     config, live, tap = live_run(
         4.0,
         settings=SETTINGS["periodic"],
         faults=FAULTS["silences"],
         busy=0.02,
-        seed=seed,
     )
     assert essence(list(events(Recording(tap.stream), config))) == essence(live)
 
@@ -126,11 +124,11 @@ def test_shifted_events_move_in_time_and_in_nothing_else() -> None:
 
 @pytest.mark.parametrize("step", [-1.0, 0.05, 3600.0])
 def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step: float) -> None:
-    config, live, tap = live_run(6.0, host_steps=((3.0, step),), settings={"imu_adjust": False})
+    config, live, tap = live_run(4.0, host_steps=((2.0, step),), settings={"imu_adjust": False})
 
     entries = [entry for entry in Recording(tap.stream) if isinstance(entry, Stepped)]
     assert [entry.by_ns for entry in entries] == [0, round(step * 1e9)]
-    assert 0 <= entries[1].time - (EPOCH_NS + 3_000_000_000 + round(step * 1e9)) < 15_000_000
+    assert 0 <= entries[1].time - (EPOCH_NS + 2_000_000_000 + round(step * 1e9)) < 15_000_000
     texts = [event.text for event in live if isinstance(event, ClockEvent)]
     assert [text for text in texts if "stepped" in text] == [
         f"host clock stepped by {step:+.3f} s"
@@ -160,8 +158,8 @@ def test_slewing_of_the_host_clock_is_told_when_it_changes_and_replayed() -> Non
 
 @pytest.mark.parametrize("late", [1.0, 5.0])
 def test_packets_that_stay_late_are_stamped_as_measured(late: float) -> None:
-    seconds = 7.0 + late
-    config, live, tap = live_run(seconds, late=[(2.0, 5.0, late)], settings={"imu_adjust": False})
+    seconds = 5.5 + late
+    config, live, tap = live_run(seconds, late=[(2.0, 4.0, late)], settings={"imu_adjust": False})
 
     stamps = [event.stamp for event in live if isinstance(event, ImuSample)]
     assert stamps[0] < EPOCH_NS + 2_000_000_000

@@ -53,6 +53,8 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
 
 
 def test_bag_in_trajectory_map_and_plot_out(run: Any, tmp_path: Path) -> None:
+    from evo.core.metrics import APE
+    from evo.core.trajectory import PoseTrajectory3D
     from evo.tools import file_interface
 
     some = write_bag(tmp_path / "run.mcap", 14)
@@ -62,7 +64,13 @@ def test_bag_in_trajectory_map_and_plot_out(run: Any, tmp_path: Path) -> None:
     found = file_interface.read_tum_trajectory_file(tmp_path / "out" / "trajectory.tum")
     assert found.num_poses == 14
     stamps = np.array([(one.start + one.end) // 2 for one in some])
-    true, _ = truth(recording("room", "walk"), stamps)
+    true, turns = truth(recording("room", "walk"), stamps)
+    np.testing.assert_allclose(found.timestamps, stamps * 1e-9, atol=1e-6)
+    reference = PoseTrajectory3D(true, turns, found.timestamps)
+    found.align(reference)
+    ape = APE()
+    ape.process_data((reference, found))
+    assert ape.get_all_statistics()["rmse"] < 0.01
     way = np.linalg.norm(np.diff(found.positions_xyz[[0, -1]], axis=0))
     assert way == pytest.approx(np.linalg.norm(true[-1] - true[0]), abs=0.02)
     assert file_interface.read_kitti_poses_file(tmp_path / "out" / "trajectory.kitti").num_poses
