@@ -8,7 +8,7 @@ and fit nowhere else nearly as well.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,15 +216,13 @@ def compare(query: SubmapView, target: SubmapView, guess: F64) -> Comparison | N
     rough = fit_of(query, target, pose, _POINTS[0])
     if rough.agreement < _HOPELESS:
         return Comparison(pose, rough, rough)
-    back = inverse(pose)
+    there = _marked(query, target, pose, _POINTS[1])
+    back = _marked(target, query, inverse(pose), _POINTS[1])
     return Comparison(
         pose,
-        fit_of(query, target, pose, _POINTS[1]),
-        fit_of(target, query, back, _POINTS[1]),
-        max(
-            obstructions(query, target, pose, _POINTS[1]),
-            obstructions(target, query, back, _POINTS[1]),
-        ),
+        _fit(there, query),
+        _fit(back, target),
+        max(_things(there, target), _things(back, query)),
     )
 
 
@@ -235,13 +233,17 @@ def likeness(rival: float, best: float) -> float:
 
 def fit_of(query: SubmapView, target: SubmapView, pose: F64, count: int) -> Fit:
     """Return how well the first so many points of a submap fit another one at a pose."""
-    upright = query.is_upright[:count]
-    on, met, free, _, _ = _marked(query, target, pose, count)
-    known = on | met | free
+    return _fit(_marked(query, target, pose, count), query)
+
+
+def _fit(marks: _Marks, query: SubmapView) -> Fit:
+    """Return how well a submap fits whose first points are marked."""
+    on, free = marks.on, marks.free
+    known = on | marks.met | free
     if not known.any():
         return Fit(0.0, 0.0, 1.0)
     agreement, seen_through = float(on[known].mean()), float(free[known].mean())
-    standing = known & upright
+    standing = known & query.is_upright[: len(known)]
     if np.count_nonzero(standing) >= _FEWEST // 2:
         agreement = min(agreement, float(on[standing].mean()))
         seen_through = max(seen_through, float(free[standing].mean()))
@@ -254,21 +256,39 @@ def obstructions(query: SubmapView, target: SubmapView, pose: F64, count: int) -
     Single points are in the way everywhere: on edges, and where the poses of a submap are bent.
     What counts is several of them side by side: a cupboard that is not there.
     """
-    on, _, _, points, distance = _marked(query, target, pose, count)
-    off = np.flatnonzero(~on)
-    points = points[off[(distance > _CLEAR_M) & target.is_open(points[off])]]
+    return _things(_marked(query, target, pose, count), target)
+
+
+def _things(marks: _Marks, target: SubmapView) -> float:
+    """Return the part of marked points that make up things; see :func:`obstructions`."""
+    points = marks.points[~marks.on]
+    points = points[(marks.distance > _CLEAR_M) & target.is_open(points)]
     beside = ((points[:, None] - points) ** 2).sum(axis=2) < _THING_M**2
-    return float((beside.sum(axis=1) >= _THING_POINTS).sum() / max(len(on), 1))
+    return float((beside.sum(axis=1) >= _THING_POINTS).sum() / max(len(marks.on), 1))
 
 
-def _marked(
-    query: SubmapView, target: SubmapView, pose: F64, count: int
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], F64, F64]:
-    """Return of the first so many points of a submap what they are at a pose in another one.
+class _Marks(NamedTuple):
+    """What the first points (N,) of a submap are at a pose in another one.
 
-    Which lie on it, which in cells of its surfaces, which where it saw through; the points in its
-    frame; and of those not on it the distance from its nearest point, inf beyond ``_CLEAR_M``.
+    Attributes
+    ----------
+    on, met, free : ndarray, shape (N,), bool
+        Which lie on it, which in cells of its surfaces, which where it saw through.
+    points : ndarray, shape (N, 3)
+        In its frame [m].
+    distance : ndarray, shape (M,)
+        Of those not on it from its nearest point [m], inf beyond ``_CLEAR_M``.
     """
+
+    on: NDArray[np.bool_]
+    met: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    points: F64
+    distance: F64
+
+
+def _marked(query: SubmapView, target: SubmapView, pose: F64, count: int) -> _Marks:
+    """Return what the first so many points of a submap are at a pose in another one."""
     points = transformed(pose, query.source[:count])
     index, _, distances = target.surfaces.match(points)
     met = np.zeros(len(points), np.bool_)
@@ -278,7 +298,8 @@ def _marked(
     off = np.flatnonzero(~on)
     distance, _ = target.tree.query(points[off], distance_upper_bound=_CLEAR_M)
     on[off] = distance < _TOUCH_M
-    return on, met, target.is_free(points) & ~on, points, distance[distance >= _TOUCH_M]
+    free = target.is_free(points) & ~on
+    return _Marks(on, met, free, points, distance[distance >= _TOUCH_M])
 
 
 def _starts(query: SubmapView, target: SubmapView, guess: F64, window: Window) -> list[F64]:
