@@ -151,7 +151,14 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     python = folder / ".venv/bin/python"
     log = ["--log-base", str(folder / "log")]
     for command in (
-        [sys.executable, "-m", "venv", "--system-site-packages", str(folder / ".venv")],
+        [
+            sys.executable,
+            "-m",
+            "venv",
+            "--without-pip",
+            "--system-site-packages",
+            str(folder / ".venv"),
+        ],
         [str(python), "-m", "colcon", *log, "build", "--base-paths", str(ROOT)],
     ):
         done = subprocess.run(

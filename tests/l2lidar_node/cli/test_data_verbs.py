@@ -43,7 +43,7 @@ from l2lidar_node.transport.session import Session
 from l2lidar_node.transport.udp import UdpTransport
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 from tests.l2lidar_node.cli.conftest import LIMIT_S, Run, Unit, free_port
-from tests.l2lidar_node.driver.virtual_host import essence
+from tests.l2lidar_node.driver.virtual_host import essence, live_run
 from tests.support.build import SHARED_DATA
 
 ROOT = Path(__file__).parents[3]
@@ -139,11 +139,10 @@ class Sniffer:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may capture packets")
-@pytest.mark.parametrize("settings", [{"sweep_cut": "turn"}, {"imu_adjust": False}], ids=str)
-def test_a_tcpdump_of_a_run_replays(make_unit: Any, tmp_path: Path, settings: Any) -> None:
+def test_a_tcpdump_of_a_run_replays(make_unit: Any, tmp_path: Path) -> None:
     unit = make_unit(int(WorkMode.WAIT_FOR_START))  # nothing is sent before all listen
     sniffer = Sniffer(tmp_path / "tcpdump.pcap", unit.host_port)
-    config, found = live(unit, tmp_path / "own.pcap", 4, **settings)
+    config, found = live(unit, tmp_path / "own.pcap", 4, sweep_cut="turn")
     sniffer.stop()
     with (tmp_path / "tcpdump.pcap").open("rb") as stream:
         replayed = list(events(Recording(stream), config))
@@ -277,11 +276,10 @@ def test_the_capture_names_an_address_of_this_machine() -> None:
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "bag"])
-def test_convert_writes_what_the_driver_hands_out(
-    run: Run, unit: Unit, tmp_path: Path, name: str
-) -> None:
+def test_convert_writes_what_the_driver_hands_out(run: Run, tmp_path: Path, name: str) -> None:
     file = tmp_path / "run.pcap"
-    config, found = live(unit, file, 4, imu_adjust=False, sweep_cut="turn")
+    config, found, tap = live_run(2.0, settings={"imu_adjust": False, "sweep_cut": "turn"})
+    file.write_bytes(tap.stream.getvalue())
     outcome = run("convert", str(file), str(tmp_path / name))
     assert (outcome.code, outcome.err) == (0, "")
     sweeps = [event for event in found if isinstance(event, Sweep)]
@@ -330,8 +328,8 @@ def test_record_writes_bags(run: Run, unit: Unit, tmp_path: Path) -> None:
     assert counts["/imu/data"] > 100
 
 
-def test_odometry_of_a_capture(run: Run, unit: Unit, tmp_path: Path) -> None:
-    live(unit, tmp_path / "run.pcap", 9)
+def test_odometry_of_a_capture(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "run.pcap").write_bytes(live_run(2.5)[2].stream.getvalue())
     outcome = run("odometry", str(tmp_path / "run.pcap"), str(tmp_path / "out"))
     assert (outcome.code, outcome.err) == (0, "")
     assert (tmp_path / "out" / "map.ply").exists()
@@ -396,11 +394,16 @@ def test_replay_refuses_wrong_ends(run: Run, tmp_path: Path, text: str) -> None:
     assert run("replay", str(path), "--to", text).code == 2
 
 
+@pytest.fixture(scope="module")
+def recorded() -> bytes:
+    """What a driver records, made in virtual time."""
+    return live_run(1.5)[2].stream.getvalue()
+
+
 @pytest.fixture
-def capture(unit: Unit, tmp_path: Path) -> tuple[Path, list[Received]]:
+def capture(recorded: bytes, tmp_path: Path) -> tuple[Path, list[Received]]:
     path = tmp_path / "run.pcap"
-    live(unit, path, 4)
-    unit.stop()
+    path.write_bytes(recorded)
     with path.open("rb") as stream:
         return path, [entry for entry in Recording(stream) if isinstance(entry, Received)]
 

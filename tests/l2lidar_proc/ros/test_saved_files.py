@@ -30,7 +30,7 @@ def odometry(tmp_path: Path) -> Iterator[Any]:
 
 def works(bench: Any) -> None:
     """Give the node good data and wait for what it makes of them."""
-    some = list(sweeps(recording("room", "walk"), "turn"))[:18]
+    some = list(sweeps(recording("room", "walk"), "turn"))[:8]
     bench.poses.clear()
     bench.send(recording("room", "walk"), some)
     bench.until(lambda: len(bench.poses) == len(some))
