@@ -9,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import time
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -38,8 +39,11 @@ DISTRIBUTIONS = {
 }
 
 
-def imported(*folders: str) -> set[str]:
+@cache
+def imported(*folders: str) -> frozenset[str]:
     """Return the top-level names that the Python files of the folders import."""
+    if len(folders) > 1:
+        return frozenset().union(*map(imported, folders))
     names: set[str] = set()
     for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -47,7 +51,8 @@ def imported(*folders: str) -> set[str]:
                 names.update(alias.name.split(".")[0] for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module.split(".")[0])
-    return names - set(sys.stdlib_module_names) - {"__future__", "l2lidar_node", "l2lidar_proc"}
+    ours = {"__future__", "l2lidar_node", "l2lidar_proc"}
+    return frozenset(names - set(sys.stdlib_module_names) - ours)
 
 
 def shared_files(folder: Path) -> set[Path]:
