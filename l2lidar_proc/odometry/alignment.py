@@ -54,8 +54,8 @@ class Alignment:
     support : Support
         Of all surfaces met.
     weakly : tuple of ndarray and Support, optional
-        Direction of the place (3,), map axes, that the points fix far less than others, and the
-        support of the surfaces that fix it; None if there is none.
+        Direction of the place (3,), map axes, that the points fix least, and the support of the
+        surfaces that fix it; None where it was not surfaces that fixed the place.
     """
 
     state: InertialState
@@ -142,10 +142,7 @@ class _Step(NamedTuple):
     def alignment(self) -> Alignment:
         """What is reported where this is the last one."""
         found = self.found
-        strength, axes = np.linalg.eigh(self.information[POSITION, POSITION])
-        weakly = None
-        if strength[0] < tuning.WEAK_SHARE * strength[-1]:
-            weakly = axes[:, 0], found.support_along(self.normals @ axes[:, 0])
+        weakest = np.linalg.eigh(self.information[POSITION, POSITION])[1][:, 0]
         return Alignment(
             self.state,
             self.covariance,
@@ -156,7 +153,7 @@ class _Step(NamedTuple):
             found.residual,
             self.number,
             found.support,
-            weakly,
+            (weakest, found.support_along(self.normals @ weakest)),
         )
 
 

@@ -51,8 +51,8 @@ class MapDrift:
         place : ndarray, shape (3,), optional
             Of the sensor, map frame [m]; needed with what follows.
         weakly : tuple of ndarray and Support, optional
-            A direction (3,), unit, map axes, that few of them hold, and the support of these. The
-            others, however old, say nothing about it.
+            The direction (3,), unit, map axes, that they hold least, and the support of those that
+            hold it. The others, however old, say nothing about it.
         """
         sweeps, shares = support
         if not len(sweeps) or not self._known:

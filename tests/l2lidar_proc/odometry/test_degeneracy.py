@@ -108,6 +108,34 @@ def test_posts_that_have_just_come_into_sight_do_not_fix_it_yet() -> None:
     assert found.covariance[3, 3] < 0.1 * before[3, 3]
 
 
+def test_the_sweeps_that_opened_what_fixes_the_least_fixed_direction_are_named() -> None:
+    """Walls are as old as the map; along them the place is known as well as the end wall is."""
+    rng = np.random.default_rng(6)
+    surfaces = SurfelMap(SIZES)
+
+    def seen(*, end: bool) -> F64:
+        points = corridor(rng, 4000, posts=False)
+        wall = rng.uniform((3.0, -1.2, -1.0), (3.0, 1.2, 1.5), (800 * end, 3))
+        return np.vstack((points, wall + 0.01 * rng.standard_normal(wall.shape)))
+
+    for number in range(14):
+        surfaces.add(seen(end=number >= 4), number)
+    points = seen(end=True)
+    covariance = 1e-4 * np.eye(eskf.ERRORS)
+    source = source_of(points, np.zeros(len(points)))
+    found = align(still(), covariance, source, surfaces, SurfaceConfig(), 100)
+    assert found is not None
+    assert found.weakly is not None
+    strength = np.linalg.eigvalsh(found.information[eskf.POSITION, eskf.POSITION])
+    assert strength[0] > tuning.WEAK_SHARE * strength[-1]  # nothing is weak here
+    direction, (sweeps, shares) = found.weakly
+    assert abs(direction[0]) > 0.99
+    assert shares.sum() == pytest.approx(1.0)
+    assert shares[sweeps >= 4].sum() > 0.9
+    sweeps, shares = found.support
+    assert shares[sweeps < 4].sum() > 0.7
+
+
 def test_all_is_kept_where_the_scene_fixes_the_pose() -> None:
     rng = np.random.default_rng(2)
     surfaces = SurfelMap(SIZES)
