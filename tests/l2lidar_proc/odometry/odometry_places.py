@@ -68,7 +68,7 @@ def shaking(seconds: float) -> NDArray[np.void]:
 
 
 @lru_cache(maxsize=2)
-def shaken(seconds: float = 8.0) -> Run:
+def shaken(seconds: float = 7.0) -> Run:
     """Return a recording of 2 s of rest and then shaking in the built-in room."""
     with tempfile.TemporaryDirectory() as folder:
         motion = Path(folder) / "motion.tum"
@@ -77,7 +77,7 @@ def shaken(seconds: float = 8.0) -> Run:
 
 
 @lru_cache(maxsize=4)
-def visited(place: str, seconds: float = 8.0) -> Run:
+def visited(place: str, seconds: float = 6.0) -> Run:
     """Return a recording of 2 s of rest and a walk at a place made here."""
     triangles = {"bushes": bushes, "poles": poles}[place]().reshape(-1, 3)
     mesh = o3d.geometry.TriangleMesh(

@@ -47,12 +47,11 @@ def test_a_start_while_walking_along_a_corridor_is_not_taken_for_slow() -> None:
     assert errors(run, estimates).max() < 0.03
 
 
-@pytest.mark.parametrize("cut", ["10 packets", "18 packets"])
-def test_short_sweeps_below_an_open_sky_are_enough(cut: str) -> None:
+def test_short_sweeps_below_an_open_sky_are_enough() -> None:
     """A hundred points each; half the packets of a turn do not meet what the other half saw."""
     run = visited("poles")
-    estimates = drive(run, cut)
-    assert len(estimates) == len(list(sweeps(run, cut)))
+    estimates = drive(run, "10 packets")
+    assert len(estimates) == len(list(sweeps(run, "10 packets")))
     assert all(item.is_aligned for item in estimates)
     assert errors(run, estimates).max() < 0.03
 
