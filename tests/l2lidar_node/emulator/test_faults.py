@@ -99,7 +99,7 @@ def test_the_packet_log_knows_what_a_good_reader_gets(name: Any, mode: Any) -> N
         assert (packets["copies"][settled] == 1).all(), "only time, stamp or company changed"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     st.fixed_dictionaries({}, optional={name: st.floats(0.01, 0.5) for name in RANDOM}),
     st.fixed_dictionaries({}, optional={"burst_ms": st.just(30.0), "jitter": st.just("uniform")}),

@@ -41,8 +41,10 @@ def test_a_level_sensor_at_rest_feels_gravity_on_plus_z() -> None:
     assert (samples["info"]["payload_size"] == 56).all()
 
 
-@pytest.mark.parametrize("motion", ["spin", "walk", "trot", "drone"])
-@pytest.mark.parametrize("mount", ["upright", "forward"])
+@pytest.mark.parametrize(
+    ("motion", "mount"),
+    [("spin", "upright"), ("walk", "forward"), ("trot", "upright"), ("drone", "forward")],
+)
 def test_clean_samples_integrate_to_the_true_pose(motion: str, mount: str) -> None:
     device = inertial(motion, mount=mount)
     first, count = 250, 2000  # from within the rest, 8 s
