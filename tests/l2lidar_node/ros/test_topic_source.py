@@ -28,18 +28,26 @@ def rig() -> Iterator[Rig]:
 
 
 @pytest.fixture(scope="module")
-def results(rig: Rig) -> dict[str, tuple[int, dict[str, Any]]]:
-    """Exit code and JSON of a check for each consumer, all at the same time."""
+def ended(rig: Rig) -> dict[str, tuple[int, str, str]]:
+    """Exit code and words of checks, one of them wrong, all at the same time."""
     running = {
         consumer: check("/points", "--for", consumer, "--seconds", "2", "--json")
         for consumer in CONSUMERS
     }
-    results = {}
-    for consumer, process in running.items():
-        said, error = process.communicate(timeout=TIMEOUT_S)
-        assert process.returncode in (0, 1), error
-        results[consumer] = (process.returncode, json.loads(said))
-    return results
+    running["nothing"] = check("/nothing", "--for", "lio_sam")
+    said = {name: process.communicate(timeout=TIMEOUT_S) for name, process in running.items()}
+    return {name: (process.returncode, *said[name]) for name, process in running.items()}
+
+
+@pytest.fixture(scope="module")
+def results(ended: dict[str, tuple[int, str, str]]) -> dict[str, tuple[int, dict[str, Any]]]:
+    """Exit code and JSON of a check for each consumer."""
+    found = {}
+    for consumer in CONSUMERS:
+        code, said, error = ended[consumer]
+        assert code in (0, 1), error
+        found[consumer] = (code, json.loads(said))
+    return found
 
 
 def check(*arguments: str) -> subprocess.Popen[str]:
@@ -80,10 +88,11 @@ def test_levelled_clouds_are_right_for_nav2(
     assert (code, errors(data)) == (0, set())
 
 
-def test_a_topic_that_is_not_there_is_a_usage_error(rig: Rig) -> None:
-    process = check("/nothing", "--for", "lio_sam")
-    _, error = process.communicate(timeout=TIMEOUT_S)
-    assert process.returncode == 2
+def test_a_topic_that_is_not_there_is_a_usage_error(
+    ended: dict[str, tuple[int, str, str]],
+) -> None:
+    code, _, error = ended["nothing"]
+    assert code == 2
     assert (
         "there is no topic '/nothing'; topics of type sensor_msgs/msg/PointCloud2 are: " in error
     )
