@@ -10,8 +10,8 @@ import numpy as np
 
 from l2lidar_node.emulator.motion import tours, trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS, Motion
-from l2lidar_node.emulator.unit import view
 from l2lidar_node.emulator.unit.inertial import ImuNoise
+from l2lidar_node.emulator.unit.view import View, carrier
 from l2lidar_node.emulator.world import buildings, scenes, woods
 from l2lidar_node.emulator.world.moving import Mover, MovingWorld
 from l2lidar_node.emulator.world.people import crowd
@@ -218,7 +218,7 @@ class Setting:
 
     world: MovingWorld
     motion: Motion
-    view: view.View
+    view: View
     imu: ImuNoise
     covered: list[tuple[float, float]]
 
@@ -230,7 +230,7 @@ def prepare(given: Scenario) -> Setting:
     motion = _motion(given, scene)
     movers: list[Mover] = []
     if given.carrier:
-        movers.append(Mover.of(World(view.carrier(given.carrier), 0.4), motion.poses))
+        movers.append(Mover.of(World(carrier(given.carrier), 0.4), motion.poses))
     if given.scene == "atrium":
         movers.append(Mover.of(World(buildings.platform(), 0.5), _lift(motion, given)))
     movers += crowd(motion, scene.ground, given.people, given.seconds, given.seed)
@@ -240,7 +240,7 @@ def prepare(given: Scenario) -> Setting:
         World(scene.glass) if len(scene.glass) else None,
         World(scene.mirrors) if len(scene.mirrors) else None,
     )
-    window = view.View(
+    window = View(
         sector=np.deg2rad(given.sector_deg),
         towards=float(rng.normal(0.0, 0.2)) if given.sector_deg < 360.0 else 0.0,
         cone=np.deg2rad(given.cone_deg),

@@ -90,7 +90,8 @@ def _live(sdk: Any, namespace: str, seconds: float | None) -> int:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
 
-        from l2lidar_node.ros import topics, viewer
+        from l2lidar_node.ros import topics
+        from l2lidar_node.ros.viewer import view as show_topics
     except ImportError as error:
         raise CommandError(
             f"viewing topics needs ROS 2 ({error}): source it, or name a recording"
@@ -104,7 +105,7 @@ def _live(sdk: Any, namespace: str, seconds: float | None) -> int:
     }
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        return viewer.view(
+        return show_topics(
             sdk, {role: namespace.rstrip("/") + name for role, name in names.items()}, seconds
         )
     finally:

@@ -14,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
 from l2lidar_node.command_line import CommandError, UsageError, for_typer
-from l2lidar_node.demo import mapping, robot
+from l2lidar_node.demo import mapping
 from l2lidar_node.demo.observer import Observer, TopicRecord, TopicRecorder
 from l2lidar_node.demo.processes import (
     ProgramError,
@@ -24,6 +24,7 @@ from l2lidar_node.demo.processes import (
     isolate_ros,
 )
 from l2lidar_node.demo.report import report
+from l2lidar_node.demo.robot import as_message, mount as example_mount
 from l2lidar_node.programs import INTERRUPTED, interruptible
 
 _WARM_UP_S = 3.0
@@ -144,9 +145,9 @@ def _run(options: _Options) -> int:
     )
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C interrupts this one
     observer = Observer()
-    mount = robot.mount("forward") if options.forward else None
+    mount = example_mount("forward") if options.forward else None
     if mount is not None:
-        observer.publish_static(robot.as_message(mount))
+        observer.publish_static(as_message(mount))
     try:
         with ExitStack() as stack:
             if options.record is not None:

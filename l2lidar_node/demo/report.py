@@ -11,8 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.demo import picture, robot
+from l2lidar_node.demo import picture
 from l2lidar_node.demo.observer import Observer
+from l2lidar_node.demo.robot import BASE_FRAME, floor_and_ceiling, moved
 from l2lidar_node.emulator.truth.results import Results
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import F64
@@ -140,16 +141,14 @@ def report(
 
 def _in_base(console: Console, cloud: NDArray[np.void], mount: F64, folder: Path) -> list[str]:
     """Show a cloud as RViz does with the fixed frame base_link; return what is wrong."""
-    shown = robot.moved(cloud, mount)
-    floor, ceiling = robot.floor_and_ceiling(shown)
-    text = (
-        f"in {robot.BASE_FRAME} the floor is at z = {floor:.2f} m, the ceiling at {ceiling:.2f} m"
-    )
+    shown = moved(cloud, mount)
+    floor, ceiling = floor_and_ceiling(shown)
+    text = f"in {BASE_FRAME} the floor is at z = {floor:.2f} m, the ceiling at {ceiling:.2f} m"
     console.print(text)
     picture.save_cloud(shown, folder / "cloud.png", text)
     expected = float(mount[2, 3]) - _SENSOR_HEIGHT_M
     if abs(floor - expected) > _HEIGHT_TOLERANCE_M:
-        return [f"the floor is at z = {floor:.2f} m in {robot.BASE_FRAME}, not {expected:.2f} m"]
+        return [f"the floor is at z = {floor:.2f} m in {BASE_FRAME}, not {expected:.2f} m"]
     return []
 
 

@@ -17,8 +17,7 @@ from typing import Annotated, Any, Final, TypeVar
 import typer
 
 from l2lidar_node.command_line import for_typer
-from l2lidar_node.emulator import assembly
-from l2lidar_node.emulator.assembly import WORLDLESS
+from l2lidar_node.emulator.assembly import WORLDLESS, opened, seen_from, stored_settings, unit
 from l2lidar_node.emulator.config import (
     AddressConfig,
     CrystalConfig,
@@ -303,19 +302,19 @@ def emulate(
         settings["boot_scale"] = 0.0
     pace = _pace(speed)
     config = group(DeviceConfig, settings)
-    physics = assembly.seen_from(config, group(PhysicsConfig, settings))
-    stored = assembly.stored_settings(flash, config, serial is not None)
+    physics = seen_from(config, group(PhysicsConfig, settings))
+    stored = stored_settings(flash, config, serial is not None)
     if truth is not None:
         _make_folder(truth)  # or a run would end with the truth having nowhere to go
     with ExitStack() as stack:
-        port = assembly.opened(stored, config, serial)
+        port = opened(stored, config, serial)
         stack.callback(port.close)
         ray_cast_worker = None
-        if physics.world not in assembly.WORLDLESS:
+        if physics.world not in WORLDLESS:
             ray_cast_worker = stack.enter_context(
                 RayCastWorker(physics, truth if truth_points else None)
             )
-        device = assembly.unit(
+        device = unit(
             config,
             stored,
             ray_cast_worker,

@@ -25,7 +25,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from l2lidar_node.clouds import fields
+from l2lidar_node.clouds.fields import DATATYPES
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Event
@@ -36,7 +36,7 @@ from l2lidar_node.types import HostNs, ImuSample, Sweep, split_stamp
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
-_DATATYPES: Final = {code: number for number, code in fields.DATATYPES.items()}
+_DATATYPES: Final = {code: number for number, code in DATATYPES.items()}
 
 
 class RecordingError(ValueError):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from l2lidar_node.clouds import fields
+from l2lidar_node.clouds.fields import DATATYPES
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
@@ -207,7 +207,7 @@ class BagMaker:
 
     def cloud(self, topic: str, stamp: int, frame: str, points: Cloud, now: int) -> None:
         types, layout = self.store.types, points.dtype
-        numbers = {code: number for number, code in fields.DATATYPES.items()}
+        numbers = {code: number for number, code in DATATYPES.items()}
         assert layout.fields is not None
         message = types["sensor_msgs/msg/PointCloud2"](
             header=self.header(stamp, frame),

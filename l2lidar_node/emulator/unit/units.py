@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.unit import errors
-from l2lidar_node.emulator.unit.errors import UnitErrors
+from l2lidar_node.emulator.unit.errors import UnitErrors, named
 from l2lidar_node.protocol import wire
 
 
@@ -87,7 +86,7 @@ def unit(name: str, power_up: int = 0) -> Unit:
     """
     if name in UNITS:
         return UNITS[name]
-    found = errors.named(name)
+    found = named(name)
     if found.are_none:
         return UNITS["a"]
     number = int(name) if name.isdecimal() else 0

@@ -17,15 +17,14 @@ from rosbags.typesys import Stores, get_typestore
 from l2lidar_node import rotations
 from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import CLOUD, IMU, TRANSFORMS, Gathering, Observation, Qos
-from l2lidar_node.clouds import fields
-from l2lidar_node.clouds.fields import RINGS
+from l2lidar_node.clouds.fields import DATATYPES, RINGS, points_of as read_points
 from l2lidar_node.clouds.layouts import LAYOUTS
 from l2lidar_node.types import Sweep
 from tests.support import build
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 T: Any = TYPES.types
-NUMBERS = {code: number for number, code in fields.DATATYPES.items()}
+NUMBERS = {code: number for number, code in DATATYPES.items()}
 
 RELIABLE = ("fast_lio", "genz_icp", "dlio", "point_lio", "rtabmap", "autoware")
 DURATION_S = 2.5
@@ -198,7 +197,7 @@ def cloud(points: np.ndarray, stamp: int, frame: str = "l2lidar_link") -> Any:
 
 
 def points_of(message: Any) -> np.ndarray:
-    return fields.points_of(message)
+    return read_points(message)
 
 
 def imu(stamp: int, wxyz: Any, rate: Any, acceleration: Any, frame: str = "l2lidar_imu") -> Any:
