@@ -47,9 +47,8 @@ from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate
 from l2lidar_node.cli.calibrate_files import capture_place
 from l2lidar_node.cli.calibrate_imu import over_time
 from l2lidar_node.cli.virtual_places import still_places
-from l2lidar_node.emulator.unit.errors import UnitErrors, drawn
 from l2lidar_node.emulator.unit.inertial import ImuNoise
-from l2lidar_node.emulator.unit.units import UNITS, Unit
+from l2lidar_node.emulator.unit.units import UNITS, Unit, UnitErrors, drawn
 from l2lidar_proc.odometry import imu_calibration
 from tests.support import odometry_runs
 from tests.support.odometry_runs import CUTS

@@ -29,7 +29,7 @@ from l2lidar_node.demo.observer import Observer
 from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.geometry import Projector
-from l2lidar_node.emulator.unit.pattern import PatternScanner
+from l2lidar_node.emulator.unit.stream import PatternScanner
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import PointPacket, decode

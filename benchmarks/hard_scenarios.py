@@ -8,15 +8,13 @@ from typing import Final
 
 import numpy as np
 
-from l2lidar_node.emulator.motion import tours, trajectories
+from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS, Motion
 from l2lidar_node.emulator.unit.inertial import ImuNoise
-from l2lidar_node.emulator.unit.view import View, carrier
-from l2lidar_node.emulator.world import buildings, scenes, woods
-from l2lidar_node.emulator.world.moving import Mover, MovingWorld
-from l2lidar_node.emulator.world.people import crowd
+from l2lidar_node.emulator.unit.scanner import View, carrier
+from l2lidar_node.emulator.world import buildings, scenes
 from l2lidar_node.emulator.world.scene import Scene
-from l2lidar_node.emulator.world.world import World
+from l2lidar_node.emulator.world.world import Mover, MovingWorld, World, crowd
 from l2lidar_node.types import F64
 
 SCENES: Final[dict[str, Callable[[int], Scene]]] = {
@@ -25,8 +23,8 @@ SCENES: Final[dict[str, Callable[[int], Scene]]] = {
     "hall": buildings.hall,
     "stairwell": buildings.stairwell,
     "atrium": buildings.atrium,
-    "wood": woods.wood,
-    "trunks": woods.trunks,
+    "wood": scenes.wood,
+    "trunks": scenes.trunks,
     "room": lambda seed: scenes.make("room"),
     "yard": lambda seed: scenes.make("yard"),
 }
@@ -45,7 +43,7 @@ class Scenario:
     scene : str
         One of :data:`SCENES`.
     motion : str
-        A style of :data:`tours.STYLES`, or one of :data:`trajectories.MOTIONS`.
+        A style of :data:`trajectories.STYLES`, or one of :data:`trajectories.MOTIONS`.
     sensor : str
         ``l2``, or one of :data:`other_sensors.SENSORS`.
     speed : float
@@ -259,11 +257,11 @@ def prepare(given: Scenario) -> Setting:
 
 
 def _motion(given: Scenario, scene: Scene) -> Motion:
-    if given.motion in tours.STYLES:
-        style = tours.STYLES[given.motion]
+    if given.motion in trajectories.STYLES:
+        style = trajectories.STYLES[given.motion]
         if given.speed:
             style = replace(style, speed=given.speed)
-        motion = tours.make(
+        motion = trajectories.tour(
             scene,
             style,
             seconds=given.seconds,
@@ -284,7 +282,7 @@ def _motion(given: Scenario, scene: Scene) -> Motion:
         rng = np.random.default_rng((given.seed, 21))
         count = max(round(given.hits * given.seconds / 10.0), 1)
         instants = np.sort(rng.uniform(3.0, given.seconds - 0.5, count)).tolist()
-        motion = tours.hit(motion, given.seconds + 1.0, instants, given.seed)
+        motion = trajectories.hit(motion, given.seconds + 1.0, instants, given.seed)
     return motion
 
 
@@ -292,7 +290,7 @@ def _lift(motion: Motion, given: Scenario) -> Callable[[F64], tuple[F64, F64]]:
     """Return where the atrium's platform is: under the sensor as long as that is above it."""
     t = np.arange(0.0, given.seconds + 1.0, 0.02)
     places = motion.poses(t)[0]
-    height = tours.STYLES[given.motion].height
+    height = trajectories.STYLES[given.motion].height
     on = np.linalg.norm(places[:, :2] - buildings.LIFT_AT, axis=1) < 0.3
     rise = np.where(on, places[:, 2] - height, np.nan)
     riding = np.flatnonzero(on & (rise > 0.1) & (rise < buildings.LIFT_RISE_M - 0.1))

@@ -40,7 +40,7 @@ from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
 from l2lidar_node.emulator.link.port import unread
 from l2lidar_node.emulator.unit.device import VirtualL2
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.settings import build

@@ -10,8 +10,7 @@ import numpy as np
 
 from l2lidar_node.calibration.observation import Gathering, Place
 from l2lidar_node.emulator.config import DeviceConfig, PowerConfig
-from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.motion.spline import PoseSpline
+from l2lidar_node.emulator.motion.motion import Motion, PoseSpline
 from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
 from l2lidar_node.emulator.unit.device import VirtualL2
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial

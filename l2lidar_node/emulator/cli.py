@@ -17,7 +17,6 @@ from typing import Annotated, Any, Final, TypeVar
 import typer
 
 from l2lidar_node.command_line import for_typer
-from l2lidar_node.emulator.assembly import WORLDLESS, opened, seen_from, stored_settings, unit
 from l2lidar_node.emulator.config import (
     AddressConfig,
     CrystalConfig,
@@ -28,12 +27,19 @@ from l2lidar_node.emulator.config import (
     PowerConfig,
 )
 from l2lidar_node.emulator.link.port import Port, PortError
-from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.ray_cast_worker import RayCastError, RayCastWorker
-from l2lidar_node.emulator.server import MAX_SPEED, Server
+from l2lidar_node.emulator.physics import PhysicsConfig, RayCastError, RayCastWorker
+from l2lidar_node.emulator.server import (
+    MAX_SPEED,
+    WORLDLESS,
+    Server,
+    opened,
+    seen_from,
+    stored_settings,
+    unit,
+)
 from l2lidar_node.emulator.truth.results import write_packet_log
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
-from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.files import write_whole

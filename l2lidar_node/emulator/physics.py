@@ -1,21 +1,38 @@
-"""Composes world, motion, scanner and IMU from one group of settings."""
+"""What there is to measure: world, motion, scanner and IMU, and a process that measures ahead.
+
+Casting rays in a process of its own disturbs no deadline.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
+from multiprocessing.connection import wait
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS, Motion, from_tum
-from l2lidar_node.emulator.unit.errors import RockingMotion
+from l2lidar_node.emulator.truth.results import write_points, write_trajectory
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scanner, mean_angle
-from l2lidar_node.emulator.unit.units import Unit, unit as named_unit
+from l2lidar_node.emulator.unit.units import RockingMotion, Unit, unit as named_unit
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
+from l2lidar_node.programs import held
+from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.settings import setting
 
 
@@ -122,3 +139,164 @@ def assemble(config: PhysicsConfig, own: Unit | None = None) -> Physics:
 
 def _is_path(text: str) -> bool:
     return "." in text or "/" in text or Path(text).exists()
+
+
+_AHEAD: Final = 4  # blocks
+_GRACE_S: Final = 0.3  # for a block that is being measured; to prepare a world takes seconds
+_IMU: Final = "imu"
+
+Block = tuple[NDArray[np.void], NDArray[np.float64]]
+_Key = tuple[str | WorkMode, int, int]
+
+
+class RayCastError(RuntimeError):
+    """The measuring process was killed."""
+
+
+class RayCastWorker:
+    """A process that measures; its sources are those of a :class:`VirtualL2`.
+
+    Parameters
+    ----------
+    config : PhysicsConfig
+        What there is to measure; assembled in the process.
+    truth : Path, optional
+        Folder into which the exact points of every measured packet are written.
+
+    Raises
+    ------
+    ValueError
+        For a scene, motion or file that cannot be used; the message names it.
+    RayCastError
+        If reading the world killed the process.
+    """
+
+    def __init__(self, config: PhysicsConfig, truth: Path | None = None) -> None:
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _settle)
+        self._futures: dict[_Key, Future[Block]] = {}
+        try:
+            resource_tracker.ensure_running()  # or starting it lets signals through
+            with held():
+                prepared = self._pool.submit(_prepare, config, truth)
+            prepared.result()
+        except BrokenProcessPool:  # open3d's readers crash on some damaged files
+            self._end()
+            raise RayCastError(
+                f"world '{config.world}': the process that reads it crashed; a mesh file that is "
+                "damaged or cut off does that"
+            ) from None
+        except BaseException:
+            self._end()
+            raise
+
+    def __enter__(self) -> RayCastWorker:
+        """Return the ray-cast worker itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """End the process."""
+        self.close()
+
+    def close(self) -> None:
+        """End the process; what it has not begun is dropped, and what takes it long as well."""
+        self._end(_GRACE_S)
+
+    def _end(self, grace_s: float = 0.0) -> None:
+        workers = [*(self._pool._processes or {}).values()]  # nobody else tells which they are
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        if len(wait([worker.sentinel for worker in workers], grace_s)) < len(workers):
+            for worker in workers:
+                worker.kill()
+        self._pool.shutdown()
+
+    def points(self, mode: WorkMode) -> WorkerScanner:
+        """Return the source of point packets in a work mode (field of view, 2D or 3D)."""
+        return WorkerScanner(self._block, mode)
+
+    def inertial(self) -> WorkerInertial:
+        """Return the source of IMU packets."""
+        return WorkerInertial(self._block)
+
+    def write_trajectory(self, folder: Path, duration_s: float, origin_ns: int) -> None:
+        """Write the poses of the cloud frame in the world; see :mod:`results`."""
+        self._pool.submit(_trajectory, folder, duration_s, origin_ns).result()
+
+    def _block(self, what: str | WorkMode, first: int, count: int) -> Block:
+        """Return a block and order the next ones."""
+        wanted: list[_Key] = [(what, first + ahead * count, count) for ahead in range(_AHEAD + 1)]
+        for key in [key for key in self._futures if key[0] == what and key not in wanted]:
+            self._futures.pop(key).cancel()
+        try:
+            for key in wanted:
+                if key not in self._futures:
+                    self._futures[key] = self._pool.submit(_measure, *key)
+            return self._futures.pop(wanted[0]).result()
+        except BrokenProcessPool:
+            raise RayCastError("the ray-cast process ended") from None
+
+
+class WorkerScanner:
+    """Point packets from the ray-cast worker; a PointSource."""
+
+    def __init__(self, block: Callable[[str | WorkMode, int, int], Block], mode: WorkMode) -> None:
+        self._block = block
+        self._mode = mode
+
+    def packets(self, first: int, count: int) -> Block:
+        """Return packets and their start times [s]; see :class:`sources.Source`."""
+        return self._block(self._mode, first, count)
+
+
+class WorkerInertial:
+    """IMU packets from the ray-cast worker; an InertialSource."""
+
+    def __init__(self, block: Callable[[str | WorkMode, int, int], Block]) -> None:
+        self._block = block
+
+    def samples(self, first: int, count: int) -> Block:
+        """Return samples and their times [s]; see :class:`sources.Source`."""
+        return self._block(_IMU, first, count)
+
+
+_state: dict[str, Any] = {}  # of the measuring process
+
+
+def _settle() -> None:
+    """Leave signals, which often go to the whole group, to the parent; go when it is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+    def follow() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(0)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _prepare(config: PhysicsConfig, truth: Path | None) -> None:
+    _state["physics"] = assemble(config)
+    _state["truth"] = truth
+
+
+def _measure(what: str | WorkMode, first: int, count: int) -> Block:
+    physics: Physics = _state["physics"]
+    if isinstance(what, str):
+        return physics.inertial.samples(first, count)
+    wide_fov = bool(what & WorkMode.WIDE_FOV)
+    scanner = physics.scanner
+    measure = scanner.scan_2d if what & WorkMode.MODE_2D else scanner.scan
+    scan = measure(first, count, wide_fov=wide_fov)
+    if _state["truth"] is not None:
+        write_points(_state["truth"], what, scan)
+    return scan.packets, scan.times_s
+
+
+def _trajectory(folder: Path, duration_s: float, origin_ns: int) -> None:
+    write_trajectory(folder, _state["physics"].motion, duration_s, origin_ns)

@@ -14,9 +14,9 @@ from benchmarks.hard_recordings import EPOCH, Recording, recording
 from benchmarks.hard_scenarios import FAMILIES, SCENES, SHORT, prepare, scenario
 from benchmarks.hard_scores import Track, errors, score, sequence
 from l2lidar_node import rotations
-from l2lidar_node.emulator.motion import tours, trajectories
+from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
-from l2lidar_node.emulator.unit import view
+from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.emulator.unit.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
@@ -148,9 +148,9 @@ def test_every_scenario_can_be_prepared_and_a_campaign_visits_all() -> None:
     assert set(SHORT) <= set(FAMILIES)
     for family, given in FAMILIES.items():
         assert given.scene in SCENES
-        assert given.motion in (*tours.STYLES, *trajectories.MOTIONS), family
+        assert given.motion in (*trajectories.STYLES, *trajectories.MOTIONS), family
         assert given.sensor in ("l2", *SENSORS)
-        assert given.carrier in ("", *view.CARRIERS)
+        assert given.carrier in ("", *scanner.CARRIERS)
         assert given.mount in MOUNTS
     for family in ("crowd in a hall", "lift in an atrium", "yard on a quadruped", "covered, room"):
         setting = prepare(scenario(family, 1, 10.0))

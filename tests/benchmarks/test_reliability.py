@@ -11,8 +11,7 @@ import pytest
 
 from benchmarks import fault_world, faults, interrupts, load_scale
 from benchmarks.fuzz import campaign
-from l2lidar_node.emulator.physics import PhysicsConfig
-from l2lidar_node.emulator.ray_cast_worker import RayCastError, RayCastWorker
+from l2lidar_node.emulator.physics import PhysicsConfig, RayCastError, RayCastWorker
 from tests.support.fault_runs import SINGLE, FaultCase, random_case, run
 
 # What the driver's own tests of faults do not go through with a truth for every point.

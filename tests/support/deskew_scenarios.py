@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.motion.spline import PoseSpline
+from l2lidar_node.emulator.motion.motion import Motion, PoseSpline
 from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
 from l2lidar_node.emulator.truth.results import undistorted
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial

@@ -16,7 +16,7 @@ from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig, IdentityConfig, PowerConfig
 from l2lidar_node.emulator.unit.device import VirtualL2
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType, WorkMode
 from l2lidar_node.settings import Value, build

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.unit.returns import noise_sigma
 from l2lidar_node.emulator.unit.scanner import Scanner, local_rays
-from l2lidar_node.emulator.world.indoors import empty_box
 from l2lidar_node.emulator.world.mapping_scenes import MappingScene, along_way
+from l2lidar_node.emulator.world.scenes import empty_box
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.types import HostNs
 from l2lidar_proc.slam import se3

@@ -13,7 +13,7 @@ import tty
 from pathlib import Path
 from typing import Final, Protocol
 
-from l2lidar_node.emulator.unit.flash import Network
+from l2lidar_node.emulator.unit.firmware import Network
 
 _TABLES: Final = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 

@@ -1,21 +1,278 @@
-"""The unit's control program: power, command inbox, settings, clock, reboots."""
+"""The unit's control program: power, command inbox, stored settings, clock, reboots."""
 
 from __future__ import annotations
 
+import ipaddress
+import json
+import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
+from itertools import compress
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
-from l2lidar_node.emulator.unit.clock import UnitClock
-from l2lidar_node.emulator.unit.flash import Flash, Network, mac_text, parameters_payload
+from l2lidar_node.emulator.config import (
+    AddressConfig,
+    CrystalConfig,
+    DeviceConfig,
+    IdentityConfig,
+    PowerConfig,
+)
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import AckStatus, Command, PacketType, UserCommand, WorkMode
 from l2lidar_node.settings import SettingError
+from l2lidar_node.types import DeviceNs
+
+
+class Network(NamedTuple):
+    """Addresses in dotted order, as command 108 carries them."""
+
+    lidar_ip: str
+    user_ip: str
+    gateway: str
+    subnet_mask: str
+    lidar_port: int
+    user_port: int
+
+
+@dataclass(frozen=True, slots=True)
+class Flash:
+    """Stored settings; those that need a restart come into force at the next boot.
+
+    Attributes
+    ----------
+    network : Network
+    mac : str
+        Hardware address, colon separated.
+    work_mode : int
+        Bits of :class:`wire.WorkMode`.
+    auto_standby : int
+        Value of the last auto-standby command; without effect.
+    parameters : str
+        Hexadecimal :data:`wire.PARAMETERS_PAYLOAD`, empty for the factory's; its work mode is
+        ignored.
+    """
+
+    network: Network
+    mac: str
+    work_mode: int = 0
+    auto_standby: int = 0
+    parameters: str = ""
+
+    @classmethod
+    def factory(cls, addresses: AddressConfig, identity: IdentityConfig) -> Flash:
+        """Return the settings of a new unit.
+
+        Raises
+        ------
+        SettingError
+            If an address is not one; the message names the setting.
+        """
+        for name, value in (("lidar_ip", addresses.lidar_ip), ("host", addresses.host)):
+            try:
+                ipaddress.IPv4Address(value)
+            except ValueError:
+                raise SettingError(
+                    f"parameter '{name}': {value!r} is not an IPv4 address; "
+                    "expected one such as 192.168.1.62"
+                ) from None
+        gateway = addresses.lidar_ip.rsplit(".", 1)[0] + ".1"
+        network = Network(
+            addresses.lidar_ip,
+            addresses.host,
+            gateway,
+            "255.255.255.0",
+            addresses.lidar_port,
+            addresses.host_port,
+        )
+        return cls(network, mac_text(mac_bytes(identity.mac)), identity.work_mode)
+
+    def to_json(self) -> str:
+        """Return a text that :meth:`from_json` reads."""
+        facts = asdict(self)
+        facts["network"] = self.network._asdict()
+        return json.dumps(facts, indent=2) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Flash:
+        """Return the settings a text states.
+
+        Raises
+        ------
+        ValueError
+            If the text is not one made by :meth:`to_json`.
+        """
+        try:
+            facts = json.loads(text)
+            network = Network(**facts.pop("network"))
+            flash = cls(network=network, **facts)
+            network_payload(network)
+            mac_bytes(flash.mac)
+            parameters_payload(flash)
+            np.array([flash.work_mode, flash.auto_standby], dtype=np.uint32)
+        except (TypeError, KeyError, AttributeError, OverflowError, ValueError) as error:
+            raise ValueError(f"no stored settings of a virtual L2: {error}") from None
+        return flash
+
+    def with_network(self, payload: bytes) -> Flash:
+        """Return the settings with a network payload stored."""
+        row = np.frombuffer(payload, wire.NETWORK_PAYLOAD)[0]
+        lidar_ip, user_ip, gateway, mask = (
+            str(ipaddress.IPv4Address(row[name].tobytes()))
+            for name in ("lidar_ip", "user_ip", "gateway", "subnet_mask")
+        )
+        ports = int(row["lidar_port"]), int(row["user_port"])
+        return replace(self, network=Network(lidar_ip, user_ip, gateway, mask, *ports))
+
+
+def network_payload(network: Network) -> bytes:
+    """Return the payload of command 108 for these addresses."""
+    addresses = b"".join(ipaddress.IPv4Address(text).packed for text in network[:4])
+    ports = np.array([network.lidar_port, network.user_port], dtype="<u2")
+    return addresses + ports.tobytes()
+
+
+def mac_bytes(text: str) -> bytes:
+    """Return the six bytes of a hardware address.
+
+    Raises
+    ------
+    SettingError
+        If the text is not six hexadecimal pairs.
+    """
+    try:
+        raw = bytes.fromhex(text.replace(":", "").replace("-", ""))
+    except ValueError:
+        raw = b""
+    if len(raw) != 6:
+        raise SettingError(
+            f"parameter 'mac': {text!r} is not a MAC address; "
+            "expected one such as 4c:32:01:00:00:62"
+        )
+    return raw
+
+
+def mac_text(raw: bytes) -> str:
+    """Return six bytes as a colon separated hardware address."""
+    return ":".join(f"{byte:02x}" for byte in raw)
+
+
+def parameters_payload(flash: Flash) -> bytes:
+    """Return the payload of packet 2001: stored parameters and the stored work mode."""
+    row = np.zeros(1, wire.PARAMETERS_PAYLOAD)
+    if flash.parameters:
+        row = np.frombuffer(bytes.fromhex(flash.parameters), wire.PARAMETERS_PAYLOAD).copy()
+    else:
+        row["range_max"] = RANGE_MAX_M
+        row["range_min"] = RANGE_MIN_M
+        for name in (
+            "calibration_3d",
+            "calibration_3d_wide",
+            "calibration_2d",
+            "calibration_2d_wide",
+        ):
+            row[name] = CALIBRATION
+    row["work_mode"] = flash.work_mode
+    return row.tobytes()
+
+
+RANGE_MIN_M = 0.05
+RANGE_MAX_M = 50.0
+CALIBRATION = (0.0445, 0.006586, 2.0769, 0.032398, 0.003818, 0.002945, -365.625, 0.000978)
+"""Calibration block of a published unit, in the order of :data:`wire.CALIBRATION`."""
+
+
+_NS = 1_000_000_000
+_KEEP_NS = 10 * _NS  # no packet is stamped later than that after the instant it carries
+
+
+class Epoch(NamedTuple):
+    """From the true instant ``start_ns`` on, the clock counts from ``value_ns``."""
+
+    start_ns: int
+    value_ns: int
+
+
+class UnitClock:
+    """Tells what the unit's clock shows at a true instant.
+
+    Parameters
+    ----------
+    config : CrystalConfig
+        Rate of the clock.
+    power_on_ns : int
+        True instant of the first power-on; drift counts from here, also over later restarts.
+
+    Notes
+    -----
+    Within an epoch the clock shows ``value + E(t) - E(start)`` truncated to whole nanoseconds,
+    E being the closed integral of the rate (see :class:`CrystalConfig`): no error accumulates.
+    """
+
+    def __init__(self, config: CrystalConfig, power_on_ns: int) -> None:
+        self._config = config
+        self._origin_ns = power_on_ns
+        self._drifts = bool(config.clock_drift_ppm_per_h or config.clock_wave_ppm)
+        self._arrange([Epoch(power_on_ns, 0)])
+
+    def set(self, now_ns: int, value_ns: int) -> None:
+        """Make the clock show a value from a true instant on; instants must not decrease."""
+        epochs = [*self._epochs, Epoch(now_ns, value_ns)]
+        ends_ns = (epoch.start_ns for epoch in epochs[1:])
+        recent = [end_ns > now_ns - _KEEP_NS for end_ns in ends_ns]
+        self._arrange([*compress(epochs, recent), epochs[-1]])
+
+    def _arrange(self, epochs: list[Epoch]) -> None:
+        """Keep epochs, and what is needed of them again and again as arrays."""
+        self._epochs = epochs
+        self._starts_ns = np.array([epoch.start_ns for epoch in epochs], dtype=np.int64)
+        self._values_ns = np.array([epoch.value_ns for epoch in epochs], dtype=np.int64)
+        self._begun = self._elapsed(self._starts_ns)
+
+    def step(self, now_ns: int, change_ns: int) -> None:
+        """Move the clock by some nanoseconds of its own at a true instant, not below 0."""
+        self.set(now_ns, max(0, self.at(now_ns) + change_ns))
+
+    def at(self, now_ns: int) -> DeviceNs:
+        """Return what the clock shows at a true instant."""
+        return DeviceNs(int(self.stamps(np.array([now_ns], dtype=np.int64))[0]))
+
+    def stamps(self, instants_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return what the clock shows at true instants.
+
+        Parameters
+        ----------
+        instants_ns : ndarray, shape (N,), dtype int64
+            Each is attributed to the epoch it lies in, so an instant before the last set still
+            shows the clock as it was.
+
+        Returns
+        -------
+        ndarray, shape (N,), dtype int64
+            Nanoseconds of the unit's clock.
+        """
+        epoch = np.maximum(np.searchsorted(self._starts_ns, instants_ns, side="right") - 1, 0)
+        elapsed = self._elapsed(instants_ns) - self._begun[epoch]
+        shown = self._values_ns[epoch] + np.floor(elapsed).astype(np.int64)
+        return np.asarray(shown, dtype=np.int64)
+
+    def _elapsed(self, instants_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the integral of the rate from power-on [ns], exact to 2 ns over a month."""
+        config = self._config
+        t = (instants_ns - self._origin_ns).astype(np.float64)
+        if not self._drifts:
+            return np.asarray(t / config.clock_ratio)
+        seconds = t / _NS
+        angular = 2.0 * math.pi / config.clock_wave_s
+        ppm_seconds = (
+            0.5 * config.clock_drift_ppm_per_h / 3600.0 * seconds** 2
+            + config.clock_wave_ppm / angular * (1.0 - np.cos(angular * seconds))
+        )
+        return np.asarray((t + ppm_seconds * 1e-6 * _NS) / config.clock_ratio)
 
 
 class PowerState(Enum):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.emulator.rng import Stream, generator
-from l2lidar_node.emulator.unit.errors import UnitErrors
+from l2lidar_node.emulator.unit.units import UnitErrors
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.settings import setting
 

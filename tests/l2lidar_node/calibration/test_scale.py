@@ -10,8 +10,7 @@ from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.scale import by_tape
 from l2lidar_node.calibration.still import CalibrationError
 from l2lidar_node.cli.virtual_places import slide
-from l2lidar_node.emulator.unit.errors import UnitErrors
-from l2lidar_node.emulator.unit.units import UNITS
+from l2lidar_node.emulator.unit.units import UNITS, UnitErrors
 
 WAY = 3.0
 

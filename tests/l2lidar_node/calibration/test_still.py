@@ -15,9 +15,8 @@ from l2lidar_node.calibration.result import Verdict
 from l2lidar_node.calibration.still import CalibrationError, calibrate
 from l2lidar_node.calibration.whirl import demodulated
 from l2lidar_node.cli.virtual_places import still_places
-from l2lidar_node.emulator.unit.errors import UnitErrors
 from l2lidar_node.emulator.unit.inertial import ImuNoise
-from l2lidar_node.emulator.unit.units import UNITS
+from l2lidar_node.emulator.unit.units import UNITS, UnitErrors
 
 DEG = np.pi / 180
 ERRORS = UnitErrors(

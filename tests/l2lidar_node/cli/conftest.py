@@ -24,8 +24,8 @@ from l2lidar_node.emulator.config import (
 from l2lidar_node.emulator.link.port import UdpPort
 from l2lidar_node.emulator.server import Server
 from l2lidar_node.emulator.unit.device import VirtualL2
-from l2lidar_node.emulator.unit.flash import Flash
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.firmware import Flash
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 
 LIMIT_S = 120.0  # generous: only a failure waits that long
 

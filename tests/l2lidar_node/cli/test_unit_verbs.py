@@ -16,7 +16,7 @@ from l2lidar_node.cli.device import Device
 from l2lidar_node.cli.stored import parameter_fields, work_mode, work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.emulator.config import FaultConfig
-from l2lidar_node.emulator.unit.flash import parameters_payload
+from l2lidar_node.emulator.unit.firmware import parameters_payload
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
 from tests.l2lidar_node.cli.conftest import LIMIT_S, Run, Unit, free_port

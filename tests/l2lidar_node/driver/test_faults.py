@@ -13,7 +13,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig, IdentityConfig
 from l2lidar_node.emulator.unit.device import VirtualL2
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import ImuPacket, PointPacket, decode
 from l2lidar_node.protocol.wire import WorkMode

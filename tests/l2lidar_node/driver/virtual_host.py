@@ -13,7 +13,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig, IdentityConfig, PowerConfig
 from l2lidar_node.emulator.unit.device import VirtualL2
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.recording.capture import Endpoint
 from l2lidar_node.recording.recording import RecordingWriter

@@ -17,8 +17,8 @@ import numpy as np
 from l2lidar_node.emulator.config import DeviceConfig, PowerConfig
 from l2lidar_node.emulator.truth.packet_log import PacketLog
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
-from l2lidar_node.emulator.unit.flash import Flash
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.firmware import Flash
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 

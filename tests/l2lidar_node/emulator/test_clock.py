@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.integrate import trapezoid
 
 from l2lidar_node.emulator.config import CrystalConfig, DeviceConfig, FaultConfig, PowerConfig
-from l2lidar_node.emulator.unit.clock import UnitClock
+from l2lidar_node.emulator.unit.firmware import UnitClock
 from tests.l2lidar_node.emulator.rig import MS, READY, Bench, S, command, identity, read
 
 

@@ -16,9 +16,8 @@ from l2lidar_node.emulator.config import (
     PowerConfig,
 )
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
-from l2lidar_node.emulator.unit.firmware import Inbox
-from l2lidar_node.emulator.unit.flash import Flash, network_payload
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.firmware import Flash, Inbox, network_payload
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.settings import SettingError

@@ -9,11 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
-from l2lidar_node.emulator.unit.errors import TYPICAL, UnitErrors, drawn
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import local_rays
-from l2lidar_node.emulator.unit.units import UNITS, unit
+from l2lidar_node.emulator.unit.units import TYPICAL, UNITS, UnitErrors, drawn, unit
 
 DEG = np.pi / 180
 

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig
-from l2lidar_node.emulator.link.datagram import Datagram, Piece
 from l2lidar_node.emulator.link.faults import HOSTILE_SIZES, Path
-from l2lidar_node.emulator.truth.packet_log import Fault, PacketLog
-from l2lidar_node.emulator.unit.flash import Flash
+from l2lidar_node.emulator.truth.packet_log import Datagram, Fault, PacketLog, Piece
+from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import (

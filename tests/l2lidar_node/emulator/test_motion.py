@@ -14,11 +14,11 @@ from l2lidar_node.emulator.motion import trajectories, tum
 from l2lidar_node.emulator.motion.motion import (
     MOUNTS,
     Motion,
+    PoseSpline,
     from_tum,
     mount_quaternion,
     rpy_quaternions,
 )
-from l2lidar_node.emulator.motion.spline import PoseSpline
 from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World

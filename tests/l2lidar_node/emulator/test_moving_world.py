@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 
 from l2lidar_node.emulator.motion import trajectories
-from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.motion.spline import PoseSpline
-from l2lidar_node.emulator.unit import view
+from l2lidar_node.emulator.motion.motion import Motion, PoseSpline
+from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.emulator.unit.returns import RangeNoise, particle_distances
 from l2lidar_node.emulator.unit.scanner import Scanner
-from l2lidar_node.emulator.world import buildings, scenes, woods
-from l2lidar_node.emulator.world.moving import Mover, MovingWorld
-from l2lidar_node.emulator.world.people import crowd
+from l2lidar_node.emulator.world import buildings, scenes
 from l2lidar_node.emulator.world.scene import box, quad
-from l2lidar_node.emulator.world.world import World
+from l2lidar_node.emulator.world.world import Mover, MovingWorld, World, crowd
 from l2lidar_node.types import F64
 
 pytest.importorskip("open3d")
@@ -74,13 +71,13 @@ def test_glass_shines_head_on_and_is_invisible_aslant() -> None:
 @pytest.mark.parametrize(
     ("window", "seen"),
     [
-        (view.View(), [True, True, True, True]),
-        (view.View(sector=np.deg2rad(100.0)), [True, False, False, False]),
-        (view.View(sector=np.deg2rad(100.0), towards=np.pi), [False, False, True, False]),
-        (view.View(cone=np.deg2rad(60.0)), [False, False, False, True]),
+        (scanner.View(), [True, True, True, True]),
+        (scanner.View(sector=np.deg2rad(100.0)), [True, False, False, False]),
+        (scanner.View(sector=np.deg2rad(100.0), towards=np.pi), [False, False, True, False]),
+        (scanner.View(cone=np.deg2rad(60.0)), [False, False, False, True]),
     ],
 )
-def test_a_window_hides_directions(window: view.View, seen: list[bool]) -> None:
+def test_a_window_hides_directions(window: scanner.View, seen: list[bool]) -> None:
     ahead_left_back_up = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 1e-3], [0.1, 0, 0.99]], float)
     ahead_left_back_up[3, 1] = -0.2 if window.cone > 6.0 and window.sector < 6.0 else 0.0
     found = window.sees(ahead_left_back_up)
@@ -93,7 +90,7 @@ def test_hidden_slots_of_the_scanner_return_nothing() -> None:
     scene = scenes.make("box")
     world = World(scene.triangles, scene.reflectivity)
     motion = trajectories.make("still", scene)
-    window = view.View(sector=np.deg2rad(120.0), towards=0.5)
+    window = scanner.View(sector=np.deg2rad(120.0), towards=0.5)
     whole = Scanner(world, motion, noise=RangeNoise.clean()).scan(0, 50)
     part = Scanner(world, motion, noise=RangeNoise.clean(), view=window).scan(0, 50)
     inside = window.sees(part.rays["direction"])  # the sensor stands level, looking along x
@@ -102,9 +99,9 @@ def test_hidden_slots_of_the_scanner_return_nothing() -> None:
     np.testing.assert_array_equal(part.packets["ranges"][inside], whole.packets["ranges"][inside])
 
 
-@pytest.mark.parametrize("name", view.CARRIERS)
+@pytest.mark.parametrize("name", scanner.CARRIERS)
 def test_a_carrier_hides_part_of_the_view_and_not_the_sensor_itself(name: str) -> None:
-    body = World(view.carrier(name))
+    body = World(scanner.carrier(name))
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -115,7 +112,7 @@ def test_a_carrier_hides_part_of_the_view_and_not_the_sensor_itself(name: str) -
 
 def test_an_unknown_carrier_is_named() -> None:
     with pytest.raises(ValueError, match="'cow' is not known, expected one of quadruped"):
-        view.carrier("cow")
+        scanner.carrier("cow")
 
 
 def test_particles_come_back_as_often_as_asked() -> None:
@@ -163,8 +160,8 @@ MAKERS = [
     buildings.hall,
     buildings.stairwell,
     buildings.atrium,
-    woods.wood,
-    woods.trunks,
+    scenes.wood,
+    scenes.trunks,
 ]
 
 

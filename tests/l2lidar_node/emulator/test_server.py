@@ -19,8 +19,8 @@ from l2lidar_node.emulator.config import AddressConfig, DeviceConfig, FaultConfi
 from l2lidar_node.emulator.link.port import Port, PortError, SerialPort, UdpPort, unread
 from l2lidar_node.emulator.server import MAX_SPEED, Latency, Server
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
-from l2lidar_node.emulator.unit.flash import Flash, Network, network_payload
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.firmware import Flash, Network, network_payload
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
 from tests.l2lidar_node.emulator.rig import READY, Frame, acks, command, identity, read

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from l2lidar_node.emulator.motion import tours, trajectories
+from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.world import buildings, scenes
 from l2lidar_node.emulator.world.scene import Scene
 from l2lidar_node.emulator.world.world import World
@@ -22,8 +22,8 @@ TOURS = [
 
 @pytest.mark.parametrize(("scene", "style"), TOURS)
 def test_a_tour_touches_nothing_and_keeps_its_pace(scene: Scene, style: str) -> None:
-    manner = tours.STYLES[style]
-    motion = tours.make(scene, manner, seconds=60.0, seed=2)
+    manner = trajectories.STYLES[style]
+    motion = trajectories.tour(scene, manner, seconds=60.0, seed=2)
     moving = motion.kinematics(np.arange(0.0, 60.0, 0.02))
     world = World(scene.triangles)
     assert world.clearance(moving.position).min() > 0.3
@@ -37,7 +37,7 @@ def test_a_tour_touches_nothing_and_keeps_its_pace(scene: Scene, style: str) -> 
 
 @pytest.mark.parametrize(("scene", "style"), TOURS[:2])
 def test_velocities_are_the_derivatives_of_places(scene: Scene, style: str) -> None:
-    motion = tours.make(scene, tours.STYLES[style], seconds=30.0)
+    motion = trajectories.tour(scene, trajectories.STYLES[style], seconds=30.0)
     t, step = np.linspace(3.0, 25.0, 400), 1e-5
     before, after = motion.poses(t - step)[0], motion.poses(t + step)[0]
     moving = motion.kinematics(t)
@@ -48,7 +48,7 @@ def test_velocities_are_the_derivatives_of_places(scene: Scene, style: str) -> N
 
 def test_blows_are_short_and_hard() -> None:
     calm = trajectories.make("still", scenes.make("room"))
-    motion = tours.hit(calm, 10.0, [3.0, 7.0], seed=1)
+    motion = trajectories.hit(calm, 10.0, [3.0, 7.0], seed=1)
     t = np.arange(0.0, 10.0, 0.004)
     moving = motion.kinematics(t)
     place, _ = calm.poses(t)
@@ -62,4 +62,4 @@ def test_blows_are_short_and_hard() -> None:
 
 def test_a_scene_without_a_tour_is_refused() -> None:
     with pytest.raises(ValueError, match="no tour"):
-        tours.make(scenes.make("room"), tours.STYLES["look"], seconds=10.0)
+        trajectories.tour(scenes.make("room"), trajectories.STYLES["look"], seconds=10.0)

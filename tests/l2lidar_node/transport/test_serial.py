@@ -20,8 +20,8 @@ from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConf
 from l2lidar_node.emulator.link.port import SerialPort
 from l2lidar_node.emulator.server import Server
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
-from l2lidar_node.emulator.unit.flash import Flash
-from l2lidar_node.emulator.unit.pattern import PatternScanner, StillInertial
+from l2lidar_node.emulator.unit.firmware import Flash
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.packets import Version
 from l2lidar_node.protocol.wire import WorkMode

@@ -11,7 +11,7 @@ from scipy.linalg import polar
 
 from l2lidar_node import rotations
 from l2lidar_node.calibration.result import Verdict
-from l2lidar_node.emulator.unit.errors import TYPICAL
+from l2lidar_node.emulator.unit.units import TYPICAL
 from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.gyro_alignment import GyroError
