@@ -40,7 +40,7 @@ from benchmarks.results import (
     verdicts,
 )
 from l2lidar_node import rotations
-from l2lidar_node.calibration import picture, report
+from l2lidar_node.calibration import report
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
 from l2lidar_node.calibration.still import DEG, CalibrationError, calibrate
@@ -255,15 +255,15 @@ def population_targets(rows: list[Row]) -> Iterator[Target]:
 def draw() -> None:
     """Draw the pictures of ``docs/calibration.md``."""
     folder = Path("docs")
-    picture.save(
+    report.save(
         calibrate(still_places(_unit(INJECTED), seconds=SECONDS)), folder / "calibration_room.png"
     )
     for place in _real_places()[:1]:
-        picture.save(calibrate([place]), folder / f"{place.name}_calibrated.png")
+        report.save(calibrate([place]), folder / f"{place.name}_calibrated.png")
     run = odometry_runs.record("room", "shake", 0, _TURNING_S, unit=calibration_units.TYPICAL)
     result = imu_calibration.calibrate(list(odometry_runs.sweeps(run, "turn")), run.imu)
     turns = folder / "calibration_turns.png"
-    picture.save_turns(over_time(result.before), over_time(result.alignment.turns), turns)
+    report.save_turns(over_time(result.before), over_time(result.alignment.turns), turns)
     for path in (*folder.glob("calibration_*.png"), *folder.glob("capture_*_calibrated.png")):
         Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
 

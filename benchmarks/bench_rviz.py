@@ -31,7 +31,7 @@ from tf2_msgs.msg import TFMessage
 from benchmarks import chain
 from benchmarks.chain import CLOUDS, TopicWatch
 from benchmarks.results import at_least, publish
-from l2lidar_node.demo import robot
+from l2lidar_node.demo import report
 from l2lidar_node.demo.processes import Programs, isolate_ros
 from l2lidar_proc.ros.intake import NeverExecuted, waiting
 
@@ -212,7 +212,7 @@ class LayoutWatch(Node):  # type: ignore[misc]  # rclpy is used as if it had no 
 
     def put_on_robot(self) -> None:
         """Publish the mount of the example robot, as robot_state_publisher does."""
-        self._mount.publish(robot.as_message(robot.mount("top")))
+        self._mount.publish(report.as_message(report.mount("top")))
 
     def _listener(self, topic: str, qos: QoSProfile) -> Any:
         return self.create_subscription(
@@ -270,7 +270,7 @@ def main(
         with TemporaryDirectory() as folder, Programs() as programs:
             watch.put_on_robot()
             unit = ["--ready", "--world", world, "--motion", motion]
-            chain.start(programs, unit, None, nodes, robot.BASE_FRAME, folder)
+            chain.start(programs, unit, None, nodes, report.BASE_FRAME, folder)
             start.until(lambda: len(start.seen(CLOUDS)) > 0, programs, "no clouds came")
             start.spin_with(watch)
             start.watch(seconds)

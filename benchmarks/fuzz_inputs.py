@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from l2lidar_node.clouds.fields import points_of
+from l2lidar_node.clouds import points_of
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import HostNs
 from l2lidar_proc.cloud import to_sweep

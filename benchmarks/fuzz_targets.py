@@ -23,8 +23,13 @@ from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import decode
-from l2lidar_node.recording.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
-from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.capture import (
+    CaptureError,
+    CaptureReader,
+    CaptureWriter,
+    Endpoint,
+    UdpDatagram,
+)
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import build

@@ -35,7 +35,7 @@ from benchmarks.results import FOLDER, KeptRows
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "results" / "mutants.md"
 FOLDERS: Final = (
-    "l2lidar_node/protocol", "l2lidar_node/clock", "l2lidar_node/clouds", "l2lidar_node/driver",
+    "l2lidar_node/protocol", "l2lidar_node/clock", "l2lidar_node/driver",
     "l2lidar_proc/deskew", "l2lidar_proc/motion",
 )  # fmt: skip
 _ODOMETRY: Final = (
@@ -43,11 +43,12 @@ _ODOMETRY: Final = (
     "zero_velocity",
 )  # fmt: skip
 FILES: Final = (
-    "l2lidar_node/frames.py", "l2lidar_node/rotations.py",
+    "l2lidar_node/clouds.py", "l2lidar_node/frames.py", "l2lidar_node/rotations.py",
     *(f"l2lidar_proc/odometry/{name}.py" for name in _ODOMETRY)
 )  # fmt: skip
 TESTS: Final = (
     *(f"tests/{folder}" for folder in FOLDERS),
+    "tests/l2lidar_node/clouds",
     "tests/l2lidar_node/recording",
     *(f"tests/l2lidar_proc/odometry/test_{name}.py" for name in (
         "alignment", "base_frame", "dead_reckoning", "degeneracy", "matcher", "odometry_parts",

@@ -165,7 +165,7 @@ REASONS: Final[dict[tuple[str, str], str]] = {
         "return _SAFETY * error / span if span > 0.0 else 1.0: 0.0 -> 1.0",
     ): "no span is longer than 0 and shorter than a nanosecond",
     (
-        "l2lidar_node/clock/schedule.py",
+        "l2lidar_node/clock/device_clock.py",
         "self.in_force = 0 <= since <= _FASTEST * elapsed + _SLACK_NS: 0 -> 1",
     ): "one nanosecond",
     (

@@ -9,8 +9,7 @@ import ipaddress
 from dataclasses import dataclass, field
 from typing import Final
 
-from l2lidar_node.clouds.fields import RINGS
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS, RINGS
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.clouds.fields import points_of
+from l2lidar_node.clouds import points_of
 
 F64 = NDArray[np.float64]
 

@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 import yaml
 
-from l2lidar_node.check.consumers import CONSUMERS as CHECKED
-from l2lidar_node.clouds.fields import RINGS, rings
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.check.requirements import CONSUMERS as CHECKED
+from l2lidar_node.clouds import LAYOUTS, RINGS, rings
 from l2lidar_node.config import DriverConfig, FrameConfig
 from l2lidar_node.ros import topics
 from l2lidar_node.ros.parameter_files import parameters_by_node, parameters_for

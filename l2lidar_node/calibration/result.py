@@ -7,9 +7,9 @@ from enum import Enum
 from typing import NamedTuple
 
 from l2lidar_node.calibration.model import Block
+from l2lidar_node.calibration.observation import Whirl
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.solver import Scene
-from l2lidar_node.calibration.whirl import Whirl
 from l2lidar_node.types import F64
 
 

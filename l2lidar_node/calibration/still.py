@@ -17,7 +17,7 @@ from l2lidar_node.calibration.bias import (
     significant,
 )
 from l2lidar_node.calibration.model import ALPHA, BETA, NAMES, ROCK_COS, ROCK_SIN, XI, B
-from l2lidar_node.calibration.observation import Place
+from l2lidar_node.calibration.observation import Place, Whirl, demodulated
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.result import (
     Estimate,
@@ -28,7 +28,6 @@ from l2lidar_node.calibration.result import (
     Verdict,
 )
 from l2lidar_node.calibration.solver import FewPlanesError, Scene, Solution, Unknown
-from l2lidar_node.calibration.whirl import Whirl, demodulated
 from l2lidar_node.types import F64
 
 DEG: Final = np.pi / 180.0

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.clouds.fields import Field, fields_of, points_of
+from l2lidar_node.clouds import Field, fields_of, points_of
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
 
 COLUMNS: Final = 1800

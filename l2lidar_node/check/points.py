@@ -27,8 +27,7 @@ from l2lidar_node.check.requirements import (
     not_judged,
     ok,
 )
-from l2lidar_node.clouds.fields import OPTICAL_CENTRE_M, RINGS, Field
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS, OPTICAL_CENTRE_M, RINGS, Field
 from l2lidar_node.types import F64, Level
 
 _SUBJECT = "cloud"

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from l2lidar_node import __version__
-from l2lidar_node.calibration import picture, report
+from l2lidar_node.calibration import report
 from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.calibration.observation import Place
 from l2lidar_node.calibration.result import StillResult, Verdict
@@ -133,7 +133,7 @@ def still(
         raise CommandError(str(error)) from None
     made = report.calibration_of(result, gathered, time.strftime("%Y-%m-%d"), firmware)
     if figure is not None:
-        picture.save(result, figure)
+        report.save(result, figure)
     if json_:
         print_json(_as_data(result, made))
     else:

@@ -22,7 +22,7 @@ from l2lidar_node.driver.driver import Driver
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import DecodeError, ImuPacket, PointPacket, Version, decode
 from l2lidar_node.protocol.wire import PacketType
-from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.recording import Received, Recorder, Recording
 
 _SPIN_UP_S: Final = 60.0

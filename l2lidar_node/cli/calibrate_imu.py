@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from l2lidar_node import __version__
-from l2lidar_node.calibration import picture, report
+from l2lidar_node.calibration import report
 from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.calibration.result import Verdict
 from l2lidar_node.cli import calibrate_files as files
@@ -30,7 +30,7 @@ from l2lidar_node.cli.device import Device
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
-from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.recording.replay import feed
 from l2lidar_node.settings import build
@@ -117,7 +117,7 @@ def imu(
         result = _estimated(path, known, quiet=json_)
     about = _about(result, firmware, known)
     if figure is not None:
-        picture.save_turns(over_time(result.before), over_time(result.alignment.turns), figure)
+        report.save_turns(over_time(result.before), over_time(result.alignment.turns), figure)
     if json_:
         print_json(_as_data(result, about))
     else:

@@ -10,17 +10,16 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import (
     Observation,
     SourceError,
     Topics,
 )
 from l2lidar_node.check.report import as_data, judge, verdict
-from l2lidar_node.check.requirements import Consumer, Finding, Use, worst
+from l2lidar_node.check.requirements import CONSUMERS, Consumer, Finding, Use, worst
 from l2lidar_node.cli.console import JsonOption, out, print_json
 from l2lidar_node.command_line import UsageError
-from l2lidar_node.recording.pcap import is_capture_file
+from l2lidar_node.recording.capture import is_capture_file
 from l2lidar_node.types import Level
 
 if TYPE_CHECKING:

@@ -13,9 +13,8 @@ from typing import Annotated, Any, Final
 import typer
 from rich.table import Table
 
-from l2lidar_node.cli.addresses import hardware_address, local_addresses
 from l2lidar_node.cli.console import JsonOption, out, print_json, say
-from l2lidar_node.cli.device import DeviceError
+from l2lidar_node.cli.device import DeviceError, hardware_address, local_addresses
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import Parameters, Version, decode

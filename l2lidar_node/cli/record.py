@@ -19,8 +19,8 @@ from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.files import free_name
 from l2lidar_node.recording.bag import BagWriter
+from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.packet_bag import PacketBagWriter, open_packets
-from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Recorder, Recording, RecordingWriter, written
 from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build

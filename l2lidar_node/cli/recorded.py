@@ -26,10 +26,10 @@ from l2lidar_node.check.observation import (
 from l2lidar_node.command_line import CommandError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver
-from l2lidar_node.driver.metadata import metadata
+from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording import bag
-from l2lidar_node.recording.pcap import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError, is_capture_file
 from l2lidar_node.recording.recording import Received, Recording
 from l2lidar_node.recording.replay import feed, measurements
 from l2lidar_node.ros.parameter_files import parameters_for

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from l2lidar_node.cli.console import out, say
 from l2lidar_node.cli.device import DeviceError
 from l2lidar_node.protocol import wire
+from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.packet_bag import PacketBag, open_packets
-from l2lidar_node.recording.pcap import CaptureError
 from l2lidar_node.recording.recording import Received, Recording
 
 _UNSWEPT: Final = 64  # commands of the driver that are thrown away between two looks

@@ -14,7 +14,7 @@ from l2lidar_node.cli.console import say
 from l2lidar_node.command_line import CommandError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.recording import bag
-from l2lidar_node.recording.pcap import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError, is_capture_file
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.recording.replay import measurements
 from l2lidar_node.settings import build
@@ -91,7 +91,7 @@ def _live(sdk: Any, namespace: str, seconds: float | None) -> int:
         from rclpy.signals import SignalHandlerOptions
 
         from l2lidar_node.ros import topics
-        from l2lidar_node.ros.viewer import view as show_topics
+        from l2lidar_node.ros.topic_source import view as show_topics
     except ImportError as error:
         raise CommandError(
             f"viewing topics needs ROS 2 ({error}): source it, or name a recording"

@@ -23,8 +23,7 @@ from l2lidar_node.demo.processes import (
     free_udp_ports,
     isolate_ros,
 )
-from l2lidar_node.demo.report import report
-from l2lidar_node.demo.robot import as_message, mount as example_mount
+from l2lidar_node.demo.report import as_message, mount as example_mount, report
 from l2lidar_node.programs import INTERRUPTED, interruptible
 
 _WARM_UP_S = 3.0

@@ -3,20 +3,189 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.demo import picture
+from l2lidar_node.config import FrameConfig
 from l2lidar_node.demo.observer import Observer
-from l2lidar_node.demo.robot import BASE_FRAME, floor_and_ceiling, moved
 from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.files import whole
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import F64
+
+BASE_FRAME: Final = "base_link"
+_EXAMPLES: Final = Path(__file__).resolve().parents[2] / "urdf" / "examples"
+_BIN_M: Final = 0.05
+
+
+def mount(example: str) -> F64:
+    """Return the pose of the cloud frame in ``base_link`` on an example robot, (4, 4).
+
+    Parameters
+    ----------
+    example : str
+        ``top`` or ``forward``.
+
+    Raises
+    ------
+    OSError
+        If there is no such robot: the demo runs from the repository.
+    """
+    robot = ElementTree.parse(_EXAMPLES / f"l2_{example}_mount_example.urdf").getroot()
+    joints = {_attribute(joint, "child", "link"): joint for joint in robot.iter("joint")}
+    pose, link = np.eye(4), FrameConfig().cloud
+    while link != BASE_FRAME:
+        step = np.eye(4)
+        rpy = [float(value) for value in _attribute(joints[link], "origin", "rpy").split()]
+        step[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+        step[:3, 3] = [float(value) for value in _attribute(joints[link], "origin", "xyz").split()]
+        pose, link = step @ pose, _attribute(joints[link], "parent", "link")
+    return pose
+
+
+def _attribute(joint: ElementTree.Element, tag: str, name: str) -> str:
+    found = joint.find(tag)
+    return "" if found is None else found.get(name, "")
+
+
+def moved(points: NDArray[np.void], T_base_cloud: F64) -> NDArray[np.void]:
+    """Return points (N,) with x, y, z in the base frame instead of the cloud frame [m]."""
+    out = points.copy()
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    for axis, column in zip("xyz", (xyz @ T_base_cloud[:3, :3].T).T, strict=True):
+        out[axis] = column + T_base_cloud["xyz".index(axis), 3]
+    return out
+
+
+def floor_and_ceiling(points: NDArray[np.void]) -> tuple[float, float]:
+    """Return the heights at which the lower and the upper half have most points (N,) [m]."""
+    z = points["z"].astype(np.float64)
+    middle = 0.5 * (float(np.percentile(z, 1)) + float(np.percentile(z, 99)))
+    return _densest(z[z < middle]), _densest(z[z >= middle])
+
+
+def _densest(values: F64) -> float:
+    if not len(values):
+        return float("nan")
+    bins = np.floor(values / _BIN_M).astype(np.int64)
+    found, counts = np.unique(bins, return_counts=True)
+    return float(np.median(values[bins == found[counts.argmax()]]))
+
+
+def as_message(T_base_cloud: F64) -> Any:
+    """Return the mount as a message for ``/tf_static``."""
+    from geometry_msgs.msg import TransformStamped
+    from tf2_msgs.msg import TFMessage
+
+    item = TransformStamped(child_frame_id=FrameConfig().cloud)
+    item.header.frame_id = BASE_FRAME
+    place, turn = item.transform.translation, item.transform.rotation
+    place.x, place.y, place.z = T_base_cloud[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = Rotation.from_matrix(T_base_cloud[:3, :3]).as_quat().tolist()
+    return TFMessage(transforms=[item])
+
+
+_WALLS_M: Final = 1.5
+
+
+def save_cloud(points: NDArray[np.void], path: Path, title: str) -> None:
+    """Write a picture of a cloud: in perspective, and from above.
+
+    Parameters
+    ----------
+    points : ndarray, shape (N,), dtype with x, y, z, range
+        Cloud frame [m].
+    path : Path
+        PNG file; missing folders are made.
+    title : str
+    """
+    figure = _figure(path)
+    figure.suptitle(title)
+    colour: dict[str, Any] = {"c": points["range"], "cmap": "turbo", "vmin": 0.0, "linewidths": 0}
+    colour["vmax"] = float(np.percentile(points["range"], 99))
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    space.scatter(points["x"], points["y"], points["z"], s=1.5, **colour)
+    space.set_aspect("equal")
+    space.view_init(elev=38, azim=-60)
+    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    plan = figure.add_subplot(1, 2, 2)
+    dots = plan.scatter(points["x"], points["y"], s=1.5, **colour)
+    plan.set_aspect("equal")
+    plan.set(xlabel="x [m]", ylabel="y [m]", title="from above")
+    figure.colorbar(dots, ax=plan, label="range [m]")
+    with whole(path) as part:
+        figure.savefig(part)
+
+
+def save_comparison(raw: NDArray[np.void], deskewed: NDArray[np.void], path: Path) -> None:
+    """Write a picture of one sweep from above, as measured and deskewed.
+
+    Parameters
+    ----------
+    raw, deskewed : ndarray, shape (N,), dtype with x, y, z
+        Cloud frame [m].
+    path : Path
+        PNG file; missing folders are made.
+    """
+    figure = _figure(path, height=6.5)
+    for column, (title, points) in enumerate((("as measured", raw), ("deskewed", deskewed))):
+        plan = figure.add_subplot(1, 2, column + 1)
+        points = points[points["z"] < _WALLS_M]  # a ceiling would hide the walls
+        height: dict[str, Any] = {
+            "c": points["z"],
+            "cmap": "viridis",
+            "vmin": 0.0,
+            "vmax": _WALLS_M,
+        }
+        plan.scatter(points["x"], points["y"], s=1.5, linewidths=0, **height)
+        plan.set_aspect("equal")
+        plan.set(xlabel="x [m]", ylabel="y [m]", title=title)
+    with whole(path) as part:
+        figure.savefig(part)
+
+
+def save_track(
+    estimated: NDArray[np.float64], true: NDArray[np.float64], path: Path, title: str
+) -> None:
+    """Write a picture of an estimated track over the true one, from above and over time.
+
+    Parameters
+    ----------
+    estimated, true : ndarray, shape (N, 3)
+        In the world [m].
+    path : Path
+        PNG file; missing folders are made.
+    title : str
+    """
+    figure = _figure(path)
+    figure.suptitle(title)
+    plan = figure.add_subplot(1, 2, 1)
+    plan.plot(true[:, 0], true[:, 1], color="0.6", linewidth=4, label="truth")
+    plan.plot(estimated[:, 0], estimated[:, 1], "tab:red", linewidth=1.2, label="odometry")
+    plan.set_aspect("equal")
+    plan.set(xlabel="x [m]", ylabel="y [m]")
+    plan.legend()
+    errors = figure.add_subplot(1, 2, 2)
+    errors.plot(1e3 * np.linalg.norm(estimated - true, axis=1), "tab:red")
+    errors.set(xlabel="sweep", ylabel="distance from the truth [mm]", ylim=(0, None))
+    with whole(path) as part:
+        figure.savefig(part)
+
+
+def _figure(path: Path, height: float = 6.0) -> Figure:
+    """Return an empty figure, the folder of whose file is there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(13, height), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
 
 class TrackError(NamedTuple):
@@ -130,7 +299,7 @@ def report(
     console.print(f"lost packets: {_lost(observer.checks.get('link', {}))}")
     if observer.cloud is not None:
         if mount is None:
-            picture.save_cloud(observer.cloud, folder / "cloud.png", "one cloud, as measured")
+            save_cloud(observer.cloud, folder / "cloud.png", "one cloud, as measured")
         else:
             troubles += _in_base(console, observer.cloud, mount, folder)
     if with_odometry:
@@ -145,7 +314,7 @@ def _in_base(console: Console, cloud: NDArray[np.void], mount: F64, folder: Path
     floor, ceiling = floor_and_ceiling(shown)
     text = f"in {BASE_FRAME} the floor is at z = {floor:.2f} m, the ceiling at {ceiling:.2f} m"
     console.print(text)
-    picture.save_cloud(shown, folder / "cloud.png", text)
+    save_cloud(shown, folder / "cloud.png", text)
     expected = float(mount[2, 3]) - _SENSOR_HEIGHT_M
     if abs(floor - expected) > _HEIGHT_TOLERANCE_M:
         return [f"the floor is at z = {floor:.2f} m in {BASE_FRAME}, not {expected:.2f} m"]
@@ -181,11 +350,11 @@ def _odometry(console: Console, observer: Observer, truth: Results, folder: Path
         f"(at most {1e3 * track.worst_m:.1f} mm) over {track.length_m:.1f} m"
     )
     console.print(text)
-    picture.save_track(track.estimated, track.true, folder / "track.png", text)
+    save_track(track.estimated, track.true, folder / "track.png", text)
     moved = [(raw, deskewed) for raw, deskewed in observer.pairs.values() if raw is not None
              and deskewed is not None]  # fmt: skip
     if moved:
-        picture.save_comparison(*moved[len(moved) // 2], folder / "deskew.png")
+        save_comparison(*moved[len(moved) // 2], folder / "deskew.png")
     if not observer.deskewed.stamps:
         return ["/points_deskewed: nothing received"]
     limit = max(_LEAST_LIMIT_M, _MAX_ATE_SHARE * track.length_m)

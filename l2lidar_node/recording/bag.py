@@ -25,8 +25,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from l2lidar_node.clouds.fields import DATATYPES
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import DATATYPES, LAYOUTS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Event
 from l2lidar_node.files import free_name

@@ -15,8 +15,7 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 
-from l2lidar_node.recording.capture import Endpoint
-from l2lidar_node.recording.pcap import CaptureError, is_capture, is_capture_file
+from l2lidar_node.recording.capture import CaptureError, Endpoint, is_capture, is_capture_file
 from l2lidar_node.recording.recording import Entry, RecordingWriter, written
 from l2lidar_node.types import HostNs
 

@@ -15,8 +15,13 @@ from l2lidar_node.config import NetworkConfig
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.commands import Command, recorded
 from l2lidar_node.protocol.framing import Frame, Framer
-from l2lidar_node.recording.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
-from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.capture import (
+    CaptureError,
+    CaptureReader,
+    CaptureWriter,
+    Endpoint,
+    UdpDatagram,
+)
 from l2lidar_node.types import HostNs
 
 WAITED: Final = b"l2lidar_node: nothing that was due is waited for from here on"

@@ -9,7 +9,7 @@ from typing import Final
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver, Event
-from l2lidar_node.recording.pcap import CaptureError
+from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.recording import Entry, Received, Recording, Sent, Slewed, Stepped
 from l2lidar_node.transport.session import Loop
 from l2lidar_node.types import LAST_STAMP, Datagram, HostNs, ImuSample, Sweep, is_ros_time

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, PointCloud2, PointField
 
-from l2lidar_node.clouds.fields import DATATYPES, points_of
+from l2lidar_node.clouds import DATATYPES, points_of
 from l2lidar_node.config import FrameConfig, ImuConfig
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import HostNs, ImuSample, split_stamp

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import itertools
 import sys
 import time
@@ -17,30 +18,97 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, PointCloud2
+from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
+from l2lidar_node import clouds
 from l2lidar_node.clock import ClockEvent
-from l2lidar_node.clouds import layouts
-from l2lidar_node.config import DriverConfig
+from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer
 from l2lidar_node.driver.driver import Driver, Event, Silence
 from l2lidar_node.files import free_name
 from l2lidar_node.protocol.packets import Parameters, Version
-from l2lidar_node.recording.packet_bag import open_packets
-from l2lidar_node.recording.pcap import CaptureError
-from l2lidar_node.recording.recording import Recorder, Recording
+from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.packet_bag import PacketBatch, open_packets
+from l2lidar_node.recording.recording import Recorder, Recording, endpoints
 from l2lidar_node.recording.replay import Playback
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.managed_node import ManagedNode, NextTurn
-from l2lidar_node.ros.packet_publisher import PacketPublisher
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.transport import session
 from l2lidar_node.transport.session import Loop, Session, Tap, Taps
 from l2lidar_node.transport.udp import TransportError
 from l2lidar_node.types import HostNs, ImuSample, StampError, Sweep, is_ros_time, split_stamp
+
+_DEPTH = 100  # 5 s: a recorder that finds the driver within that has all from its first packet
+
+
+class PacketPublisher:
+    """A session's tap that publishes what it hears, a twentieth of a second per message.
+
+    Parameters
+    ----------
+    node : Node
+    topic : str
+    network : NetworkConfig
+        Addresses that the captures name.
+    """
+
+    def __init__(self, node: Node, topic: str, network: NetworkConfig) -> None:
+        self._node = node
+        latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publisher = node.create_publisher(UInt8MultiArray, topic, latched)
+        self._batch = PacketBatch(*endpoints(network))
+
+    def received(self, data: bytes, arrival: HostNs) -> None:
+        """Publish bytes that came from the device."""
+        self._add("received", data, arrival)
+
+    def sent(self, frame: bytes, at: HostNs) -> None:
+        """Publish a frame that goes to the device."""
+        self._add("sent", frame, at)
+
+    def waited(self, until: HostNs) -> None:
+        """Publish that the driver gave up waiting."""
+        self._add("waited", until)
+
+    def stepped(self, by_ns: int, at: HostNs) -> None:
+        """Publish that the driver was told that the host's clock was set."""
+        self._add("stepped", by_ns, at)
+
+    def slewed(self, by_ns: int, at: HostNs) -> None:
+        """Publish how far slewing has moved the host's clock."""
+        self._add("slewed", by_ns, at)
+
+    def close(self) -> None:
+        """Publish what is left."""
+        self._publish()
+
+    def _add(self, kind: str, *arguments: object) -> None:
+        now = arguments[-1]
+        assert isinstance(now, int)
+        if self._batch.is_due(HostNs(now)):
+            self._publish()
+        try:
+            self._batch.add(kind, *arguments)
+        except OSError as error:
+            text = f"packets not published: {error.strerror}"
+            self._node.get_logger().error(text, throttle_duration_sec=10.0)
+
+    def _publish(self) -> None:
+        data = self._batch.take()
+        if not data:
+            return
+        try:
+            self._publisher.publish(UInt8MultiArray(data=array.array("B", data)))
+        except RCLError:
+            # A signal ends rclpy while the session still hands out what it holds.
+            if self._node.context.ok():
+                raise
+
 
 T = TypeVar("T")
 
@@ -183,7 +251,7 @@ class DriverNode(ManagedNode):
             if topics.qos_reliability == "reliable"
             else ReliabilityPolicy.BEST_EFFORT
         )
-        self._layout = layouts.LAYOUTS[topics.point_layout].with_rings(topics.ring_count)
+        self._layout = clouds.LAYOUTS[topics.point_layout].with_rings(topics.ring_count)
         self._cloud_template = CloudTemplate(self._layout.dtype, config.frames.cloud)
         self._cloud_publisher = self.create_lifecycle_publisher(
             PointCloud2,

@@ -1,4 +1,4 @@
-"""Gathers what comes on a pair of live topics, and what their publishers say of themselves."""
+"""Live topics for the command line: gathered to be checked, or shown in the viewer."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.check.observation import Gathering, Observation, Qos, SourceError, Topics, choose
 from l2lidar_node.programs import held
-from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
+from l2lidar_node.ros.mounting import ImuAdjustClient
+from l2lidar_node.viewing import ROLES, Viewer
 
 _DISCOVERY_S: Final = 6.0
 _LOOK_S: Final = 0.1
@@ -147,3 +150,47 @@ def _offers(node: Node, topic: str) -> tuple[Qos, ...]:
         Qos(names.get(info.qos_profile.reliability, "unknown"), info.qos_profile.depth)
         for info in node.get_publishers_info_by_topic(topic)
     )
+
+
+class ViewerNode(Node):
+    """Hands every message to the viewer.
+
+    Parameters
+    ----------
+    viewer : Viewer
+    topics : dict
+        Topic names by role: those of :data:`l2lidar_node.viewing.ROLES`, ``imu``, ``odometry``.
+    """
+
+    def __init__(self, viewer: Viewer, topics: dict[str, str]) -> None:
+        super().__init__("l2lidar_viewer")
+        sensor_data = qos_profile_sensor_data
+        for role in ROLES:
+            self.create_subscription(
+                PointCloud2,
+                topics[role],
+                lambda message, role=role: viewer.cloud(message, role),
+                sensor_data,
+            )
+        self.create_subscription(Imu, topics["imu"], viewer.imu, sensor_data)
+        self.create_subscription(Odometry, topics["odometry"], viewer.odometry, sensor_data)
+        self.create_subscription(DiagnosticArray, "/diagnostics", viewer.diagnostics, 10)
+
+
+def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
+    """Show topics until interrupted or for some seconds; return how many messages were shown.
+
+    rclpy has to be initialised, without handlers of signals.
+    """
+    viewer = Viewer(rerun)
+    node = ViewerNode(viewer, topics)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    end = None if seconds is None else time.monotonic() + seconds
+    try:
+        while executor.context.ok() and (end is None or time.monotonic() < end):
+            with held():
+                executor.spin_once(timeout_sec=0.1)
+    finally:
+        node.destroy_node()
+    return viewer.messages

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from l2lidar_node.clouds.fields import RINGS
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS, RINGS
 from l2lidar_node.config import LifecycleConfig
 from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 from l2lidar_proc.motion.config import MotionConfig

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.clouds import fields
+from l2lidar_node import clouds
 from l2lidar_node.recording.bag import (
     CLOUD as CLOUD,
     IMU as IMU,
@@ -68,7 +68,7 @@ def points_of(message: Any) -> NDArray[np.void]:
     ValueError
         If fields and sizes do not agree.
     """
-    return fields.points_of(message)
+    return clouds.points_of(message)
 
 
 _LIVOX_POINT: Final = np.dtype(

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS
 from l2lidar_node.ros.conversions import CloudTemplate, from_time, to_cloud
-from l2lidar_node.ros.imu_adjust_client import ImuAdjustClient
 from l2lidar_node.ros.managed_node import ManagedNode
+from l2lidar_node.ros.mounting import ImuAdjustClient, StaticFrames, untied
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.ros.static_frames import StaticFrames, untied
 from l2lidar_node.types import HostNs, Level, Sweep, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, without_time
 from l2lidar_proc.deskew import report

@@ -23,9 +23,9 @@ from l2lidar_node import rotations
 from l2lidar_node.files import DataFolder, FileNameError, write_whole
 from l2lidar_node.ros.conversions import to_cloud
 from l2lidar_node.ros.managed_node import ManagedNode
+from l2lidar_node.ros.mounting import StaticFrames, untied
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.ros.static_frames import StaticFrames, untied
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc.cloud import CloudError

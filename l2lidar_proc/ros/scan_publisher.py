@@ -10,7 +10,7 @@ from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import to_time
-from l2lidar_node.ros.static_frames import StaticFrames
+from l2lidar_node.ros.mounting import StaticFrames
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.deskew.config import ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, PointCloud2
 
-from l2lidar_node.clouds.fields import Field, points_of
+from l2lidar_node.clouds import Field, points_of
 from l2lidar_node.ros.conversions import from_time
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.motion.imu_buffer import Samples

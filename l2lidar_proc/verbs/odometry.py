@@ -19,7 +19,7 @@ from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.frames import FrameTree
-from l2lidar_node.recording.pcap import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError, is_capture_file
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.recording.replay import measurements
 from l2lidar_node.ros.parameter_files import settings_for

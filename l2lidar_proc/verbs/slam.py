@@ -10,7 +10,7 @@ from rich.progress import Progress as Bar
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.files import write_whole
-from l2lidar_node.recording.pcap import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError, is_capture_file
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryNodeConfig

@@ -52,7 +52,7 @@ def test_every_mutant_of_a_module_differs_from_it() -> None:
 
 
 def test_a_sample_is_the_same_for_a_seed_and_has_mutants_of_every_module() -> None:
-    paths = [CADENCE, Path("l2lidar_node/clock/schedule.py")]
+    paths = [CADENCE, Path("l2lidar_node/clock/device_clock.py")]
     some = mutants.sampled(paths, 20, 1)
     assert some == mutants.sampled(paths, 20, 1)
     assert some != mutants.sampled(paths, 20, 2)
@@ -71,7 +71,7 @@ def test_a_mutant_meets_the_tests_that_call_its_function_its_own_first() -> None
         "tests/clock/test_cadence.py::c": Called(5.0, {path: ["Cadence.advance"]}),
         "tests/clock/test_cadence.py::g": Called(2.0, {}),
         "tests/test_other.py::d": Called(0.1, {path: ["Cadence.noise"]}),
-        "tests/test_else.py::e": Called(0.1, {"l2lidar_node/clock/schedule.py": ["advance"]}),
+        "tests/test_else.py::e": Called(0.1, {"l2lidar_node/clock/device_clock.py": ["advance"]}),
         "tests/test_endless.py::f": Called(100.0, {path: ["Cadence.advance"]}),
     }
     assert [test[-1] for test in mutants.tests_for(inside, calls, 10.0)] == ["c", "b", "a"]

@@ -13,7 +13,7 @@ import pytest
 from benchmarks import bench_odometry, odometry_methods, odometry_referee
 from benchmarks.odometry_methods import OURS, PLAIN, REFEREES, SLOW, Found, Plan, Rows
 from l2lidar_node import rotations
-from l2lidar_node.clouds.fields import rings
+from l2lidar_node.clouds import rings
 from tests.support import odometry_runs
 
 PLAN = Plan(

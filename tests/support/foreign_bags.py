@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from l2lidar_node.clouds.fields import DATATYPES
+from l2lidar_node.clouds import DATATYPES
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial

@@ -10,10 +10,9 @@ import pytest
 
 from benchmarks import calibration_units
 from l2lidar_node.calibration import still
-from l2lidar_node.calibration.observation import GYRO, Gathering, Place
+from l2lidar_node.calibration.observation import GYRO, Gathering, Place, demodulated
 from l2lidar_node.calibration.result import Verdict
 from l2lidar_node.calibration.still import CalibrationError, calibrate
-from l2lidar_node.calibration.whirl import demodulated
 from l2lidar_node.cli.virtual_places import still_places
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.emulator.unit.units import UNITS, UnitErrors

@@ -15,10 +15,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node import rotations
-from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import CLOUD, IMU, TRANSFORMS, Gathering, Observation, Qos
-from l2lidar_node.clouds.fields import DATATYPES, RINGS, points_of as read_points
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.check.requirements import CONSUMERS
+from l2lidar_node.clouds import DATATYPES, LAYOUTS, RINGS, points_of as read_points
 from l2lidar_node.types import Sweep
 from tests.support import build
 

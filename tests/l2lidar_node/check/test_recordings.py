@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import CLOUD, IMU, SourceError, Topics, choose
+from l2lidar_node.check.requirements import CONSUMERS
 from l2lidar_node.cli import main
 from tests.l2lidar_node.check.recordings import Recording, copied, good
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import Gathering
 from l2lidar_node.check.report import judge
-from l2lidar_node.check.requirements import worst
-from l2lidar_node.clouds.fields import DATATYPES, points_of
+from l2lidar_node.check.requirements import CONSUMERS, worst
+from l2lidar_node.clouds import DATATYPES, points_of
 from l2lidar_node.types import Level
 from tests.l2lidar_node.check import recordings
 

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.observation import Gathering, Observation, kept_share
 from l2lidar_node.check.points import reading
 from l2lidar_node.check.report import judge
-from l2lidar_node.check.requirements import TimeField, TimeUnit
+from l2lidar_node.check.requirements import CONSUMERS, TimeField, TimeUnit
 from l2lidar_node.check.timing import Timing, timing
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS
 from tests.l2lidar_node.check import recordings
 
 STAMP = 1_700_000_000_250_000_000

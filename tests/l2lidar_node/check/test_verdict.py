@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 import l2lidar_node.check
-from l2lidar_node.check.consumers import CONSUMERS
 from l2lidar_node.check.report import judge
-from l2lidar_node.check.requirements import Finding, worst
+from l2lidar_node.check.requirements import CONSUMERS, Finding, worst
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import build, settings_of
 from l2lidar_node.types import Level

@@ -27,8 +27,7 @@ from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
-from l2lidar_node.recording.capture import Endpoint
-from l2lidar_node.recording.pcap import is_capture
+from l2lidar_node.recording.capture import Endpoint, is_capture
 from l2lidar_node.recording.recording import (
     Received,
     Recorder,

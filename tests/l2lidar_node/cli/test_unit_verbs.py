@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from l2lidar_node.cli.device import Device
-from l2lidar_node.cli.stored import parameter_fields, work_mode, work_mode_text
+from l2lidar_node.cli.stored import parameter_fields, parse_work_mode, work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.emulator.config import FaultConfig
 from l2lidar_node.emulator.unit.firmware import parameters_payload
@@ -251,7 +251,7 @@ def test_a_reset_that_does_not_arrive_is_noticed(run: Run, make_unit: Any) -> No
     ],
 )
 def test_work_modes_as_people_write_them(text: str, now: int, expected: int) -> None:
-    assert work_mode(text, now) == expected
+    assert parse_work_mode(text, now) == expected
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_work_modes_as_people_write_them(text: str, now: int, expected: int) -> 
 )
 def test_wrong_work_modes_are_refused(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        work_mode(text, 0)
+        parse_work_mode(text, 0)
 
 
 def test_unknown_bits_are_shown() -> None:

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, strategies as st
 
 from l2lidar_node.clock.cadence import Cadence
+from l2lidar_node.clock.device_clock import SyncSchedule
 from l2lidar_node.clock.host_clock_model import HostClockModel, HostSlewing
 from l2lidar_node.clock.lower_envelope import supporting_line
-from l2lidar_node.clock.schedule import SyncSchedule
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import HostNs
 

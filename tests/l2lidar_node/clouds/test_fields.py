@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.clouds.fields import DATATYPES, Field, dtype_of, points_of
+from l2lidar_node.clouds import DATATYPES, Field, dtype_of, points_of
 
 CODES = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
 

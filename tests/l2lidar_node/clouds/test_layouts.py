@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.clouds.fields import RINGS, rings
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS, RINGS, rings
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import POINT, HostNs

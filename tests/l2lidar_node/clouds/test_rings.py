@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.clouds.fields import OPTICAL_CENTRE_M, RINGS, rings
+from l2lidar_node.clouds import OPTICAL_CENTRE_M, RINGS, rings
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import POINT

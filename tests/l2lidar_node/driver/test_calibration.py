@@ -13,7 +13,7 @@ from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver import health
 from l2lidar_node.driver.geometry import Projector
-from l2lidar_node.driver.metadata import metadata
+from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording.replay import NoTransport

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.driver.counters import Counters
 from l2lidar_node.driver.device import REPEAT_NS, TRIES, Answer, DeviceState
-from l2lidar_node.driver.driver import Driver, Event, Silence
+from l2lidar_node.driver.driver import Counters, Driver, Event, Silence
 from l2lidar_node.driver.reorder import REORDER_NS, SequenceCounts
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.packets import Parameters, Version

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from l2lidar_node.driver.metadata import metadata
+from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol.wire import PacketType, WorkMode
 from tests.l2lidar_node.driver.test_driver import Run
 from tests.support import build

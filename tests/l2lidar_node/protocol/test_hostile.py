@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver
-from l2lidar_node.driver.health import judge, observe
-from l2lidar_node.driver.metadata import metadata
+from l2lidar_node.driver.health import judge, metadata, observe
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.settings import build as configure

@@ -7,8 +7,15 @@ import dpkt
 import pytest
 from hypothesis import example, given, strategies as st
 
-from l2lidar_node.recording.capture import CaptureReader, CaptureWriter, Endpoint, UdpDatagram
-from l2lidar_node.recording.pcap import CaptureError, PacketReader, PacketWriter
+from l2lidar_node.recording.capture import (
+    CaptureError,
+    CaptureReader,
+    CaptureWriter,
+    Endpoint,
+    PacketReader,
+    PacketWriter,
+    UdpDatagram,
+)
 from l2lidar_node.recording.recording import (
     SLEWED,
     STEPPED,

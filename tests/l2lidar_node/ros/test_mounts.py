@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.config import FrameConfig  # noqa: E402
-from l2lidar_node.demo.robot import as_message, floor_and_ceiling, mount, moved  # noqa: E402
-from l2lidar_node.ros.mount import MAX_TILT_DEG, MountMonitor  # noqa: E402
+from l2lidar_node.demo.report import as_message, floor_and_ceiling, mount, moved  # noqa: E402
+from l2lidar_node.ros.diagnostics import MAX_TILT_DEG, MountMonitor  # noqa: E402
 from l2lidar_node.types import Level  # noqa: E402
 from tests.l2lidar_node.ros.rig import TIMEOUT_S, open_rig  # noqa: E402
 from tests.support.odometry_runs import record, sweeps  # noqa: E402

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 
-from l2lidar_node.clouds.layouts import LAYOUTS
+from l2lidar_node.clouds import LAYOUTS
 from l2lidar_node.ros.conversions import to_cloud, to_time
 from l2lidar_node.types import HostNs
 from l2lidar_proc.ros import serialized

@@ -1,1 +1,0 @@
-"""Point layouts: the fields of a published cloud."""
