@@ -28,8 +28,8 @@ from benchmarks.hard_scores import Track, score
 from benchmarks.odometry_methods import Rows
 from benchmarks.results import FOLDER, Target, at_least, at_most, keep, measured_on, verdicts
 from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.kiss import PlainOdometry
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.plain import PlainOdometry
 
 OURS: Final = methods.OURS
 REFEREES: Final = ("rko_lio", "genz_lio", "ct_icp")

@@ -26,7 +26,7 @@ from l2lidar_node.cli.virtual_places import slide, still_places
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import Sweep
 from l2lidar_proc.motion.config import ImuConfig
-from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.odometry import imu_calibration
 from tests.support import odometry_runs
 from tests.support.odometry_runs import Run

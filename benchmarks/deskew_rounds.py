@@ -29,7 +29,7 @@ from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs, ImuSample
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.preintegration import integrate, segment
-from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
+from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 from tests.support.deskew_scenarios import Recording, Scenario, record
 
 FOLDER: Final = Path(__file__).resolve().parents[2] / "shared" / "data" / "newer_college"

@@ -23,9 +23,8 @@ from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.deskew.config import DeskewConfig, ProcConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.kiss import PlainKiss
+from l2lidar_proc.odometry.kiss import PlainKiss, PlainOdometry
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.plain import PlainOdometry
 from tests.support import odometry_runs
 from tests.support.odometry_runs import CUTS, Run
 

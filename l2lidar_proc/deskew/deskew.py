@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F32, HostNs
-from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
+from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 
 
 def deskew(

@@ -15,7 +15,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.preintegration import coverage
-from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory, still_trajectory
+from l2lidar_proc.motion.sweep_motion import SweepTrajectory, still_trajectory
 from l2lidar_proc.motion.twist_filter import TwistFilter
 
 

@@ -20,15 +20,15 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
-from l2lidar_proc.motion.initialization import initial_state
 from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration, integrate, segment
 from l2lidar_proc.motion.static import (
     StaticReference,
     gravity_is_plausible,
+    initial_state,
     static_reference,
     white_noise,
 )
-from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory
+from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 
 F64 = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_proc.motion.filter import skew
 from l2lidar_proc.odometry.estimate import OdometryEstimate
-from l2lidar_proc.recording.trajectory import StampedPoses, levelled_start
+from l2lidar_proc.recording.outputs import StampedPoses, levelled_start
 
 F64 = NDArray[np.float64]
 

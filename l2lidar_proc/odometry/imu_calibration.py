@@ -20,7 +20,7 @@ from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import GyroAlignment, GyroError, GyroModel, Turns
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import POSITION, InertialState
-from l2lidar_proc.motion.initialization import InitialState, initial_state
+from l2lidar_proc.motion.static import InitialState, initial_state
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.matcher import SweepMatcher

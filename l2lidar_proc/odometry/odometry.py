@@ -17,9 +17,8 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.consistency import InnovationTest
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, FrameJump, Return
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
-from l2lidar_proc.odometry.frame_jump import FrameJump
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor

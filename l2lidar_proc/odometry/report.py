@@ -9,8 +9,8 @@ from l2lidar_node import rotations
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.earlier_maps import FrameJump
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
-from l2lidar_proc.odometry.frame_jump import FrameJump
 from l2lidar_proc.odometry.map_drift import MapDrift
 
 F64 = NDArray[np.float64]

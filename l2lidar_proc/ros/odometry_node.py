@@ -31,7 +31,7 @@ from l2lidar_node.types import F64, Sweep
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.deskew.config import DeskewTopics
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.base_frame import BaseFrame
@@ -39,7 +39,7 @@ from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
-from l2lidar_proc.recording import map_file, trajectory
+from l2lidar_proc.recording import outputs
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import (
     InputMonitor,
@@ -390,7 +390,7 @@ class OdometryNode(ManagedNode):
             return response
         try:
             (path,) = self._folder.new_files(self._settings.value.files.map_file)
-            count = map_file.save(path, self._map_points(last))
+            count = outputs.save(path, self._map_points(last))
             response.success, response.message = True, f"{count} points in {path.absolute()}"
         except (OSError, FileNameError) as error:
             response.success, response.message = False, str(error)
@@ -404,8 +404,8 @@ class OdometryNode(ManagedNode):
         poses = self._base.poses(self.pipeline.trajectory.poses)
         try:
             path, beside = self._folder.new_files(name, f"{FilePath(name).stem}.kitti")
-            write_whole(path, trajectory.tum(poses))
-            write_whole(beside, trajectory.kitti(poses))
+            write_whole(path, outputs.tum(poses))
+            write_whole(beside, outputs.kitti(poses))
             response.success = True
             response.message = f"{len(poses)} poses in {path.absolute()} and beside it"
         except (OSError, FileNameError) as error:

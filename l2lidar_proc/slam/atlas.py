@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.files import free_name, write_whole
 from l2lidar_node.types import HostNs
-from l2lidar_proc.recording.trajectory import STAMPED_POSE
+from l2lidar_proc.recording.outputs import STAMPED_POSE
 from l2lidar_proc.slam.nodes import Map, Node
 from l2lidar_proc.slam.pose_graph import EDGE
 from l2lidar_proc.slam.submap import REACH_M, SUBMAP_POINT, Submap

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.files import whole, write_whole
-from l2lidar_proc.recording import map_file, trajectory
-from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses
+from l2lidar_proc.recording import outputs
+from l2lidar_proc.recording.outputs import STAMPED_POSE, StampedPoses
 from l2lidar_proc.slam.nodes import Map
 from l2lidar_proc.slam.pose_graph import CUT, LOOP
 from l2lidar_proc.slam.se3 import inverse, transformed
@@ -142,11 +142,11 @@ def _write_g2o(built: Map, target: Path) -> list[Path]:
 
 
 def _write_tum(built: Map, target: Path) -> list[Path]:
-    return [_text(target / "trajectory.tum", trajectory.tum(built.trajectory()))]
+    return [_text(target / "trajectory.tum", outputs.tum(built.trajectory()))]
 
 
 def _write_kitti(built: Map, target: Path) -> list[Path]:
-    return [_text(target / "trajectory.kitti", trajectory.kitti(built.trajectory()))]
+    return [_text(target / "trajectory.kitti", outputs.kitti(built.trajectory()))]
 
 
 def _write_ply(built: Map, target: Path) -> list[Path]:
@@ -198,8 +198,8 @@ def _write_qn(built: Map, target: Path) -> list[Path]:
         for number in range(len(built.nodes))
     ]
     poses = _node_poses(built)
-    files.append(_text(target / "poses_kitti.txt", trajectory.kitti(poses)))
-    files.append(_text(target / "poses_tum.txt", trajectory.tum(poses)))
+    files.append(_text(target / "poses_kitti.txt", outputs.kitti(poses)))
+    files.append(_text(target / "poses_tum.txt", outputs.tum(poses)))
     return files
 
 
@@ -278,5 +278,5 @@ def _text(path: Path, content: str) -> Path:
 
 
 def _cloud(path: Path, points: F64) -> Path:
-    map_file.save(path, points)
+    outputs.save(path, points)
     return path

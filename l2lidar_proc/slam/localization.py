@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_proc.slam.candidates import odometry_covariance
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.hypotheses import PlaceHypotheses
+from l2lidar_proc.slam.loops import odometry_covariance
 from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.se3 import (

@@ -14,9 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
-from l2lidar_proc.recording.trajectory import STAMPED_POSE, StampedPoses, Trajectory
-from l2lidar_proc.slam.candidates import odometry_covariance
+from l2lidar_proc.recording.outputs import STAMPED_POSE, StampedPoses, Trajectory
 from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.loops import odometry_covariance
 from l2lidar_proc.slam.pose_graph import CUT, ODOMETRY
 from l2lidar_proc.slam.se3 import (
     SHIFT,

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_proc.slam import pose_graph
-from l2lidar_proc.slam.admission import LARGEST_DEVIATION, Admission, Loop
-from l2lidar_proc.slam.candidates import Graph
 from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.loops import LARGEST_DEVIATION, Admission, Graph, Loop
 from l2lidar_proc.slam.nodes import (
     Health,
     Keyframe,

@@ -26,15 +26,15 @@ from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
-from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
-from l2lidar_proc.recording import bag, map_file
+from l2lidar_proc.recording import bag, outputs
 from l2lidar_proc.recording.bag import RecordingError
-from l2lidar_proc.recording.trajectory import StampedPoses, kitti, tum
+from l2lidar_proc.recording.outputs import StampedPoses, kitti, tum
 
 _END_NS: Final = 2**62
 _LOOK_AHEAD_NS: Final = 2_000_000_000
@@ -474,7 +474,7 @@ def write(run: OdometryRun, folder: Path) -> list[Path]:
     write_whole(paths[0], tum(run.poses))
     write_whole(paths[1], kitti(run.poses))
     if len(run.map_points):
-        map_file.save(paths[2], run.map_points)
+        outputs.save(paths[2], run.map_points)
     _plot(run, paths[3])
     return [path for path in paths if path.exists()]
 

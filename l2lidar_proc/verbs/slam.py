@@ -16,7 +16,7 @@ from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.recording.bag import RecordingError
-from l2lidar_proc.recording.trajectory import tum
+from l2lidar_proc.recording.outputs import tum
 from l2lidar_proc.slam import atlas, export
 from l2lidar_proc.slam.atlas import AtlasError
 from l2lidar_proc.slam.config import SlamNodeConfig

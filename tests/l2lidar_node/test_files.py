@@ -20,8 +20,8 @@ from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.truth.packet_log import PacketLog
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.recording.bag import BagFile
-from l2lidar_proc.recording import map_file
-from l2lidar_proc.recording.trajectory import Trajectory
+from l2lidar_proc.recording import outputs
+from l2lidar_proc.recording.outputs import Trajectory
 from l2lidar_proc.verbs import odometry
 
 ROOT = Path(__file__).parents[2]
@@ -75,8 +75,8 @@ def _a_way(folder: Path) -> Path:
 
 
 WRITERS = [
-    pytest.param(lambda folder: map_file.save(folder / "m.ply", POINTS), marks=needs_open3d),
-    pytest.param(lambda folder: map_file.save(folder / "m.pcd", POINTS), marks=needs_open3d),
+    pytest.param(lambda folder: outputs.save(folder / "m.ply", POINTS), marks=needs_open3d),
+    pytest.param(lambda folder: outputs.save(folder / "m.pcd", POINTS), marks=needs_open3d),
     pytest.param(_way, marks=needs_open3d),
     lambda folder: results.write_tum(
         folder / "t.tum", from_tum(_a_way(folder)), np.linspace(0.0, 1.0, 5)
@@ -110,9 +110,9 @@ def test_a_map_is_whole_whenever_its_writer_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     code = (
         "import sys, numpy as np; from pathlib import Path\n"
-        "from l2lidar_proc.recording import map_file\n"
+        "from l2lidar_proc.recording import outputs\n"
         "points = np.random.default_rng(1).random((100_000, 3))\n"
-        "while True: map_file.save(Path(sys.argv[1]), points); print('.', flush=True)"
+        "while True: outputs.save(Path(sys.argv[1]), points); print('.', flush=True)"
     )
     sizes = set()
     for times in (1, 2, 3):

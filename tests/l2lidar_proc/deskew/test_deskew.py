@@ -9,7 +9,7 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_proc.deskew.deskew import deskew
-from l2lidar_proc.motion.sweep_trajectory import still_trajectory
+from l2lidar_proc.motion.sweep_motion import still_trajectory
 from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz
 from tests.l2lidar_proc.motion.test_sweep_trajectory import trajectory
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import POINT
-from l2lidar_proc.deskew.organise import SLOTS, organise
+from l2lidar_proc.deskew.filters import SLOTS, organise
 
 SLOT, PERIOD = 7.7316e-6, 4.63895e-3
 

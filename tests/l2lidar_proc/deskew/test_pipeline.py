@@ -12,7 +12,7 @@ from l2lidar_node.settings import build
 from l2lidar_node.types import POINT, HostNs, Sweep
 from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
-from l2lidar_proc.motion.sweep_trajectory import still_trajectory
+from l2lidar_proc.motion.sweep_motion import still_trajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, noisy, rms, seen, xyz
 

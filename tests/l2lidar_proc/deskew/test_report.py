@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from l2lidar_node.types import Level
-from l2lidar_proc.deskew import report
+from l2lidar_proc.deskew import pipeline
 from l2lidar_proc.deskew.pipeline import PipelineCounts
 from l2lidar_proc.motion.imu_buffer import ImuCounts
 from l2lidar_proc.motion.tracker import Flag, Quality
@@ -31,7 +31,7 @@ def quality(*flags: Flag, still: bool = False) -> Quality:
     ],
 )
 def test_a_sweep(flags: Any, level: Any) -> None:
-    told = report.of_sweep(quality(*flags), 7_000_000)
+    told = pipeline.of_sweep(quality(*flags), 7_000_000)
     assert told.level == level
     assert all(flag.value in told.message for flag in flags)
     assert told.values["velocity source"] == "odometry"
@@ -42,15 +42,15 @@ def test_a_sweep(flags: Any, level: Any) -> None:
 
 def period(
     before: int, after: int, last: Any, *, is_levelled: bool = False, untied: str = ""
-) -> report.Report:
-    return report.of_period(
+) -> pipeline.Report:
+    return pipeline.of_period(
         PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, ImuCounts(), None,
         {"no time field": 3}, is_levelled=is_levelled, untied=untied,
     )  # fmt: skip
 
 
 def test_a_period() -> None:
-    last = report.of_sweep(quality(still=True), 0)
+    last = pipeline.of_sweep(quality(still=True), 0)
     told = period(3, 8, last)
     assert told.level == Level.OK
     assert "5 sweeps" in told.message
@@ -62,13 +62,15 @@ def test_a_period() -> None:
 
 
 def test_a_velocity_that_cannot_be_used_is_told_unless_worse_is() -> None:
-    told = period(3, 8, report.of_sweep(quality(), 0), untied="'base' is not tied")
+    told = period(3, 8, pipeline.of_sweep(quality(), 0), untied="'base' is not tied")
     assert told.level == Level.WARN
     assert told.message.endswith("velocity not used: 'base' is not tied")
-    assert period(3, 8, report.of_sweep(quality(Flag.NO_IMU), 0), untied="x").level == Level.ERROR
+    assert (
+        period(3, 8, pipeline.of_sweep(quality(Flag.NO_IMU), 0), untied="x").level == Level.ERROR
+    )
 
 
 def test_levelled_clouds_are_an_error_whatever_else() -> None:
-    told = period(3, 8, report.of_sweep(quality(), 0), is_levelled=True)
+    told = period(3, 8, pipeline.of_sweep(quality(), 0), is_levelled=True)
     assert told.level == Level.ERROR
     assert "imu_adjust" in told.message

@@ -12,7 +12,7 @@ from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.types import IMU_SAMPLE, HostNs
-from l2lidar_proc.motion.imu_convention import ImuConvention
+from l2lidar_proc.motion.imu_corrections import ImuConvention
 
 
 def samples_of(motion: Any, seconds: float, factor: float = 1.0) -> np.ndarray:

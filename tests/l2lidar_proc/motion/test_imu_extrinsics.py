@@ -13,7 +13,7 @@ from l2lidar_node.calibration.file import CalibrationFile, ImuCalibration
 from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import IMU_SAMPLE
 from l2lidar_proc.motion.config import ImuConfig, MotionConfig
-from l2lidar_proc.motion.imu_extrinsics import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.odometry.config import OdometryTopics
 
 IMU = ImuCalibration(

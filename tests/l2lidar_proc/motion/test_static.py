@@ -9,8 +9,12 @@ import pytest
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.initialization import initial_state
-from l2lidar_proc.motion.static import gravity_is_plausible, may_be_static, static_reference
+from l2lidar_proc.motion.static import (
+    gravity_is_plausible,
+    initial_state,
+    may_be_static,
+    static_reference,
+)
 from tests.l2lidar_proc.motion.analytic import Motion, noisy
 
 LEVELS = {"quiet": (0.0, 0.0, 0.0), "usual": (0.03, 0.03, 0.06), "rough": (0.1, 0.2, 0.1)}

@@ -11,7 +11,7 @@ from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.preintegration import integrate, segment
-from l2lidar_proc.motion.sweep_trajectory import SweepTrajectory, still_trajectory
+from l2lidar_proc.motion.sweep_motion import SweepTrajectory, still_trajectory
 from tests.l2lidar_proc.motion.analytic import T_CLOUD_IMU, G, Motion, at
 
 WALK = Motion(turn=1.0, nod=0.15, speed=1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, strategies as st
 
-from l2lidar_proc.odometry.cell_index import CellIndex
+from l2lidar_proc.odometry.surfel_map import CellIndex
 
 KEYS = st.one_of(
     st.integers(0, (1 << 63) - 1),

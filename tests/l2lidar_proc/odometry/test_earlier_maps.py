@@ -9,8 +9,7 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState, with_loose_pose
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, moved
-from l2lidar_proc.odometry.frame_jump import FrameJump
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, FrameJump, moved
 from l2lidar_proc.odometry.matcher import SweepMatcher
 
 RNG = np.random.default_rng(3)

@@ -16,12 +16,11 @@ from l2lidar_proc.motion.filter import ERRORS, InertialState
 from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.estimate import Status
-from l2lidar_proc.odometry.kiss import thinned_indices
+from l2lidar_proc.odometry.kiss import PlainOdometry, thinned_indices
 from l2lidar_proc.odometry.matcher import SweepMatcher
-from l2lidar_proc.odometry.plain import PlainOdometry
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.recording.trajectory import Trajectory, kitti, levelled_start, tum
+from l2lidar_proc.recording.outputs import Trajectory, kitti, levelled_start, tum
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps

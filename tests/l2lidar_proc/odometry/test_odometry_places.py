@@ -12,7 +12,7 @@ import pytest
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
-from l2lidar_proc.motion.initialization import initial_state
+from l2lidar_proc.motion.static import initial_state
 from l2lidar_proc.odometry.alignment import align
 from l2lidar_proc.odometry.config import OdometryConfig, SurfaceConfig
 from l2lidar_proc.odometry.correspondences import Source

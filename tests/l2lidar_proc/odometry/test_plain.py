@@ -10,7 +10,7 @@ import pytest
 from l2lidar_node.types import HostNs, Sweep
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
-from l2lidar_proc.odometry.plain import PlainOdometry
+from l2lidar_proc.odometry.kiss import PlainOdometry
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
 

@@ -11,7 +11,7 @@ import pytest
 from l2lidar_node.types import POINT
 from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.config import FilterConfig
-from l2lidar_proc.deskew.organise import organise
+from l2lidar_proc.deskew.filters import organise
 
 FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="the recordings are not here")

@@ -11,9 +11,8 @@ import pytest
 
 from l2lidar_node.emulator.world.mapping_scenes import office_ring
 from l2lidar_proc.slam import se3
-from l2lidar_proc.slam.admission import Admission, Loop
-from l2lidar_proc.slam.candidates import Graph
 from l2lidar_proc.slam.config import LoopConfig, SlamConfig
+from l2lidar_proc.slam.loops import Admission, Graph, Loop
 from l2lidar_proc.slam.nodes import Health, Keyframe, SlamState
 from l2lidar_proc.slam.pose_graph import (
     CUT,

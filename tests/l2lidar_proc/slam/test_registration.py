@@ -10,8 +10,7 @@ from l2lidar_proc.slam import places, se3
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.places import Place
 from l2lidar_proc.slam.se3 import F64, SHIFT
-from l2lidar_proc.slam.submap import STEP_M, Submap, SubmapBuilder, SubmapView
-from l2lidar_proc.slam.surface_grid import SurfaceGrid
+from l2lidar_proc.slam.submap import STEP_M, Submap, SubmapBuilder, SubmapView, SurfaceGrid
 from l2lidar_proc.slam.verification import (
     REASONS,
     Match,

@@ -1,13 +1,15 @@
-"""Keeps poses with their instants and writes them as the lines that evo and others read."""
+"""Trajectories and maps as files that others read."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
+from l2lidar_node.files import whole
 from l2lidar_node.types import F64, HostNs
 
 STAMPED_POSE: Final = np.dtype([("stamp", "<i8"), ("pose", "<f8", (4, 4))])
@@ -68,3 +70,20 @@ def levelled_start(pose: F64) -> F64:
     out[:3, :3] = turn
     out[:3, 3] = -turn @ pose[:3, 3]
     return out
+
+
+def save(path: Path, points: NDArray[np.float64]) -> int:
+    """Write points (N, 3) [m] in the format that the suffix names; return how many.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points)))
+    with whole(path) as part:
+        if not o3d.io.write_point_cloud(part, cloud):
+            raise OSError(f"{path} could not be written")
+    return len(points)
