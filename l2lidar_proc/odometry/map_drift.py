@@ -140,14 +140,16 @@ class MapDrift:
         """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m].
 
         What a unit's calibration is wrong by adds up with the distance; and with the way, where
-        the map of the place that was there first is forgotten.
+        the map of the place that was there first is forgotten. The map bends where it grows: the
+        attitude errs with the way as the vertical does.
         """
         moved = _carried(place)
         away = float(np.linalg.norm(place))
         left = 1.0 - np.exp(-max(away, self._behind) / tuning.UNIT_FROM_M)  # 0 defines the frame
         share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self._behind)
         shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
-        unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2] * 3)
+        bend = tuning.MAP_BEND**2 * max(away, self._behind)
+        unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
         return np.asarray(moved @ self._current @ moved.T + unit)
 
 

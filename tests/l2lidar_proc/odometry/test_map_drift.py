@@ -58,6 +58,9 @@ def test_around_and_back_only_the_first_map_of_the_place_holds_it() -> None:
     added = (drift.at(ZERO) - SURE)[:3, :3]
     expected = (tuning.UNIT_WAY_SHARE * 80.0) ** 2 + tuning.UNIT_SHIFT**2
     np.testing.assert_allclose(added, np.eye(3) * expected, rtol=1e-4)
+    turned = (drift.at(ZERO) - SURE)[3:, 3:]
+    expected = tuning.MAP_BEND**2 * 80.0 + tuning.UNIT_TURN**2
+    np.testing.assert_allclose(turned, np.eye(3) * expected, rtol=1e-4)
     drift.meet(held_by(0))
     np.testing.assert_allclose(drift.at(ZERO), SURE, atol=1e-9)
 
