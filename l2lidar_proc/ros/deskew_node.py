@@ -27,10 +27,9 @@ from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.types import F64, HostNs, Level, Sweep, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, without_time
-from l2lidar_proc.deskew import pipeline
 from l2lidar_proc.deskew.config import AS_INPUT, DeskewNodeConfig, ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
-from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
+from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, Report, of_period, of_sweep
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, MotionTracker, carried_over
 from l2lidar_proc.ros import odometry_messages as messages
@@ -171,7 +170,7 @@ class DeskewNode(ManagedNode):
         velocity = [topics.velocity_topic] if topics.velocity_type != "none" else []
         self._inputs = InputMonitor(self, (topics.cloud_topic, topics.imu_topic, *velocity))
         self._untied = ""
-        self._last: pipeline.Report | None = None
+        self._last: Report | None = None
         self._before = self._pipeline.counts
         speaking = QoSProfile(depth=10, reliability=RELIABILITY[topics.qos_reliability])
         self._output = self.create_publisher(PointCloud2, topics.output_topic, speaking)
@@ -331,7 +330,7 @@ class DeskewNode(ManagedNode):
     def _publish(self, item: Deskewed) -> None:
         self._output.publish(self._serialised(item.points, item.stamp))
         self._scan.publish(item, self._cloud_frame, self.pipeline.tracker)
-        self._last = pipeline.of_sweep(item.quality, item.waited_ns)
+        self._last = of_sweep(item.quality, item.waited_ns)
         if self._statistics.get_subscription_count():
             self._statistics.publish(self._status(self._last, "sweep"))
 
@@ -359,7 +358,7 @@ class DeskewNode(ManagedNode):
 
     def _diagnose(self) -> None:
         tracker = self.pipeline.tracker
-        judged = pipeline.of_period(
+        judged = of_period(
             self._before,
             self.pipeline.counts,
             self._last,
@@ -380,7 +379,7 @@ class DeskewNode(ManagedNode):
         message.status = [self._status(judged, "deskew")]
         self._diagnostics.publish(message)
 
-    def _status(self, judged: pipeline.Report, name: str) -> DiagnosticStatus:
+    def _status(self, judged: Report, name: str) -> DiagnosticStatus:
         return DiagnosticStatus(
             level=bytes([judged.level]),
             name=f"{self.get_fully_qualified_name().lstrip('/')}: {name}",
