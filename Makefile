@@ -57,8 +57,8 @@ docs: setup pages ## the documents as a site with search and API pages, in site/
 docs-serve: docs ## the same at http://127.0.0.1:8000, renewed at every change
 	$(RUN) -m mkdocs serve
 
-pages: setup ## write the pages that follow from the code (docs/parameters.md)
-	$(RUN) -m benchmarks.pages
+pages: setup ## write what follows from the settings (config/, docs/parameters.md)
+	$(RUN) -m scripts.make_reference
 
 animation: setup ## draw README's animation (docs/demo.gif)
 	$(RUN) -m benchmarks.animation

@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import chain, cost_rounds, reference_load
+from benchmarks import chain, cost_rounds, results
 from benchmarks.chain import CLOUDS, DESKEWED, ODOMETRY
 from benchmarks.cost_rounds import NOW, THEN_NODES, Chain, Round
 from benchmarks.results import Target, at_most, markdown, publish, replaced, verdicts
@@ -220,7 +220,7 @@ def main() -> int:
             file=sys.stderr,
         )
         return 1
-    rate = reference_load.packets_per_cpu_s()
+    rate = results.packets_per_cpu_s()
     blocks = {
         "processes": process_rows(rounds),
         "threads": thread_rows(rounds["now"], rate),

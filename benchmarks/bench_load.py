@@ -17,13 +17,16 @@ import numpy as np
 import rclpy
 
 from benchmarks import load_chain, load_scale
-from benchmarks.reference_load import (
+from benchmarks.results import (
     Relative,
+    Target,
+    at_least,
+    at_most,
     checksums_per_cpu_s,
     packets_per_cpu_s,
+    publish,
     relative,
 )
-from benchmarks.results import Target, at_least, at_most, publish
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros

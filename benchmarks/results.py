@@ -1,18 +1,28 @@
-"""The common form of what the measuring commands find: a table to read and a file to compare."""
+"""The common form of what the measuring commands find: a table to read and a file to compare.
+
+The speed of a machine swings from day to day, and with what else runs on it, by half. A figure in
+units of a fixed load (:func:`relative`), both measured in alternation, hardly does.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
+import statistics
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+import time
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
+
+from l2lidar_node.protocol import wire
 
 FOLDER = Path("out") / "bench"
 
@@ -213,3 +223,61 @@ def _processor() -> str:
 
 def _text(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+_PACKET: Final = (bytes(range(256)) * 5)[: wire.FRAME_SIZES[wire.PacketType.POINTS_3D]]
+_LAYOUT: Final = np.dtype(np.uint8)
+_ROUND: Final = 20_000
+
+
+class Relative(NamedTuple):
+    """A rate of packets, and the reference load's beside it.
+
+    Attributes
+    ----------
+    rate : float
+        Median [packets per CPU s].
+    ratio : float
+        Median of the ratios to the reference load's rate that was measured next to each.
+    low, high : float
+        The smallest and the largest of these.
+    """
+
+    rate: float
+    ratio: float
+    low: float
+    high: float
+
+
+def packets_per_cpu_s(packets: int = _ROUND) -> float:
+    """Return how many packets per CPU second this load takes: their CRC-32 and a view."""
+    begin = time.process_time()
+    for _ in range(packets):
+        zlib.crc32(_PACKET)
+        np.frombuffer(_PACKET, _LAYOUT)
+    return packets / (time.process_time() - begin)
+
+
+def checksums_per_cpu_s(packets: int = 5 * _ROUND) -> float:
+    """Return how many CRC-32 of a packet of points zlib makes in a CPU second."""
+    begin = time.process_time()
+    for _ in range(packets):
+        zlib.crc32(_PACKET)
+    return packets / (time.process_time() - begin)
+
+
+def relative(
+    measure: Callable[[], float],
+    rounds: int,
+    reference: Callable[[], float] = packets_per_cpu_s,
+) -> Relative:
+    """Measure a rate [packets per CPU s] some times, the reference load before and after each."""
+    rates, ratios = [], []
+    before = reference()
+    for _ in range(rounds):
+        rate = measure()
+        after = reference()
+        rates.append(rate)
+        ratios.append(2.0 * rate / (before + after))
+        before = after
+    return Relative(statistics.median(rates), statistics.median(ratios), min(ratios), max(ratios))

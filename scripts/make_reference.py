@@ -1,6 +1,7 @@
-"""Writes the parameter files of config/ from the settings; ``make pages`` writes their tables.
+"""Writes what follows from the settings: the parameter files of config/, and docs/parameters.md.
 
-Run ``python -m scripts.make_reference`` after a setting changed; ``--check`` tells if it is due.
+Run ``make pages`` or ``python -m scripts.make_reference`` after a setting changed; ``--check``
+tells if it is due.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import textwrap
 from pathlib import Path
 
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.settings import Setting, settings_of
+from l2lidar_node.settings import Setting, markdown_table, settings_of
 from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.slam.config import SlamNodeConfig
@@ -35,6 +36,16 @@ HEAD = """\
 # This file is written by scripts/make_reference.py; copy it and give yours to the launch file.
 """
 
+PAGE_HEAD = """# Parameters
+
+Parameters marked as live can be set while the node runs. A wrong value is refused with a reason,
+at start and live, all or nothing. Upstream's YAML file works as it is.
+`ros2 param describe /l2lidar_node NAME` says the same.
+
+The files to start from are `config/l2lidar_node.yaml` and `config/l2lidar_proc.yaml`;
+`config/consumers/` has the driver's parameters for LIO-SAM, FAST-LIO and others.
+"""
+
 
 def parameter_file(nodes: dict[str, type]) -> str:
     """Return the text of a parameter file from the settings of each node it is for."""
@@ -49,6 +60,15 @@ def parameter_file(nodes: dict[str, type]) -> str:
                 lines.append(f"    # (the default is {_scalar(item.default)})\n")
             lines.append(f"    {item.name}: {_scalar(value)}\n")
     return "".join(lines)
+
+
+def parameter_page() -> str:
+    """Return the page of all parameters of all nodes."""
+    nodes = {"l2lidar_node" if node == "/**" else node: group
+             for file in FILES.values() for node, group in file.items()}  # fmt: skip
+    parts = [PAGE_HEAD]
+    parts += [f"## {name}\n\n{markdown_table(group)}\n" for name, group in nodes.items()]
+    return "\n".join(parts)
 
 
 def _meaning(item: Setting) -> str:
@@ -70,7 +90,8 @@ def _scalar(value: object) -> str:
 
 def outputs() -> dict[Path, str]:
     """Return the text of every file that follows from the settings."""
-    return {ROOT / "config" / name: parameter_file(nodes) for name, nodes in FILES.items()}
+    files = {ROOT / "config" / name: parameter_file(nodes) for name, nodes in FILES.items()}
+    return {**files, ROOT / "docs" / "parameters.md": parameter_page()}
 
 
 def main() -> int:

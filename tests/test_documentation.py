@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from benchmarks import pages
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import settings_of
 
@@ -105,10 +104,6 @@ def test_the_site_shows_every_page() -> None:
     """mkdocs builds what is in its list, the start page and the generated ones besides."""
     listed = set(re.findall(r"^ +- .*?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
     assert {page.name for page in (ROOT / "docs").glob("*.md")} <= listed
-
-
-def test_the_page_of_parameters_is_that_of_the_code() -> None:
-    assert pages.PAGE.read_text() == pages.parameters(), "run `make pages`"
 
 
 def test_the_first_screen_names_parameters_that_exist() -> None:
