@@ -23,9 +23,9 @@ def rms_mm(scenario: Scenario) -> dict[str, float]:
 @pytest.mark.parametrize(
     "scenario",
     [
-        Scenario("walk", "walk", 1.0, seconds=7.0),
-        Scenario("noise and bias", "trot", 0.8, seconds=7.0, imu=ImuNoise(gyro_bias=(0.03,) * 3)),
-        Scenario("tilted", "walk", 0.7, mount="forward", seconds=6.5, gap_s=0.01, loss=0.05),
+        Scenario("walk", "walk", 1.0, seconds=5.5),
+        Scenario("noise and bias", "trot", 0.8, seconds=5.5, imu=ImuNoise(gyro_bias=(0.03,) * 3)),
+        Scenario("tilted", "walk", 0.7, mount="forward", seconds=5.5, gap_s=0.01, loss=0.05),
     ],
     ids=lambda scenario: scenario.name,
 )
@@ -39,6 +39,6 @@ def test_with_odometry_a_moving_sensor_sees_what_a_still_one_would(scenario: Any
 
 
 def test_turning_in_place_needs_no_velocity() -> None:
-    found = rms_mm(Scenario("pivot", "pivot", 3.0, seconds=6.0))
+    found = rms_mm(Scenario("pivot", "pivot", 3.0, seconds=5.0))
     assert found["none"] > 500.0
     assert found["gyro only"] < 1.0
