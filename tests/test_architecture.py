@@ -29,7 +29,8 @@ FILE_FORMATS = {
 def sources(module: str) -> list[Path]:
     """Return the files of a module or package."""
     place = ROOT / module.replace(".", "/")
-    return sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+    # after a pull the folder of what is one module now may still hold bytecode
+    return sorted(place.rglob("*.py")) or [place.with_suffix(".py")]
 
 
 def opened_in(path: Path) -> Iterator[int]:
