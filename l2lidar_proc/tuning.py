@@ -187,7 +187,7 @@ USUAL_LEAST: Final = 0.75  # inliers needed whatever is usual
 OVERLAP: Final = (0.0, 0.25)  # likewise, share of the points that must meet the map
 MATCHED: Final = (0, 50)  # and how many: a few fit in many places
 # A place farther from the predicted one than the robust kernel reaches has to be fixed, along the
-# way there, by so many points. Tuned on: camera looking into rooms (4 at wrong places, 11 to 30 at
+# way there, by so many points. Tuned on: camera looking into rooms (4 at wrong places, 11 to 19 at
 # the right one)
 FAR_MOVE: Final = 0.1  # [m]
 FAR_POINTS: Final = 10.0
