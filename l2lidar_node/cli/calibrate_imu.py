@@ -48,6 +48,7 @@ _BEFORE: Final = """\
     together, as fast as a quick look around (1 to 2 rad/s, not above 3), and shake it meanwhile,
     until the three bars are full: 30 s or so"""
 _AXES: Final = ("roll about x", "nod about y", "turn about z")
+_FIRST_SAMPLE_S: Final = 10.0  # the clock needs a second or two of packets before it gives any
 _STILL_S: Final = 5.0
 _SHORTEST_S: Final = 20.0  # of motion, however vivid
 _VIRTUAL_S: Final = 36.0
@@ -188,16 +189,16 @@ def _live(
         with ExitStack() as stack:
             device = stack.enter_context(Device(network, watch, recorder))
             files.wait_for_points(device, quiet=quiet)
+            if device.wait_for(lambda driver: driver.last_imu, _FIRST_SAMPLE_S) is None:
+                raise CommandError(
+                    "no IMU samples from the L2; switch its IMU on: l2lidar set work-mode -- "
+                    "-imu_off"
+                )
             progress = stack.enter_context(_bar(quiet))
             task = progress.add_task("still", total=_STILL_S)
             files.pass_time(
                 _STILL_S, failures, lambda passed: progress.update(task, completed=passed)
             )
-            if not len(watch.samples):
-                raise CommandError(
-                    "no IMU packets from the L2; switch its IMU on: l2lidar set work-mode -- "
-                    "-imu_off"
-                )
             watch.clear()
             bars = [progress.add_task(name, total=ENOUGH) for name in _AXES]
             clock = progress.add_task("time", total=seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from l2lidar_node.calibration.file import CalibrationFile, load
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
 from l2lidar_node.protocol import wire
-from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.protocol.wire import PacketType, WorkMode
 from l2lidar_node.recording.capture import Endpoint
 from l2lidar_node.recording.recording import RecordingWriter
 from l2lidar_node.types import HostNs
@@ -174,6 +175,21 @@ def test_turning_is_shown_in_bars_and_can_be_given_up(unit: Unit, tmp_path: Path
         terminal.interrupt()
         assert terminal.exit_code() == 130
         assert "Traceback" not in terminal.said
+    assert not output.exists()
+
+
+def test_a_unit_whose_imu_is_off_is_told_before_anybody_turns_it(
+    run: Run,
+    make_unit: Callable[..., Unit],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("l2lidar_node.cli.calibrate_imu._FIRST_SAMPLE_S", 0.5)
+    unit = make_unit(mode=int(WorkMode.IMU_OFF))
+    output = tmp_path / "unit.yaml"
+    done = run("calibrate", "imu", "-o", str(output), *unit.options, answer="y")
+    assert done.code == 1
+    assert "no IMU samples from the L2; switch its IMU on" in done.err
     assert not output.exists()
 
 
