@@ -560,8 +560,8 @@ class Outcome:
         return {name: some[-1] - some[len(some) // 2] for name, some in self.sizes_mb.items()}
 
 
-def fuzz(seconds: float, seed: int, attacks: int) -> Outcome:
-    """Run rounds for a time."""
+def fuzz(seconds: float, seed: int, attacks: int, least: int = _CALM_EVERY) -> Outcome:
+    """Run rounds for a time, and at least so many; the first is calm."""
     isolate_ros()
     run = record("room", "walk", 1, _RUN_S)
     rclpy.init()
@@ -577,7 +577,7 @@ def fuzz(seconds: float, seed: int, attacks: int) -> Outcome:
                 campaign.spin(0.1)
             load.begin()
             deadline = time.monotonic() + seconds
-            while time.monotonic() < deadline or campaign.rounds < _CALM_EVERY:
+            while time.monotonic() < deadline or campaign.rounds < least:
                 is_calm = campaign.rounds % _CALM_EVERY == 0
                 campaign.round(0 if is_calm else attacks)
                 if is_calm:
