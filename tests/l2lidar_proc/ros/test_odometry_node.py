@@ -326,6 +326,37 @@ def test_what_other_sensors_do_differently_is_recognized_and_said(bench: Any) ->
     assert np.allclose(bench.node._pipeline.odometry.T_cloud_imu, np.eye(4))
 
 
+@pytest.mark.parametrize(
+    ("bench", "most"), [((), 3), (("max_skipped:=0",), 0)], indirect=["bench"]
+)
+def test_clouds_that_wait_are_skipped_in_part_and_all_come_out(bench: Any, most: int) -> None:
+    """As after a hold-up: eight clouds at once, and the samples that cover them."""
+    statuses: list[DiagnosticArray] = []
+    bench.hear(DiagnosticArray, "odometry_status", statuses.append)
+    bench.until(bench.node._status.get_subscription_count)
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:16]
+    bench.send(run, some[:8])
+    first, last = np.searchsorted(run.imu["stamp"], [some[7].end, some[-1].end]) + 1
+    for sample in run.imu[first:last]:
+        bench.send_sample(sample)
+        bench.executor.spin_once(timeout_sec=0.0)
+    for sweep in some[8:]:
+        bench.send_cloud(sweep.points, sweep.start)
+    bench.until(lambda: len(statuses) == len(bench.poses) == 16)
+
+    stamps = [from_time(message.header.stamp) for message in bench.poses]
+    middles = [(sweep.start + sweep.end) // 2 for sweep in some]
+    # a cloud ends with its last point, where the sweep may end with a packet
+    np.testing.assert_allclose(np.subtract(stamps, middles), 0, atol=100_000)
+    skipped = ["SKIPPED" in message.status[0].message for message in statuses]
+    assert not any(skipped[:8])
+    assert any(skipped) == (most > 0)
+    in_a_row = max(len(part) for part in "".join("01"[one] for one in skipped).split("0"))
+    assert in_a_row <= most
+    assert not any(skipped[-2:]), "no two clouds wait behind the last ones"
+
+
 def test_back_ends_get_deskewed_clouds_and_the_status_of_each_pose(bench: Any) -> None:
     clouds: list[PointCloud2] = []
     statuses: list[DiagnosticArray] = []
