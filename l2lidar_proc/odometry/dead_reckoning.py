@@ -98,10 +98,7 @@ class DeadReckoning:
         rate = _mean(np.vstack((before[1], rates)), weights) - anchor.gyro_bias
         force = _mean(np.vstack((before[2], forces)), weights) - anchor.accel_bias
         self._move(HostNs(int(stamps[-1])), rate, force, anchor.gravity)
-        pose = np.eye(4)
-        pose[:3, :3] = self._rotation
-        pose[:3, 3] = self._place - self._rotation @ self._lever
-        return pose
+        return self._pose()
 
     @property
     def estimate(self) -> OdometryEstimate:
@@ -115,16 +112,20 @@ class DeadReckoning:
         if self._anchor is None:
             raise ValueError("no estimate to carry on from")
         rotation = self._rotation
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, self._place - rotation @ self._lever
         return dataclasses.replace(
             self._anchor,
             stamp=self.stamp,
-            T_map_lidar=pose,
+            T_map_lidar=self._pose(),
             covariance=_grown(self._anchor, rotation, (self.stamp - self._anchor.stamp) * 1e-9),
             velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
             angular_velocity=self._rate,
         )
+
+    def _pose(self) -> F64:
+        pose = np.eye(4)
+        pose[:3, :3] = self._rotation
+        pose[:3, 3] = self._place - self._rotation @ self._lever
+        return pose
 
     def _usable(self, samples: Samples) -> tuple[NDArray[np.int64], F64, F64]:
         rates, forces = samples["angular_velocity"], samples["linear_acceleration"]

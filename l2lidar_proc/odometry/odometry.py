@@ -251,7 +251,7 @@ class Odometry:
         if gaps_in(predicted):
             return None
         status = [Status.PREDICTED, Status.SKIPPED]
-        if self._is_at_rest(sweep):
+        if self._stays_at_rest(sweep):
             rested = self._predictor.static_update(state, covariance, predicted.state.stamp)
             motion = predicted.at_rest(*rested)
         else:
@@ -352,7 +352,7 @@ class Odometry:
 
     def _hold(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Hold the pose; return None if IMU or sweep show motion, then the sweep is tracked."""
-        if not self._is_at_rest(sweep):
+        if not self._stays_at_rest(sweep):
             return None
         assert self._belief is not None
         state, covariance = self._belief
@@ -383,8 +383,8 @@ class Odometry:
         self.matcher.extend(estimate.points, still, still.state)
         return estimate
 
-    def _is_at_rest(self, sweep: Sweep) -> bool:
-        """Return whether the sensor was at rest before a sweep and the IMU does not object."""
+    def _stays_at_rest(self, sweep: Sweep) -> bool:
+        """Return whether the sensor rests and the IMU does not object; if it does, let go."""
         if self.phase is not Phase.STATIONARY:
             return False
         samples = self._predictor.samples(sweep.end - tuning.STILL_IMU_NS, sweep.end)
