@@ -212,7 +212,7 @@ class Driver:
         """Return what need not wait any longer, nothing more having arrived until then.
 
         Packets that waited :data:`~l2lidar_node.driver.reorder.REORDER_NS` for an earlier one, and
-        the sweep of a stream of points that paused for :data:`MAX_GAP_NS`.
+        the sweep of a stream of points that paused for :data:`MAX_GAP_NS`, unless it is a turn.
         """
         events = self._released(self._reorder_buffer.settle(until))
         if self._has_stalled(until):
@@ -420,7 +420,7 @@ class Driver:
         return [answer]
 
     def _has_stalled(self, until: HostNs) -> bool:
-        return self._assembler.is_collecting and self._reorder_buffer.pause_ns(until) > MAX_GAP_NS
+        return self._assembler.ends_at_pause and self._reorder_buffer.pause_ns(until) > MAX_GAP_NS
 
     def _send_due(self, now: HostNs) -> list[Event]:
         due = [commands.sync_time(now)] if self._clock.sync_due(now) else []

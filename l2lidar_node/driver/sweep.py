@@ -191,9 +191,13 @@ class SweepAssembler:
         self.blocks.configure(config)
 
     @property
-    def is_collecting(self) -> bool:
-        """Whether packets wait for their sweep to be complete."""
-        return bool(self._packets)
+    def ends_at_pause(self) -> bool:
+        """Whether what has been collected is a sweep if nothing more comes.
+
+        Part of a turn is not. It waits: packets that the network or a busy host held back go on
+        where the ones before ended, and then the turn is whole. Their stamps tell.
+        """
+        return bool(self._packets) and not self._cuts_by_angle(self._packets[0].packet)
 
     def push(self, packet: PointPacket, start: HostNs, missing: int = 0) -> list[Sweep]:
         """Add a packet and return the sweeps this completes: none, one or two.

@@ -292,6 +292,26 @@ def test_a_stalled_stream_hands_out_what_there_is(datagrams: list[Datagram]) -> 
     assert len(run.of(Sweep)) == complete + 1
 
 
+@pytest.mark.parametrize("cut", ["turn", "half_turn"])
+@pytest.mark.parametrize("every_ms", [300, 900])
+def test_turns_are_whole_where_packets_come_in_bursts(
+    datagrams: list[Datagram], cut: str, every_ms: int
+) -> None:
+    """A busy host or a Wi-Fi holds packets back; none is lost, and no turn is given up."""
+    every = every_ms * 1_000_000
+    locked = datagrams[0][0] + 1_000_000_000
+    held_back = [
+        (locked - (locked - arrival) // every * every if arrival > locked else arrival, data)
+        for arrival, data in datagrams
+    ]
+    smooth = Run(sweep_cut=cut).play(datagrams)
+    bursts = Run(sweep_cut=cut).play(held_back)
+    assert len(smooth.of(Sweep)) >= 5
+    for one, other in zip(bursts.of(Sweep), smooth.of(Sweep), strict=True):
+        np.testing.assert_array_equal(one.points["range"], other.points["range"])
+    assert bursts.driver.counters.fragments == 1  # of the turn during which the clock locked
+
+
 def test_flush_hands_out_everything(datagrams: list[Datagram]) -> None:
     run = Run().play(datagrams)
     (sweep,) = (event for event in run.driver.flush() if isinstance(event, Sweep))
