@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final
 
+from l2lidar_node.demo.machine import ProcessorTime, processor_time
 from l2lidar_node.programs import held
 
 GRACE_S: Final = 30.0  # for a program that ends; only one that hangs takes so long
@@ -135,6 +136,11 @@ class Programs:
         """Stop one of them now; the others go on."""
         self._running.remove(program)
         program.stop()
+
+    def processor_times(self) -> dict[str, ProcessorTime]:
+        """Return the processor time of those that run, by module; where the system tells it."""
+        times = {item.module: processor_time(item.pid) for item in self._running}
+        return {module: time for module, time in times.items() if time is not None}
 
     def check(self) -> None:
         """Raise :class:`ProgramError` if any of them has ended."""

@@ -196,10 +196,9 @@ def end(device: VirtualL2, server: Server) -> Iterator[str]:
         f"{count} {PacketType(kind).name}" for kind, count in sorted(device.received.items())
     )
     yield f"sent in {seconds:.1f} s: {sent or 'nothing'}; heard: {heard or 'nothing'}"
-    late = server.latency
-    if late.count:
-        p50, p99 = late.quantile_ns(0.5) * 1e-6, late.quantile_ns(0.99) * 1e-6
-        yield f"latency: p50 {p50:.2f} ms, p99 {p99:.2f} ms, max {late.max_ns * 1e-6:.2f} ms"
+    if server.latency.count:
+        late = ", ".join(f"{name} {ms:.2f} ms" for name, ms in server.latency.summary_ms().items())
+        yield f"latency: {late}"
     counts = device.packet_log.counts
     if counts:
         happened = ", ".join(f"{count} {fault.name}" for fault, count in counts.items())
@@ -340,7 +339,7 @@ def emulate(
             _say(*end(device, server))
             if truth is not None:
                 values = {**values_of(physics), **values_of(config), "speed": speed}
-                _write_truth(truth, device, ray_cast_worker, values)
+                _write_truth(truth, device, server, ray_cast_worker, values)
 
 
 def _pace(text: str) -> float:
@@ -371,10 +370,15 @@ def _make_folder(folder: Path) -> None:
 def _write_truth(
     folder: Path,
     device: VirtualL2,
+    server: Server,
     ray_cast_worker: RayCastWorker | None,
     values: dict[str, Value],
 ) -> None:
-    run = {"power_on_ns": device.power_on_ns, "settings": values}
+    run = {
+        "power_on_ns": device.power_on_ns,
+        "latency_ms": server.latency.summary_ms(),
+        "settings": values,
+    }
     write_packet_log(folder, device.packet_log, run)
     if ray_cast_worker is not None:
         lasted_s = max(device.now_ns - device.power_on_ns, 0) * 1e-9

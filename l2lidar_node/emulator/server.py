@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import math
 import os
@@ -130,32 +131,46 @@ def _pattern(mode: WorkMode, empty: bool) -> PatternScanner:
 
 
 _BIN_NS: Final = 10_000
-_BINS: Final = 10_000  # up to 100 ms
+_FINE_NS: Final = 100_000_000
+_COARSE_BIN_NS: Final = 10_000_000
+_COARSE_NS: Final = 60_000_000_000
 
 
 class Latency:
-    """Distribution of delays with a resolution of 10 us up to 100 ms, and the exact maximum."""
+    """Distribution of delays, and the exact maximum.
+
+    The resolution is 10 us up to 100 ms, and 10 ms up to a minute.
+    """
 
     def __init__(self) -> None:
-        self._counts = [0] * (_BINS + 1)
+        self._edges = [  # upper ends of the bins
+            *range(_BIN_NS, _FINE_NS, _BIN_NS),
+            *range(_FINE_NS, _COARSE_NS + 1, _COARSE_BIN_NS),
+        ]
+        self._counts = [0] * (len(self._edges) + 1)
         self.count = 0
         self.max_ns = 0
 
     def add(self, late_ns: int) -> None:
         """Count one delay; a negative one counts as none."""
         late_ns = max(late_ns, 0)
-        self._counts[min(late_ns // _BIN_NS, _BINS)] += 1
+        self._counts[bisect.bisect_right(self._edges, late_ns)] += 1
         self.count += 1
         self.max_ns = max(self.max_ns, late_ns)
 
     def quantile_ns(self, share: float) -> int:
         """Return a delay that at least this share of all did not exceed; 0 without any."""
         seen = 0
-        for number, count in enumerate(self._counts):
+        for count, edge in zip(self._counts, [*self._edges, self.max_ns], strict=True):
             seen += count
             if count and seen >= share * self.count:
-                return self.max_ns if number == _BINS else min((number + 1) * _BIN_NS, self.max_ns)
+                return min(edge, self.max_ns)
         return 0
+
+    def summary_ms(self) -> dict[str, float]:
+        """Return median, 99th percentile and maximum [ms]: ``p50``, ``p99``, ``max``."""
+        p50, p99 = self.quantile_ns(0.5), self.quantile_ns(0.99)
+        return {"p50": p50 * 1e-6, "p99": p99 * 1e-6, "max": self.max_ns * 1e-6}
 
 
 _LONGEST_WAIT_S: Final = 0.05  # to notice a stop or a held-back packet

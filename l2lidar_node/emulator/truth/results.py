@@ -96,7 +96,8 @@ class Results:
     faults : list of FaultEvent
         In order.
     run : dict
-        Settings and ``power_on_ns``.
+        ``settings``, ``power_on_ns``, and ``latency_ms``: how late packets left, as ``p50``,
+        ``p99`` and ``max``.
     """
 
     def __init__(self, folder: Path) -> None:

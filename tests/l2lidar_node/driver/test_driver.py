@@ -301,8 +301,8 @@ def test_turns_are_whole_where_packets_come_in_bursts(
     every = every_ms * 1_000_000
     locked = datagrams[0][0] + 1_000_000_000
     held_back = [
-        (locked - (locked - arrival) // every * every if arrival > locked else arrival, data)
-        for arrival, data in datagrams
+        Datagram(HostNs(locked - (locked - at) // every * every if at > locked else at), data)
+        for at, data in datagrams
     ]
     smooth = Run(sweep_cut=cut).play(datagrams)
     bursts = Run(sweep_cut=cut).play(held_back)

@@ -329,6 +329,8 @@ def test_the_truth_of_a_run(host: socket.socket, tmp_path: Path) -> None:
 
     results = Results(folder)
     assert results.run["settings"]["seed"] == 7
+    late = results.run["latency_ms"]
+    assert 0.0 < late["p50"] <= late["p99"] <= late["max"]
     assert json.loads((folder / "run.json").read_text())["settings"]["world"] == "box"
     packets = results.packets[results.packets["type"] == 102]
     whole = packets[packets["copies"] > 0]

@@ -331,3 +331,8 @@ def test_latency_is_counted_in_bounded_memory() -> None:
     assert late.quantile_ns(0.5) == pytest.approx(500_000, abs=10_000)
     assert late.quantile_ns(1.0) == late.max_ns == 10**12
     assert late.count == 1002
+    seconds = Latency()
+    for k in range(1000):
+        seconds.add(k * 10_000_000)
+    assert seconds.quantile_ns(0.5) == pytest.approx(5_000_000_000, abs=10_000_000)
+    assert seconds.quantile_ns(0.99) == pytest.approx(9_900_000_000, abs=10_000_000)

@@ -15,6 +15,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from l2lidar_node.demo.__main__ import main
+from l2lidar_node.demo.machine import INCONCLUSIVE
 
 pytestmark = pytest.mark.ros
 
@@ -28,8 +29,8 @@ PACE = re.compile(r" ms apart, expected |/odometry: \d poses, expected ")
 def run(*options: str) -> tuple[str, bool]:
     """Run the demo, in which nothing may be wrong; return what it says.
 
-    But for the pace: where the machine is too slow, most clouds do not come through. Return as
-    well whether they did.
+    But for the pace: where the machine is too slow, most clouds do not come through, or the demo
+    says that nobody can tell. Return as well whether they did.
     """
     done = subprocess.run(
         [*COMMAND, *options],
@@ -38,7 +39,10 @@ def run(*options: str) -> tuple[str, bool]:
     )  # fmt: skip
     said, _, after = done.stdout.partition("pictures: ")
     assert after, done.stdout + done.stderr
-    wrong = after.splitlines()[1:]
+    if done.returncode == INCONCLUSIVE:
+        assert "THIS MACHINE DID NOT KEEP UP" in after
+        return said, False
+    wrong = [line for line in after.splitlines()[1:] if "machine was busy" not in line]
     assert [line for line in wrong if not PACE.search(line)] == [], done.stdout
     assert (done.returncode, done.stderr) == (int(bool(wrong)), "")
     return said, not wrong
