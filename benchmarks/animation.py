@@ -13,21 +13,18 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.recording import bag
 from l2lidar_node.settings import build
-from l2lidar_node.types import ImuSample, Sweep
+from l2lidar_node.types import F64, ImuSample, Sweep
 from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording.bag import points_of, stamp_of
 from l2lidar_proc.verbs.deskew import deskew_recording
 from l2lidar_proc.verbs.odometry import run_bag
 from tests.support.odometry_runs import Run, record, sweeps
-
-F64 = NDArray[np.float64]
 
 PAGE: Final = Path("docs/demo.gif")
 _SCENE, _MOTION, _SEED, _SECONDS = "room", "trot", 3, 15.0

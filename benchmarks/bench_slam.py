@@ -32,13 +32,13 @@ from benchmarks.slam_pages import Row, targets
 from benchmarks.slam_referee import STYLES
 from l2lidar_node.emulator.world import mapping_scenes as scenes
 from l2lidar_node.emulator.world.mapping_scenes import MappingScene
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import pose_graph, se3
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.localization import Localizer
 from l2lidar_proc.slam.loops import Graph
 from l2lidar_proc.slam.nodes import Map, SlamState
 from l2lidar_proc.slam.pose_graph import LOOP
-from l2lidar_proc.slam.se3 import F64
 from l2lidar_proc.slam.slam import Slam
 from tests.support.mapping_runs import MappingRun, ate, drifting, scan, walk
 

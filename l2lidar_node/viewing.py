@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.clouds import points_of
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 _ODOMETRY: Final = "world"
 _SENSOR: Final = f"{_ODOMETRY}/sensor"

@@ -20,9 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import F64
-
-I8 = NDArray[np.int64]
+from l2lidar_node.types import F64, I64
 
 RETURN: Final = np.dtype(
     [
@@ -111,7 +109,7 @@ class Angles(NamedTuple):
 
 
 def angles(
-    returns: NDArray[np.void], block: Block, correction: F64, group: I8 | None = None
+    returns: NDArray[np.void], block: Block, correction: F64, group: I64 | None = None
 ) -> Angles:
     """Return what :func:`beams` and :func:`derivatives` need of the angles; see there."""
     own = block.values
@@ -146,7 +144,7 @@ def beams(
     returns: NDArray[np.void],
     block: Block,
     correction: F64,
-    group: I8 | None = None,
+    group: I64 | None = None,
     at: Angles | None = None,
 ) -> Beams:
     """Return the rays of returns under a corrected block.
@@ -216,6 +214,6 @@ def derivatives(returns: NDArray[np.void], at: Angles, normals: F64, distance: F
     return found.T
 
 
-def _each(values: F64, group: I8 | None) -> F64:
+def _each(values: F64, group: I64 | None) -> F64:
     """Return a value () as it is, values (G,) for each return."""
     return values if group is None else values[group]

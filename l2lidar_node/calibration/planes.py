@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import F64
+from l2lidar_node.types import F64, I64
 
 CELLS_M: Final = (0.4, 0.6)  # edges of the cells of both grids
 _FEWEST: Final = 40  # points of a cell
@@ -27,8 +27,6 @@ _SHIFT: Final = np.array(
     [0.137, 0.211, 0.173]
 )  # of the grid: walls like to stand on round numbers
 
-I8 = NDArray[np.int64]
-
 
 class Planes(NamedTuple):
     """Planes and the points on them.
@@ -45,8 +43,8 @@ class Planes(NamedTuple):
         Variances of the points along the normal and two axes in the plane, ascending [m^2].
     """
 
-    member: I8
-    first: I8
+    member: I64
+    first: I64
     center: F64
     normal: F64
     u: F64
@@ -54,12 +52,12 @@ class Planes(NamedTuple):
     spread: F64
 
     @property
-    def plane(self) -> I8:
+    def plane(self) -> I64:
         """Number of the plane of each member, shape (M,)."""
         return np.repeat(np.arange(len(self.first)), self.counts)
 
     @property
-    def counts(self) -> I8:
+    def counts(self) -> I64:
         """Points of each plane, shape (K,)."""
         return np.diff(np.append(self.first, len(self.member)))
 
@@ -74,7 +72,7 @@ class Planes(NamedTuple):
         return np.asarray(np.einsum("ni,ni->n", away, self.normal[plane]))
 
 
-def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8, most: int = _MOST) -> Planes:
+def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I64, most: int = _MOST) -> Planes:
     """Return the flat cells of two grids that hold points of both halves of the fan.
 
     Parameters
@@ -92,7 +90,7 @@ def cells(points: F64, is_far_half: NDArray[np.bool_], groups: I8, most: int = _
 
 
 def _cells(
-    points: F64, is_far_half: NDArray[np.bool_], groups: I8, size: float, most: int
+    points: F64, is_far_half: NDArray[np.bool_], groups: I64, size: float, most: int
 ) -> Planes:
     found = _grid(points, groups, size, is_far_half)
     found = _kept(found, _flat(found))
@@ -102,7 +100,7 @@ def _cells(
 
 
 def large(
-    points: F64, is_far_half: NDArray[np.bool_], groups: I8, extent: float = _LARGE_M
+    points: F64, is_far_half: NDArray[np.bool_], groups: I64, extent: float = _LARGE_M
 ) -> Planes:
     """Return large flat surfaces, merged from neighboring cells; one half may see them alone.
 
@@ -164,7 +162,7 @@ def refitted(planes: Planes, points: F64) -> Planes:
     return _fitted(planes.member, planes.first, points)
 
 
-def products(columns: F64, first: I8, weight: F64 | None = None) -> F64:
+def products(columns: F64, first: I64, weight: F64 | None = None) -> F64:
     """Return the weighted scalar products of columns (N, C) in each plane, shape (K, C, C)."""
     count = columns.shape[1]
     rows = np.ascontiguousarray(columns.T)
@@ -177,7 +175,7 @@ def products(columns: F64, first: I8, weight: F64 | None = None) -> F64:
 
 
 def _grid(
-    points: F64, groups: I8, size: float, is_far_half: NDArray[np.bool_] | None = None
+    points: F64, groups: I64, size: float, is_far_half: NDArray[np.bool_] | None = None
 ) -> Planes:
     """Return the cells of a grid with enough points, and of both halves where these are given."""
     cell = np.floor(points / size + _SHIFT).astype(np.int64)
@@ -193,7 +191,7 @@ def _grid(
     return _sorted(np.arange(len(points)), np.where(enough[label], label, -1), points)
 
 
-def _sorted(member: I8, key: I8, points: F64) -> Planes:
+def _sorted(member: I64, key: I64, points: F64) -> Planes:
     """Return planes of members by key; negative keys are left out."""
     member, key = member[key >= 0], key[key >= 0]
     order = np.argsort(key, kind="stable")
@@ -203,7 +201,7 @@ def _sorted(member: I8, key: I8, points: F64) -> Planes:
     return _fitted(member, np.flatnonzero(is_first), points)
 
 
-def _fitted(member: I8, first: I8, points: F64) -> Planes:
+def _fitted(member: I64, first: I64, points: F64) -> Planes:
     if not len(first):
         none = np.empty((0, 3))
         return Planes(member, first, none, none, none, none, none)

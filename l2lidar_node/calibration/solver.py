@@ -18,8 +18,8 @@ from l2lidar_node.calibration.model import (
     beams,
     derivatives,
 )
-from l2lidar_node.calibration.planes import I8, Planes
-from l2lidar_node.types import F64
+from l2lidar_node.calibration.planes import Planes
+from l2lidar_node.types import F64, I64
 
 # 1-sigma range noise of a real unit along smooth surfaces, over the distance
 NOISE_AT_M: Final = np.array([0.0, 8.0, 12.5, 20.0, 30.0])
@@ -40,7 +40,7 @@ _STEP: Final = np.array(
 _BALANCE: Final = 2.0  # a direction of normals counts at most so many times the mean of all
 
 
-Finder = Callable[[F64, NDArray[np.bool_], I8], Planes]
+Finder = Callable[[F64, NDArray[np.bool_], I64], Planes]
 
 
 class FewPlanesError(ValueError):
@@ -69,7 +69,7 @@ class Scene(NamedTuple):
     """
 
     returns: NDArray[np.void]
-    group: I8
+    group: I64
     known: F64
     block: Block
 
@@ -78,7 +78,7 @@ class Scene(NamedTuple):
         """Whether alpha is above 90 degrees, shape (N,)."""
         return np.asarray(self.returns["alpha"] > np.pi / 2)
 
-    def part(self, keep: NDArray[np.bool_] | I8) -> Scene:
+    def part(self, keep: NDArray[np.bool_] | I64) -> Scene:
         """Return the scene of some of the returns."""
         return self._replace(returns=self.returns[keep], group=self.group[keep])
 
@@ -334,7 +334,7 @@ def meeting(rays: Beams, planes: Planes) -> Meeting:
 
 
 def system(
-    planes: Planes, met: Meeting, jacobian: F64, group: I8, information: F64 | float = 0.0
+    planes: Planes, met: Meeting, jacobian: F64, group: I64, information: F64 | float = 0.0
 ) -> System:
     """Return the normal equations of unknowns that move points which lie on planes.
 
@@ -395,7 +395,7 @@ def system(
     )
 
 
-def _per_cluster(scores: F64, center: F64, group: I8) -> F64:
+def _per_cluster(scores: F64, center: F64, group: I64) -> F64:
     """Return the sums of the scores of neighboring planes, whose errors are correlated."""
     place = np.column_stack((group, np.floor(center / _CLUSTER_M).astype(np.int64)))
     cluster = np.unique(place, axis=0, return_inverse=True)[1].ravel()

@@ -16,15 +16,12 @@ from importlib import import_module
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration
-
-F64 = NDArray[np.float64]
 
 ROTATION: Final = slice(0, 3)
 POSITION: Final = slice(3, 6)

@@ -14,12 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, I64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

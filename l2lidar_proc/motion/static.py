@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
@@ -27,8 +26,6 @@ from l2lidar_proc.motion.filter import (
     InertialState,
 )
 from l2lidar_proc.motion.imu_buffer import Samples
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

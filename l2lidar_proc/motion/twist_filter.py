@@ -12,10 +12,10 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from l2lidar_node import rotations
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, GYRO_BIAS, POSITION, ROTATION, VELOCITY
@@ -29,8 +29,6 @@ from l2lidar_proc.motion.static import (
     white_noise,
 )
 from l2lidar_proc.motion.sweep_motion import SweepTrajectory
-
-F64 = NDArray[np.float64]
 
 _PENDING = 400  # velocities that wait for their IMU samples: two seconds at IMU rate
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
+from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
@@ -27,9 +28,6 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 Support = tuple[I64, F64]
 """Numbers of sweeps (N,), ascending, and the share of the weight that each has (N,)."""

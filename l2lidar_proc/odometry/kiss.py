@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -23,7 +23,6 @@ from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, S
 if TYPE_CHECKING:
     from kiss_icp.config import KISSConfig
 
-F64 = NDArray[np.float64]
 
 _BITS = 21  # of a voxel's number along an axis, so that three fit
 _MASK = (1 << _BITS) - 1

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import POSITION, InertialState
 from l2lidar_proc.motion.static import InitialState, initial_state
@@ -23,8 +23,6 @@ from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
-
-F64 = NDArray[np.float64]
 
 
 class Trial(NamedTuple):

@@ -15,9 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
-
-I64 = NDArray[np.int64]
 
 _ODD: Final = np.uint64(0x9E3779B97F4A7C15)  # 2^64 divided by the golden ratio (Knuth, 6.4)
 _LEAST_BITS: Final = 10
@@ -97,8 +96,6 @@ class CellIndex:
     def _first_slots(self, keys: I64) -> I64:
         return ((keys.view(np.uint64) * _ODD) >> self._shift).view(np.int64)
 
-
-F64 = NDArray[np.float64]
 
 CELL: Final = np.dtype(
     [

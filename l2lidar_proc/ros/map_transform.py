@@ -6,18 +6,15 @@ import time
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node.ros.conversions import from_time
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.slam.config import SlamTopics
 from l2lidar_proc.slam.se3 import interpolated, inverse
-
-F64 = NDArray[np.float64]
 
 AHEAD_NS: Final = 2_000_000_000
 """How far beyond the newest odometry message the transform is carried on at most [ns].

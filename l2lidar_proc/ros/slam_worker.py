@@ -12,8 +12,8 @@ from queue import Empty, PriorityQueue
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import atlas
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
 from l2lidar_proc.slam.config import SlamNodeConfig, check_map_name
@@ -21,8 +21,6 @@ from l2lidar_proc.slam.localization import Localizer
 from l2lidar_proc.slam.nodes import Keyframe, Map, OdometrySweep, SlamState
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 from l2lidar_proc.slam.slam import Slam
-
-F64 = NDArray[np.float64]
 
 Answer = tuple[bool, str]
 """Whether something worked, and what there is to say."""

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.files import whole, write_whole
+from l2lidar_node.types import F64
 from l2lidar_proc.recording import outputs
 from l2lidar_proc.recording.outputs import STAMPED_POSE, StampedPoses
 from l2lidar_proc.slam.nodes import Map
 from l2lidar_proc.slam.pose_graph import CUT, LOOP
 from l2lidar_proc.slam.se3 import inverse, transformed
-
-F64 = NDArray[np.float64]
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # gray values of nav2's map_server
 _BAND_M: Final = (-0.4, 0.8)  # heights about the sensor that an occupancy map shows

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import places
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.nodes import Node
@@ -25,8 +26,6 @@ from l2lidar_proc.slam.place_search import Found, PlaceSearch, nearest
 from l2lidar_proc.slam.se3 import error, inverse, magnitude, planar, yaw_of
 from l2lidar_proc.slam.submap import SubmapView
 from l2lidar_proc.slam.verification import Comparison, Window, compare, verify
-
-F64 = NDArray[np.float64]
 
 _LOOKS: Final = 8  # against which all places are held
 _FEWEST: Final = 3  # before a place may be announced

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.hypotheses import PlaceHypotheses
 from l2lidar_proc.slam.loops import odometry_covariance
@@ -32,8 +32,6 @@ from l2lidar_proc.slam.se3 import (
 )
 from l2lidar_proc.slam.submap import SubmapBuilder, SubmapView, ViewCache
 from l2lidar_proc.slam.verification import Match, Window, verify
-
-F64 = NDArray[np.float64]
 
 _LOOK_BACK: Final = 3  # steps whose sweeps a look is made of
 _VOTES: Final = 3  # looks that must agree before a place is announced

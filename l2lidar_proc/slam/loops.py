@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam.config import LoopConfig, SlamConfig
 from l2lidar_proc.slam.pose_graph import CUT, relative
 from l2lidar_proc.slam.se3 import SHIFT, TURN, adjoint, error, inverse
 from l2lidar_proc.slam.verification import Match, Window
-
-F64 = NDArray[np.float64]
 
 _NO_WAY_M: Final = 0.01  # what a loop counts as way, so that fewer loops are better
 _SLACK_M: Final = 0.5  # two passes of one place are rarely closer

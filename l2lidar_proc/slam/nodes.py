@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from l2lidar_node.types import HostNs
-from l2lidar_proc.odometry.base_frame import BaseFrame
-from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
 from l2lidar_proc.recording.outputs import STAMPED_POSE, StampedPoses, Trajectory
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.loops import odometry_covariance
@@ -29,8 +28,6 @@ from l2lidar_proc.slam.se3 import (
     transformed,
 )
 from l2lidar_proc.slam.submap import Submap, SubmapBuilder
-
-F64 = NDArray[np.float64]
 
 _TURN_ARM_M = 0.5  # a turn counts like the way it makes at this distance
 

@@ -9,14 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import places
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.nodes import Node
 from l2lidar_proc.slam.se3 import error, inverse, magnitude, planar
 from l2lidar_proc.slam.submap import SubmapView, structure_of
 from l2lidar_proc.slam.verification import Match, Window, likeness, verify
-
-F64 = NDArray[np.float64]
 
 _PEAKS: Final = 6  # places of the plan that are looked at closely
 _WINDOW: Final = Window(1.0, 0.8, np.radians(4.0))  # what the plan leaves open

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam.submap import STRUCTURE_CELL_M
-
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 _BESIDE: Final = 0.6  # what structure one cell off counts
 _APART: Final = (1.0, np.radians(12.0))  # [m, rad] peaks closer than this are one place

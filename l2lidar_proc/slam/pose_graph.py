@@ -11,9 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam.se3 import error
-
-F64 = NDArray[np.float64]
 
 EDGE: Final = np.dtype(
     [

@@ -9,12 +9,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from l2lidar_node import rotations
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 TURN: Final = slice(0, 3)
 SHIFT: Final = slice(3, 6)

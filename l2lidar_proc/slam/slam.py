@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import pose_graph
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.loops import LARGEST_DEVIATION, Admission, Graph, Loop
@@ -26,8 +27,6 @@ from l2lidar_proc.slam.pose_graph import CUT, EDGE, LOOP, ODOMETRY, GtsamMissing
 from l2lidar_proc.slam.se3 import adjoint, error, inverse, magnitude, transformed
 from l2lidar_proc.slam.submap import SubmapView, ViewCache, voxel_keys
 from l2lidar_proc.slam.verification import verify
-
-F64 = NDArray[np.float64]
 
 _TIE: Final = (np.radians(0.1), 0.02)  # [rad, m] by which a saved map is bent itself
 _CUT_SIGMA: Final = (3.0, 1000.0)  # [rad, m] an edge that says nothing

@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from l2lidar_node.types import F64, I64
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.slam.se3 import error, magnitude, transformed
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 BITS: Final = 21
 """Of a key, for each of the three axes."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import places
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.places import Place
@@ -29,8 +30,6 @@ from l2lidar_proc.slam.se3 import (
     yaw_of,
 )
 from l2lidar_proc.slam.submap import SubmapView
-
-F64 = NDArray[np.float64]
 
 _REACH_M: Final = (0.8, 0.2)  # farthest point from its plane in the first step, in the last
 _SCALE_M: Final = 0.06  # distance at which a point loses three quarters of its weight

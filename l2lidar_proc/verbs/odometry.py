@@ -27,9 +27,8 @@ from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
-from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
-from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag, outputs

@@ -12,9 +12,8 @@ from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.files import write_whole
 from l2lidar_node.recording.capture import CaptureError, is_capture_file
 from l2lidar_node.ros.parameter_files import settings_for
-from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryNodeConfig
-from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate
 from l2lidar_proc.recording.bag import RecordingError
 from l2lidar_proc.recording.outputs import tum
 from l2lidar_proc.slam import atlas, export

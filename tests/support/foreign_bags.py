@@ -21,8 +21,7 @@ from l2lidar_node.emulator.unit.other_sensors import SENSORS, RangeSensor, spinn
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.protocol import wire
-
-F64 = NDArray[np.float64]
+from l2lidar_node.types import F64
 
 EPOCH: Final = 1_700_000_000_000_000_000
 SECONDS: Final = 2.2

@@ -23,11 +23,9 @@ from l2lidar_node.emulator.unit.scanner import Scanner, local_rays
 from l2lidar_node.emulator.world.mapping_scenes import MappingScene, along_way
 from l2lidar_node.emulator.world.scenes import empty_box
 from l2lidar_node.emulator.world.world import World
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.slam import se3
 from l2lidar_proc.slam.nodes import Health, OdometrySweep
-
-F64 = NDArray[np.float64]
 
 EPOCH = 1_700_000_000_000_000_000
 SPEED = 1.0  # [m/s] a walk

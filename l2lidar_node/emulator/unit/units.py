@@ -12,8 +12,8 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.motion.motion import Kinematics, Motion
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.protocol import wire
+from l2lidar_node.types import F64
 
-F64 = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 _DEG: Final = np.pi / 180.0

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs
+from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs
 
 EPOCH = HostNs(1_700_000_000_000_000_000)
 G = 9.80665
 T_CLOUD_IMU = np.eye(4)
 T_CLOUD_IMU[:3, 3] = (-0.007698, -0.014655, 0.00667)
-
-F64 = NDArray[np.float64]
 
 
 def at(seconds: float) -> HostNs:

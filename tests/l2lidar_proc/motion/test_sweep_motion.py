@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState, Noise
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
-from tests.l2lidar_proc.motion.analytic import F64, T_CLOUD_IMU, G, Motion, at
+from tests.l2lidar_proc.motion.analytic import T_CLOUD_IMU, G, Motion, at
 
 LEVER = T_CLOUD_IMU[:3, 3]
 WALK = Motion(turn=0.8, nod=0.2, speed=1.0)

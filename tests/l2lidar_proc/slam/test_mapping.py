@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.emulator.world.mapping_scenes import office_ring
+from l2lidar_node.types import F64
 from l2lidar_proc.slam import se3
 from l2lidar_proc.slam.config import LoopConfig, SlamConfig
 from l2lidar_proc.slam.loops import Admission, Graph, Loop
@@ -23,7 +24,6 @@ from l2lidar_proc.slam.pose_graph import (
     deviations,
     optimized,
 )
-from l2lidar_proc.slam.se3 import F64
 from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.slam.verification import Fit, Match
 from tests.l2lidar_proc.conftest import STEP

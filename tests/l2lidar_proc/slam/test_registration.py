@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node.types import F64
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.slam import places, se3
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.places import Place
-from l2lidar_proc.slam.se3 import F64, SHIFT
+from l2lidar_proc.slam.se3 import SHIFT
 from l2lidar_proc.slam.submap import STEP_M, Submap, SubmapBuilder, SubmapView, SurfaceGrid
 from l2lidar_proc.slam.verification import (
     REASONS,
