@@ -24,7 +24,7 @@ from l2lidar_node.calibration.scale import by_tape
 from l2lidar_node.calibration.still import calibrate
 from l2lidar_node.cli.virtual_places import slide, still_places
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import Sweep
+from l2lidar_node.types import F64, Sweep
 from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.odometry import imu_calibration
@@ -123,8 +123,6 @@ _SLOT_RAD: Final = np.deg2rad(0.6)
 _MIRROR_S: Final = 0.004639
 _RATIO: Final = 1.99866
 _SAME_M: Final = 0.02
-
-F64 = NDArray[np.float64]
 
 
 def packets(path: Path) -> NDArray[np.void]:

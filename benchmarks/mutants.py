@@ -39,8 +39,7 @@ FOLDERS: Final = (
     "l2lidar_proc/deskew", "l2lidar_proc/motion",
 )  # fmt: skip
 _ODOMETRY: Final = (
-    "alignment", "base_frame", "correspondences", "dead_reckoning", "degeneracy", "matcher",
-    "zero_velocity",
+    "alignment", "correspondences", "estimate", "matcher", "prediction", "zero_velocity",
 )  # fmt: skip
 FILES: Final = (
     "l2lidar_node/clouds.py", "l2lidar_node/frames.py", "l2lidar_node/rotations.py",
@@ -51,8 +50,7 @@ TESTS: Final = (
     "tests/l2lidar_node/clouds",
     "tests/l2lidar_node/recording",
     *(f"tests/l2lidar_proc/odometry/test_{name}.py" for name in (
-        "alignment", "base_frame", "dead_reckoning", "degeneracy", "matcher", "odometry_parts",
-        "zero_velocity",
+        "alignment", "estimate", "kiss", "matcher", "prediction", "surfel_map", "zero_velocity",
     )),
     "tests/l2lidar_proc/test_hostile_input.py",
     "tests/l2lidar_node/test_frames.py",

@@ -26,7 +26,7 @@ class Fault:
     tests: tuple[str, ...]
 
 
-_BASE: Final = "l2lidar_proc/odometry/base_frame.py"
+_BASE: Final = "l2lidar_proc/odometry/estimate.py"
 _MESSAGES: Final = "l2lidar_node/ros/conversions.py"
 _TRACKER: Final = "l2lidar_proc/motion/tracker.py"
 _PROC: Final = "tests/l2lidar_proc"
@@ -43,13 +43,13 @@ FAULTS: Final = (
         _BASE,
         "velocity = estimate.velocity + rotations.cross(estimate.angular_velocity, arm)",
         "velocity = estimate.velocity",
-        (f"{_PROC}/odometry/test_base_frame.py",),
+        (f"{_PROC}/odometry/test_estimate.py",),
     ),
     Fault(
         _BASE,
         "twist[:3, 3:] = -skew(arm)",
         "twist[:3, 3:] = skew(arm)",
-        (f"{_PROC}/odometry/test_base_frame.py",),
+        (f"{_PROC}/odometry/test_estimate.py",),
     ),
     Fault(
         _MESSAGES,
@@ -79,7 +79,7 @@ FAULTS: Final = (
         "l2lidar_proc/odometry/prediction.py",
         'max(settings.accel_noise, white_noise(samples["linear_acceleration"])) * scale',
         'max(settings.accel_noise, white_noise(samples["linear_acceleration"]))',
-        (f"{_PROC}/odometry/test_odometry_parts.py",),
+        (f"{_PROC}/odometry/test_prediction.py",),
     ),
     Fault(
         "l2lidar_node/clock/cadence.py",

@@ -20,9 +20,8 @@ from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.filters import FilterError, organise
-from l2lidar_proc.motion.imu_buffer import ImuCounts, Samples
+from l2lidar_proc.motion.imu_buffer import ImuCounts, Reason, Release, Samples, Sequencer
 from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
-from l2lidar_proc.motion.sequencer import Reason, Release, Sequencer
 from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, Quality
 from l2lidar_proc.motion.twist_filter import TwistFilter

@@ -1,4 +1,4 @@
-"""Says what the odometry found out from one sweep."""
+"""The estimate of one sweep: its pose, its quality, and the same for the robot's base frame."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import HostNs
+from l2lidar_node import rotations
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-
-F64 = NDArray[np.float64]
+from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
+from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift
+from l2lidar_proc.recording.outputs import StampedPoses, levelled_start
 
 
 class Status(Enum):
@@ -157,20 +160,160 @@ class OdometryEstimate:
         return not {Status.PREDICTED, Status.REFUSED} & set(self.status)
 
 
-def degeneracy_ratio(information: F64) -> float:
-    """Return the share of some information (3, 3) that its least observed direction has."""
-    strength = np.linalg.eigvalsh(information)
-    return float(strength[0] / max(float(strength.sum()), 1e-12))
+def cloud_pose(state: InertialState, lever: F64) -> F64:
+    """Return the pose (4, 4) of the cloud frame, in which the IMU is at ``lever`` (3,) [m]."""
+    pose = np.eye(4)
+    pose[:3, :3] = state.rotation
+    pose[:3, 3] = state.position - state.rotation @ lever
+    return pose
 
 
-def weakest_direction(information: F64) -> tuple[float, float, float]:
-    """Return the direction, unit, of which some information (3, 3) says least."""
-    x, y, z = np.linalg.eigh(information)[1][:, 0].tolist()
-    return x, y, z
+def gaps_in(motion: SweepMotion) -> list[Status]:
+    """Return what is to be said of the IMU samples of a motion."""
+    if motion.imu.missing.all():
+        return [Status.NO_IMU]
+    return [Status.IMU_GAP] if motion.imu.missing.any() else []
 
 
-def unobserved_directions(information: F64) -> F64:
-    """Return the directions (3, K), orthonormal, of which some information (3, 3) says nothing."""
-    strength, directions = np.linalg.eigh(information)
-    total = max(float(strength.sum()), 1e-12)
-    return np.asarray(directions[:, strength < tuning.DEGENERATE_SHARE * total])
+def estimate_of(
+    motion: SweepMotion,
+    lever: F64,
+    moved: NDArray[np.void],
+    status: tuple[Status, ...],
+    quality: AlignmentQuality,
+    gyro_noise: float,
+    jump: FrameJump,
+    drift: MapDrift,
+) -> OdometryEstimate:
+    """Return the estimate that a motion amounts to.
+
+    Parameters
+    ----------
+    motion : SweepMotion
+    lever : ndarray, shape (3,)
+        Place of the IMU in the cloud frame [m].
+    moved : ndarray, shape (N,)
+        The points it deskewed.
+    status : tuple of Status
+        DEGENERATE is added here.
+    quality : AlignmentQuality
+    gyro_noise : float
+        Of an angular velocity [rad/s].
+    jump : FrameJump
+    drift : MapDrift
+        What the map's own place, and its own error, add to the covariance.
+    """
+    state, p = motion.state, quality.excess * motion.covariance
+    if quality.matched and quality.degeneracy_ratio < tuning.DEGENERATE_SHARE:
+        status = (*status, Status.DEGENERATE)
+    pose = np.zeros((6, 18))
+    pose[:3, POSITION] = np.eye(3)
+    pose[3:, ROTATION] = state.rotation
+    twist = np.zeros((6, 18))
+    twist[:3, VELOCITY] = state.rotation.T
+    twist[3:, GYRO_BIAS] = np.eye(3)
+    twist_covariance = twist @ p @ twist.T
+    twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)
+    rate = motion.rate
+    return OdometryEstimate(
+        stamp=state.stamp,
+        T_map_lidar=cloud_pose(state, lever),
+        covariance=pose @ p @ pose.T + jump.at(state.position) + drift.at(state.position),
+        velocity=state.rotation.T @ state.velocity - rotations.cross(rate, lever),
+        angular_velocity=rate,
+        twist_covariance=twist_covariance,
+        points=moved,
+        status=status,
+        quality=quality,
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        gravity=state.gravity,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BaseMotion:
+    """Pose and twist of the base frame.
+
+    Attributes
+    ----------
+    T_odom_base : ndarray, shape (4, 4)
+    covariance : ndarray, shape (6, 6)
+        Of x, y, z and the turns about the odometry frame's axes [m, rad].
+    velocity, angular_velocity : ndarray, shape (3,)
+        Base axes [m/s, rad/s].
+    twist_covariance : ndarray, shape (6, 6)
+        Base axes.
+    """
+
+    T_odom_base: F64
+    covariance: F64
+    velocity: F64
+    angular_velocity: F64
+    twist_covariance: F64
+
+
+class BaseFrame:
+    """The base frame on the sensor; the odometry frame begins below its first place, yaw 0.
+
+    Parameters
+    ----------
+    T_lidar_base : ndarray, shape (4, 4)
+        Base coordinates to cloud coordinates.
+    """
+
+    def __init__(self, T_lidar_base: F64) -> None:
+        self.T_lidar_base = np.asarray(T_lidar_base, dtype=np.float64)
+        self._T_odom_map: F64 | None = None
+
+    def reset(self) -> None:
+        """Let the odometry frame begin at the next pose."""
+        self._T_odom_map = None
+
+    def odom_from_map(self, T_map_lidar: F64) -> F64:
+        """Return what takes the odometry's own coordinates to the odometry frame, (4, 4).
+
+        The first pose that is given decides.
+        """
+        if self._T_odom_map is None:
+            self._T_odom_map = levelled_start(T_map_lidar @ self.T_lidar_base)
+        return self._T_odom_map
+
+    def pose(self, T_map_lidar: F64) -> F64:
+        """Return the pose (..., 4, 4) of the base frame for one of the cloud frame."""
+        return np.asarray(self.odom_from_map(T_map_lidar) @ T_map_lidar @ self.T_lidar_base)
+
+    def poses(self, of_lidar: StampedPoses) -> StampedPoses:
+        """Return the poses (N,) of the base frame for those of the cloud frame, oldest first."""
+        found = of_lidar.copy()
+        if len(found):
+            self.odom_from_map(of_lidar["pose"][0])
+            found["pose"] = self.pose(of_lidar["pose"])
+        return found
+
+    def motion(self, estimate: OdometryEstimate) -> BaseMotion:
+        """Return an estimate as one of the base frame."""
+        pose = estimate.T_map_lidar
+        turn_odom = self.odom_from_map(pose)[:3, :3]
+        arm = self.T_lidar_base[:3, 3]
+        swing = np.eye(6)
+        swing[:3, 3:] = -skew(pose[:3, :3] @ arm)
+        swing = _twice(turn_odom) @ swing
+        turn_base = self.T_lidar_base[:3, :3].T
+        twist = np.eye(6)
+        twist[:3, 3:] = -skew(arm)
+        twist = _twice(turn_base) @ twist
+        velocity = estimate.velocity + rotations.cross(estimate.angular_velocity, arm)
+        return BaseMotion(
+            self.pose(pose),
+            swing @ estimate.covariance @ swing.T,
+            turn_base @ velocity,
+            turn_base @ estimate.angular_velocity,
+            twist @ estimate.twist_covariance @ twist.T,
+        )
+
+
+def _twice(turn: F64) -> F64:
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = turn
+    return out

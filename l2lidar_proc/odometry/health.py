@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
-from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck
+from l2lidar_proc.odometry.imu_calibration import ExtrinsicCheck
 
 OK: Final = 0
 WARN: Final = 1

@@ -6,9 +6,8 @@ import dataclasses
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
@@ -16,16 +15,19 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.consistency import InnovationTest
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, FrameJump, Return
-from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
+from l2lidar_proc.odometry.estimate import (
+    AlignmentQuality,
+    OdometryEstimate,
+    Status,
+    estimate_of,
+    gaps_in,
+)
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
-from l2lidar_proc.odometry.report import estimate_of, gaps_in
+from l2lidar_proc.odometry.uncertainty import FrameJump, InnovationTest
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
-
-F64 = NDArray[np.float64]
 
 
 class Phase(Enum):

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import HostNs, Sweep
-from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_buffer import Samples, Sequencer
 from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
-from l2lidar_proc.motion.sequencer import Sequencer
 from l2lidar_proc.motion.sweep_motion import still_trajectory
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import DOUBTFUL, OdometryEstimate, Status
-from l2lidar_proc.odometry.extrinsic_check import ExtrinsicCheck
+from l2lidar_proc.odometry.imu_calibration import ExtrinsicCheck
 from l2lidar_proc.odometry.kiss import PlainOdometry
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.recording.outputs import Trajectory

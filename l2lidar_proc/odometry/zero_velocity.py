@@ -15,8 +15,8 @@ import dataclasses
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
+from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ERRORS,
@@ -27,10 +27,7 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.static import StaticReference, static_reference
-from l2lidar_proc.odometry.alignment import Alignment
-from l2lidar_proc.odometry.estimate import degeneracy_ratio
-
-F64 = NDArray[np.float64]
+from l2lidar_proc.odometry.alignment import Alignment, degeneracy_ratio
 
 
 class ZeroVelocityTest:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import to_time
 from l2lidar_node.types import F64, HostNs
-from l2lidar_proc.odometry.base_frame import BaseMotion
-from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.estimate import BaseMotion, OdometryEstimate, Status
 
 if TYPE_CHECKING:
     from l2lidar_proc.slam.nodes import Keyframe  # brings half of scipy along

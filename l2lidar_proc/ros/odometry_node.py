@@ -34,9 +34,8 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry import health
-from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
-from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
+from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import outputs

@@ -17,10 +17,9 @@ from tf2_msgs.msg import TFMessage
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.odometry.base_frame import BaseFrame
 from l2lidar_proc.odometry.config import OdometryTopics
-from l2lidar_proc.odometry.dead_reckoning import DeadReckoning
-from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate
+from l2lidar_proc.odometry.prediction import DeadReckoning
 from l2lidar_proc.ros import odometry_messages as messages
 
 _JITTER_NS: Final = 2_000_000  # a step may come half an IMU period early, or it would miss one

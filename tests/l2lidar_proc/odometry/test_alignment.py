@@ -5,13 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
-from l2lidar_proc.odometry.alignment import align
+from l2lidar_proc.odometry.alignment import (
+    Alignment,
+    WeakDirections,
+    align,
+    unobserved_directions,
+    weak_directions,
+)
 from l2lidar_proc.odometry.config import SurfaceConfig
-from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.correspondences import (
+    Source,
+    correspondences,
+    pose_jacobian,
+    residual_jacobian,
+)
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from tests.l2lidar_proc.odometry.odometry_world import drive, errors, recording
 
@@ -54,3 +66,183 @@ def test_a_wrong_range_noise_costs_little(monkeypatch: pytest.MonkeyPatch) -> No
     for factor in (0.5, 2.0):
         monkeypatch.setattr(tuning, "RANGE_NOISE_SLOPE", factor * slope)
         assert errors(run, drive(run)).max() < right + 0.001
+
+
+STEP = 1e-6
+SIZES = (0.15, 0.3, 0.6, 1.5)
+
+
+def corridor(rng: np.random.Generator, count: int, *, posts: bool) -> F64:
+    """Return points of two walls and a floor along x, with the noise of a depth camera."""
+    points = rng.uniform((-4.0, -1.2, -1.0), (4.0, 1.2, 1.5), (count, 3))
+    kind = rng.integers(0, 3, count)
+    points[kind == 0, 1], points[kind == 1, 1], points[kind == 2, 2] = -1.2, 1.2, -1.0
+    points += 0.02 * rng.standard_normal(points.shape)
+    if posts:
+        for x in (-2.0, 0.5, 3.0):
+            post = rng.uniform((x, 0.7, -1.0), (x, 1.2, 1.5), (count // 12, 3))
+            post[:, 0] += 0.02 * rng.standard_normal(len(post))
+            points = np.vstack([points, post])
+    return points
+
+
+def source_of(points: F64, times: F64) -> Source:
+    return Source(points, times, np.linalg.norm(points, axis=1))
+
+
+def still(**changes: F64) -> InertialState:
+    start = {"rotation": np.eye(3), "position": ZERO, "velocity": ZERO} | changes
+    return InertialState(
+        HostNs(0), gyro_bias=ZERO, accel_bias=ZERO, gravity=np.array([0.0, 0.0, -9.8]), **start
+    )
+
+
+def aligned(
+    *, posts: bool, off: F64, seed: int = 5, sweeps: int = 6, posts_since: int = 0
+) -> tuple[Alignment, F64]:
+    """Return a sweep's alignment in a corridor from a wrong place, and the prior covariance.
+
+    The posts are in sight from the map's sweep of that number on.
+    """
+    rng = np.random.default_rng(seed)
+    surfaces = SurfelMap(SIZES)
+    for number in range(sweeps):
+        seen = posts and number >= posts_since
+        surfaces.add(corridor(rng, 5000, posts=seen), number)
+    sigma = np.full(eskf.ERRORS, 1e-3)
+    sigma[eskf.POSITION], sigma[eskf.ROTATION], sigma[eskf.VELOCITY] = 0.1, 0.01, 0.1
+    covariance = np.diag(sigma**2)
+    # as after a prediction, a wrong velocity comes with a wrong place
+    covariance[3:6, 6:9] = covariance[6:9, 3:6] = 0.009 * np.eye(3)
+    points = corridor(rng, 2000, posts=posts)
+    source = source_of(points, rng.uniform(-0.05, 0.05, len(points)))
+    found = align(still(position=off), covariance, source, surfaces, SurfaceConfig(), 100)
+    assert found is not None
+    return found, covariance
+
+
+def test_along_a_bare_corridor_nothing_is_learned() -> None:
+    off = np.array([0.05, 0.03, -0.02])
+    found, before = aligned(posts=False, off=off)
+    free = unobserved_directions(found.information[eskf.POSITION, eskf.POSITION])
+    assert free.shape == (3, 1)
+    assert abs(free[0, 0]) > 0.999
+    # across, the place is found; along, place, velocity and their covariance stay as they were
+    np.testing.assert_allclose(found.state.position[1:], 0.0, atol=0.005)
+    assert found.state.position[0] == pytest.approx(off[0], abs=0.005)
+    assert abs(found.state.velocity[0]) < 0.005
+    for row in (3, 6):
+        assert found.covariance[row, row] > 0.95 * before[row, row]
+        assert found.covariance[row + 1, row + 1] < 0.3 * before[row + 1, row + 1]
+
+
+def test_door_posts_fix_the_place_along_a_corridor() -> None:
+    found, before = aligned(posts=True, off=np.array([0.05, 0.03, -0.02]))
+    np.testing.assert_allclose(found.state.position, 0.0, atol=0.008)
+    assert found.covariance[3, 3] < 0.1 * before[3, 3]
+
+
+def test_posts_that_have_just_come_into_sight_do_not_fix_it_yet() -> None:
+    """What the last sweeps have put there is where a wrong velocity has put it."""
+    off = np.array([0.05, 0.03, -0.02])
+    found, before = aligned(posts=True, off=off, sweeps=14, posts_since=8)
+    assert found.state.position[0] == pytest.approx(off[0], abs=0.01)
+    assert found.covariance[3, 3] > 0.8 * before[3, 3]  # some share a cell with floor or wall
+    found, before = aligned(posts=True, off=off, sweeps=14, posts_since=4)
+    np.testing.assert_allclose(found.state.position, 0.0, atol=0.008)
+    assert found.covariance[3, 3] < 0.1 * before[3, 3]
+
+
+def test_the_sweeps_that_opened_what_fixes_the_least_fixed_direction_are_named() -> None:
+    """Walls are as old as the map; along them the place is known as well as the end wall is."""
+    rng = np.random.default_rng(6)
+    surfaces = SurfelMap(SIZES)
+
+    def seen(*, end: bool) -> F64:
+        points = corridor(rng, 4000, posts=False)
+        wall = rng.uniform((3.0, -1.2, -1.0), (3.0, 1.2, 1.5), (800 * end, 3))
+        return np.vstack((points, wall + 0.01 * rng.standard_normal(wall.shape)))
+
+    for number in range(14):
+        surfaces.add(seen(end=number >= 4), number)
+    points = seen(end=True)
+    covariance = 1e-4 * np.eye(eskf.ERRORS)
+    source = source_of(points, np.zeros(len(points)))
+    found = align(still(), covariance, source, surfaces, SurfaceConfig(), 100)
+    assert found is not None
+    assert found.weakly is not None
+    strength = np.linalg.eigvalsh(found.information[eskf.POSITION, eskf.POSITION])
+    assert strength[0] > tuning.WEAK_SHARE * strength[-1]  # nothing is weak here
+    direction, (sweeps, shares) = found.weakly
+    assert abs(direction[0]) > 0.99
+    assert shares.sum() == pytest.approx(1.0)
+    assert shares[sweeps >= 4].sum() > 0.9
+    sweeps, shares = found.support
+    assert shares[sweeps < 4].sum() > 0.7
+
+
+def test_all_is_kept_where_the_scene_fixes_the_pose() -> None:
+    rng = np.random.default_rng(2)
+    surfaces = SurfelMap(SIZES)
+
+    def box() -> F64:
+        points = rng.uniform(-2.0, 2.0, (6000, 3))
+        points[np.arange(6000), rng.integers(0, 3, 6000)] = rng.choice((-2.0, 2.0), 6000)
+        return points + 0.01 * rng.standard_normal(points.shape)
+
+    for number in range(4):
+        surfaces.add(box(), number)
+    source = source_of(box(), np.zeros(6000))
+
+    def match_again(state: InertialState, some: np.ndarray) -> object:
+        raise AssertionError("nothing is weak")
+
+    found = correspondences(still(), still(), source, surfaces, SurfaceConfig(), 0.15)
+    assert weak_directions(still(), found, match_again) is None  # type: ignore[arg-type]
+
+
+def test_reduced_derivatives_scale_information_by_the_square_of_the_share() -> None:
+    rng = np.random.default_rng(1)
+    scale = np.repeat((0.5, 1.0), 3)
+    axes, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    shares = np.array([0.0, 0.5])
+    weak = WeakDirections(scale, axes[:, :2], shares)
+    pose = rng.normal(size=(200, 6)) * 3.0  # all of them face both directions
+    along = (pose * scale) @ axes
+    pose = pose[(np.abs(along[:, :2]) > tuning.WEAK_FACING).all(axis=1)]
+    settled = np.ones(len(pose), np.bool_)
+    before, after = (pose * scale) @ axes, (weak.reduced(pose, settled) * scale) @ axes
+    np.testing.assert_allclose(after[:, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(after[:, 1], 0.5 * before[:, 1])
+    np.testing.assert_allclose(after[:, 2:], before[:, 2:])
+    # residuals that hardly face a direction say nothing of it, whatever the share
+    slight = (axes[:, 3] + 0.1 * axes[:, 1]) / scale
+    reduced = weak.reduced(slight[None], settled[:1]) * scale @ axes
+    assert reduced[0, 1] == pytest.approx(0.0, abs=1e-12)
+    # nor do surfaces that are new
+    new = (weak.reduced(pose, ~settled) * scale) @ axes
+    np.testing.assert_allclose(new[:, :2], 0.0, atol=1e-12)
+
+
+def test_derivatives_by_all_errors_are_those_of_the_residuals() -> None:
+    rng = np.random.default_rng(3)
+    turn = rotations.matrices(rotations.exp((0.3, -0.2, 1.0)))
+    state = still(rotation=turn, position=np.array([0.1, 0.0, 0.2]))
+    surfaces = SurfelMap((1.5,))
+    wall = rng.uniform((-3.0, 2.24, -3.0), (3.0, 2.26, 3.0), (20000, 3))
+    surfaces.add(wall)
+    points = (wall[::100] - state.position) @ turn
+    source = source_of(points, rng.uniform(-0.1, 0.1, len(points)))
+
+    def residuals(error: F64) -> F64:
+        moved = state.boxplus(error)
+        return correspondences(state, moved, source, surfaces, SurfaceConfig(), 1.0).distances
+
+    base = correspondences(state, state, source, surfaces, SurfaceConfig(), 1.0)
+    assert len(base.index) > 150
+    h = residual_jacobian(pose_jacobian(base, turn), base.times, turn)
+    for column in range(eskf.ERRORS):
+        error = np.zeros(eskf.ERRORS)
+        error[column] = STEP
+        moved = residuals(error)
+        np.testing.assert_allclose(h[:, column], (moved - base.distances) / STEP, atol=5e-5)

@@ -9,8 +9,9 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState, with_loose_pose
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, FrameJump, moved
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, moved
 from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.uncertainty import FrameJump
 
 RNG = np.random.default_rng(3)
 STATE = InertialState(

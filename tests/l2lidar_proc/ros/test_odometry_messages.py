@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
-from l2lidar_proc.odometry.base_frame import BaseMotion
+from l2lidar_proc.odometry.estimate import BaseMotion
 from l2lidar_proc.ros import odometry_messages as messages
 
 pytestmark = pytest.mark.ros

@@ -7,8 +7,7 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, POINT, HostNs
-from l2lidar_proc.odometry.base_frame import BaseFrame
-from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate
+from l2lidar_proc.odometry.estimate import AlignmentQuality, BaseFrame, OdometryEstimate
 
 ARM = np.array([0.4, -0.3, 0.2])
 MOUNT = rotations.transform(rotations.exp((0.2, -0.4, 1.1)), ARM)
@@ -85,3 +84,13 @@ def test_the_first_pose_is_the_origin_with_yaw_zero() -> None:
     first = base.pose(POSE)
     assert first[:3, 3] == pytest.approx(0.0, abs=1e-12)
     assert np.arctan2(first[1, 0], first[0, 0]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_base_frame_moves_with_the_arm() -> None:
+    T_lidar_base = np.eye(4)
+    T_lidar_base[:3, 3] = [-1.0, 0.0, 0.0]
+    base = BaseFrame(T_lidar_base)
+    np.testing.assert_allclose(base.pose(np.eye(4)), np.eye(4), atol=1e-12)
+    turned = np.eye(4)
+    turned[:3, :3] = rotations.matrices(rotations.exp((0.0, 0.0, np.pi / 2)))
+    np.testing.assert_allclose(base.pose(turned)[:3, 3], [1.0, -1.0, 0.0], atol=1e-12)

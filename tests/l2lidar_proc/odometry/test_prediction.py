@@ -11,8 +11,9 @@ import pytest
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.dead_reckoning import LONGEST_NS, DeadReckoning
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, Predictor
+from tests.l2lidar_proc.motion.analytic import Motion
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording
 from tests.support.odometry_runs import sweeps
 
@@ -173,3 +174,19 @@ def test_untrusted_gravity_holds_the_speed(estimate: Any) -> None:
     carried = carry(reckoning, samples(estimate.stamp, 10, linear_acceleration=[40.0, 0.0, 0.0]))
     before = estimate.T_map_lidar[:3, :3] @ estimate.velocity
     np.testing.assert_allclose(carried.T_map_lidar[:3, :3] @ carried.velocity, before, atol=1e-9)
+
+
+def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> None:
+    """White noise of a standard deviation s in samples 4 ms apart has the density 2 s sqrt(ms)."""
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    settings = OdometryConfig().inertial
+    samples = Motion().imu(0, 40)
+    quiet = predictor._noise(samples)
+    assert quiet.gyro == pytest.approx(settings.gyro_noise * np.sqrt(0.004))
+    assert quiet.accel == pytest.approx(settings.accel_noise * np.sqrt(0.004))
+    rng = np.random.default_rng(0)
+    samples["angular_velocity"] += rng.normal(0.0, 0.3, (len(samples), 3))
+    samples["linear_acceleration"] += rng.normal(0.0, 0.7, (len(samples), 3))
+    loud = predictor._noise(samples)
+    assert loud.gyro == pytest.approx(0.3 * np.sqrt(0.004), rel=0.05)
+    assert loud.accel == pytest.approx(0.7 * np.sqrt(0.004), rel=0.05)

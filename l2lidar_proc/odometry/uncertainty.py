@@ -1,0 +1,318 @@
+"""Uncertainty beyond the filter's own: of the map, of its place, and of the noise assumed.
+
+:class:`MapDrift`: what a sweep adds to the map carries the error of the pose that added it. A
+sweep that is aligned with what the last few sweeps have put into the map learns where it is
+relative to them, not where it is. So every cell remembers the sweep that opened it, every sweep
+how uncertain its pose was, and a pose is as uncertain as the surfaces that hold it, and by its
+alignment with them besides (VoxelMap, Yuan et al. 2022, carries the like in its planes).
+
+:class:`FrameJump`: a map begun after a loss lies where the prediction had come to.
+
+:class:`InnovationTest`: each alignment corrects what the IMU predicted. By how much it may is
+known: the covariance of the correction is the prior's less the posterior's. The corrections of
+some seconds show two things. Their size shows whether the noise is as assumed: the mean of the
+normalized innovation squared (NIS) is 1 for each degree of freedom (Bar-Shalom et al. 2001,
+section 5.4). Their sum shows whether the accelerometer, with biases and gravity as estimated,
+contradicts the alignments: corrections of the velocity that are all alike do not average out.
+Neither sees an error along a direction that nothing measures.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node.types import F64
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import POSE, POSITION, ROTATION, VELOCITY, InertialState, skew
+from l2lidar_proc.odometry.correspondences import Support
+
+_MOTION: Final = slice(POSE.start, VELOCITY.stop)  # turn, place and velocity
+_VELOCITY: Final = slice(VELOCITY.start - POSE.start, VELOCITY.stop - POSE.start)
+
+
+class MapDrift:
+    """How wrong the map may be where it is in use, as a small move of the whole map.
+
+    Covariances (6, 6) are of a shift and a turn of the map about its origin [m, rad], in its axes.
+    """
+
+    def __init__(self) -> None:
+        self._history = np.zeros((64, 6, 6), np.float32)
+        self._ways = np.zeros(64)  # on which they were [m]
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything: a new map begins, without error by definition."""
+        self._known = 0
+        self._current = np.zeros((6, 6))
+        self._way, self._before = 0.0, np.zeros(3)
+        self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
+
+    def meet(
+        self,
+        support: Support,
+        place: F64 | None = None,
+        weakly: tuple[F64, Support] | None = None,
+    ) -> None:
+        """Take the surfaces that hold the latest sweep.
+
+        Parameters
+        ----------
+        support : Support
+            All of them.
+        place : ndarray, shape (3,), optional
+            Of the sensor, map frame [m]; needed with what follows.
+        weakly : tuple of ndarray and Support, optional
+            The direction (3,), unit, map axes, that they hold least, and the support of those that
+            hold it. The others, however old, say nothing about it.
+        """
+        sweeps, shares = support
+        if not len(sweeps) or not self._known:
+            return
+        rows = self._rows(sweeps)
+        self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
+        self._behind = float(shares @ self._ways[rows])
+        if place is None or weakly is None:
+            return
+        weakest, (sweeps, shares) = weakly
+        holding = np.tensordot(shares, self._history[self._rows(sweeps)].astype(np.float64), 1)
+        along = np.zeros((6, 6))
+        along[:3, :3] = np.outer(weakest, weakest)
+        self._combine(place, self._current, holding, along)
+
+    def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
+
+    def _combine(self, place: F64, most: F64, some: F64, along: F64) -> F64:
+        """Let the error be ``some`` along a projection (6, 6) of a place, else ``most``.
+
+        Return what it is there.
+        """
+        moved, back = _carried(place), _carried(-place)
+        across = np.eye(6) - along
+        there = across @ moved @ most @ moved.T @ across + along @ moved @ some @ moved.T @ along
+        self._current = back @ there @ back.T
+        return np.asarray(there)
+
+    def meet_partly(self, support: Support, place: F64, free: F64, ways: F64) -> None:
+        """Take surfaces that leave some directions free: along these nothing is held.
+
+        What is registered along them is where the sensor is relative to what the last sweeps put
+        into the map with the same wrong velocity: that error adds up linearly, not by chance.
+
+        Parameters
+        ----------
+        support : Support
+            As in :meth:`meet`.
+        place : ndarray, shape (3,)
+            Of the sensor, map frame [m].
+        free : ndarray, shape (3, K)
+            The directions, orthonormal, map axes.
+        ways : ndarray, shape (K,)
+            By how much the place may have run away along each since the sweep before, 1 sigma [m].
+        """
+        before = self._current
+        self.meet(support)
+        along = np.zeros((6, 6))
+        along[:3, :3] = free @ free.T
+        now = self._combine(place, self._current, before, along)
+        for direction, way in zip(free.T, ways.tolist(), strict=True):
+            sigma = float(np.sqrt(max(direction @ now[:3, :3] @ direction, 0.0)))
+            now[:3, :3] += (2.0 * sigma + way) * way * np.outer(direction, direction)
+        back = _carried(-place)
+        self._current = back @ now @ back.T
+
+    def record(self, sweep: int, place: F64, covariance: F64) -> None:
+        """Remember how uncertain the pose was that added a sweep.
+
+        Parameters
+        ----------
+        sweep : int
+            Its number in this map.
+        place : ndarray, shape (3,)
+            Where it was, map frame [m].
+        covariance : ndarray, shape (6, 6)
+            Of place and turn relative to the surfaces around, map axes [m, rad].
+        """
+        row = sweep // tuning.DRIFT_GROUP
+        if row >= len(self._history):
+            grown = np.zeros((2 * row, 6, 6), np.float32)
+            grown[: len(self._history)] = self._history
+            self._ways = np.concatenate((self._ways, np.zeros(2 * row - len(self._ways))))
+            self._history = grown
+        if self._known:
+            self._way += float(np.linalg.norm(place - self._before))
+        self._before = place
+        self._ways[self._known : row + 1] = self._way
+        moved = _carried(-place)
+        self._history[self._known : row + 1] = self._current + moved @ covariance @ moved.T
+        self._known = max(self._known, row + 1)
+
+    def at(self, place: F64) -> F64:
+        """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m].
+
+        What a unit's calibration is wrong by adds up with the distance; and with the way, where
+        the map of the place that was there first is forgotten. The map bends where it grows: the
+        attitude errs with the way as the vertical does.
+        """
+        moved = _carried(place)
+        away = float(np.linalg.norm(place))
+        left = 1.0 - np.exp(-max(away, self._behind) / tuning.UNIT_FROM_M)  # 0 defines the frame
+        share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self._behind)
+        shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
+        bend = tuning.MAP_BEND**2 * max(away, self._behind)
+        unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
+        return np.asarray(moved @ self._current @ moved.T + unit)
+
+
+def _carried(place: F64) -> F64:
+    """Return what a shift and a turn about the origin do at a place: (6, 6)."""
+    moved = np.eye(6)
+    moved[:3, 3:] = -skew(place)
+    return moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameJump:
+    """How wrong the map's place in the odometry frame may be; nothing at the beginning.
+
+    Alignment with the map cannot tell, so this stays for good.
+
+    Attributes
+    ----------
+    place : ndarray, shape (3,)
+        Where the latest jump happened, odometry frame [m].
+    covariance : ndarray, shape (6, 6)
+        Of x, y, z and of the turns about the frame's axes, there [m, rad].
+    """
+
+    place: F64 = field(default_factory=lambda: np.zeros(3))
+    covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def at(self, place: F64) -> F64:
+        """Return the covariance (6, 6) at another place (3,): a turn moves what is far away."""
+        moved = _carried(place - self.place)
+        return np.asarray(moved @ self.covariance @ moved.T)
+
+    def added(self, state: InertialState, covariance: F64, drift: F64) -> FrameJump:
+        """Return this and a further jump.
+
+        Parameters
+        ----------
+        state : InertialState
+            Where it happens.
+        covariance : ndarray, shape (18, 18)
+            Of the state, relative to the map before.
+        drift : ndarray, shape (6, 6)
+            Of that map itself, at the state's place.
+        """
+        errors = np.r_[POSITION, ROTATION]
+        axes = np.eye(6)
+        axes[3:, 3:] = state.rotation
+        jump = axes @ covariance[np.ix_(errors, errors)] @ axes.T
+        return FrameJump(state.position, self.at(state.position) + jump + drift)
+
+    def unseen(self, state: InertialState) -> FrameJump:
+        """Return this and what may have happened from a state on while no time was told."""
+        way = tuning.UNSEEN_POSITION + tuning.UNSEEN_S * float(np.linalg.norm(state.velocity))
+        jump = np.diag(np.square([way] * 3 + [tuning.UNSEEN_ROTATION] * 3))
+        return FrameJump(state.position, self.at(state.position) + jump)
+
+
+class _Correction(NamedTuple):
+    stamp: int
+    squared: float  # normalized, of all degrees of freedom
+    freedoms: int
+    velocity: F64  # correction of the velocity, map axes [m/s], shape (3,)
+    allowed: F64  # its covariance, shape (3, 3)
+
+
+class InnovationTest:
+    """Compares the corrections of the last seconds with their covariances."""
+
+    def __init__(self) -> None:
+        self._recent: deque[_Correction] = deque()
+
+    def clear(self) -> None:
+        """Forget everything, as after a rest or a loss."""
+        self._recent.clear()
+
+    def take(
+        self,
+        prior: InertialState,
+        covariance: F64,
+        posterior: InertialState,
+        corrected: F64,
+    ) -> None:
+        """Take an alignment.
+
+        Parameters
+        ----------
+        prior : InertialState
+            As predicted.
+        covariance : ndarray, shape (18, 18)
+            Of the prior.
+        posterior : InertialState
+            As aligned.
+        corrected : ndarray, shape (18, 18)
+            Covariance of the posterior.
+        """
+        before = covariance[_MOTION, _MOTION]
+        allowed = before - corrected[_MOTION, _MOTION]
+        change = posterior.boxminus(prior)[_MOTION]
+        unit = np.sqrt(np.maximum(np.diag(before), 1e-18))
+        # only directions that were measured: elsewhere nothing was corrected, nor could be
+        share, axes = np.linalg.eigh(allowed / np.outer(unit, unit))
+        seen = share > tuning.NIS_SEEN
+        if not seen.any():
+            return
+        normalized = (axes[:, seen].T @ (change / unit)) ** 2 / share[seen]
+        recent = self._recent
+        recent.append(
+            _Correction(
+                posterior.stamp,
+                float(normalized.sum()),
+                int(seen.sum()),
+                change[_VELOCITY],
+                allowed[_VELOCITY, _VELOCITY],
+            )
+        )
+        while recent[-1].stamp - recent[0].stamp > tuning.NIS_WINDOW_NS:
+            recent.popleft()
+
+    @property
+    def nis(self) -> float:
+        """Mean normalized innovation squared for each degree of freedom; 0 before the first."""
+        freedoms = sum(item.freedoms for item in self._recent)
+        return sum(item.squared for item in self._recent) / max(freedoms, 1)
+
+    @property
+    def velocity_nis(self) -> float:
+        """Normalized square of the sum of all corrections of the velocity, for each of its axes.
+
+        1 on average if they are independent; 0 as long as there are few.
+        """
+        if len(self._recent) < tuning.NIS_LEAST:
+            return 0.0
+        total = np.sum([item.velocity for item in self._recent], axis=0)
+        allowed = np.sum([item.allowed for item in self._recent], axis=0)
+        allowed = allowed + tuning.NIS_SPEED_FLOOR**2 * np.eye(3)
+        return float(total @ np.linalg.solve(allowed, total)) / 3.0
+
+    @property
+    def excess(self) -> float:
+        """By how much variances are too small, at least 1."""
+        if len(self._recent) < tuning.NIS_LEAST:
+            return 1.0
+        worse = max(self.nis, self.velocity_nis / tuning.NIS_CHANCE, 1.0)
+        return min(worse, tuning.NIS_MOST)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether chance does not explain the corrections."""
+        return self.excess > tuning.NIS_SUSPECT

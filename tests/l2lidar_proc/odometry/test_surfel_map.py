@@ -1,0 +1,151 @@
+"""Surfaces in cells, what is forgotten of them, and their hash table against a dictionary."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from hypothesis import given, strategies as st
+
+from l2lidar_node.types import HostNs
+from l2lidar_proc.motion.filter import ERRORS, InertialState
+from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.surfel_map import CellIndex, SurfelMap
+from tests.l2lidar_proc.motion.analytic import EPOCH, Motion
+
+KEYS = st.one_of(
+    st.integers(0, (1 << 63) - 1),
+    st.integers(0, 2000),  # neighbors
+    st.integers(0, 200).map(lambda number: number << 52),  # that differ in high bits alone
+)
+
+
+@given(st.lists(st.lists(KEYS, max_size=400), max_size=6), st.lists(KEYS, max_size=100))
+def test_it_finds_what_a_dictionary_finds(batches: list[list[int]], others: list[int]) -> None:
+    index = CellIndex()
+    known: dict[int, int] = {}
+    for batch in batches:
+        new = [key for key in dict.fromkeys(batch) if key not in known]
+        rows = np.arange(len(known) + 1, len(known) + 1 + len(new))
+        index.insert(np.array(new, np.int64), rows)
+        known.update(zip(new, rows.tolist(), strict=True))
+        assert len(index) == len(known)
+        asked = np.array([*known, *others], np.int64)
+        found = index.find(asked).tolist()
+        assert found == [known.get(key, 0) for key in asked.tolist()]
+    index.clear()
+    assert len(index) == 0
+    assert not index.find(np.array([*known, *others], np.int64)).any()
+
+
+RNG_SEED = 4
+
+
+def wall(x: float = 2.0) -> Any:
+    """Return points on a wall across x, with 1 cm of noise."""
+    rng = np.random.default_rng(RNG_SEED)
+    points = rng.uniform((x, -1.0, 0.0), (x, 1.0, 2.0), (4000, 3))
+    points[:, 0] += 0.01 * rng.standard_normal(len(points))
+    return points
+
+
+def test_a_wall_becomes_surfaces_and_gives_distances() -> None:
+    surfaces = SurfelMap((0.25, 0.6))
+    surfaces.add(wall(2.12))
+    probe = np.array([[2.15, 0.1, 1.1], [2.09, -0.6, 0.4], [5.0, 5.0, 5.0]])
+    found = surfaces.match(probe)
+    order = np.argsort(found.index)
+    assert found.index[order].tolist() == [0, 1]
+    np.testing.assert_allclose(np.abs(found.normals[order]), [[1, 0, 0]] * 2, atol=0.05)
+    signed = found.distances[order] * np.sign(found.normals[order, 0])
+    np.testing.assert_allclose(signed, [0.03, -0.03], atol=0.006)
+    assert (found.variances < 0.01**2).all()
+
+
+def test_points_of_one_line_are_no_surface() -> None:
+    surfaces = SurfelMap((0.25,))
+    line = np.linspace(0.0, 0.24, 200)[:, None] * [0.6, 0.8, 0.0]
+    surfaces.add(line + 0.002 * np.random.default_rng(RNG_SEED).standard_normal((200, 3)))
+    assert not len(surfaces.match(line).index)
+
+
+def test_a_full_cell_changes_no_more() -> None:
+    surfaces = SurfelMap((4.0,), capacity=1000)
+    surfaces.add(wall())
+    before = surfaces.match(np.array([[2.0, 0.5, 0.5]])).distances
+    surfaces.add(wall(2.3))
+    np.testing.assert_array_equal(surfaces.match(np.array([[2.0, 0.5, 0.5]])).distances, before)
+
+
+def test_far_cells_are_forgotten_and_the_rest_stays() -> None:
+    surfaces = SurfelMap((0.25,))
+    surfaces.add(wall(2.12))
+    surfaces.add(wall(52.12))
+    count = len(surfaces)
+    surfaces.forget(np.zeros(3), 10.0)
+    assert 0 < len(surfaces) < count
+    assert len(surfaces.match(np.array([[2.12, 0.1, 1.1], [52.12, 0.1, 1.1]])).index) == 1
+    surfaces.add(wall(52.12))
+    assert len(surfaces) == count
+
+
+def test_cells_out_of_sight_are_forgotten_and_full_ones_in_sight_stay() -> None:
+    surfaces = SurfelMap((0.25,), capacity=10)
+    places = np.array([[2.12, 0.1, 1.1], [5.12, 0.1, 1.1]])
+    surfaces.add(np.concatenate((wall(2.12), wall(5.12))), 0)
+    surfaces.add(wall(2.12), 7)  # full already: not fitted again, but seen
+    surfaces.forget(np.zeros(3), 10.0, 7)
+    assert surfaces.match(places).index.tolist() == [0]
+    surfaces.forget(np.zeros(3), 10.0, 8)
+    assert not len(surfaces)
+
+
+def test_what_was_left_behind_a_long_way_ago_is_forgotten_however_near_it_is() -> None:
+    """Around a block and back: the beginning of the lap has drifted away from the present."""
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    predictor.imu(Motion().imu(0, 40))
+    start = EPOCH
+    state = InertialState(start, np.eye(3), *np.zeros((5, 3)))
+    motion = predictor.over(state, np.eye(ERRORS) * 1e-4, (start, HostNs(EPOCH + 10**8)), start)
+
+    def seen_from(place: float, x: float) -> None:
+        """Extend the map with a wall across x, seen from a place on the x axis."""
+        at = dataclasses.replace(state, position=np.array([place, 0.0, 0.0]))
+        points = np.zeros(4000, [(axis, "<f4") for axis in "xyz"])
+        points["x"], points["y"], points["z"] = (wall(x) - at.position).T
+        matcher.extend(points, dataclasses.replace(motion, state=at), at)
+
+    seen_from(0.0, 3.0)
+    for place in np.arange(1.0, 14.0):  # there,
+        seen_from(float(place), 13.0)
+    for place in np.arange(12.0, -1.0, -1.0):  # and back
+        seen_from(float(place), -4.0)
+    probe = np.array([[3.0, 0.1, 1.1], [13.0, 0.1, 1.1]])
+    assert matcher.surfaces.match(probe).index.tolist() == [0, 1]  # 26 m
+    for place in np.arange(1.0, 8.0):
+        seen_from(float(place), 13.0)
+    assert matcher.surfaces.match(probe).index.tolist() == [1]
+
+
+def test_cells_remember_the_sweep_that_opened_their_place() -> None:
+    rng = np.random.default_rng(4)
+    surfaces = SurfelMap((0.15, 0.3, 0.6, 1.5))
+
+    def wall(start: float) -> np.ndarray:
+        points = rng.uniform((start, 0.0, 0.0), (start + 3.0, 0.0, 3.0), (6000, 3))
+        points[:, 1] = 0.07 + rng.normal(0.0, 0.003, len(points))
+        return points
+
+    assert surfaces.add(wall(0.0)[:300], 3) == 1.0  # sparse: fine cells come later
+    assert surfaces.add(wall(0.0), 8) == 0.0
+    assert 0.4 < surfaces.add(wall(1.5), 12) < 0.6
+    found = surfaces.match(wall(0.0))
+    assert len(found.index) > 5000
+    assert set(found.born.tolist()) == {3}
+    beyond = surfaces.match(wall(3.2)[:500])
+    assert set(beyond.born.tolist()) == {12}
+    assert surfaces.add(np.empty((0, 3)), 13) == 0.0
