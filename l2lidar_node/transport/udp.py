@@ -11,19 +11,15 @@ import time
 from typing import Final
 
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.types import Datagram, HostNs
+from l2lidar_node.transport.recvmmsg import MOST, SO_TIMESTAMPNS, DatagramReader
+from l2lidar_node.types import Datagram
 
 # Not in Python's socket module; from Linux's asm-generic/socket.h.
 _SO_ATTACH_FILTER: Final = 26
 _SO_DETACH_FILTER: Final = 27
-_SO_TIMESTAMPNS: Final = 35
 _SO_MEMINFO: Final = 55
-_TIMESPEC = struct.Struct("@ll")
 _TIMEVAL = struct.Struct("@ll")
 _MEMINFO = struct.Struct("@9I")  # the last is what was dropped, see linux/sock_diag.h
-_ANCILLARY_SIZE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
-_MAX_DATAGRAM: Final = 65_536
-_FRESH_NS: Final = 300_000
 _BATCH: Final = 256  # datagrams read before the caller gets a turn
 
 FLOOD_HZ: Final = 1000
@@ -84,12 +80,13 @@ class UdpTransport:
         self._peer = (config.l2_ip, config.l2_port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, config.receive_buffer_bytes)
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         try:
             self._socket.bind((config.host_ip, config.host_port))
         except OSError as error:
             self._socket.close()
             raise TransportError(error.errno, _bind_advice(config, error)) from None
+        self._reader = DatagramReader(self._socket, config.l2_ip)
         self._timeout_s = -1.0
         self._interval_s = config.receive_interval_ms / 1e3
         self._looked_s = 0.0
@@ -123,9 +120,8 @@ class UdpTransport:
     def receive(self, timeout_s: float) -> list[Datagram]:
         """Return what has arrived from the device, in order; empty when nothing did in time.
 
-        One system call takes a datagram that just came; only when it has waited already are there
-        likely to be more. The kernel has noted when each came: reading them some at a time saves
-        most of the wake-ups and costs no accuracy.
+        The kernel has noted when each came: reading them some at a time saves most of the wake-ups
+        and costs no accuracy.
         """
         if self._interval_s and not self._is_behind:
             pause = self._looked_s + self._interval_s - time.monotonic()
@@ -133,27 +129,16 @@ class UdpTransport:
                 time.sleep(min(pause, timeout_s))
         if timeout_s != self._timeout_s:
             self._set_timeout(timeout_s)
-        batch: list[Datagram] = []
-        flags = 0
-        self._is_behind = False
-        for number in range(_BATCH):
-            try:
-                data, ancillary, _, sender = self._socket.recvmsg(
-                    _MAX_DATAGRAM, _ANCILLARY_SIZE, flags
-                )
-            except BlockingIOError:
-                break
-            except OSError:  # an ICMP error of an earlier send, reported here
-                continue
-            arrival = self._arrival(ancillary)
-            if sender[0] == self._device:
-                batch.append(Datagram(data, arrival))
-            else:
-                self._refuse(sender[0])
-            if not flags and 0 <= time.time_ns() - arrival < _FRESH_NS:
-                break
-            flags = socket.MSG_DONTWAIT
-            self._is_behind = number == _BATCH - 1
+        reader = self._reader
+        taken = count = reader.read()
+        while taken == MOST and count < _BATCH:
+            taken = reader.read(wait=False)
+            count += taken
+        self._is_behind = count >= _BATCH
+        batch, reader.datagrams = reader.datagrams, []
+        if reader.strangers:
+            self._refuse(reader.strangers)
+            reader.strangers = []
         if self._filters:
             self._watch_flood()
         self._looked_s = time.monotonic()
@@ -178,17 +163,10 @@ class UdpTransport:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
         self._timeout_s = timeout_s
 
-    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> HostNs:
-        for _, kind, value in ancillary:
-            if kind == _SO_TIMESTAMPNS:
-                seconds, nanoseconds = _TIMESPEC.unpack(value)
-                return HostNs(seconds * 1_000_000_000 + nanoseconds)
-        return HostNs(time.time_ns())
-
-    def _refuse(self, sender: str) -> None:
-        """Count a datagram of another sender; have the kernel refuse them where there are many."""
-        self.stranger = sender
-        self._foreign += 1
+    def _refuse(self, strangers: list[bytes]) -> None:
+        """Count datagrams of other senders; have the kernel refuse them where there are many."""
+        self.stranger = socket.inet_ntoa(strangers[-1])
+        self._foreign += len(strangers)
         now = time.monotonic_ns()
         if now - self._window_since > _FLOOD_NS:
             self._window_since, self._window_foreign = now, self._foreign
