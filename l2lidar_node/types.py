@@ -137,6 +137,10 @@ class Datagram(NamedTuple):
     arrival: HostNs
 
 
+NOT_AWAITED: Final = HostNs(0)
+"""In place of the instant at which something is awaited: it may come now."""
+
+
 class TransportCounts(Protocol):
     """What a transport counts."""
 
@@ -156,8 +160,11 @@ class TransportCounts(Protocol):
 class Transport(TransportCounts, Protocol):
     """Where bytes come from and go to."""
 
-    def receive(self, timeout_s: float) -> list[Datagram]:
-        """Return what has arrived, waiting at most ``timeout_s`` for the first of it."""
+    def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
+        """Return what has arrived, waiting at most ``timeout_s`` for the first of it.
+
+        ``awaited`` predicts when something will arrive that is wanted soon; the rest may wait.
+        """
 
     def send(self, frame: bytes) -> None:
         """Send one frame to the device."""

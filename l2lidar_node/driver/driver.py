@@ -104,6 +104,8 @@ class Counters:
 
 
 _ROUND_TRIPS: Final = 60  # the last minute's
+_POINTS_PERIOD_NS: Final = round(wire.MIRROR_PERIOD_S * 1e9)
+_IMU_PERIOD_NS: Final = round(1e9 / wire.IMU_RATE_HZ)
 # Looking up a member of an Enum takes long.
 _IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
 
@@ -238,6 +240,17 @@ class Driver:
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would do anything."""
         return self._reorder_buffer.is_overdue(until) or self._has_stalled(until)
+
+    def awaited(self) -> HostNs:
+        """Return when the next datagram that somebody waits for is expected to arrive.
+
+        That of an IMU sample, if samples are published, or that which completes a sweep.
+        """
+        points, imu = self._reorder_buffer.last_arrivals
+        awaited = points + self._assembler.packets_left * _POINTS_PERIOD_NS
+        if self._config.imu.enable_publishing:
+            awaited = min(awaited, imu + _IMU_PERIOD_NS)
+        return HostNs(awaited)
 
     def outbox(self) -> list[Outgoing]:
         """Return the frames to send now, in order, once."""

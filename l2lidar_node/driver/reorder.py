@@ -303,6 +303,11 @@ class ReorderBuffer:
         """What the sequence numbers say, by stream; goes on counting."""
         return {stream: lane.order.counts for stream, lane in self._lanes.items()}
 
+    @property
+    def last_arrivals(self) -> tuple[int, int]:
+        """Arrivals of the last packets of points and of the IMU [ns]; 0 before there were any."""
+        return self._points.arrival, self._imu.arrival
+
     def follows(self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs) -> bool:
         """Take a packet that comes just after the one before, as nearly all do.
 

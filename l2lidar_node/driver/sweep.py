@@ -119,6 +119,7 @@ class BlockChoice:
 
 MAX_GAP_NS: Final = 200_000_000  # a stream that stalled this long starts a new sweep
 MAX_PACKETS: Final = 4000
+_UNEVEN: Final = 1.2  # one step of the head in another; its speed swings by 3 % within a turn
 _BACKWARDS_RAD: Final = 1.9 * math.pi  # a head that stands still seems to advance by this or more
 
 Level = Callable[[list[HostNs]], NDArray[np.float64]]
@@ -199,6 +200,23 @@ class SweepAssembler:
         """
         return bool(self._packets) and not self._cuts_by_angle(self._packets[0].packet)
 
+    @property
+    def packets_left(self) -> int:
+        """How many packets it takes to complete the sweep, at the least; 1 where that is open."""
+        packets = self._packets
+        if self._config.cut == "packets":
+            return max(self._config.packets - len(packets), 1)
+        if len(packets) < 2:
+            return 1
+        before, last = packets[-2], packets[-1]
+        if self._cuts_by_angle(last.packet):
+            left = self._turn - last.packet.head_angle % self._turn
+            step = (last.packet.head_angle - before.packet.head_angle) % (2 * math.pi)
+        else:
+            left = packets[0].given + self._config.duration_ms * 1_000_000 - last.given
+            step = last.given - before.given
+        return max(int(left / (_UNEVEN * step)), 1) if step > 0 else 1
+
     def push(self, packet: PointPacket, start: HostNs, missing: int = 0) -> list[Sweep]:
         """Add a packet and return the sweeps this completes: none, one or two.
 
@@ -237,6 +255,11 @@ class SweepAssembler:
             return None
         return next(iter(self._finish(_Cut.BREAK)), None)
 
+    @property
+    def _turn(self) -> float:
+        """The angle that ends sweeps [rad]."""
+        return 2 * math.pi if self._config.cut == "turn" else math.pi
+
     def _cuts_by_angle(self, packet: PointPacket) -> bool:
         """Whether the head's angle ends sweeps; 2D packets have none."""
         is_3d = packet.packet_type == wire.PacketType.POINTS_3D
@@ -251,8 +274,7 @@ class SweepAssembler:
         if self._config.cut == "packets":
             return _Cut.NONE
         if self._cuts_by_angle(packet):
-            period = 2 * math.pi if self._config.cut == "turn" else math.pi
-            is_over = _passes(last.packet.head_angle, packet.head_angle, period)
+            is_over = _passes(last.packet.head_angle, packet.head_angle, self._turn)
         else:
             is_over = start - first.given >= self._config.duration_ms * 1_000_000
         return _Cut.BOUNDARY if is_over else _Cut.NONE

@@ -12,7 +12,15 @@ from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.recording import Entry, Received, Recording, Sent, Slewed, Stepped
 from l2lidar_node.transport.session import Loop
-from l2lidar_node.types import LAST_STAMP, Datagram, HostNs, ImuSample, Sweep, is_ros_time
+from l2lidar_node.types import (
+    LAST_STAMP,
+    NOT_AWAITED,
+    Datagram,
+    HostNs,
+    ImuSample,
+    Sweep,
+    is_ros_time,
+)
 
 
 def feed(driver: Driver, entry: Entry) -> list[Event]:
@@ -102,9 +110,9 @@ class NoTransport:
     stranger = ""
     kernel_drops = 0
 
-    def receive(self, timeout_s: float) -> list[Datagram]:
+    def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
         """Return nothing."""
-        del timeout_s
+        del timeout_s, awaited
         return []
 
     def send(self, frame: bytes) -> None:

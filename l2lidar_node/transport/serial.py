@@ -15,7 +15,7 @@ from collections import deque
 from typing import Final
 
 from l2lidar_node.transport.udp import TransportError
-from l2lidar_node.types import Datagram, HostNs
+from l2lidar_node.types import NOT_AWAITED, Datagram, HostNs
 
 _READ: Final = 16_384  # a UDP datagram holds it, so a capture can
 _BACKLOG: Final = 4_194_304  # 17 s of a unit's data
@@ -70,8 +70,9 @@ class SerialTransport:
         self._thread = threading.Thread(target=self._read_on, name="l2lidar-serial", daemon=True)
         self._thread.start()
 
-    def receive(self, timeout_s: float) -> list[Datagram]:
+    def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
         """Return what has arrived, in order; empty when nothing did in time."""
+        del awaited  # a thread reads all as it comes
         with self._arrived:
             if not self._backlog:
                 self._arrived.wait(timeout_s)

@@ -257,7 +257,7 @@ class Session(Loop):
         self._stepped(0, now)
         self._watch_slewing(now)
         while not self._stopping.is_set():
-            batch = self.transport.receive(TICK_S)
+            batch = self.transport.receive(TICK_S, self.driver.awaited())
             for data, arrival in batch:
                 if self._tap:
                     self._tap.received(data, arrival)

@@ -12,7 +12,7 @@ from typing import Final
 
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.transport.recvmmsg import MOST, SO_TIMESTAMPNS, DatagramReader
-from l2lidar_node.types import Datagram
+from l2lidar_node.types import NOT_AWAITED, Datagram, HostNs
 
 # Not in Python's socket module; from Linux's asm-generic/socket.h.
 _SO_ATTACH_FILTER: Final = 26
@@ -88,8 +88,8 @@ class UdpTransport:
             raise TransportError(error.errno, _bind_advice(config, error)) from None
         self._reader = DatagramReader(self._socket, config.l2_ip)
         self._timeout_s = -1.0
-        self._interval_s = config.receive_interval_ms / 1e3
-        self._looked_s = 0.0
+        self._interval_ns = config.receive_interval_ms * 1_000_000
+        self._looked = 0  # [ns]
         self._is_behind = False  # more waited than one batch holds
 
     @property
@@ -117,16 +117,17 @@ class UdpTransport:
         """The receive buffer the kernel granted [B]; it doubles what it grants for its own use."""
         return self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
-    def receive(self, timeout_s: float) -> list[Datagram]:
+    def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
         """Return what has arrived from the device, in order; empty when nothing did in time.
 
         The kernel has noted when each came: reading them some at a time saves most of the wake-ups
-        and costs no accuracy.
+        and costs no accuracy. What is ``awaited`` waits no longer than the interval, the rest no
+        longer than the timeout.
         """
-        if self._interval_s and not self._is_behind:
-            pause = self._looked_s + self._interval_s - time.monotonic()
-            if pause > 0.0:
-                time.sleep(min(pause, timeout_s))
+        if self._interval_ns and not self._is_behind:
+            pause = max(awaited, self._looked) + self._interval_ns - time.time_ns()
+            if pause > 0:
+                time.sleep(min(pause * 1e-9, timeout_s))
         if timeout_s != self._timeout_s:
             self._set_timeout(timeout_s)
         reader = self._reader
@@ -141,7 +142,7 @@ class UdpTransport:
             reader.strangers = []
         if self._filters:
             self._watch_flood()
-        self._looked_s = time.monotonic()
+        self._looked = time.time_ns()
         return batch
 
     def send(self, frame: bytes) -> None:

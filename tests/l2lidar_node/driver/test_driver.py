@@ -579,3 +579,22 @@ def test_user_command_numbers_are_not_confused_between_families() -> None:
     assert run.hear(PacketType.ACK, build.ack(100, UserCommand.VERSION, 3)) == []
     (answer,) = run.hear(PacketType.ACK, build.ack(2000, wire.Command.PARAM_GET, 3))
     assert answer.command == commands.request_parameters()
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_the_next_datagram_that_somebody_waits_for_is_predicted(with_imu: bool) -> None:
+    """An IMU sample, if they are published, or the packet that completes a sweep."""
+    values = {"aggregateNframes": 5, "enable_IMU_publishing": with_imu}
+    driver = Driver(configure(DriverConfig, PLAIN | values))
+    wanted: list[int] = []
+    predicted: list[tuple[int, int]] = []
+    for arrival, data in build.capture(2.0):
+        events = driver.receive(data, HostNs(arrival))
+        if any(isinstance(event, Sweep) or (with_imu and isinstance(event, ImuSample))
+               for event in events):  # fmt: skip
+            wanted.append(arrival)
+            predicted.append((arrival, driver.awaited()))
+    assert len(wanted) > (100 if with_imu else 10)
+    for now, later in predicted[:-1]:
+        following = wanted[wanted.index(now) + 1]
+        assert abs(later - following) < 1_500_000

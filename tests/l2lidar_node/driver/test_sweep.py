@@ -226,6 +226,23 @@ def test_another_type_ends_the_sweep() -> None:
     assert len(stream.assembler.flush().points) == 1800
 
 
+@pytest.mark.parametrize("cut", ["packets", "turn", "half_turn", "duration"])
+def test_the_packets_left_are_told_never_too_many_and_hardly_too_few(cut: Any) -> None:
+    """Somebody waits for the packet that completes a sweep, as many as four fifths of them."""
+    stream = Stream(cut=cut)
+    told, completing = [], []
+    for number in range(200):
+        angle = TURN * number / 49.5
+        before = stream.assembler.fragments  # the first turn is not whole
+        done = stream.push(PLAIN._replace(head_angle=(angle + 0.03 * math.sin(angle)) % TURN))
+        if done or stream.assembler.fragments > before:
+            completing.append(number)
+        told.append(stream.assembler.packets_left)
+    for number in range(2, completing[-1]):
+        left = next(later for later in completing if later > number) - number
+        assert math.floor(0.8 * left - 1) <= told[number] <= left or told[number] == 1
+
+
 def test_two_sweeps_at_once() -> None:
     stream = Stream(packets=2)
     stream.push()

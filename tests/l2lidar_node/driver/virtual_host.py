@@ -20,7 +20,7 @@ from l2lidar_node.recording.recording import RecordingWriter
 from l2lidar_node.settings import build
 from l2lidar_node.transport.host_clock import HostClock
 from l2lidar_node.transport.session import Session
-from l2lidar_node.types import Datagram, HostNs, ImuSample, Sweep
+from l2lidar_node.types import NOT_AWAITED, Datagram, HostNs, ImuSample, Sweep
 
 EPOCH_NS = 1_700_000_000_000_000_000
 DEVICE = Endpoint("192.168.1.62", 6101)
@@ -102,7 +102,8 @@ class VirtualHost:
         self._rng = np.random.default_rng(seed)
         self._held: list[Datagram] = []
 
-    def receive(self, timeout_s: float) -> list[Datagram]:
+    def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
+        del awaited
         is_busy = self._rng.random() < self._busy
         step_s = self._rng.uniform(0.05, 0.5) if is_busy else self._rng.uniform(0.0, timeout_s)
         self.now += round(step_s * 1e9)

@@ -20,7 +20,7 @@ from l2lidar_node.protocol import commands, wire
 from l2lidar_node.settings import build as configure
 from l2lidar_node.transport.session import Session
 from l2lidar_node.transport.udp import UdpTransport
-from l2lidar_node.types import Datagram, HostNs, ImuSample, Sweep
+from l2lidar_node.types import NOT_AWAITED, Datagram, HostNs, ImuSample, Sweep
 from tests.support import build
 
 DEVICE, HOST = "127.0.0.1", "127.0.0.3"
@@ -264,7 +264,8 @@ class Scripted:
         self.closed = 0
         self.is_empty = threading.Event()
 
-    def receive(self, timeout_s: float) -> list[Datagram]:
+    def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
+        del awaited
         if self.batches:
             return self.batches.pop(0)
         self.is_empty.set()

@@ -16,7 +16,7 @@ from l2lidar_node.config import NetworkConfig
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.transport import udp
 from l2lidar_node.transport.udp import TransportError, UdpTransport
-from l2lidar_node.types import Datagram
+from l2lidar_node.types import Datagram, HostNs
 
 DEVICE, FOREIGNER, HOST = "127.0.0.1", "127.0.0.2", "127.0.0.3"
 LIMIT_S = 60.0  # generous: only a failure waits that long
@@ -239,6 +239,18 @@ def test_closing_twice_and_listening_again(device: socket.socket) -> None:
         link.close()
     with opened(device, host_port=port) as again:
         assert again.port == port
+
+
+def test_what_is_awaited_later_is_waited_for_and_the_rest_waits_with_it(
+    device: socket.socket,
+) -> None:
+    with opened(device, receive_interval_ms=20) as link:
+        awaited = HostNs(time.time_ns() + 50_000_000)
+        device.sendto(b"x", (HOST, link.port))
+        batch = link.receive(10.0, awaited)
+        read = time.time_ns()
+    assert [item.data for item in batch] == [b"x"]
+    assert batch[0].arrival < awaited < read
 
 
 def test_a_pause_between_looks_costs_no_accuracy(device: socket.socket) -> None:
