@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
@@ -182,77 +183,87 @@ def predict(
     blind_forces : bool
         The forces were not used.
     """
+    if knot <= preintegrated.anchor:
+        return state.at(preintegrated, knot), covariance
     edges = np.unique(
         np.linspace(preintegrated.anchor, knot, tuning.COVARIANCE_STEPS + 1).astype(int)
     )
-    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        at = state.at(preintegrated, first)
-        dt = float(preintegrated.stamps[last] - preintegrated.stamps[first]) * 1e-9
-        spans = np.diff(imu.stamps[first : last + 1])
-        blind = float(spans[imu.missing[first:last]].sum()) / float(spans.sum())
-        held = float(np.abs(preintegrated.rates[first : last + 1]).max())
-        unmeasured = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
-        gyro2 = (1.0 - blind) * noise.gyro**2 + blind * unmeasured
-        blind = 1.0 if blind_forces else blind
-        accel2 = (1.0 - blind) * noise.accel**2 + blind * tuning.BLIND_ACCEL**2
-        turn = rotations.matrices(preintegrated.rotations_wxyz[[first, last]])
-        gained = preintegrated.velocities[last] - preintegrated.velocities[first]
-        f = transition(at.rotation, turn[0].T @ turn[1], turn[0].T @ gained / dt, dt)
-        q = process_noise(gyro2, accel2, noise, dt)
-        _, covariance = kalman().predict(np.zeros(ERRORS), covariance, f, q)
+    first, last = edges[:-1], edges[1:]
+    dt = np.diff(preintegrated.stamps[edges]) * 1e-9
+    turns = rotations.matrices(preintegrated.rotations_wxyz[edges])
+    back = np.swapaxes(turns[:-1], 1, 2)
+    gained = np.diff(preintegrated.velocities[edges], axis=0)
+    forces = (back @ (gained / dt[:, None])[..., None])[..., 0]
+    f = transition(state.rotation @ turns[:-1], back @ turns[1:], forces, dt)
+    spans = np.diff(imu.stamps[: knot + 1])
+    blind = np.add.reduceat(spans * imu.missing[:knot], first) / np.add.reduceat(spans, first)
+    rates = np.abs(preintegrated.rates[: knot + 1]).max(axis=1)
+    held = np.maximum(np.maximum.reduceat(rates[:-1], first), rates[last])
+    unmeasured = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
+    gyro2 = (1.0 - blind) * noise.gyro**2 + blind * unmeasured
+    blind = np.ones_like(blind) if blind_forces else blind
+    accel2 = (1.0 - blind) * noise.accel**2 + blind * tuning.BLIND_ACCEL**2
+    q = process_noise(gyro2, accel2, noise, dt)
+    whole, added = f[0], q[0]
+    for step, more in zip(f[1:], q[1:], strict=True):
+        whole, added = step @ whole, step @ added @ step.T + more
+    _, covariance = kalman().predict(np.zeros(ERRORS), covariance, whole, added)
     return state.at(preintegrated, knot), covariance
 
 
-def transition(rotation: F64, turn: F64, force: F64, dt: float) -> F64:
-    """Return the derivatives (18, 18) of the errors ``dt`` later by the errors now.
+def transition(rotation: F64, turn: F64, force: F64, dt: ArrayLike) -> F64:
+    """Return the derivatives (..., 18, 18) of the errors ``dt`` later by the errors now.
 
     Parameters
     ----------
-    rotation : ndarray, shape (3, 3)
+    rotation : ndarray, shape (..., 3, 3)
         Attitude at the beginning.
-    turn : ndarray, shape (3, 3)
+    turn : ndarray, shape (..., 3, 3)
         Axes at the end to axes at the beginning.
-    force : ndarray, shape (3,)
+    force : ndarray, shape (..., 3)
         Mean specific force without bias, axes of the beginning [m/s^2].
-    dt : float
+    dt : array-like, shape (...)
         [s]
     """
+    h = np.asarray(dt)[..., None, None]
     lean = -rotation @ skew(force)
     eye = np.eye(3)
-    f = np.eye(ERRORS)
-    f[ROTATION, ROTATION] = turn.T
-    f[ROTATION, GYRO_BIAS] = -dt * eye
-    f[VELOCITY, ROTATION] = dt * lean
-    f[VELOCITY, GYRO_BIAS] = -0.5 * dt * dt * lean
-    f[VELOCITY, ACCEL_BIAS] = -dt * rotation
-    f[VELOCITY, GRAVITY] = dt * eye
-    f[POSITION, ROTATION] = 0.5 * dt * dt * lean
-    f[POSITION, VELOCITY] = dt * eye
-    f[POSITION, GYRO_BIAS] = -(dt**3) / 6.0 * lean
-    f[POSITION, ACCEL_BIAS] = -0.5 * dt * dt * rotation
-    f[POSITION, GRAVITY] = 0.5 * dt * dt * eye
+    f = np.zeros((*h.shape[:-2], ERRORS, ERRORS))
+    f[..., range(ERRORS), range(ERRORS)] = 1.0
+    f[..., ROTATION, ROTATION] = np.swapaxes(turn, -1, -2)
+    f[..., ROTATION, GYRO_BIAS] = -h * eye
+    f[..., VELOCITY, ROTATION] = h * lean
+    f[..., VELOCITY, GYRO_BIAS] = -0.5 * h * h * lean
+    f[..., VELOCITY, ACCEL_BIAS] = -h * rotation
+    f[..., VELOCITY, GRAVITY] = h * eye
+    f[..., POSITION, ROTATION] = 0.5 * h * h * lean
+    f[..., POSITION, VELOCITY] = h * eye
+    f[..., POSITION, GYRO_BIAS] = -(h**3) / 6.0 * lean
+    f[..., POSITION, ACCEL_BIAS] = -0.5 * h * h * rotation
+    f[..., POSITION, GRAVITY] = 0.5 * h * h * eye
     return f
 
 
-def process_noise(gyro2: float, accel2: float, noise: Noise, dt: float) -> F64:
-    """Return the covariance (18, 18) that a step of ``dt`` [s] adds.
+def process_noise(gyro2: ArrayLike, accel2: ArrayLike, noise: Noise, dt: ArrayLike) -> F64:
+    """Return the covariances (..., 18, 18) that steps of ``dt`` [s] add.
 
     Parameters
     ----------
-    gyro2, accel2 : float
+    gyro2, accel2 : array-like, shape (...)
         Squared densities of gyro [(rad/s)^2/Hz] and accelerometer [(m/s^2)^2/Hz] in the step.
     noise : Noise
         Gives the random walks of the biases.
-    dt : float
+    dt : array-like, shape (...)
     """
-    q = np.zeros((ERRORS, ERRORS))
+    h, gyro, accel = (np.asarray(item)[..., None, None] for item in (dt, gyro2, accel2))
     eye = np.eye(3)
-    q[ROTATION, ROTATION] = gyro2 * dt * eye
-    q[VELOCITY, VELOCITY] = accel2 * dt * eye
-    q[POSITION, POSITION] = accel2 * dt**3 / 3.0 * eye
-    q[POSITION, VELOCITY] = q[VELOCITY, POSITION] = accel2 * dt * dt / 2.0 * eye
-    q[GYRO_BIAS, GYRO_BIAS] = noise.gyro_walk**2 * dt * eye
-    q[ACCEL_BIAS, ACCEL_BIAS] = noise.accel_walk**2 * dt * eye
+    q = np.zeros((*h.shape[:-2], ERRORS, ERRORS))
+    q[..., ROTATION, ROTATION] = gyro * h * eye
+    q[..., VELOCITY, VELOCITY] = accel * h * eye
+    q[..., POSITION, POSITION] = accel * h**3 / 3.0 * eye
+    q[..., POSITION, VELOCITY] = q[..., VELOCITY, POSITION] = accel * h * h / 2.0 * eye
+    q[..., GYRO_BIAS, GYRO_BIAS] = noise.gyro_walk**2 * h * eye
+    q[..., ACCEL_BIAS, ACCEL_BIAS] = noise.accel_walk**2 * h * eye
     return q
 
 
@@ -590,6 +601,8 @@ def after_time_jump(
 
 
 def skew(v: F64) -> F64:
-    """Return the matrix of the cross product, shape (3, 3)."""
-    x, y, z = v.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Return the matrices of the cross product, shape (..., 3, 3)."""
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., (2, 0, 1), (1, 2, 0)] = v
+    matrix[..., (1, 2, 0), (2, 0, 1)] = -v
+    return matrix
