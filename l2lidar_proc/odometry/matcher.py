@@ -117,16 +117,17 @@ class SweepMatcher:
 
     def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
         """Return the points to align, deskewed along a predicted motion."""
-        trajectory, reference = motion.trajectory(self.lever), motion.state.stamp
-        moved = coordinates(sweep.points, sweep.start, trajectory, reference)
-        points = np.stack(moved, axis=1).astype(np.float64)
-        chosen = thinned_indices(points, self.config.surfaces.source_voxel)
+        # thinned before they are moved: a tenth of the points is left to deskew
+        chosen = thinned_indices(xyz(sweep.points), self.config.surfaces.source_voxel)
         chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
+        some = sweep.points[chosen]
+        moved = coordinates(some, sweep.start, motion.trajectory(self.lever), motion.state.stamp)
+        points = np.stack(moved, axis=1).astype(np.float64)
         offset = (sweep.start - motion.state.stamp) * 1e-9
         return Source(
-            points[chosen] - self.lever,
-            offset + sweep.points["time"][chosen].astype(np.float64),
-            np.linalg.norm(points[chosen], axis=1),
+            points - self.lever,
+            offset + some["time"].astype(np.float64),
+            np.linalg.norm(points, axis=1),
         )
 
     def match(self, source: Source, motion: SweepMotion, *, initial: bool = False) -> Match:
