@@ -15,7 +15,7 @@ import numpy as np
 from l2lidar_node import rotations
 from l2lidar_node.calibration.file import CalibrationFileError, load
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import unmixing
@@ -70,8 +70,7 @@ class ImuConvention:
 
     def forget_motion(self) -> None:
         """Forget poses and samples, as after a restart; what was recognized stays."""
-        self._stamps: list[int] = []
-        self._forces: list[F64] = []
+        self._recent: Samples = np.empty(0, IMU_SAMPLE)
         self._poses: list[tuple[HostNs, F64]] = []
         self._bends: list[tuple[F64, F64]] = []
 
@@ -93,13 +92,12 @@ class ImuConvention:
             if len(self._norms):
                 self.in_g = bool(_G_NORMS[0] < np.median(self._norms) < _G_NORMS[1])
         samples = self.applied(samples)
-        if len(self._stamps) > _MOST_KEPT:  # no poses come that would let them go
-            self._drop(self._stamps[_MOST_KEPT // 2])
-        stamps = samples["stamp"].tolist()
-        if stamps and self._stamps and abs(stamps[0] - self._stamps[-1]) > _KEPT_NS:
-            self.forget_motion()  # the clock was set
-        self._stamps += stamps
-        self._forces += list(samples["linear_acceleration"].astype(np.float64))
+        if len(samples) and len(self._recent):
+            step = int(samples["stamp"][0]) - int(self._recent["stamp"][-1])
+            if abs(step) > _KEPT_NS:
+                self.forget_motion()  # the clock was set
+        # as many as fit where no poses come that would let them go
+        self._recent = np.concatenate((self._recent, samples))[-_MOST_KEPT:]
         return samples
 
     def watch(self, stamp: HostNs, R_odom_imu: F64, position: F64) -> bool:
@@ -131,8 +129,7 @@ class ImuConvention:
 
     def _drop(self, before: int) -> None:
         """Forget samples that no pose will ask for again."""
-        count = int(np.searchsorted(self._stamps, before))
-        del self._stamps[:count], self._forces[:count]
+        self._recent = self._recent[np.searchsorted(self._recent["stamp"], before) :]
 
     def _bend(self) -> tuple[F64, F64] | None:
         """Return the change of velocity between three poses, by the poses and by the samples.
@@ -142,7 +139,7 @@ class ImuConvention:
         """
         instants = np.array([stamp for stamp, _ in self._poses], dtype=np.int64)
         t = (instants - instants[1]) * 1e-9
-        stamps = np.array(self._stamps, dtype=np.int64)
+        stamps = self._recent["stamp"]
         if (np.diff(t) <= 0.0).any() or np.diff(t).max() > _LONGEST_S or not len(stamps):
             return None
         within = (stamps > instants[0]) & (stamps < instants[2])
@@ -152,7 +149,7 @@ class ImuConvention:
         seen = (p[2] - p[1]) / (t[2] - t[1]) - (p[1] - p[0]) / (t[1] - t[0])
         when = (stamps[within] - instants[1]) * 1e-9
         weight = np.interp(when, t, [0.0, 1.0, 0.0])
-        force = np.array(self._forces)[within]
+        force = self._recent["linear_acceleration"][within]
         turns = np.array([pose[:, :3] for _, pose in self._poses])
         near = np.clip(np.searchsorted((t[:-1] + t[1:]) / 2.0, when), 0, 2)
         turned = np.einsum("nij,nj->ni", turns[near], force)
