@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import POINT, HostNs, Sweep, is_ros_time
 
 TIME_FIELDS: Final = ("time", "t", "timestamp", "offset_time")
@@ -81,7 +82,7 @@ def to_sweep(
     times = _relative_ns(cloud[name], stamp, unit)
     if (np.diff(times) < 0).any():
         order = np.argsort(times, kind="stable")
-        cloud, times = cloud[order], times[order]
+        cloud, times = records.selected(cloud, order), times[order]
     lasts = (int(times[-1]) - min(int(times[0]), 0)) / 1e9
     if lasts > MAX_DURATION_NS / 1e9:
         raise CloudError(

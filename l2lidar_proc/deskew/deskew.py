@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node import rotations
+from l2lidar_node import records, rotations
 from l2lidar_node.types import F32, HostNs
 from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 
@@ -41,7 +41,7 @@ def deskew(
     """
     if not len(points) or trajectory.is_still:
         return points
-    moved = points.copy()
+    moved = records.copied(points)
     for name, coordinate in zip(
         "xyz", coordinates(points, start, trajectory, reference), strict=True
     ):

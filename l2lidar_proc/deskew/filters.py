@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_proc.deskew.config import FilterConfig
 
 Points = NDArray[np.void]
@@ -129,7 +130,7 @@ def apply(points: Points, names: Sequence[str], config: FilterConfig) -> NDArray
     for name in names:
         if not len(kept):
             break
-        left = points if len(kept) == len(points) else points[kept]
+        left = points if len(kept) == len(points) else records.selected(points, kept)
         kept = kept[FILTERS[name](left, config)]
     return kept
 

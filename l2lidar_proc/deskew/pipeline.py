@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import F64, HostNs, Level, Sweep
 from l2lidar_proc.cloud import without_time
 from l2lidar_proc.deskew import filters
@@ -204,7 +205,11 @@ class Pipeline:
         """
         chain = self._config.filters
         before, problem = self._kept(sweep.points, chain.filters_before)
-        points = sweep.points if len(before) == len(sweep.points) else sweep.points[before]
+        points = (
+            sweep.points
+            if len(before) == len(sweep.points)
+            else records.selected(sweep.points, before)
+        )
         reference = self._config.deskew.reference if trajectory is not None else "start"
         stamp = _instant(reference, sweep, points)
         moved = (
@@ -212,7 +217,7 @@ class Pipeline:
         )
         after, another = self._kept(moved, chain.filters_after)
         if len(after) < len(moved):
-            points, moved = points[after], moved[after]
+            points, moved = records.selected(points, after), records.selected(moved, after)
             if _instant(reference, sweep, points) != stamp:
                 stamp = _instant(reference, sweep, points)
                 moved = (
@@ -273,7 +278,7 @@ def _timed(
     """Return the points with times after the stamp in place of times after the start."""
     if stamp == start:
         return points
-    timed = points.copy()
+    timed = records.copied(points)
     # to whole nanoseconds, so that the first is exactly 0
     timed["time"] = np.round(times - np.float64((stamp - start) * 1e-9), 9) + 0.0
     return timed

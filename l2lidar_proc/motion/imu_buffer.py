@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc import tuning
 
@@ -113,7 +114,7 @@ class ImuBuffer:
         stamps = self.samples["stamp"]
         first = max(int(np.searchsorted(stamps, start, side="right")) - 1, 0)
         last = int(np.searchsorted(stamps, end, side="left")) + 1
-        return self.samples[first:last].copy()
+        return records.copied(self.samples[first:last])
 
     def turn(self, rotation: NDArray[np.float64]) -> None:
         """Turn rates and forces of all samples by a rotation matrix (3, 3)."""

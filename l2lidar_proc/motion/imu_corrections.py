@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from l2lidar_node import rotations
+from l2lidar_node import records, rotations
 from l2lidar_node.calibration.file import CalibrationFileError, load
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
@@ -97,7 +97,7 @@ class ImuConvention:
             if abs(step) > _KEPT_NS:
                 self.forget_motion()  # the clock was set
         # as many as fit where no poses come that would let them go
-        self._recent = np.concatenate((self._recent, samples))[-_MOST_KEPT:]
+        self._recent = records.joined((self._recent, samples))[-_MOST_KEPT:]
         return samples
 
     def watch(self, stamp: HostNs, R_odom_imu: F64, position: F64) -> bool:

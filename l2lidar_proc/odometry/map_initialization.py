@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import POSITION, InertialState
@@ -306,11 +307,15 @@ def cropped(sweep: Sweep, nearest: float, farthest: float) -> Sweep:
     points = sweep.points
     squared = sum(points[axis].astype(np.float64) ** 2 for axis in "xyz")
     inside = (squared >= nearest**2) & (squared <= farthest**2) & np.isfinite(points["time"])
-    return sweep if inside.all() else dataclasses.replace(sweep, points=points[inside])
+    return (
+        sweep
+        if inside.all()
+        else dataclasses.replace(sweep, points=records.selected(points, inside))
+    )
 
 
 def _one(sweeps: list[Sweep]) -> Sweep:
-    points = np.concatenate([sweep.points for sweep in sweeps])
+    points = records.joined([sweep.points for sweep in sweeps])
     shift = [(sweep.start - sweeps[0].start) * 1e-9 for sweep in sweeps]
     counts = [len(sweep.points) for sweep in sweeps]
     points["time"] += np.repeat(shift, counts).astype(points["time"].dtype)

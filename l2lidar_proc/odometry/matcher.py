@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node import rotations
+from l2lidar_node import records, rotations
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.deskew.deskew import coordinates, deskew
@@ -120,7 +120,7 @@ class SweepMatcher:
         # thinned before they are moved: a tenth of the points is left to deskew
         chosen = thinned_indices(xyz(sweep.points), self.config.surfaces.source_voxel)
         chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
-        some = sweep.points[chosen]
+        some = records.selected(sweep.points, chosen)
         moved = coordinates(some, sweep.start, motion.trajectory(self.lever), motion.state.stamp)
         points = np.stack(moved, axis=1).astype(np.float64)
         offset = (sweep.start - motion.state.stamp) * 1e-9

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
 
@@ -321,7 +322,13 @@ class SurfelMap:
         rows_found, indices, axes = zip(*found, strict=True)
         axis = np.repeat(axes, [len(some) for some in indices])
         row = np.concatenate(rows_found)
-        return _matches(points, np.concatenate(indices), self._cells[row], axis, self._kind[row])
+        return _matches(
+            points,
+            np.concatenate(indices),
+            records.selected(self._cells, row),
+            axis,
+            self._kind[row],
+        )
 
     def _rows(self, points: F64, levels: slice) -> I64:
         """Return the rows of the cells of some levels that points (N, 3) lie in, (L, N)."""
@@ -336,7 +343,8 @@ class SurfelMap:
         if kept.all():
             return
         rows = np.concatenate(([0], 1 + np.flatnonzero(kept)))
-        self._cells, self._kind = self._cells[rows], self._kind[rows]
+        self._cells = records.selected(self._cells, rows)
+        self._kind = self._kind[rows]
         self._index.clear()
         self._index.insert(self._cells["key"][1:].copy(), np.arange(1, len(rows)))
 
@@ -348,7 +356,7 @@ class SurfelMap:
         """
         order = np.argsort(self._cells["key"][1 : len(self) + 1]) + 1
         flat = order[self._kind[order] == _FLAT]
-        cells = self._cells[flat]
+        cells = records.selected(self._cells, flat)
         level = cells["key"] >> 3 * _BITS
         places, means, normals = _places(cells["key"]), cells["mean"], cells["axes"][:, 0]
         return [

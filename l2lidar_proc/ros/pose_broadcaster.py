@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from tf2_msgs.msg import TFMessage
 
-from l2lidar_node import rotations
+from l2lidar_node import records, rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.config import OdometryTopics
@@ -106,7 +106,7 @@ class PoseBroadcaster:
             if estimate is None or not self._recent:
                 return
             # What came while the sweep was registered moves the new estimate, too.
-            samples = np.concatenate(self._recent)
+            samples = records.joined(self._recent)
             samples = samples[samples["stamp"] > estimate.stamp]
             is_known = samples["stamp"] <= self._reckoned_ns
             for step in self._steps(samples[is_known]):
@@ -131,7 +131,7 @@ class PoseBroadcaster:
         if not self._pending or self._topics().imu_rate <= 0.0:
             self._pending.clear()
             return
-        samples = np.concatenate(self._pending)
+        samples = records.joined(self._pending)
         self._pending.clear()
         step_ns = self._step_ns
         first = 0
