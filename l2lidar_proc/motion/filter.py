@@ -31,6 +31,7 @@ GYRO_BIAS: Final = slice(9, 12)
 ACCEL_BIAS: Final = slice(12, 15)
 GRAVITY: Final = slice(15, 18)
 POSE: Final = slice(ROTATION.start, POSITION.stop)
+MOTION: Final = slice(VELOCITY.start, GYRO_BIAS.stop)
 ERRORS: Final = 18
 
 

@@ -27,6 +27,7 @@ from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ERRORS,
+    MOTION,
     POSE,
     POSITION,
     InertialState,
@@ -194,7 +195,9 @@ def _step(
 
 
 def _is_small(change: F64) -> bool:
-    return bool(np.abs(change[POSE]).max() < tuning.CONVERGED)
+    """Return whether a step moves neither the pose nor, by its motion, the points any more."""
+    motion = np.abs(change[MOTION]).max()
+    return bool(np.abs(change[POSE]).max() < tuning.CONVERGED and motion < tuning.CONVERGED_MOTION)
 
 
 Views = Sequence[tuple[InertialState, NDArray[np.int64]]]
