@@ -143,7 +143,7 @@ class Latency:
     """
 
     def __init__(self) -> None:
-        self._edges = [  # upper ends of the bins
+        self._edges: list[int] = [  # upper ends of the bins
             *range(_BIN_NS, _FINE_NS, _BIN_NS),
             *range(_FINE_NS, _COARSE_NS + 1, _COARSE_BIN_NS),
         ]
@@ -164,7 +164,7 @@ class Latency:
         for count, edge in zip(self._counts, [*self._edges, self.max_ns], strict=True):
             seen += count
             if count and seen >= share * self.count:
-                return min(edge, self.max_ns)
+                return edge if edge < self.max_ns else self.max_ns
         return 0
 
     def summary_ms(self) -> dict[str, float]:

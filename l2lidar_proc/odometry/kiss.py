@@ -8,7 +8,7 @@ point: nothing of that kind gets past this module.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,14 @@ def kiss_config(config: OdometryConfig) -> KISSConfig:
     return out
 
 
+class _Parts(NamedTuple):
+    """What KISS-ICP consists of; kiss_icp has no types."""
+
+    map: Any
+    registration: Any
+    threshold: Any
+
+
 class KissMatcher:
     """Scan matching with KISS-ICP's public parts; deskew and initial guess are the caller's.
 
@@ -56,23 +64,34 @@ class KissMatcher:
     """
 
     def __init__(self, config: OdometryConfig) -> None:
-        self._config = kiss_config(config)
-        self.clear()
+        self._config = config
+        self._voxel_size = config.kiss.kiss_voxel_size
+        self._made: _Parts | None = None
 
     def clear(self) -> None:
         """Forget the map and what was learnt about the predictions."""
-        from kiss_icp.mapping import get_voxel_hash_map
-        from kiss_icp.registration import get_registration
-        from kiss_icp.threshold import get_threshold_estimator
+        self._made = None
 
-        self._map = get_voxel_hash_map(self._config)
-        self._registration = get_registration(self._config)
-        self._threshold = get_threshold_estimator(self._config)
+    @property
+    def _parts(self) -> _Parts:
+        """Return what KISS-ICP consists of, made and imported when it is first needed."""
+        if self._made is None:
+            from kiss_icp.mapping import get_voxel_hash_map
+            from kiss_icp.registration import get_registration
+            from kiss_icp.threshold import get_threshold_estimator
+
+            config = kiss_config(self._config)
+            self._made = _Parts(
+                get_voxel_hash_map(config),
+                get_registration(config),
+                get_threshold_estimator(config),
+            )
+        return self._made
 
     @property
     def threshold(self) -> float:
         """How far predictions have lately been off [m]."""
-        return float(self._threshold.get_threshold())
+        return float(self._parts.threshold.get_threshold())
 
     def register(self, points: F64, guess: F64, most: float = np.inf) -> F64 | None:
         """Return the pose (4, 4) that aligns points (N, 3) with the map, None without a map.
@@ -85,13 +104,13 @@ class KissMatcher:
         most : float
             Largest threshold to use [m].
         """
-        if self._map.empty() or len(points) < LEAST_POINTS:
+        if self._parts.map.empty() or len(points) < LEAST_POINTS:
             return None
         sigma = min(self.threshold, most)
-        source = _thinned(points, 1.5 * self._config.mapping.voxel_size)
-        pose = self._registration.align_points_to_map(
+        source = _thinned(points, 1.5 * self._voxel_size)
+        pose = self._parts.registration.align_points_to_map(
             points=source,
-            voxel_map=self._map,
+            voxel_map=self._parts.map,
             initial_guess=guess,
             max_correspondance_distance=3.0 * sigma,
             kernel=sigma,
@@ -102,12 +121,12 @@ class KissMatcher:
         """Add points (N, 3) [m] at a pose (4, 4) to the map; learn how good its guess was."""
         if len(points) < LEAST_POINTS:
             return
-        self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
-        self._map.update(_thinned(points, 0.5 * self._config.mapping.voxel_size), pose)
+        self._parts.threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
+        self._parts.map.update(_thinned(points, 0.5 * self._voxel_size), pose)
 
     def points(self) -> F64:
         """Return the map's points [m], shape (N, 3)."""
-        return np.asarray(self._map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+        return np.asarray(self._parts.map.point_cloud(), dtype=np.float64).reshape(-1, 3)
 
 
 class PlainKiss:

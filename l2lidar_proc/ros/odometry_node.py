@@ -111,7 +111,15 @@ class OdometryNode(ManagedNode):
         map_period_s = self._settings.value.topics.map_period_s
         if map_period_s > 0.0:
             steady_timer(self, map_period_s, guarded(self._show_map))
-        load_libraries("filterpy.kalman", "kiss_icp.voxelization", "scipy.spatial.transform")
+        load_libraries(
+            "kiss_icp.config",
+            "kiss_icp.mapping",
+            "kiss_icp.registration",
+            "kiss_icp.threshold",
+            "kiss_icp.voxelization",
+            "filterpy.kalman",
+            "scipy.spatial.transform",
+        )
 
     def pause(self) -> None:
         """Listen no more."""
