@@ -11,6 +11,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import groupby
+from operator import attrgetter
 from typing import Any, Final, NamedTuple, Protocol
 
 from rclpy.callback_groups import CallbackGroup
@@ -20,6 +22,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, PointCloud2
 
+from l2lidar_node import records
 from l2lidar_node.types import Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
 from l2lidar_proc.motion.imu_buffer import Samples
@@ -32,7 +35,7 @@ CLOUD_DEPTH: Final = 30
 IMU_DEPTH: Final = 2000
 _AHEAD: Final = 4  # clouds that are taken out of their queue at once, to know how many wait
 
-SLOW_LOOK_S: Final = 0.05
+SLOW_LOOK_S: Final = 0.1
 """Between looks into the IMU's queue where nobody is in a hurry."""
 
 _WAIT_S: Final = 0.003  # between looks while a sweep waits for its last samples
@@ -256,8 +259,10 @@ class SensorIntake:
     def drain(self) -> None:
         """Hand out the IMU samples that have come."""
         self._take()
-        while self._taken:
-            samples, frame = self._taken.popleft()
+        taken = [self._taken.popleft() for _ in range(len(self._taken))]
+        # what came in several batches is handed out as one: each costs as much as its samples
+        for frame, batches in groupby(taken, key=attrgetter("frame")):
+            samples = records.joined([batch.samples for batch in batches])
             for feed in self._feeds:
                 feed.samples(samples, frame)
 
