@@ -32,7 +32,7 @@ from l2lidar_node.clock import ClockEvent
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.driver.driver import Driver, Event, Silence
-from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.emulator.truth import Results
 from l2lidar_node.files import write_whole
 from l2lidar_node.recording.recording import Recorder
 from l2lidar_node.settings import build

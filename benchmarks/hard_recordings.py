@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from benchmarks.hard_scenarios import Imperfections, Scenario, Setting, prepare
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.emulator.unit.inertial import Inertial
-from l2lidar_node.emulator.unit.other_sensors import CLOUD_POINT, SENSORS
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scanner
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs, Sweep
+from tests.support.other_sensors import CLOUD_POINT, SENSORS
 
 FOLDER: Final = Path("out") / "recordings"
 EPOCH: Final = 1_700_000_000_000_000_000

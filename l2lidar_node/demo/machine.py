@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.emulator.truth import Results
 
 INCONCLUSIVE: Final = os.EX_TEMPFAIL
 """Exit code of a demo whose figures are wrong on a machine that did not keep up."""

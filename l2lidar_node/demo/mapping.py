@@ -20,7 +20,7 @@ from l2lidar_node.command_line import CommandError
 from l2lidar_node.demo.observer import Observer, TopicRecord
 from l2lidar_node.demo.processes import ProgramError, Programs, assigned
 from l2lidar_node.demo.report import track_error
-from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.emulator.truth import Results
 from l2lidar_node.ros.conversions import from_time
 from l2lidar_node.types import F64
 

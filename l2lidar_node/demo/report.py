@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node.config import FrameConfig
 from l2lidar_node.demo.observer import Observer
-from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.emulator.truth import Results
 from l2lidar_node.files import whole
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import F64

@@ -37,7 +37,7 @@ from l2lidar_node.emulator.server import (
     stored_settings,
     unit,
 )
-from l2lidar_node.emulator.truth.results import write_packet_log
+from l2lidar_node.emulator.truth import write_packet_log
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.emulator.unit.inertial import ImuNoise

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS, Motion, from_tum
-from l2lidar_node.emulator.truth.results import write_points, write_trajectory
+from l2lidar_node.emulator.truth import write_points, write_trajectory
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scanner, mean_angle

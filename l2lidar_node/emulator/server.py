@@ -16,7 +16,7 @@ from typing import Final
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.link.port import Port, SerialPort, UdpPort
 from l2lidar_node.emulator.physics import PhysicsConfig, RayCastWorker
-from l2lidar_node.emulator.truth.packet_log import PacketLog
+from l2lidar_node.emulator.truth import PacketLog
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.firmware import Flash, version_payload
 from l2lidar_node.emulator.unit.stream import VIEW, PatternScanner, PointSource, StillInertial

@@ -17,7 +17,7 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
-from l2lidar_node.emulator.unit.other_sensors import SENSORS
+from tests.support.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
 

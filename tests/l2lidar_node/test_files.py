@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from l2lidar_node.emulator import truth
 from l2lidar_node.emulator.motion.motion import from_tum
-from l2lidar_node.emulator.truth import results
-from l2lidar_node.emulator.truth.packet_log import PacketLog
+from l2lidar_node.emulator.truth import PacketLog
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.recording.bag import BagFile
 from l2lidar_proc.recording import outputs
@@ -78,10 +78,10 @@ WRITERS = [
     pytest.param(lambda folder: outputs.save(folder / "m.ply", POINTS), marks=needs_open3d),
     pytest.param(lambda folder: outputs.save(folder / "m.pcd", POINTS), marks=needs_open3d),
     pytest.param(_way, marks=needs_open3d),
-    lambda folder: results.write_tum(
+    lambda folder: truth.write_tum(
         folder / "t.tum", from_tum(_a_way(folder)), np.linspace(0.0, 1.0, 5)
     ),
-    lambda folder: results.write_packet_log(folder, PacketLog(), {}),
+    lambda folder: truth.write_packet_log(folder, PacketLog(), {}),
 ]
 
 

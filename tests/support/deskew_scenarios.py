@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.emulator.motion.motion import Motion, PoseSpline
 from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
-from l2lidar_node.emulator.truth.results import undistorted
+from l2lidar_node.emulator.truth import undistorted
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scan, Scanner, local_rays

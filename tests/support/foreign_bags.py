@@ -17,11 +17,11 @@ from l2lidar_node.clouds import DATATYPES
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
-from l2lidar_node.emulator.unit.other_sensors import SENSORS, RangeSensor, spinning
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64
+from tests.support.other_sensors import SENSORS, RangeSensor, spinning
 
 EPOCH: Final = 1_700_000_000_000_000_000
 SECONDS: Final = 2.2

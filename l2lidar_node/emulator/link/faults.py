@@ -10,7 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from l2lidar_node.emulator.config import FaultConfig
-from l2lidar_node.emulator.truth.packet_log import JUNK, Datagram, Fault, PacketLog, Piece
+from l2lidar_node.emulator.truth import JUNK, Datagram, Fault, PacketLog, Piece
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 

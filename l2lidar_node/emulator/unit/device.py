@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.link.faults import Dice, Path, is_silent, stages
-from l2lidar_node.emulator.truth.packet_log import Datagram, Fault, PacketLog
+from l2lidar_node.emulator.truth import Datagram, Fault, PacketLog
 from l2lidar_node.emulator.unit.firmware import Firmware, Flash, Inbox, Network, Received
 from l2lidar_node.emulator.unit.stream import (
     VIEW,

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.truth.packet_log import PACKET, Datagram, PacketLog, Piece
+from l2lidar_node.emulator.truth import PACKET, Datagram, PacketLog, Piece
 from l2lidar_node.emulator.unit.firmware import CALIBRATION, RANGE_MAX_M, RANGE_MIN_M, UnitClock
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType, WorkMode

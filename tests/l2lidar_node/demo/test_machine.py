@@ -17,8 +17,7 @@ from l2lidar_node.demo.machine import (
     verdict,
 )
 from l2lidar_node.emulator.server import Latency
-from l2lidar_node.emulator.truth.packet_log import PacketLog
-from l2lidar_node.emulator.truth.results import write_packet_log
+from l2lidar_node.emulator.truth import PacketLog, write_packet_log
 
 OFF = "odometry is off by 0.505 m, expected less than 0.050 m"
 BUSY = {"odometry": ProcessorTime(5.0, 1.0)}

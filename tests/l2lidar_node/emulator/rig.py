@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from l2lidar_node.emulator.config import DeviceConfig, PowerConfig
-from l2lidar_node.emulator.truth.packet_log import PacketLog
+from l2lidar_node.emulator.truth import PacketLog
 from l2lidar_node.emulator.unit.device import Link, VirtualL2
 from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial

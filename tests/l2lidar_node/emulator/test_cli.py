@@ -22,8 +22,7 @@ from l2lidar_node.emulator.cli import main
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
-from l2lidar_node.emulator.truth.packet_log import Fault
-from l2lidar_node.emulator.truth.results import Results
+from l2lidar_node.emulator.truth import Fault, Results
 from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode

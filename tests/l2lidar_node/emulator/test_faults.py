@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 
 from l2lidar_node.emulator.config import DeviceConfig, FaultConfig
 from l2lidar_node.emulator.link.faults import HOSTILE_SIZES, Path
-from l2lidar_node.emulator.truth.packet_log import Datagram, Fault, PacketLog, Piece
+from l2lidar_node.emulator.truth import Datagram, Fault, PacketLog, Piece
 from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode

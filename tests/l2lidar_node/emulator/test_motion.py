@@ -10,6 +10,7 @@ from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2lidar_node import rotations
+from l2lidar_node.emulator import truth
 from l2lidar_node.emulator.motion import trajectories, tum
 from l2lidar_node.emulator.motion.motion import (
     MOUNTS,
@@ -19,7 +20,6 @@ from l2lidar_node.emulator.motion.motion import (
     mount_quaternion,
     rpy_quaternions,
 )
-from l2lidar_node.emulator.truth import results
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.types import STANDARD_GRAVITY
@@ -312,7 +312,7 @@ def test_the_true_trajectory_is_written_in_host_time(tmp_path: Path) -> None:
     origin = 1_750_000_000_000_000_001
     path = tmp_path / "truth.tum"
 
-    results.write_tum(path, motion, t, origin)
+    truth.write_tum(path, motion, t, origin)
 
     read = tum.load(path)
     np.testing.assert_array_equal(read["stamp"], origin + np.round(t * 1e9).astype(np.int64))

@@ -10,7 +10,7 @@ import pytest
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.truth.results import into_cloud
+from l2lidar_node.emulator.truth import into_cloud
 from l2lidar_node.emulator.unit.returns import RangeNoise, noise_sigma
 from l2lidar_node.emulator.unit.scanner import TWO_D_PERIOD_S, Scan, Scanner
 from l2lidar_node.emulator.unit.units import UNITS

@@ -10,7 +10,7 @@ import pytest
 
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
-from l2lidar_node.emulator.truth.results import into_cloud, undistorted
+from l2lidar_node.emulator.truth import into_cloud, undistorted
 from l2lidar_node.emulator.unit.returns import RangeNoise
 from l2lidar_node.emulator.unit.scanner import Scan, Scanner, local_rays
 from l2lidar_node.emulator.world import scenes

@@ -7,9 +7,9 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
-from l2lidar_node.emulator.unit.other_sensors import SENSORS
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
+from tests.support.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
 
