@@ -31,8 +31,7 @@ from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.capture import CaptureError
-from l2lidar_node.recording.recording import Recording
-from l2lidar_node.recording.replay import feed
+from l2lidar_node.recording.recording import Recording, feed
 from l2lidar_node.settings import build
 from l2lidar_node.types import F64, IMU_SAMPLE, ImuSample, Sweep
 

@@ -30,8 +30,7 @@ from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording import bag
 from l2lidar_node.recording.capture import CaptureError, is_capture_file
-from l2lidar_node.recording.recording import Received, Recording
-from l2lidar_node.recording.replay import feed, measurements
+from l2lidar_node.recording.recording import Received, Recording, feed, measurements
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import build
 from l2lidar_node.types import Stream, Sweep

@@ -17,6 +17,7 @@ from rich.live import Live
 from rich.progress import track
 from rich.table import Table
 
+from l2lidar_node.cli.commands import work_mode_text
 from l2lidar_node.cli.console import (
     JsonOption,
     as_data,
@@ -28,7 +29,6 @@ from l2lidar_node.cli.console import (
     with_network,
 )
 from l2lidar_node.cli.device import Device, DeviceError
-from l2lidar_node.cli.stored import work_mode_text
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.clock.lower_envelope import supporting_line
 from l2lidar_node.config import NetworkConfig

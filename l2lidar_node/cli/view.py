@@ -15,8 +15,7 @@ from l2lidar_node.command_line import CommandError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.recording import bag
 from l2lidar_node.recording.capture import CaptureError, is_capture_file
-from l2lidar_node.recording.recording import Recording
-from l2lidar_node.recording.replay import measurements
+from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.settings import build
 from l2lidar_node.types import Sweep
 from l2lidar_node.viewing import Viewer

@@ -31,8 +31,7 @@ from l2lidar_node.files import free_name
 from l2lidar_node.protocol.packets import Parameters, Version
 from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.packet_bag import PacketBatch, open_packets
-from l2lidar_node.recording.recording import Recorder, Recording, endpoints
-from l2lidar_node.recording.replay import Playback
+from l2lidar_node.recording.recording import Playback, Recorder, Recording, endpoints
 from l2lidar_node.ros.conversions import CloudTemplate, ImuTemplate, imu_transform, to_time
 from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.managed_node import ManagedNode, NextTurn

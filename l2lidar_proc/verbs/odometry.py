@@ -20,8 +20,7 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.frames import FrameTree
 from l2lidar_node.recording.capture import CaptureError, is_capture_file
-from l2lidar_node.recording.recording import Recording
-from l2lidar_node.recording.replay import measurements
+from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep

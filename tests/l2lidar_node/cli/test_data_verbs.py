@@ -35,8 +35,8 @@ from l2lidar_node.recording.recording import (
     RecordingWriter,
     Sent,
     endpoints,
+    events,
 )
-from l2lidar_node.recording.replay import events
 from l2lidar_node.settings import build
 from l2lidar_node.transport.session import Session
 from l2lidar_node.transport.udp import UdpTransport

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from l2lidar_node.cli.commands import parameter_fields, parse_work_mode, work_mode_text
 from l2lidar_node.cli.device import Device
-from l2lidar_node.cli.stored import parameter_fields, parse_work_mode, work_mode_text
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.emulator.config import FaultConfig
 from l2lidar_node.emulator.unit.firmware import parameters_payload

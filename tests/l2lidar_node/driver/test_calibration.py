@@ -16,7 +16,7 @@ from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
-from l2lidar_node.recording.replay import NoTransport
+from l2lidar_node.recording.recording import NoTransport
 from l2lidar_node.settings import SettingError, change
 from l2lidar_node.types import HostNs, Level, Sweep
 from tests.l2lidar_node.driver.test_driver import Run

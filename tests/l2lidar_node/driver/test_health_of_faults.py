@@ -11,7 +11,7 @@ from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.health import Check, Period, judge, observe
 from l2lidar_node.emulator.config import PowerConfig
 from l2lidar_node.protocol.wire import WorkMode
-from l2lidar_node.recording.replay import NoTransport
+from l2lidar_node.recording.recording import NoTransport
 from l2lidar_node.types import HostNs, Level
 from tests.l2lidar_node.driver.virtual_host import live_run
 

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from l2lidar_node.driver.driver import Event
-from l2lidar_node.recording.recording import Recording
-from l2lidar_node.recording.replay import Playback
+from l2lidar_node.recording.recording import Playback, Recording
 from l2lidar_node.settings import change
 from l2lidar_node.types import ImuSample, Sweep
 from tests.l2lidar_node.driver.virtual_host import essence, live_run

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.clock import ClockEvent, ClockEventKind
-from l2lidar_node.recording.recording import Recording, Slewed, Stepped, Waited
-from l2lidar_node.recording.replay import events, shifted
+from l2lidar_node.recording.recording import Recording, Slewed, Stepped, Waited, events, shifted
 from l2lidar_node.types import ImuSample, Sweep
 from tests.l2lidar_node.driver.virtual_host import EPOCH_NS, VirtualClock, essence, live_run
 

@@ -25,7 +25,7 @@ from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.packets import Version
 from l2lidar_node.protocol.wire import WorkMode
-from l2lidar_node.recording import replay
+from l2lidar_node.recording import recording
 from l2lidar_node.recording.recording import Recording
 from l2lidar_node.settings import build
 from l2lidar_node.transport.serial import SerialTransport
@@ -236,7 +236,7 @@ def test_a_driver_works_over_a_serial_line(monkeypatch: pytest.MonkeyPatch) -> N
     assert any(isinstance(item, Version) for item in events)
     assert counters.frames[wire.PacketType.POINTS_3D] > 200
     assert driver.clock_status().locked
-    replayed = replay.events(Recording(tap.stream), driver.config)
+    replayed = recording.events(Recording(tap.stream), driver.config)
     assert essence(list(replayed)) == essence(events)
     sweeps = [item for item in events if isinstance(item, Sweep)]
     assert {item.packets for item in sweeps} <= {49, 50}
