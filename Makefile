@@ -6,8 +6,8 @@ PYTEST_ARGS ?=
 # Containers often forbid bytecode: every program would compile all that it imports at each start.
 unexport PYTHONDONTWRITEBYTECODE
 MYPY = $(RUN) -m mypy --num-workers $(shell nproc)
-# A process for every core; more than four find too little to do.
-WORKERS := -n logical --maxprocesses 4
+# Three processes for two cores: a third of the time tests wait for units, nodes and discovery.
+WORKERS := -n $(shell expr \( 3 \* $$(nproc) + 1 \) / 2) --maxprocesses 6
 BENCH_ARGS ?=
 
 BENCHES := $(subst _,-,$(patsubst benchmarks/bench_%.py,%,$(wildcard benchmarks/bench_*.py)))

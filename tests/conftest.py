@@ -22,6 +22,11 @@ isolate_ros()
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# Threads of OpenBLAS that wait for work spin, and the arrays of tests are small: beside other
+# workers that is twice the CPU time for nothing. Before anything imports numpy.
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
 # A shell has what runs in the background ignore interrupts, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
