@@ -33,7 +33,7 @@ for python in "${found[@]}"; do
     venv=.venv-noble-$version
     PYTHON=$python scripts/setup.sh "$venv" requirements/noble.txt
     echo "test-noble: Python $version ($python)"
-    "$venv/bin/python" -m pytest -n logical --maxprocesses 4 "$@" || failed+=("$version")
+    "$venv/bin/python" -m pytest -n $((($(nproc) * 3 + 1) / 2)) --maxprocesses 6 "$@" || failed+=("$version")
 done
 if [ ${#failed[@]} != 0 ]; then
     echo "test-noble: failed with Python ${failed[*]}" >&2

@@ -40,7 +40,8 @@ def view(
         Path | None, typer.Option(help="Write an .rrd file instead of showing.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="End after so long; else Ctrl-C ends it.")
+        float | None,
+        typer.Option(min=0.1, help="End so long after the first message; else Ctrl-C ends it."),
     ] = None,
     namespace: Annotated[
         str, typer.Option(help="Namespace of the topics, for example /front.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from l2lidar_node.ros.mounting import ImuAdjustClient
 from l2lidar_node.viewing import ROLES, Viewer
 
 _DISCOVERY_S: Final = 6.0
+_SILENCE_S: Final = 10.0  # then the viewer gives up
 _LOOK_S: Final = 0.1
 _ASK_AGAIN_S: Final = 1.0
 _IDLE: Final = 50  # turns of the executor without a message of before
@@ -113,13 +115,8 @@ class _Ear:
         self._handled = 0
 
     def listen(self, seconds: float) -> None:
-        """Take what comes within some seconds; while this machine pauses they do not pass."""
-        left = seconds
-        while left > 0:
-            begun = time.monotonic()
-            with held():
-                self._executor.spin_once(timeout_sec=min(left, _LOOK_S))
-            left -= min(time.monotonic() - begun, 2 * _LOOK_S)
+        """Take what comes within some seconds."""
+        _spin(self._executor, seconds)
         # What came by now still waits where this program is slow, more samples than clouds.
         self._end_ns = time.time_ns()
         idle = 0
@@ -178,19 +175,42 @@ class ViewerNode(Node):
 
 
 def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
-    """Show topics until interrupted or for some seconds; return how many messages were shown.
+    """Show topics until interrupted, or for some seconds; return how many messages were shown.
 
     rclpy has to be initialised, without handlers of signals.
+
+    Parameters
+    ----------
+    rerun : module
+        The rerun SDK, see :func:`l2lidar_node.viewing.open_viewer`.
+    topics : dict
+        See :class:`ViewerNode`.
+    seconds : float or None
+        How long to show from the first message on. If none comes, it gives up.
     """
     viewer = Viewer(rerun)
     node = ViewerNode(viewer, topics)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    end = None if seconds is None else time.monotonic() + seconds
     try:
-        while executor.context.ok() and (end is None or time.monotonic() < end):
-            with held():
-                executor.spin_once(timeout_sec=0.1)
+        if seconds is not None:
+            _spin(executor, _SILENCE_S, lambda: viewer.messages > 0)
+        if seconds is None or viewer.messages:
+            _spin(executor, seconds)
     finally:
         node.destroy_node()
     return viewer.messages
+
+
+def _spin(
+    executor: SingleThreadedExecutor,
+    seconds: float | None,
+    is_over: Callable[[], bool] = lambda: False,
+) -> None:
+    """Take messages for some seconds (None: until interrupted), which pauses do not shorten."""
+    left = math.inf if seconds is None else seconds
+    while executor.context.ok() and left > 0 and not is_over():
+        begun = time.monotonic()
+        with held():
+            executor.spin_once(timeout_sec=min(left, _LOOK_S))
+        left -= min(time.monotonic() - begun, 2 * _LOOK_S)
