@@ -33,7 +33,7 @@ from l2lidar_node.protocol.packets import (
     Version,
     decode,
 )
-from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep
+from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep, new_tuple
 
 
 @dataclass(slots=True)
@@ -382,7 +382,7 @@ class Driver:
         if stamp is None:
             self.counters.unlocked[_IMU] += 1
             return []
-        sample = ImuSample(stamp, *packet[2:])
+        sample = new_tuple(ImuSample, (stamp, *packet[2:]))
         self.counters.samples += 1
         self.last_imu = sample
         self._gravity_alignment.add(sample)
@@ -398,7 +398,8 @@ class Driver:
         events: list[Event] = []
         for sweep in self._assembler.push(packet, start, missing):
             events += self._finished(sweep)
-        self._count_fragments()
+        if self._assembler.fragments != self.counters.fragments:
+            self._count_fragments()
         return events
 
     def _count_fragments(self) -> None:

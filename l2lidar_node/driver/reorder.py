@@ -112,7 +112,8 @@ class SequenceOrder(Generic[T]):
         if seq != self._next or self.waiting:
             return False
         self._next = seq + 1 if seq + 1 != self._modulus else 0
-        self._given_up.discard(seq)
+        if self._given_up:
+            self._given_up.discard(seq)
         return True
 
     def push(self, seq: int, item: T) -> list[tuple[int, T]]:
@@ -244,6 +245,7 @@ class SequenceOrder(Generic[T]):
 REORDER_NS: Final = 60_000_000  # a packet waits at most this long for an earlier one
 RESTART_NS: Final = 1_000_000_000  # device stamps that fall by more than this began anew
 
+_IMU: Final = Stream.IMU  # to look up a member of an Enum takes long
 _FEW: Final = 8  # packets that may be late in a row
 _CONFIRMING: Final = 3  # packets in a row that show a restart, two of them could be stale
 _MOST_SUSPECTS: Final = 64
@@ -314,7 +316,7 @@ class ReorderBuffer:
         Returns whether it did. Others are for :meth:`begins_anew` and :meth:`push`, which would
         treat this one alike.
         """
-        lane = self._lanes[stream]
+        lane = self._imu if stream is _IMU else self._points
         if (
             lane.newest is None
             or packet.stamp < lane.newest.stamp

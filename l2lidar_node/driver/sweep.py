@@ -20,7 +20,7 @@ from l2lidar_node.driver.geometry import Projector, RangeCalibration, RangeLimit
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.packets import NS, PointPacket
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import HostNs, Sweep, new_tuple
 
 UNIT: Final = "unit"
 PARAMETER: Final = "parameter"
@@ -120,6 +120,7 @@ class BlockChoice:
 MAX_GAP_NS: Final = 200_000_000  # a stream that stalled this long starts a new sweep
 MAX_PACKETS: Final = 4000
 _UNEVEN: Final = 1.2  # one step of the head in another; its speed swings by 3 % within a turn
+_TURNS: Final = {"turn": 2 * math.pi, "half_turn": math.pi}  # [rad]
 _BACKWARDS_RAD: Final = 1.9 * math.pi  # a head that stands still seems to advance by this or more
 
 Level = Callable[[list[HostNs]], NDArray[np.float64]]
@@ -139,6 +140,11 @@ class _Cut(Enum):
     NONE = "none"
     BOUNDARY = "boundary"  # of the kind that was asked for
     BREAK = "break"  # a gap, a step of the clock, another kind of packet
+
+
+# To look up a member of an Enum takes long.
+_NONE, _BOUNDARY, _BREAK = _Cut.NONE, _Cut.BOUNDARY, _Cut.BREAK
+_POINTS_3D: Final = wire.PacketType.POINTS_3D
 
 
 class SweepAssembler:
@@ -174,7 +180,7 @@ class SweepAssembler:
         self.fragments = 0
         self.fragment_packets = 0
         self._begins_at_boundary = False
-        self._config = config
+        self._follow(config)
         self._level = level
         self._packets: list[_Placed] = []
         self._missing = 0
@@ -187,9 +193,14 @@ class SweepAssembler:
         """Use other settings from the next packet on."""
         if config.cut != self._config.cut:
             self._begins_at_boundary = False
-        self._config = config
+        self._follow(config)
         self._level = level
         self.blocks.configure(config)
+
+    def _follow(self, config: SweepConfig) -> None:
+        self._config = config
+        self._turn = _TURNS.get(config.cut, 0.0)
+        self._most = max(config.packets, 1) if config.cut == "packets" else MAX_PACKETS
 
     @property
     def ends_at_pause(self) -> bool:
@@ -205,7 +216,7 @@ class SweepAssembler:
         """How many packets it takes to complete the sweep, at the least; 1 where that is open."""
         packets = self._packets
         if self._config.cut == "packets":
-            return max(self._config.packets - len(packets), 1)
+            return max(self._most - len(packets), 1)
         if len(packets) < 2:
             return 1
         before, last = packets[-2], packets[-1]
@@ -230,20 +241,20 @@ class SweepAssembler:
         """
         sweeps: list[Sweep] = []
         placed = start
-        cut = self._cut_before(packet, start) if self._packets else _Cut.BREAK
-        if self._packets and cut is not _Cut.NONE:
-            sweeps += self._finish(cut)
-        elif self._packets:
+        cut = self._cut_before(packet, start) if self._packets else _BREAK
+        if cut is not _NONE:
+            if self._packets:
+                sweeps += self._finish(cut)
+            self._begins_at_boundary = cut is _BOUNDARY
+        else:
             # A correction of the clock, or stamps of arrival in a burst, must not let a packet
             # begin before the previous one ended.
             last = self._packets[-1]
             placed = HostNs(max(start, last.start + last.packet.duration_ns))
             self._missing += missing
-        if cut is not _Cut.NONE:
-            self._begins_at_boundary = cut is _Cut.BOUNDARY
-        self._packets.append(_Placed(packet, start, placed))
-        if self._is_full():
-            sweeps += self._finish(_Cut.BREAK)
+        self._packets.append(new_tuple(_Placed, (packet, start, placed)))
+        if len(self._packets) >= self._most:
+            sweeps += self._finish(_BREAK)
         return sweeps
 
     def flush(self) -> Sweep | None:
@@ -253,37 +264,25 @@ class SweepAssembler:
         """
         if not self._packets:
             return None
-        return next(iter(self._finish(_Cut.BREAK)), None)
-
-    @property
-    def _turn(self) -> float:
-        """The angle that ends sweeps [rad]."""
-        return 2 * math.pi if self._config.cut == "turn" else math.pi
+        return next(iter(self._finish(_BREAK)), None)
 
     def _cuts_by_angle(self, packet: PointPacket) -> bool:
         """Whether the head's angle ends sweeps; 2D packets have none."""
-        is_3d = packet.packet_type == wire.PacketType.POINTS_3D
-        return is_3d and self._config.cut in ("turn", "half_turn")
+        return self._turn > 0.0 and packet.packet_type == _POINTS_3D
 
     def _cut_before(self, packet: PointPacket, start: HostNs) -> _Cut:
         first, last = self._packets[0], self._packets[-1]
         if packet.packet_type != last.packet.packet_type:
-            return _Cut.BREAK
+            return _BREAK
         if start - last.given > MAX_GAP_NS or start < last.given:
-            return _Cut.BREAK
+            return _BREAK
         if self._config.cut == "packets":
-            return _Cut.NONE
+            return _NONE
         if self._cuts_by_angle(packet):
             is_over = _passes(last.packet.head_angle, packet.head_angle, self._turn)
         else:
             is_over = start - first.given >= self._config.duration_ms * 1_000_000
-        return _Cut.BOUNDARY if is_over else _Cut.NONE
-
-    def _is_full(self) -> bool:
-        count = len(self._packets)
-        if self._config.cut == "packets":
-            return count >= max(self._config.packets, 1)
-        return count >= MAX_PACKETS
+        return _BOUNDARY if is_over else _NONE
 
     def _finish(self, end: _Cut) -> list[Sweep]:
         """Return what has been collected as one sweep; nothing where it is part of a turn.

@@ -21,6 +21,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from l2lidar_node.protocol import wire
+from l2lidar_node.types import new_tuple
 
 _HEADER_SIZE: Final = wire.HEADER.size
 _TAIL_SIZE: Final = wire.TAIL.size
@@ -28,9 +29,13 @@ _ELASTIC: Final = frozenset({int(wire.PacketType.PARAMETERS)})
 """Known types whose size differs between firmware versions."""
 _MAX_MISSES: Final = 8
 _WHOLE: Final = {
-    size: struct.Struct(f"<4sII{size - wire.OVERHEAD}sI6x2s") for size in wire.FRAME_SIZES.values()
+    wire.HEADER.pack(wire.MAGIC, packet_type, size): (
+        packet_type,
+        struct.Struct(f"<{_HEADER_SIZE}x{size - wire.OVERHEAD}sI6x2s"),
+    )
+    for packet_type, size in wire.FRAME_SIZES.items()
 }
-"""A whole frame by its size: magic, packet type, size, payload, crc, end mark."""
+"""Packet type and layout of a whole frame (payload, crc, end mark) by its header."""
 
 
 class Fault(Enum):
@@ -86,9 +91,12 @@ class Framer:
     def feed(self, data: bytes) -> list[FramingEvent]:
         """Return the frames and errors that these bytes complete, in order."""
         if not self._pending:
-            frame = _whole(data)
-            if frame is not None:
-                return [frame]
+            whole = _WHOLE.get(data[:_HEADER_SIZE])
+            if whole is not None and len(data) == whole[1].size:  # as nearly all are
+                packet_type, layout = whole
+                payload, crc, end = layout.unpack(data)
+                if end == wire.TAIL_END and crc == zlib.crc32(payload):
+                    return [new_tuple(Frame, (packet_type, payload))]
         elif data.startswith(wire.MAGIC):
             events, rest = _parse(data)
             if not rest:
@@ -99,23 +107,6 @@ class Framer:
     def reset(self) -> None:
         """Forget an incomplete frame, for example when the sender restarted."""
         self._pending = b""
-
-
-def _whole(data: bytes) -> Frame | None:
-    """Return the frame that a datagram is, as nearly all are; None if it is anything else."""
-    layout = _WHOLE.get(len(data))
-    if layout is None:
-        return None
-    magic, packet_type, size, payload, crc, end = layout.unpack(data)
-    if (
-        magic != wire.MAGIC
-        or size != len(data)
-        or size != wire.FRAME_SIZES.get(packet_type)
-        or end != wire.TAIL_END
-        or crc != zlib.crc32(payload)
-    ):
-        return None
-    return Frame(packet_type, payload)
 
 
 def _parse(data: bytes) -> tuple[list[FramingEvent], bytes]:

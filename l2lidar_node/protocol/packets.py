@@ -13,7 +13,7 @@ import numpy as np
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame
-from l2lidar_node.types import DeviceNs, Quaternion, Vector3
+from l2lidar_node.types import DeviceNs, Quaternion, Vector3, new_tuple
 
 NS: Final = 1_000_000_000
 
@@ -183,14 +183,10 @@ def _points(layout: _PointLayout, payload: bytes) -> PointPacket | DecodeError:
         return DecodeError(packet_type, "implausible" if is_finite else "not_finite")
     if not 0.0 < time_increment < _MAX_TIME_INCREMENT_S:
         return DecodeError(packet_type, "time_increment")
-    return PointPacket(
-        packet_type,
-        seq,
-        DeviceNs(sec * NS + nsec),
-        math.ceil(max(count - 1, 0) * time_increment * NS),
-        0.0 if head_angle is None else fields[head_angle],
-        payload,
-    )
+    stamp = sec * NS + nsec
+    duration_ns = math.ceil((count - 1) * time_increment * NS) if count else 0
+    angle = 0.0 if head_angle is None else fields[head_angle]
+    return new_tuple(PointPacket, (packet_type, seq, stamp, duration_ns, angle, payload))
 
 
 def _imu(payload: bytes) -> ImuPacket | DecodeError:
@@ -208,13 +204,8 @@ def _imu(payload: bytes) -> ImuPacket | DecodeError:
     strongest = max(ax, ay, az, -ax, -ay, -az)
     if fastest > _MAX_RATE or strongest > _MAX_ACCELERATION:
         return DecodeError(wire.PacketType.IMU, "implausible")
-    return ImuPacket(
-        seq,
-        DeviceNs(sec * NS + nsec),
-        (w / norm, x / norm, y / norm, z / norm),
-        (p, q, r),
-        (ax, ay, az),
-    )
+    attitude = w / norm, x / norm, y / norm, z / norm
+    return new_tuple(ImuPacket, (seq, sec * NS + nsec, attitude, (p, q, r), (ax, ay, az)))
 
 
 def _version(payload: bytes) -> Version | DecodeError:

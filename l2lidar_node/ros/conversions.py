@@ -169,18 +169,27 @@ class ImuTemplate:
             ),
         ):
             setattr(message, f"{name}_covariance", np.diag(variances).reshape(9))
-        self._data = bytearray(serialize_message(message))
-        self._at = [self._data.index(struct.pack("<d", value)) for value in self._SLOTS]
+        data = serialize_message(message)
+        slots = [data.index(struct.pack("<d", value)) for value in self._SLOTS]
+        sizes = (_QUATERNION.size, _VECTOR.size, _VECTOR.size)
+        begins = [_STAMP_AT + _STAMP.size, *(at + n for at, n in zip(slots, sizes, strict=True))]
+        # What never changes: the encapsulation, and what stands before, between and behind.
+        self._constant = (
+            data[:_STAMP_AT],
+            *(data[begin:end] for begin, end in zip(begins, [*slots, len(data)], strict=True)),
+        )
+        first, *rest = (f"{len(part)}s" for part in self._constant)
+        frame, orientation, rate, end = rest
+        self._message = struct.Struct(f"<{first}iI{frame}4d{orientation}3d{rate}3d{end}")
 
     def serialize(self, sample: ImuSample) -> bytes:
         """Return the CDR message of a sample."""
         stamp, (w, x, y, z), rate, acceleration = sample
-        data = self._data
-        _STAMP.pack_into(data, _STAMP_AT, *split_stamp(stamp))
-        _QUATERNION.pack_into(data, self._at[0], x, y, z, w)
-        _VECTOR.pack_into(data, self._at[1], *rate)
-        _VECTOR.pack_into(data, self._at[2], *acceleration)
-        return bytes(data)
+        head, frame, after_orientation, after_rate, end = self._constant
+        return self._message.pack(
+            head, *split_stamp(stamp), frame, x, y, z, w, after_orientation, *rate,
+            after_rate, *acceleration, end,
+        )  # fmt: skip
 
 
 def _split(data: bytes, mark: bytes) -> tuple[bytes, bytes]:

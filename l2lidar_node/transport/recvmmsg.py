@@ -12,7 +12,7 @@ import struct
 import time
 from typing import Final
 
-from l2lidar_node.types import Datagram, HostNs
+from l2lidar_node.types import Datagram, HostNs, new_tuple
 
 SO_TIMESTAMPNS: Final = 35
 """Has the kernel note arrivals (asm-generic/socket.h); Python's socket module lacks it."""
@@ -99,7 +99,8 @@ class DatagramReader:
                 continue
             arrival = seconds * 1_000_000_000 + nanoseconds if told else time.time_ns()
             begin = number * _STRIDE
-            self.datagrams.append(Datagram(bytes(view[begin : begin + size]), HostNs(arrival)))
+            data = bytes(view[begin : begin + size])
+            self.datagrams.append(new_tuple(Datagram, (data, HostNs(arrival))))
         used = count * _HEADER.size
         headers[:used] = self._fresh[:used]
         return count
