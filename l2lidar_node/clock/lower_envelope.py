@@ -245,8 +245,8 @@ class LowerEnvelope:
             Whether it did; the block has been used then.
         """
         self._latest.append(low)
-        if len(self._latest) < _VOTERS:
-            return False
+        if len(self._latest) < _VOTERS or self._evidence < _BETTER * _RESOLUTION_NS:
+            return False  # too few, or no blocks can say so much more
         recent = sorted(self._latest)
         ratio = self.line.ratio
         line = supporting_line(recent, ratio)
@@ -300,6 +300,8 @@ class LowerEnvelope:
             line = supporting_line(recent, self.line.ratio)
             if line is None or abs(line.ratio - self.line.ratio) > most * line.ratio:
                 continue
+            if self._lo <= line.ratio <= self._hi:
+                continue  # nothing to follow
             u0, h0 = recent[0]
             points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]
             error = self._error(points, float(line.host - h0), 0.0)

@@ -247,6 +247,8 @@ class CommandClient:
         """Return the commands to send again and the ends of those that were given up."""
         repeats: list[Command] = []
         given_up: list[Answer] = []
+        if not self._pending:
+            return repeats, given_up
         too_many = len(self._pending) - MAX_PENDING
         for index, entry in enumerate(list(self._pending)):
             if not _old(entry, now) and index >= too_many:
