@@ -94,6 +94,26 @@ class Level(IntEnum):
     STALE = 3
 
 
+@dataclass(frozen=True, slots=True)
+class Check:
+    """The judgement of one aspect.
+
+    Attributes
+    ----------
+    name : str
+    level : Level
+    message : str
+        One sentence.
+    values : dict
+        Figures by name, the unit in the name.
+    """
+
+    name: str
+    level: Level
+    message: str
+    values: dict[str, str]
+
+
 class Stream(Enum):
     """The two streams of measurements that carry sequence numbers and device stamps."""
 

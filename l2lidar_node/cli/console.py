@@ -17,7 +17,7 @@ from l2lidar_node.config import NetworkConfig
 from l2lidar_node.settings import Setting, build, settings_of
 
 if TYPE_CHECKING:
-    from l2lidar_node.driver.health import Check
+    from l2lidar_node.types import Check
 
 out: Final = Console(highlight=False)
 _COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "dim"}

@@ -23,7 +23,7 @@ from l2lidar_node.protocol.packets import Parameters
 from l2lidar_node.settings import build, values_of
 from l2lidar_node.transport import session
 from l2lidar_node.transport.session import Session, Tap
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import Check, HostNs
 
 _SIOCGIFADDR: Final = 0x8915
 _NEIGHBOURS: Final = Path("/proc/net/arp")
@@ -194,10 +194,10 @@ class Device:
             lambda driver, now: health.observe(driver, self._session.transport, now)
         ).result()
 
-    def checks(self, before: health.Period) -> tuple[list[health.Check], health.Period]:
+    def checks(self, before: health.Period) -> tuple[list[Check], health.Period]:
         """Return how the time since is judged, and what has been counted by now."""
 
-        def look(driver: Driver, now: HostNs) -> tuple[list[health.Check], health.Period]:
+        def look(driver: Driver, now: HostNs) -> tuple[list[Check], health.Period]:
             after = health.observe(driver, self._session.transport, now)
             return health.judge(driver, before, after), after
 

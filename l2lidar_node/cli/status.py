@@ -32,12 +32,11 @@ from l2lidar_node.cli.device import Device, DeviceError
 from l2lidar_node.clock import ClockEvent
 from l2lidar_node.clock.lower_envelope import supporting_line
 from l2lidar_node.config import NetworkConfig
-from l2lidar_node.driver import health
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import ImuPacket, PointPacket, decode
-from l2lidar_node.types import HostNs, Level, Stream
+from l2lidar_node.types import Check, HostNs, Level, Stream
 
 _WAIT_S = 3.0
 _PERIOD_S = 1.0  # that is judged at a time
@@ -142,7 +141,7 @@ def monitor(
     The exit code is 1 if any aspect was in error at the end. With --json one line per second.
     """
     with Device(network, enable_latency_measure=True) as device:
-        judged: list[health.Check] = []
+        judged: list[Check] = []
         try:
             with Live(console=out, auto_refresh=False, transient=False) as live:
                 for judged in _seconds(device, duration):
@@ -156,7 +155,7 @@ def monitor(
         raise typer.Exit(1)
 
 
-def _seconds(device: Device, duration: float) -> Iterator[list[health.Check]]:
+def _seconds(device: Device, duration: float) -> Iterator[list[Check]]:
     before = device.period()
     while duration > 0.0:
         time.sleep(min(_PERIOD_S, duration))

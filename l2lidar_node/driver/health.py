@@ -17,7 +17,7 @@ from l2lidar_node.driver.device import DeviceState
 from l2lidar_node.driver.driver import Counters, Driver
 from l2lidar_node.driver.orientation import GravityReport
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import STANDARD_GRAVITY, HostNs, Level, Stream, TransportCounts
+from l2lidar_node.types import STANDARD_GRAVITY, Check, HostNs, Level, Stream, TransportCounts
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,26 +162,6 @@ _CALIBRATION_UNITS: Final = {
     "range_bias": "counts",
     "range_scale": "m/count",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """The judgement of one aspect.
-
-    Attributes
-    ----------
-    name : str
-    level : Level
-    message : str
-        One sentence.
-    values : dict
-        Figures by name, the unit in the name.
-    """
-
-    name: str
-    level: Level
-    message: str
-    values: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import array
 import struct
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.serialization import serialize_message
@@ -20,7 +22,7 @@ from sensor_msgs.msg import Imu, PointCloud2, PointField
 from l2lidar_node.clouds import DATATYPES, points_of
 from l2lidar_node.config import FrameConfig, ImuConfig
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import HostNs, ImuSample, split_stamp
+from l2lidar_node.types import Check, HostNs, ImuSample, split_stamp
 
 _NUMBERS: Final = {code: number for number, code in DATATYPES.items()}
 
@@ -210,3 +212,25 @@ def imu_transform(frames: FrameConfig, stamp: HostNs) -> TransformStamped:
     translation.x, translation.y, translation.z = wire.IMU_POSITION_M
     transform.transform.rotation.w = 1.0
     return transform
+
+
+def diagnostic_status(check: Check, name: str = "", hardware_id: str = "") -> DiagnosticStatus:
+    """Return a check as a message; with a ``name`` the status is called ``<name>: <check>``."""
+    return DiagnosticStatus(
+        level=bytes([check.level]),
+        name=f"{name}: {check.name}" if name else check.name,
+        message=check.message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=value) for key, value in check.values.items()],
+    )
+
+
+def diagnostic_array(
+    checks: Iterable[Check], name: str, stamp: HostNs, hardware_id: str = ""
+) -> DiagnosticArray:
+    """Return checks of a node of some name as a message for ``/diagnostics``."""
+    message = DiagnosticArray(
+        status=[diagnostic_status(check, name, hardware_id) for check in checks]
+    )
+    message.header.stamp = to_time(stamp)
+    return message

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -22,12 +22,12 @@ from std_msgs.msg import String
 
 from l2lidar_node.driver import health
 from l2lidar_node.driver.driver import Driver
-from l2lidar_node.driver.health import Check, metadata
-from l2lidar_node.ros.conversions import to_time
+from l2lidar_node.driver.health import metadata
+from l2lidar_node.ros.conversions import diagnostic_array
 from l2lidar_node.ros.mounting import StaticFrames
 from l2lidar_node.ros.program import StartError
 from l2lidar_node.transport.session import Loop
-from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, HostNs, Level
+from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Check, HostNs, Level
 
 MAX_TILT_DEG: Final = 2.0
 """At 5 m a floor is 17 cm off: more than the sensor's own alignment error of about 1 degree."""
@@ -78,26 +78,7 @@ PERIOD_S = 1.0
 _SHORTEST_NS = 500_000_000
 _SILENT_S = 3.0
 
-_Figures = tuple[list[health.Check], dict[str, Any], HostNs]
-
-
-def diagnostic_array(
-    checks: list[health.Check], name: str, hardware_id: str, stamp: HostNs
-) -> DiagnosticArray:
-    """Return checks as a message; every status is called ``<node>: <check>``."""
-    message = DiagnosticArray()
-    message.header.stamp = to_time(stamp)
-    message.status = [
-        DiagnosticStatus(
-            level=bytes([check.level]),
-            name=f"{name}: {check.name}",
-            message=check.message,
-            hardware_id=hardware_id,
-            values=[KeyValue(key=key, value=value) for key, value in check.values.items()],
-        )
-        for check in checks
-    ]
-    return message
+_Figures = tuple[list[Check], dict[str, Any], HostNs]
 
 
 class HealthPublisher:
@@ -139,7 +120,7 @@ class HealthPublisher:
         if silent_s < _SILENT_S:
             return
         text = f"the receiving thread has not answered for {silent_s:.0f} s"
-        check = health.Check("device", Level.ERROR, text, {})
+        check = Check("device", Level.ERROR, text, {})
         self._send([check], HostNs(self._node.get_clock().now().nanoseconds))
 
     def _publish(self) -> None:
@@ -161,10 +142,10 @@ class HealthPublisher:
             self._metadata = text
             self._about.publish(String(data=text))
 
-    def _send(self, checks: list[health.Check], now: HostNs) -> None:
+    def _send(self, checks: list[Check], now: HostNs) -> None:
         name = self._node.get_fully_qualified_name().lstrip("/")
         stamp = HostNs(min(max(now, FIRST_STAMP), LAST_STAMP))
-        self._diagnostics.publish(diagnostic_array(checks, name, self._hardware_id(), stamp))
+        self._diagnostics.publish(diagnostic_array(checks, name, stamp, self._hardware_id()))
 
     def _hardware_id(self) -> str:
         """Name the unit: its line or address, and its calibration block, which no other has."""

@@ -1,7 +1,7 @@
 """Takes sweeps, IMU samples and velocities as they come and gives deskewed, filtered clouds.
 
 Composes sequencer, tracker, filters and deskew; node, offline tool and tests all use this. A
-:class:`Report` says in words and figures how it is doing.
+:class:`~l2lidar_node.types.Check` says in words and figures how it is doing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node import records
-from l2lidar_node.types import F64, HostNs, Level, Sweep
+from l2lidar_node.types import F64, Check, HostNs, Level, Sweep
 from l2lidar_proc.cloud import without_time
 from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.config import ProcConfig
@@ -284,24 +284,7 @@ def _timed(
     return timed
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """A judgement with figures.
-
-    Attributes
-    ----------
-    level : Level
-    message : str
-    values : dict of str
-        Figures by name, the unit in the name.
-    """
-
-    level: Level
-    message: str
-    values: dict[str, str]
-
-
-def of_sweep(quality: Quality, waited_ns: int) -> Report:
+def of_sweep(quality: Quality, waited_ns: int) -> Check:
     """Return what there is to say about one sweep."""
     serious = {Flag.NO_IMU, Flag.ACCELEROMETER_FAULT, Flag.CLOCK_JUMP}
     if serious & set(quality.flags):
@@ -309,7 +292,7 @@ def of_sweep(quality: Quality, waited_ns: int) -> Report:
     else:
         level = Level.WARN if quality.flags else Level.OK
     told = "; ".join(flag.value for flag in quality.flags)
-    return Report(level, told or ("at rest" if quality.is_still else "deskewed"), {
+    return Check("sweep", level, told or ("at rest" if quality.is_still else "deskewed"), {
         "IMU coverage [%]": f"{100.0 * quality.imu_covered:.1f}",
         "largest IMU gap [ms]": f"{quality.imu_gap_ns * 1e-6:.1f}",
         "rotation [deg]": f"{math.degrees(quality.rotation_rad):.2f}",
@@ -327,20 +310,20 @@ def of_sweep(quality: Quality, waited_ns: int) -> Report:
 def of_period(
     before: PipelineCounts,
     after: PipelineCounts,
-    last: Report | None,
+    last: Check | None,
     imu: ImuCounts,
     motion: TwistFilter | None,
     refused: dict[str, int],
     *,
     is_levelled: bool,
     untied: str = "",
-) -> Report:
+) -> Check:
     """Return what there is to say about the time between two looks.
 
     Parameters
     ----------
     before, after : PipelineCounts
-    last : Report or None
+    last : Check or None
         Of the newest sweep.
     imu : ImuCounts
     motion : TwistFilter or None
@@ -372,12 +355,12 @@ def of_period(
         values["gravity [m/s^2]"] = f"{motion.gravity:.2f}"
     if is_levelled:
         text = "the clouds come levelled (imu_adjust), so deskewing makes them wrong"
-        return Report(Level.ERROR, text, values)
+        return Check("deskew", Level.ERROR, text, values)
     if not sweeps:
-        return Report(Level.WARN, "no clouds", values)
+        return Check("deskew", Level.WARN, "no clouds", values)
     level, text = Level.OK, f"{sweeps} sweeps"
     if last is not None:
         level, text = last.level, f"{text}, the last one: {last.message}"
     if untied:
         level, text = max(level, Level.WARN), f"{text}; velocity not used: {untied}"
-    return Report(level, text, values)
+    return Check("deskew", level, text, values)

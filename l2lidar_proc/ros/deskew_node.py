@@ -5,11 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped, Vector3
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
@@ -20,16 +19,23 @@ from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
 from l2lidar_node.clouds import LAYOUTS
-from l2lidar_node.ros.conversions import CloudTemplate, from_time, to_cloud, to_time
+from l2lidar_node.ros.conversions import (
+    CloudTemplate,
+    diagnostic_array,
+    diagnostic_status,
+    from_time,
+    to_cloud,
+    to_time,
+)
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.mounting import ImuAdjustClient, StaticFrames, untied
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
-from l2lidar_node.types import F64, HostNs, Level, Sweep, is_ros_time
+from l2lidar_node.types import F64, Check, HostNs, Sweep, is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, without_time
 from l2lidar_proc.deskew.config import AS_INPUT, DeskewNodeConfig, ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
-from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, Report, of_period, of_sweep
+from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, of_period, of_sweep
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, MotionTracker, carried_over
 from l2lidar_proc.ros import odometry_messages as messages
@@ -170,7 +176,7 @@ class DeskewNode(ManagedNode):
         velocity = [topics.velocity_topic] if topics.velocity_type != "none" else []
         self._inputs = InputMonitor(self, (topics.cloud_topic, topics.imu_topic, *velocity))
         self._untied = ""
-        self._last: Report | None = None
+        self._last: Check | None = None
         self._before = self._pipeline.counts
         speaking = QoSProfile(depth=10, reliability=RELIABILITY[topics.qos_reliability])
         self._output = self.create_publisher(PointCloud2, topics.output_topic, speaking)
@@ -332,7 +338,8 @@ class DeskewNode(ManagedNode):
         self._scan.publish(item, self._cloud_frame, self.pipeline.tracker)
         self._last = of_sweep(item.quality, item.waited_ns)
         if self._statistics.get_subscription_count():
-            self._statistics.publish(self._status(self._last, "sweep"))
+            name = self.get_fully_qualified_name().lstrip("/")
+            self._statistics.publish(diagnostic_status(self._last, name))
 
     def _serialised(self, points: NDArray[np.void], stamp: HostNs) -> bytes | PointCloud2:
         """Return a cloud to publish; a plain one is put together as bytes, three times as fast."""
@@ -369,23 +376,12 @@ class DeskewNode(ManagedNode):
             untied=self._untied,
         )
         self._before = self.pipeline.counts
-        level, text = self._inputs.judge(judged.level, judged.message)
-        if self._frames is not None and self._frames.refused:
-            level, text = max(level, Level.WARN), f"{text}; {self._frames.refused}"
-        values = {**judged.values, "calibration of the IMU": self.pipeline.extrinsics.source}
-        judged = replace(judged, level=Level(level), message=text, values=values)
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [self._status(judged, "deskew")]
-        self._diagnostics.publish(message)
-
-    def _status(self, judged: Report, name: str) -> DiagnosticStatus:
-        return DiagnosticStatus(
-            level=bytes([judged.level]),
-            name=f"{self.get_fully_qualified_name().lstrip('/')}: {name}",
-            message=judged.message,
-            values=[KeyValue(key=key, value=value) for key, value in judged.values.items()],
-        )
+        judged.values["calibration of the IMU"] = self.pipeline.extrinsics.source
+        refused = self._frames.refused if self._frames is not None else ""
+        judged = self._inputs.judge(judged, refused)
+        name = self.get_fully_qualified_name().lstrip("/")
+        now = HostNs(self.get_clock().now().nanoseconds)
+        self._diagnostics.publish(diagnostic_array([judged], name, now))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from functools import wraps
 from importlib import import_module
 from typing import Any, Final, TypeVar
@@ -18,7 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Sweep
+from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Check, Level, Sweep
 from l2lidar_proc.motion.imu_buffer import Samples
 
 _MAX_REASONS: Final = 20  # senders choose field names and numbers, so reasons have no end
@@ -127,17 +128,17 @@ class InputMonitor:
         self._failure = f"internal error, begun again: {type(error).__name__}: {error}"
         self._node.get_logger().error(f"{self._failure}\n{traceback.format_exc()}")
 
-    def judge(self, level: int, text: str) -> tuple[int, str]:
-        """Return level and text of a diagnostic status with what the inputs add; forgets it."""
+    def judge(self, check: Check, *others: str) -> Check:
+        """Return a check with what is wrong with the inputs, and with others; forgets it."""
         problems = [*self._of_topics(), *self._of_frames(), *self._of_times(), *self._of_shape()]
-        if problems:
-            level = max(level, 1)
+        problems += filter(None, others)
+        level = max(check.level, Level.WARN) if problems else check.level
         if self._failure:
             problems.insert(0, self._failure)
-            level, self._failure = 2, ""
+            level, self._failure = Level.ERROR, ""
         self._overlaps = self._largest_step_ns = 0
         self._newest = None
-        return level, "; ".join([text, *problems])
+        return replace(check, level=level, message="; ".join([check.message, *problems]))
 
     def _of_topics(self) -> list[str]:
         problems = []

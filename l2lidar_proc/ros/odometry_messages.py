@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Pose, PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.ros.conversions import to_time
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.ros.conversions import diagnostic_status, to_time
+from l2lidar_node.types import F64, Check, HostNs, Level
 from l2lidar_proc.odometry.estimate import BaseMotion, OdometryEstimate, Status
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def odometry_status(
         [ns]
     """
     lost = {Status.LOST, Status.RESTARTED} & set(estimate.status)
-    level = DiagnosticStatus.WARN if estimate.status else DiagnosticStatus.OK
+    level = Level.WARN if estimate.status else Level.OK
     quality = estimate.quality
     sigma = np.sqrt(np.diag(estimate.covariance))
     degenerate = np.zeros(3)
@@ -83,17 +83,15 @@ def odometry_status(
         "tilt_rad": f"{estimate.tilt:.5f}",
         "age_s": f"{(now - estimate.stamp) * 1e-9:.3f}",
     }
-    message = DiagnosticArray()
+    check = Check(
+        "odometry",
+        Level.ERROR if lost else level,
+        ",".join(status.name for status in estimate.status) or "ALIGNED",
+        {name: str(value) for name, value in values.items()},
+    )
+    message = DiagnosticArray(status=[diagnostic_status(check)])
     message.header.stamp = to_time(estimate.stamp)
     message.header.frame_id = base_frame
-    message.status = [
-        DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if lost else level,
-            name="odometry",
-            message=",".join(status.name for status in estimate.status) or "ALIGNED",
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-    ]
     return message
 
 

@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry as OdometryMessage, Path
 from rclpy.node import Node
@@ -21,23 +21,22 @@ from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
 from l2lidar_node.files import DataFolder, FileNameError, write_whole
-from l2lidar_node.ros.conversions import to_cloud
+from l2lidar_node.ros.conversions import diagnostic_array, to_cloud
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.mounting import StaticFrames, untied
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import F64, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.deskew.config import DeskewTopics
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
-from l2lidar_proc.odometry import health
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.pipeline import OdometryPipeline
+from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
 from l2lidar_proc.recording import outputs
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import (
@@ -432,7 +431,7 @@ class OdometryNode(ManagedNode):
     def _diagnose(self) -> None:
         since = self.pipeline.sweeps - self._looked_at
         self._looked_at = self.pipeline.sweeps
-        level, text, values = health.judged(
+        judged = judge(
             self.pipeline.last,
             self.pipeline.sweeps,
             since,
@@ -441,23 +440,14 @@ class OdometryNode(ManagedNode):
             self._untied(),
             self.pipeline.check,
         )
-        level, text = self._inputs.judge(level, text)
-        if self._frames is not None and self._frames.refused:
-            level, text = max(level, health.WARN), f"{text}; {self._frames.refused}"
-        values["calibration of the IMU"] = self.pipeline.extrinsics.source
+        judged.values["calibration of the IMU"] = self.pipeline.extrinsics.source
         if self._said:
-            values["recognized"] = "; ".join(sorted(self._said))
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [
-            DiagnosticStatus(
-                level=bytes([level]),
-                name=f"{self.get_fully_qualified_name().lstrip('/')}: odometry",
-                message=text,
-                values=[KeyValue(key=key, value=value) for key, value in values.items()],
-            )
-        ]
-        self._diagnostics.publish(message)
+            judged.values["recognized"] = "; ".join(sorted(self._said))
+        refused = self._frames.refused if self._frames is not None else ""
+        judged = self._inputs.judge(judged, refused)
+        name = self.get_fully_qualified_name().lstrip("/")
+        now = HostNs(self.get_clock().now().nanoseconds)
+        self._diagnostics.publish(diagnostic_array([judged], name, now))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -6,11 +6,11 @@ import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -21,11 +21,18 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from l2lidar_node.ros.conversions import from_cloud, from_time, to_cloud, to_time
+from l2lidar_node.ros.conversions import (
+    diagnostic_array,
+    diagnostic_status,
+    from_cloud,
+    from_time,
+    to_cloud,
+    to_time,
+)
 from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
-from l2lidar_node.types import F64, HostNs, is_ros_time
+from l2lidar_node.types import F64, Check, HostNs, Level, is_ros_time
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.map_transform import FARTHEST_NS, MapTransform
@@ -40,11 +47,11 @@ _LATER_NS: Final = 2 * FARTHEST_NS  # than a pose that the transform is stamped,
 _PENDING: Final = 40  # stamps that wait for their other messages
 _SHOWN_POINTS: Final = 400_000  # of the map at most, in one message
 _LEVELS: Final = {
-    SlamState.LOCALIZED: DiagnosticStatus.OK,
-    SlamState.TENTATIVE: DiagnosticStatus.WARN,
-    SlamState.SEARCHING: DiagnosticStatus.WARN,
-    SlamState.DEAD_RECKONING: DiagnosticStatus.ERROR,
-    SlamState.LOST: DiagnosticStatus.ERROR,
+    SlamState.LOCALIZED: Level.OK,
+    SlamState.TENTATIVE: Level.WARN,
+    SlamState.SEARCHING: Level.WARN,
+    SlamState.DEAD_RECKONING: Level.ERROR,
+    SlamState.LOST: Level.ERROR,
 }
 
 
@@ -354,31 +361,21 @@ class SlamNode(ManagedNode):
         text, level = state.value, _LEVELS[state]
         parent = self._transform.other_parent
         if parent:
-            level = DiagnosticStatus.ERROR
+            level = Level.ERROR
             text = (
                 f"'{parent}' is the parent of the odometry frame already: set "
                 "invert_tf of the odometry to false, or publish_tf of slam_node"
             )
         if self.worker.failures > self._failures:
             self._failures = self.worker.failures
-            level, text = DiagnosticStatus.ERROR, f"{text}; internal error in the worker, see log"
-        number, text = self._inputs.judge(level[0], text)
-        level = bytes([number])
+            level, text = Level.ERROR, f"{text}; internal error in the worker, see log"
         values = {**values_of(self.worker), "sweeps refused": self._refused}
-        status = DiagnosticStatus(
-            level=level,
-            name=f"{self.get_fully_qualified_name().lstrip('/')}: slam",
-            message=text,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
-        self._state.publish(
-            DiagnosticStatus(
-                level=level, name="slam", message=state.name, values=list(status.values)
-            )
-        )
+        told = {name: str(value) for name, value in values.items()}
+        judged = self._inputs.judge(Check("slam", level, text, told))
+        name = self.get_fully_qualified_name().lstrip("/")
+        now = HostNs(self.get_clock().now().nanoseconds)
+        self._diagnostics.publish(diagnostic_array([judged], name, now))
+        self._state.publish(diagnostic_status(replace(judged, message=state.name)))
 
 
 def _problem(stamp: HostNs, pose: F64, odometry: Odometry) -> str:

@@ -18,7 +18,7 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording.recording import NoTransport
 from l2lidar_node.settings import SettingError, change
-from l2lidar_node.types import HostNs, Level, Sweep
+from l2lidar_node.types import Check, HostNs, Level, Sweep
 from tests.l2lidar_node.driver.test_driver import Run
 from tests.support import build
 
@@ -135,7 +135,7 @@ def test_metadata_say_what_is_reported_what_is_used_and_from_where(file: str) ->
     assert metadata(run.driver).calibration_source["xi_angle"] == "unit"
 
 
-def checked(run: Run) -> health.Check | None:
+def checked(run: Run) -> Check | None:
     before = health.observe(run.driver, NoTransport(), HostNs(run.now))
     found = health.judge(run.driver, before, dataclasses.replace(before, now=HostNs(run.now + 1)))
     return next((check for check in found if check.name == "calibration"), None)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.driver.health import Check, Period, judge, observe
+from l2lidar_node.driver.health import Period, judge, observe
 from l2lidar_node.protocol.wire import PacketType
-from l2lidar_node.types import HostNs, Level
+from l2lidar_node.types import Check, HostNs, Level
 from tests.l2lidar_node.driver.test_driver import Run
 from tests.support import build
 

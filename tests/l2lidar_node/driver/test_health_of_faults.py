@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from l2lidar_node.driver.driver import Driver
-from l2lidar_node.driver.health import Check, Period, judge, observe
+from l2lidar_node.driver.health import Period, judge, observe
 from l2lidar_node.emulator.config import PowerConfig
 from l2lidar_node.protocol.wire import WorkMode
 from l2lidar_node.recording.recording import NoTransport
-from l2lidar_node.types import HostNs, Level
+from l2lidar_node.types import Check, HostNs, Level
 from tests.l2lidar_node.driver.virtual_host import live_run
 
 OK, WARN, ERROR = Level.OK, Level.WARN, Level.ERROR

@@ -16,13 +16,14 @@ from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.unit.inertial import Inertial
 from l2lidar_node.emulator.unit.units import TYPICAL, unit
 from l2lidar_node.emulator.world import scenes
-from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs, Sweep
+from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs, Level, Sweep
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import GyroError
-from l2lidar_proc.odometry import health, imu_calibration
+from l2lidar_proc.odometry import imu_calibration
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.imu_calibration import ExtrinsicCheck, ImuResult
+from l2lidar_proc.odometry.pipeline import judge
 from tests.l2lidar_proc.motion.turned_gyro import TRUE, recording
 from tests.l2lidar_proc.odometry.bare_estimates import estimate
 from tests.support import odometry_runs
@@ -175,12 +176,10 @@ def test_a_rotation_that_is_off_is_said_with_its_size() -> None:
     check = followed("perfect", rotation=turned)
     assert "extrinsic rotation looks 1.2 degrees off (" in check.finding
     assert "-1.2 about z" in check.finding
-    level, text, values = health.judged(
-        estimate(EPOCH, np.eye(4)), 10, 1, Counter(), Counter(), check=check
-    )
-    assert level == health.WARN
-    assert text == f"aligned; {check.finding}"
-    told = [float(x) for x in values["extrinsic rotation off, x y z [deg]"].split()]
+    judged = judge(estimate(EPOCH, np.eye(4)), 10, 1, Counter(), Counter(), check=check)
+    assert judged.level is Level.WARN
+    assert judged.message == f"aligned; {check.finding}"
+    told = [float(x) for x in judged.values["extrinsic rotation off, x y z [deg]"].split()]
     np.testing.assert_allclose(told, (0.0, 0.0, -1.2), atol=0.15)
 
 

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from l2lidar_node import rotations
-from l2lidar_node.types import POINT, HostNs, Sweep
-from l2lidar_proc.odometry import health
+from l2lidar_node.types import POINT, HostNs, Level, Sweep
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry, Phase
-from l2lidar_proc.odometry.pipeline import OdometryPipeline
+from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
 from tests.l2lidar_proc.odometry.odometry_world import (
     T_CLOUD_IMU,
     drive,
@@ -237,12 +236,12 @@ def test_only_a_backlog_makes_a_pipeline_skip_and_never_many_in_a_row() -> None:
 def test_a_skipped_sweep_is_a_warning_and_a_blocked_sensor_an_error() -> None:
     last = driven("room", "walk")[-1]
     for status, expected in (
-        ((Status.PREDICTED, Status.SKIPPED), health.WARN),
-        ((Status.PREDICTED, Status.SPARSE), health.ERROR),
-        ((), health.OK),
+        ((Status.PREDICTED, Status.SKIPPED), Level.WARN),
+        ((Status.PREDICTED, Status.SPARSE), Level.ERROR),
+        ((), Level.OK),
     ):
         one = dataclasses.replace(last, status=status)
-        assert health.judged(one, 9, 4, Counter(), Counter())[0] == expected
+        assert judge(one, 9, 4, Counter(), Counter()).level == expected
 
 
 def test_dropped_sweeps_are_survived() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from l2lidar_node.types import Level
+from l2lidar_node.types import Check, Level
 from l2lidar_proc.deskew import pipeline
 from l2lidar_proc.deskew.pipeline import PipelineCounts
 from l2lidar_proc.motion.imu_buffer import ImuCounts
@@ -42,7 +42,7 @@ def test_a_sweep(flags: Any, level: Any) -> None:
 
 def period(
     before: int, after: int, last: Any, *, is_levelled: bool = False, untied: str = ""
-) -> pipeline.Report:
+) -> Check:
     return pipeline.of_period(
         PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, ImuCounts(), None,
         {"no time field": 3}, is_levelled=is_levelled, untied=untied,
