@@ -258,12 +258,12 @@ class Session(Loop):
         self._watch_slewing(now)
         while not self._stopping.is_set():
             batch = self.transport.receive(TICK_S, self.driver.awaited())
+            events: list[Event] = []
             for data, arrival in batch:
                 if self._tap:
                     self._tap.received(data, arrival)
-                events = self.driver.receive(data, arrival)
-                if events:
-                    self._hand_out(events)
+                events += self.driver.receive(data, arrival)
+            self._hand_out(events)
             if not self._calls.empty():
                 self._run_calls()
                 self._send()
