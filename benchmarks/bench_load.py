@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import socket
 import statistics
 import struct
 import sys
@@ -32,13 +33,15 @@ from l2lidar_node.demo.observer import Observer
 from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports, isolate_ros
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.geometry import Projector
-from l2lidar_node.emulator.unit.stream import PatternScanner
+from l2lidar_node.emulator.config import DeviceConfig, IdentityConfig, PowerConfig
+from l2lidar_node.emulator.unit.device import VirtualL2
+from l2lidar_node.emulator.unit.stream import PatternScanner, StillInertial
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import PointPacket, decode
 from l2lidar_node.settings import build
 from l2lidar_node.transport.udp import UdpTransport
-from l2lidar_node.types import HostNs, Sweep
+from l2lidar_node.types import HostNs
 from tests.support.cpu import process_cpu_s, resident_mb
 
 FULL_TURN = 50
@@ -51,6 +54,8 @@ Both per CPU second on one core of an AMD EPYC: the client over loopback (socket
 parse), and zlib's checksum of as many packets.
 """
 _SYNTHETIC_PACKETS = 5_000
+_SENT_AT_ONCE = 80  # datagrams, which fit in the receive buffer that the kernel grants by default
+_WARM_UP_SWEEPS = 10
 _STAMP = struct.Struct("<II")
 _CLOCK_RATIO = 1.99866  # of the virtual L2
 Row = Callable[..., None]
@@ -83,55 +88,56 @@ def decode_rate(rounds: int) -> float:
 def socket_rate(seconds: float, with_imu: bool) -> dict[str, float]:
     """Return what it costs to make full-turn sweeps of packets from a socket.
 
-    A virtual L2 in a process of its own sends as fast as this one reads. Only this process's CPU
-    time counts, and only its point packets.
+    A virtual L2's packets are put into the socket some at a time and then read, so that the reader
+    never waits for its sender. Only the CPU time of reading counts, and only point packets.
     """
     host_port, lidar_port = free_udp_ports(2)
     values = {
         "l2_ip": "127.0.0.1", "l2_port": lidar_port,
-        "host_ip": "127.0.0.1", "host_port": host_port,
+        "host_ip": "127.0.0.1", "host_port": host_port, "receive_interval_ms": 0,
         "imu_adjust": False, "sweep_cut": "turn", "enable_l2_host_sync": False,
     }  # fmt: skip
     config = build(DriverConfig, values)
+    mode = 0 if with_imu else int(wire.WorkMode.IMU_OFF)
+    unit = DeviceConfig(power=PowerConfig(boot_scale=0.0), identity=IdentityConfig(work_mode=mode))
+    device = VirtualL2(unit, PatternScanner(), StillInertial(), power_on_ns=_EPOCH_NS)
     driver, transport = Driver(config), UdpTransport(config.network)
-    mode = "0" if with_imu else str(int(wire.WorkMode.IMU_OFF))
-    arguments = [
-        "--ready", "--world", "pattern", "--speed", "max", "--work-mode", mode,
-        "--host-port", str(host_port), "--lidar-port", str(lidar_port),
-    ]  # fmt: skip
-    with Programs() as programs:
-        programs.start("l2lidar_node.emulator", arguments)
-        while not driver.counters.sweeps:
-            _take(driver, transport, programs)
-        before, cpu, wall = driver.counters.snapshot(), time.process_time(), time.monotonic()
-        sweeps = 0
-        while time.monotonic() - wall < seconds:
-            sweeps += _take(driver, transport, programs)
-        spent, elapsed = time.process_time() - cpu, time.monotonic() - wall
+    now, spent, end = _EPOCH_NS, 0.0, time.monotonic() + seconds
+    packets, size = 0, wire.FRAME_SIZES[wire.PacketType.POINTS_3D]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        while time.monotonic() < end:
+            now += 1_000_000_000
+            datagrams = [data for _, data in device.advance(now)]
+            for first in range(0, len(datagrams), _SENT_AT_ONCE):
+                some = datagrams[first : first + _SENT_AT_ONCE]
+                for data in some:
+                    sender.sendto(data, ("127.0.0.1", host_port))
+                begin = time.process_time()
+                _take(driver, transport, len(some))
+                if driver.counters.sweeps > _WARM_UP_SWEEPS:
+                    spent += time.process_time() - begin
+                    packets += sum(len(data) == size for data in some)
     transport.close()
-    after = driver.counters
-    kind = wire.PacketType.POINTS_3D
-    packets = after.frames[kind] - before.frames[kind]
-    lost = sum(after.sequence[key].lost - before.sequence[key].lost for key in after.sequence)
+    lost = sum(counts.lost for counts in driver.counters.sequence.values())
     return {
         "rate": packets / spent,
-        "speed": packets * wire.MIRROR_PERIOD_S / elapsed,
+        "speed": packets * wire.MIRROR_PERIOD_S / spent,
         "lost": lost,
     }
 
 
-def _take(driver: Driver, transport: UdpTransport, programs: Programs) -> int:
-    """Handle what has arrived; return how many sweeps it completed."""
-    sweeps = 0
-    batch = transport.receive(0.1)
-    if not batch:
-        programs.check()
+def _take(driver: Driver, transport: UdpTransport, count: int) -> None:
+    """Handle so many datagrams."""
     arrival = HostNs(0)
-    for data, _ in batch:
-        arrival = _arrival_at_real_time(data)
-        sweeps += sum(isinstance(event, Sweep) for event in driver.receive(data, arrival))
+    while count:
+        batch = transport.receive(1.0)
+        if not batch:
+            raise RuntimeError(f"{count} datagrams were lost on the way")
+        count -= len(batch)
+        for data, _ in batch:
+            arrival = _arrival_at_real_time(data)
+            driver.receive(data, arrival)
     driver.tick(arrival)
-    return sweeps
 
 
 def _arrival_at_real_time(data: bytes) -> HostNs:
