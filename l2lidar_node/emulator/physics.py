@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -16,7 +17,7 @@ from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from pathlib import Path
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any, Final
 
 import numpy as np
@@ -267,7 +268,13 @@ _state: dict[str, Any] = {}  # of the measuring process
 
 
 def _settle() -> None:
-    """Leave signals, which often go to the whole group, to the parent; go when it is gone."""
+    """Leave signals, which often go to the whole group, to the parent; go when it is gone.
+
+    Nobody draws in a notebook here: without Dash open3d is imported in half of the time.
+    """
+    dash = ModuleType("dash")
+    dash.__dict__.update(dict.fromkeys(("Dash", "dcc", "html")))
+    sys.modules["dash"] = dash
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
