@@ -124,6 +124,9 @@ def in_own_process(name: str, inputs: int, seconds: float, seed: int) -> Outcome
             return Outcome(failures={"the process died": 1})
 
 
+_HANG_S: Final = 300  # by the clock on the wall: a busy machine may not run it for a minute
+
+
 def guided(name: str, seconds: float) -> tuple[int, int, list[str]]:
     """Return inputs, branches reached and failures of a run under atheris."""
     corpus = _CORPUS / name
@@ -132,7 +135,7 @@ def guided(name: str, seconds: float) -> tuple[int, int, list[str]]:
         (corpus / f"seed_{number}").write_bytes(data)
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.fuzz_guided", name, f"-max_total_time={seconds:.0f}",
-         "-max_len=8192", "-timeout=10", "-rss_limit_mb=4096", "-verbosity=1",
+         "-max_len=8192", f"-timeout={_HANG_S}", "-rss_limit_mb=4096", "-verbosity=1",
          "-print_final_stats=1", f"-artifact_prefix={_CORPUS.parent}/{name}-", str(corpus)],
         capture_output=True, text=True, errors="replace", check=False,
     )  # fmt: skip
