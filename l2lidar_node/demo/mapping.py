@@ -67,7 +67,9 @@ class MappingRun:
         self, console: Console, observer: Observer, programs: Programs, folder: Path
     ) -> None:
         if importlib.util.find_spec("gtsam") is None:
-            raise CommandError("--slam needs gtsam: python3 -m pip install 'gtsam>=4.3,<5'")
+            raise CommandError(
+                "--slam needs the Python package gtsam; docs/install.md says how to add it"
+            )
         self._console, self._observer = console, observer
         self._programs, self._folder = programs, folder
         self._state = ""

@@ -42,8 +42,8 @@ class GtsamMissingError(ImportError):
 
     def __init__(self) -> None:
         super().__init__(
-            "SLAM needs gtsam, which is not installed: python3 -m pip install 'gtsam>=4.3,<5', or "
-            "this package with its extra 'slam'; or set 'loops' to false"
+            "SLAM needs the Python package gtsam; docs/install.md says how to add it without "
+            "changing the system's Python. Or set 'loops' to false"
         )
 
 
