@@ -367,7 +367,12 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
     if new.unlevelled > old.unlevelled:
         message = "imu_adjust drops points for want of IMU data"
         return Check("points", Level.WARN, message, values)
-    if slots and share < _MIN_VALID_SHARE:
+    if not slots and new.fragments > old.fragments:
+        message = "no turn was whole, and parts of turns are left out"
+        return Check("points", Level.WARN, message, values)
+    if not slots:
+        return Check("points", Level.OK, "no cloud was completed lately", values)
+    if share < _MIN_VALID_SHARE:
         return Check("points", Level.WARN, "hardly any returns: is the sensor covered?", values)
     return Check("points", Level.OK, f"{100 * share:.0f} % of the slots return", values)
 

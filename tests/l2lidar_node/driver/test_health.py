@@ -220,6 +220,22 @@ def test_a_covered_sensor() -> None:
     assert message == "hardly any returns: is the sensor covered?"
 
 
+def test_where_no_cloud_is_made_nothing_is_said_of_its_slots() -> None:
+    waiting = streaming(1.2, sweep_cut="packets", aggregateNframes=4000)
+    assert waiting.verdict("points") == (Level.OK, "no cloud was completed lately")
+
+    def has_gaps(item: Any) -> bool:
+        """Tell whether it comes in the 0.15 s between outages of 0.25 s: a turn takes longer."""
+        return bool((item.arrival_ns - build.EPOCH_NS) % 400_000_000 > 250_000_000)
+
+    torn = streaming(3.0, has_gaps, sweep_cut="turn")
+    level, message = torn.verdict("points")
+    assert (level, message) == (
+        Level.WARN,
+        "no turn was whole, and parts of turns are left out",
+    )
+
+
 def test_gravity_alignment_without_imu() -> None:
     watched = streaming(keep=lambda item: not is_imu(item), imu_adjust=True)
     assert watched.verdict("points") == (
