@@ -119,7 +119,7 @@ class BlockChoice:
 
 MAX_GAP_NS: Final = 200_000_000  # a stream that stalled this long starts a new sweep
 MAX_PACKETS: Final = 4000
-_UNEVEN: Final = 1.2  # one step of the head in another; its speed swings by 3 % within a turn
+_UNEVEN: Final = 1.1  # one step of the head in another, at most: jitter of 1 %, and a wobble
 _TURNS: Final = {"turn": 2 * math.pi, "half_turn": math.pi}  # [rad]
 _BACKWARDS_RAD: Final = 1.9 * math.pi  # a head that stands still seems to advance by this or more
 
@@ -226,7 +226,7 @@ class SweepAssembler:
         else:
             left = packets[0].given + self._config.duration_ms * 1_000_000 - last.given
             step = last.given - before.given
-        return max(int(left / (_UNEVEN * step)), 1) if step > 0 else 1
+        return max(math.ceil(left / (_UNEVEN * step)), 1) if step > 0 else 1
 
     def push(self, packet: PointPacket, start: HostNs, missing: int = 0) -> list[Sweep]:
         """Add a packet and return the sweeps this completes: none, one or two.

@@ -20,6 +20,7 @@ _SO_DETACH_FILTER: Final = 27
 _SO_MEMINFO: Final = 55
 _TIMEVAL = struct.Struct("@ll")
 _MEMINFO = struct.Struct("@9I")  # the last is what was dropped, see linux/sock_diag.h
+_JITTER_NS: Final = 250_000  # of arrivals: what is due when an interval ends is not to be missed
 _BATCH: Final = 256  # datagrams read before the caller gets a turn
 
 FLOOD_HZ: Final = 1000
@@ -125,7 +126,8 @@ class UdpTransport:
         longer than the timeout.
         """
         if self._interval_ns and not self._is_behind:
-            pause = max(awaited, self._looked) + self._interval_ns - time.time_ns()
+            until = max(awaited, self._looked) + self._interval_ns + _JITTER_NS
+            pause = until - time.time_ns()
             if pause > 0:
                 time.sleep(min(pause * 1e-9, timeout_s))
         if timeout_s != self._timeout_s:

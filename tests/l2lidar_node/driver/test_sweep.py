@@ -228,7 +228,7 @@ def test_another_type_ends_the_sweep() -> None:
 
 @pytest.mark.parametrize("cut", ["packets", "turn", "half_turn", "duration"])
 def test_the_packets_left_are_told_never_too_many_and_hardly_too_few(cut: Any) -> None:
-    """Somebody waits for the packet that completes a sweep, as many as four fifths of them."""
+    """Somebody waits for the packet that completes a sweep; told are nine tenths of them."""
     stream = Stream(cut=cut)
     told, completing = [], []
     for number in range(200):
@@ -240,7 +240,7 @@ def test_the_packets_left_are_told_never_too_many_and_hardly_too_few(cut: Any) -
         told.append(stream.assembler.packets_left)
     for number in range(2, completing[-1]):
         left = next(later for later in completing if later > number) - number
-        assert math.floor(0.8 * left - 1) <= told[number] <= left or told[number] == 1
+        assert 0.8 * left - 1 <= told[number] <= left or told[number] == 1
 
 
 def test_two_sweeps_at_once() -> None:
