@@ -104,7 +104,7 @@ class ScanPublisher:
         if self._transforms is not None:
             T_cloud_level = rotations.inverse(T_scan_cloud)
             made = messages.transform(T_cloud_level, item.stamp, cloud_frame, frame)
-            self._transforms.publish(TFMessage(transforms=[made]))
+            self._transforms.publish(made)
         self._scans.publish(message)
 
     def _place(

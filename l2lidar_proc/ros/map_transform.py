@@ -104,7 +104,7 @@ class MapTransform:
             return  # a transform of that instant is out already
         self._stamped = stamped
         made = messages.transform(shown, HostNs(stamped), topics.map_frame, odom_frame)
-        self._publisher.publish(TFMessage(transforms=[made]))
+        self._publisher.publish(made)
 
 
 def reach(stamp: HostNs, waited_ns: int, transforms_until: int) -> int:

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
-from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import records, rotations
 from l2lidar_node.types import F64, HostNs
@@ -170,4 +169,4 @@ class PoseBroadcaster:
         if topics.invert_tf:
             T_odom_base, frames = rotations.inverse(T_odom_base), frames[::-1]
         made = messages.transform(T_odom_base, stamp, *frames)
-        self._transforms.publish(TFMessage(transforms=[made]))
+        self._transforms.publish(made)

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
+from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
@@ -22,11 +24,25 @@ def quaternion(message: Any) -> list[float]:
     return [message.x, message.y, message.z, message.w]
 
 
+def transform_of(message: bytes) -> Any:
+    (found,) = deserialize_message(message, TFMessage).transforms
+    return found
+
+
+@pytest.mark.parametrize("length", range(1, 10))
+def test_a_transform_is_serialized_as_rclpy_does(length: int) -> None:
+    data = messages.transform(POSE, HostNs(-3_999_999_999), "o" * length, "base")
+    found = transform_of(data)
+    assert serialize_message(TFMessage(transforms=[found])) == data
+    assert (found.header.frame_id, found.child_frame_id) == ("o" * length, "base")
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (-4, 1)
+
+
 def test_quaternions_are_x_y_z_w_in_every_message() -> None:
     motion = BaseMotion(POSE, np.eye(6), np.zeros(3), np.zeros(3), np.eye(6))
     stamp = HostNs(5_000_000_007)
     odometry = messages.odometry(motion, stamp, "odom", "base")
-    transform = messages.transform(POSE, stamp, "odom", "base")
+    transform = transform_of(messages.transform(POSE, stamp, "odom", "base"))
     path = messages.pose_stamped(POSE, stamp, "odom")
     for found in (
         odometry.pose.pose.orientation,
