@@ -12,10 +12,10 @@ of a second to the next sweep the two differ by less than a millimeter.
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs, Sweep
@@ -175,7 +175,7 @@ class DeadReckoning:
         self._place: F64 = np.zeros(3)  # of the IMU, map axes
         self._velocity: F64 = np.zeros(3)  # of the IMU, map axes
         self._rate: F64 = np.zeros(3)  # cloud axes
-        self._sample: tuple[HostNs, F64, F64] | None = None  # that the state belongs to
+        self._sample: tuple[HostNs, F64] | None = None  # that the state belongs to
 
     def reset(self, estimate: OdometryEstimate | None) -> None:
         """Go on from an estimate at the newest sample, or from none."""
@@ -206,23 +206,24 @@ class DeadReckoning:
             None without an estimate to begin with, after a gap between samples, and
             :data:`LONGEST_NS` after the latest sweep.
         """
-        stamps, rates, forces = self._usable(samples)
-        if not len(stamps):
+        stamps, measured = self._usable(samples)
+        if not stamps:
             return None
-        before, self._sample = self._sample, (HostNs(int(stamps[-1])), rates[-1], forces[-1])
+        before, self._sample = self._sample, (stamps[-1], measured[-1])
         anchor = self._anchor
         if anchor is None:
             return None
         if before is None or before[0] != self.stamp:
-            before = (self.stamp, rates[0], forces[0])
-        steps = np.diff(stamps, prepend=before[0])
-        if stamps[-1] - anchor.stamp > LONGEST_NS or steps.max() > _MAX_GAP_NS:
+            before = (self.stamp, measured[0])
+        steps = [later - earlier for earlier, later in pairwise((before[0], *stamps))]
+        if stamps[-1] - anchor.stamp > LONGEST_NS or max(steps) > _MAX_GAP_NS:
             self._anchor = None
             return None
-        weights = steps / float(steps.sum())
-        rate = _mean(np.vstack((before[1], rates)), weights) - anchor.gyro_bias
-        force = _mean(np.vstack((before[2], forces)), weights) - anchor.accel_bias
-        self._move(HostNs(int(stamps[-1])), rate, force, anchor.gravity)
+        knots = np.vstack((before[1], measured))
+        # the mean over time of what is linear between the samples
+        mean = np.array(steps) / sum(steps) @ (0.5 * (knots[1:] + knots[:-1]))
+        rate, force = mean[:3] - anchor.gyro_bias, mean[3:] - anchor.accel_bias
+        self._move(stamps[-1], rate, force, anchor.gravity)
         return self._pose()
 
     @property
@@ -252,21 +253,22 @@ class DeadReckoning:
         pose[:3, 3] = self._place - self._rotation @ self._lever
         return pose
 
-    def _usable(self, samples: Samples) -> tuple[NDArray[np.int64], F64, F64]:
-        rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
-        stamps = samples["stamp"]
-        after = self._sample[0] if self._sample is not None else np.iinfo(np.int64).min
+    def _usable(self, samples: Samples) -> tuple[list[HostNs], F64]:
+        """Return stamps and, in cloud axes, rates and forces (N, 6) of samples that are sound."""
+        measured = np.hstack((samples["angular_velocity"], samples["linear_acceleration"]))
+        stamps = samples["stamp"].tolist()
+        newest = self._sample[0] if self._sample is not None else np.iinfo(np.int64).min
         if self._anchor is not None:
-            after = max(after, self.stamp)
-        before = np.concatenate(([after], stamps))[: len(stamps)]
-        is_sound = (
-            (stamps > before).all() and np.isfinite(rates).all() and np.isfinite(forces).all()
-        )
-        if not is_sound:
-            newest = np.maximum.accumulate(before)
-            kept = (stamps > newest) & np.isfinite(rates).all(1) & np.isfinite(forces).all(1)
-            stamps, rates, forces = stamps[kept], rates[kept], forces[kept]
-        return stamps, rates @ self._turn, forces @ self._turn
+            newest = max(newest, self.stamp)
+        is_ordered = all(earlier < later for earlier, later in pairwise((newest, *stamps)))
+        if not (is_ordered and np.isfinite(measured).all()):
+            kept = []
+            for number, is_finite in enumerate(np.isfinite(measured).all(axis=1).tolist()):
+                if is_finite and stamps[number] > newest:
+                    newest = stamps[number]
+                    kept.append(number)
+            stamps, measured = [stamps[number] for number in kept], measured[kept]
+        return stamps, (measured.reshape(-1, 2, 3) @ self._turn).reshape(-1, 6)
 
     def _move(self, stamp: HostNs, rate: F64, force: F64, gravity: F64) -> None:
         """Carry the state on by a step with its mean rate and force [rad/s, m/s^2]."""
@@ -297,8 +299,3 @@ def _grown(anchor: OdometryEstimate, rotation: F64, seconds: float) -> F64:
     rate = rotation @ anchor.twist_covariance[3:, 3:] @ rotation.T
     found[3:, 3:] += rate * (_PERIOD_S * seconds)
     return found
-
-
-def _mean(values: F64, weights: F64) -> F64:
-    """Return the mean over time of values (K, 3) that are linear between knots."""
-    return np.asarray(weights @ (0.5 * (values[1:] + values[:-1])))

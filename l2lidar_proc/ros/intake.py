@@ -35,7 +35,7 @@ CLOUD_DEPTH: Final = 30
 IMU_DEPTH: Final = 2000
 _AHEAD: Final = 4  # clouds that are taken out of their queue at once, to know how many wait
 
-SLOW_LOOK_S: Final = 0.1
+SLOW_LOOK_S: Final = 0.25
 """Between looks into the IMU's queue where nobody is in a hurry."""
 
 _WAIT_S: Final = 0.003  # between looks while a sweep waits for its last samples
