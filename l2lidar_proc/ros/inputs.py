@@ -19,7 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Check, Level, Sweep
+from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Check, HostNs, Level, Sweep
 from l2lidar_proc.motion.imu_buffer import Samples
 
 _MAX_REASONS: Final = 20  # senders choose field names and numbers, so reasons have no end
@@ -77,7 +77,8 @@ class InputMonitor:
         self.refused: Counter[str] = Counter()
         self._node = node
         self._topics = topics
-        self._newest: Sweep | None = None
+        self._newest: Sweep | None = None  # since the last judgement
+        self._latest_end: HostNs | None = None
         self._overlaps = 0
         self._largest_step_ns = 0
         self._failure = ""
@@ -97,10 +98,11 @@ class InputMonitor:
 
     def sweep(self, sweep: Sweep) -> None:
         """Note a sweep that is used, in the order of arrival."""
-        before, self._newest = self._newest, sweep
-        if before is not None and sweep.start < before.end - _BACK_NS:
+        self._newest = sweep
+        before, self._latest_end = self._latest_end, sweep.end
+        if before is not None and sweep.start < before - _BACK_NS:
             self._overlaps += 1
-            self._largest_step_ns = max(self._largest_step_ns, before.end - sweep.start)
+            self._largest_step_ns = max(self._largest_step_ns, before - sweep.start)
 
     def guarded(
         self, callback: Callable[..., None], recover: Callable[[], None]
