@@ -430,7 +430,7 @@ def test_another_parent_of_odom_silences_the_transform(
         bench.until(lambda: bench.transforms)
         inverted = messages.transform(np.eye(4), sweeps_of(office)[0].stamp, "base_link", "odom")
         bench.until(bench.tf_also.get_subscription_count)
-        bench.tf_also.publish(TFMessage(transforms=[inverted]))
+        bench.tf_also.publish(inverted)
         bench.until(lambda: bench.node._transform.other_parent)
         before = len(bench.transforms)
         bench.diagnostics.clear()
