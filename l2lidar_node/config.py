@@ -41,9 +41,9 @@ class NetworkConfig:
     )
     receive_interval_ms: int = setting(
         4,
-        "longest that an IMU sample, or the packet that completes a cloud, waits in the socket, "
-        "so that several are read at once; the kernel stamps arrivals, so that it costs latency "
-        "only; 0 reads each datagram as it comes",
+        "longest that an IMU sample waits in the socket, so that several datagrams are read at "
+        "once; the kernel stamps arrivals, so that it costs latency only; 0 reads each datagram "
+        "as it comes",
         unit="ms",
         lo=0,
         hi=100,

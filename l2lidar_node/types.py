@@ -165,7 +165,7 @@ class Datagram(NamedTuple):
 
 
 NOT_AWAITED: Final = HostNs(0)
-"""In place of the instant at which something is awaited: it may come now."""
+"""In place of the instant at which something is awaited: nobody knows when."""
 
 
 class TransportCounts(Protocol):
@@ -190,7 +190,7 @@ class Transport(TransportCounts, Protocol):
     def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
         """Return what has arrived, waiting at most ``timeout_s`` for the first of it.
 
-        ``awaited`` predicts when something will arrive that is wanted soon; the rest may wait.
+        ``awaited`` says when somebody will want what has arrived by then.
         """
 
     def send(self, frame: bytes) -> None:

@@ -151,6 +151,7 @@ class Driver:
         self.gravity = GravityMonitor()
         self.round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
         self._config = config
+        self._imu_wait_ns = config.network.receive_interval_ms * 1_000_000
         self._framer = Framer()
         self._reorder_buffer = ReorderBuffer(config.sweep.reorder_window)
         self.counters.sequence = self._reorder_buffer.counts
@@ -242,14 +243,15 @@ class Driver:
         return self._reorder_buffer.is_overdue(until) or self._has_stalled(until)
 
     def awaited(self) -> HostNs:
-        """Return when the next datagram that somebody waits for is expected to arrive.
+        """Return when it is worth while to look for datagrams.
 
-        That of an IMU sample, if samples are published, or that which completes a sweep.
+        When the packet is expected that completes a sweep, and ``receive_interval_ms`` after the
+        next IMU sample is, if samples are published. Something else may wait longer.
         """
         points, imu = self._reorder_buffer.last_arrivals
         awaited = points + self._assembler.packets_left * _POINTS_PERIOD_NS
         if self._config.imu.enable_publishing:
-            awaited = min(awaited, imu + _IMU_PERIOD_NS)
+            awaited = min(awaited, imu + _IMU_PERIOD_NS + self._imu_wait_ns)
         return HostNs(awaited)
 
     def outbox(self) -> list[Outgoing]:

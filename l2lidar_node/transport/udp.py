@@ -20,7 +20,7 @@ _SO_DETACH_FILTER: Final = 27
 _SO_MEMINFO: Final = 55
 _TIMEVAL = struct.Struct("@ll")
 _MEMINFO = struct.Struct("@9I")  # the last is what was dropped, see linux/sock_diag.h
-_JITTER_NS: Final = 250_000  # of arrivals: what is due when an interval ends is not to be missed
+_JITTER_NS: Final = 250_000  # of arrivals: what is due when it looks is not to be missed
 _BATCH: Final = 256  # datagrams read before the caller gets a turn
 
 FLOOD_HZ: Final = 1000
@@ -122,12 +122,13 @@ class UdpTransport:
         """Return what has arrived from the device, in order; empty when nothing did in time.
 
         The kernel has noted when each came: reading them some at a time saves most of the wake-ups
-        and costs no accuracy. What is ``awaited`` waits no longer than the interval, the rest no
-        longer than the timeout.
+        and costs no accuracy. It looks when something is ``awaited``, at the latest after the
+        timeout; an interval after the last look if that has passed already.
         """
         if self._interval_ns and not self._is_behind:
-            until = max(awaited, self._looked) + self._interval_ns + _JITTER_NS
-            pause = until - time.time_ns()
+            now = time.time_ns()
+            until = awaited if awaited > now else self._looked + self._interval_ns
+            pause = until + _JITTER_NS - now
             if pause > 0:
                 time.sleep(min(pause * 1e-9, timeout_s))
         if timeout_s != self._timeout_s:

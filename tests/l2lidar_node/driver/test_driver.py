@@ -584,7 +584,9 @@ def test_user_command_numbers_are_not_confused_between_families() -> None:
 @pytest.mark.parametrize("with_imu", [True, False])
 def test_the_next_datagram_that_somebody_waits_for_is_predicted(with_imu: bool) -> None:
     """An IMU sample, if they are published, or the packet that completes a sweep."""
-    values = {"aggregateNframes": 5, "enable_IMU_publishing": with_imu}
+    values = {
+        "aggregateNframes": 5, "enable_IMU_publishing": with_imu, "receive_interval_ms": 0
+    }  # fmt: skip
     driver = Driver(configure(DriverConfig, PLAIN | values))
     wanted: list[int] = []
     predicted: list[tuple[int, int]] = []
