@@ -33,7 +33,7 @@ _HEADING: Final = 26
 _FRAME_MS: Final = 230  # a turn of the head, so that it plays as fast as it happened
 _HOLD_MS: Final = 2500
 _LAYER_M: Final = (-0.7, 0.9)  # height about the sensor; leaves floor and ceiling out
-_COLOURS: Final = 24
+_COLORS: Final = 24
 
 
 def main() -> int:
@@ -55,7 +55,7 @@ def main() -> int:
             frames.append((_layer(measured, pose), _layer(deskewed, pose)))
     images = _draw(frames)
     durations = [_FRAME_MS] * (len(images) - 1) + [_HOLD_MS]
-    palette = images[-1].quantize(_COLOURS, dither=Image.Dither.NONE)
+    palette = images[-1].quantize(_COLORS, dither=Image.Dither.NONE)
     plain = [item.quantize(palette=palette, dither=Image.Dither.NONE) for item in images]
     plain[0].save(
         PAGE, save_all=True, append_images=plain[1:], duration=durations, loop=0, optimize=True

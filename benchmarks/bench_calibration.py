@@ -272,7 +272,7 @@ def refused(seed: int) -> Iterator[Row | Target]:
     """Yield what must not be believed."""
     yield from _refusal("one turn of the head", still_places("perfect", seconds=0.24, seed=seed))
     yield from _refusal("sensor that moved", _moved())
-    strong = _unit(replace(INJECTED, whirl=(0.6 * DEG, 0.0)))
+    strong = _unit(replace(INJECTED, precession=(0.6 * DEG, 0.0)))
     yield from _refusal(
         "mount that rocks by 0.6 deg", still_places(strong, seconds=SECONDS, poses=("tilted",))
     )
@@ -295,7 +295,7 @@ def poor_places(seed: int) -> Iterator[Row | Target]:
 
 def rocking(seed: int) -> Iterator[Row | Target]:
     """Yield what a mount that rocks by 0.3 degrees leaves in alpha and beta."""
-    errors = UnitErrors(whirl=(0.3 * DEG, -0.1 * DEG), whirl_back=(0.05 * DEG, 0.0))
+    errors = UnitErrors(precession=(0.3 * DEG, -0.1 * DEG), precession_back=(0.05 * DEG, 0.0))
     result = calibrate(still_places(_unit(errors), seconds=SECONDS, seed=seed), keep_alpha=True)
     yield _row("rocking 0.3 deg", seed, result, UnitErrors())
     off = max(abs(result.estimates[name].value) for name in ("alpha", "beta")) / DEG

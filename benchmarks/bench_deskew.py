@@ -184,7 +184,7 @@ def _true_velocities(recording: Recording, item: TrueSweep) -> list[tuple[HostNs
 
 
 def _per_packet(recording: Recording, item: TrueSweep) -> F64:
-    """Turn every packet by the newest onboard orientation: what a driver's levelling can do."""
+    """Turn every packet by the newest onboard orientation: what a driver's leveling can do."""
     packets = np.array([stamp(t) for t in np.unique(item.packet_start_s)])
     newest = np.searchsorted(recording.samples["stamp"], packets, side="right") - 1
     q = rotations.normalised(recording.samples["orientation_wxyz"][np.maximum(newest, 0)])
@@ -294,7 +294,7 @@ def cost(recording: Recording, rounds: int = 100) -> dict[str, float]:
         "kiss-icp preprocess alone": lambda: kiss._preprocess(vector, times, delta),
     }
     best = dict.fromkeys(jobs, np.inf)
-    for _ in range(rounds):  # in turns, so that all of them meet the same neighbours
+    for _ in range(rounds):  # in turns, so that all of them meet the same neighbors
         for name, job in jobs.items():
             begin = time.perf_counter()
             job()
@@ -312,9 +312,9 @@ def _rows(scenario: Scenario, errors: dict[str, list[F64]]) -> list[dict[str, An
     rms: dict[str, Any] = {"scenario": scenario.name, "figure": "RMS"}
     far: dict[str, Any] = {"scenario": scenario.name, "figure": "p95"}
     for method, found in errors.items():
-        millimetres = 1e3 * np.concatenate(found)
-        rms[method] = round(float(np.sqrt((millimetres**2).mean())), 2)
-        far[method] = round(float(np.quantile(millimetres, 0.95)), 2)
+        millimeters = 1e3 * np.concatenate(found)
+        rms[method] = round(float(np.sqrt((millimeters**2).mean())), 2)
+        far[method] = round(float(np.quantile(millimeters, 0.95)), 2)
     return [rms, far]
 
 
@@ -322,12 +322,12 @@ def _targets(rows: list[dict[str, Any]]) -> list[Target]:
     by_name = {row["scenario"]: row for row in rows if row["figure"] == "RMS"}
     moving = [row for name, row in by_name.items() if name != "still"]
     clean = [row for row in moving if "noise" not in row["scenario"]]
-    travelling = [row for row in moving if "pure rotation" not in row["scenario"]]
+    traveling = [row for row in moving if "pure rotation" not in row["scenario"]]
     found = []
     for method in ("odometry", "true velocity"):
         worst = max(row[method] for row in clean)
         found.append(at_most(f"{method}: worst RMS without IMU noise, mm", worst, 10.0))
-        least = min(row["none"] / max(row[method], 0.01) for row in travelling)
+        least = min(row["none"] / max(row[method], 0.01) for row in traveling)
         found.append(at_least(f"{method}: least gain over no deskew", least, 10.0))
     pure = by_name["pure rotation 3 rad/s"]
     for method in ("gyro only", "odometry"):

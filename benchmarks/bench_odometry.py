@@ -41,7 +41,7 @@ Row = dict[str, Any]
 
 
 def score(run: Run, found: methods.Found) -> tuple[float, float, float]:
-    """Return ATE after an SE(3) alignment, the largest error, RPE over a metre, all [m]."""
+    """Return ATE after an SE(3) alignment, the largest error, RPE over a meter, all [m]."""
     from evo.core.metrics import APE, RPE, PoseRelation, Unit
     from evo.core.trajectory import PoseTrajectory3D
 
@@ -56,7 +56,7 @@ def score(run: Run, found: methods.Found) -> tuple[float, float, float]:
     try:
         rpe.process_data((reference, estimate))
         relative = float(np.sqrt(np.mean(rpe.error**2)))
-    except Exception:  # evo has an exception of its own for a way under a metre
+    except Exception:  # evo has an exception of its own for a way under a meter
         relative = float("nan")
     return float(np.sqrt(np.mean(ape.error**2))), float(ape.error.max()), relative
 
@@ -285,10 +285,10 @@ def _table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
-def _mm(metres: float) -> str:
-    if not np.isfinite(metres):
+def _mm(meters: float) -> str:
+    if not np.isfinite(meters):
         return "lost"
-    return f"{1e3 * metres:.1f}" if metres < 0.1 else f"{1e3 * metres:.0f}"
+    return f"{1e3 * meters:.1f}" if meters < 0.1 else f"{1e3 * meters:.0f}"
 
 
 def _draw(rows: list[Row]) -> None:

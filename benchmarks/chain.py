@@ -79,7 +79,7 @@ def start(
 
 _START_S: Final = 60.0  # until programs are at work, on a busy machine
 _STAMP: Final = struct.Struct("<iI")
-_ENCAPSULATION: Final = 4  # bytes before a serialised message, which begins with its stamp
+_ENCAPSULATION: Final = 4  # bytes before a serialized message, which begins with its stamp
 
 CLOUDS: Final = "/points"
 IMU: Final = "/imu/data"

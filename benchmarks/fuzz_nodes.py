@@ -67,7 +67,7 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.slam.config import SlamNodeConfig
-from tests.support.cpu import resident_mb
+from tests.support.cpu import ForeignLoad, resident_mb
 from tests.support.odometry_runs import Run, record, sweeps
 
 _SETTINGS: Final[dict[str, type]] = {
@@ -589,51 +589,6 @@ def fuzz(seconds: float, seed: int, attacks: int, least: int = _CALM_EVERY) -> O
     fuzzer.node.destroy_node()
     rclpy.shutdown()
     return Outcome(campaign, sizes, ended, foreign)
-
-
-class ForeignLoad:
-    """How much of the machine programs use that are not of a process and its children.
-
-    Parameters
-    ----------
-    pid : int
-    """
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-        self.begin()
-
-    def begin(self) -> None:
-        """Count from here on."""
-        self._busy_s, self._own_s, self._at_s = *self._read(), time.monotonic()
-
-    def share(self) -> float:
-        """Return the share of all processors since the beginning, 0 to 1."""
-        busy, own = self._read()
-        elapsed = (time.monotonic() - self._at_s) * (os.cpu_count() or 1)
-        return max(busy - self._busy_s - (own - self._own_s), 0.0) / max(elapsed, 1e-9)
-
-    def _read(self) -> tuple[float, float]:
-        """Return processor time of the machine and of the process with its children [s]."""
-        tick = os.sysconf("SC_CLK_TCK")
-        counts = Path("/proc/stat").read_text().splitlines()[0].split()[1:9]
-        busy = sum(map(int, counts)) - int(counts[3]) - int(counts[4])  # idle, iowait
-        children: dict[int, list[int]] = {}
-        own: dict[int, int] = {}
-        for path in Path("/proc").glob("[0-9]*/stat"):
-            try:
-                fields = path.read_text().rpartition(")")[2].split()
-            except OSError:  # it has ended
-                continue
-            pid = int(path.parent.name)
-            children.setdefault(int(fields[1]), []).append(pid)
-            own[pid] = int(fields[11]) + int(fields[12])
-        total, todo = 0, [self._pid]
-        while todo:
-            pid = todo.pop()
-            total += own.get(pid, 0)
-            todo += children.get(pid, [])
-        return busy / tick, total / tick
 
 
 def report(outcome: Outcome) -> tuple[list[dict[str, Any]], list[Target]]:

@@ -201,7 +201,7 @@ class Layout:
                 rings(points, self.ring_count) if is_ring else _field(name, points, start)
             )
         if self.name == "ouster_legacy":
-            converted["range"] = np.rint(_range(points) * 1e3)  # whole millimetres
+            converted["range"] = np.rint(_range(points) * 1e3)  # whole millimeters
         return converted
 
 

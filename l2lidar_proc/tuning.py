@@ -35,7 +35,7 @@ BLIND_GYRO_SHARE: Final = 0.6  # [sqrt(s)] and this part of the rate held: what 
 BLIND_ACCEL: Final = 1.0  # [m/s^2/sqrt(Hz)]
 ZERO_VELOCITY: Final = 0.003  # [m/s] noise of a zero-velocity update. Tuned on: captures
 # A velocity known worse than the first is drawn towards zero as if that were measured once a
-# second with the second. Derived: walking and driving speeds are a few metres a second.
+# second with the second. Derived: walking and driving speeds are a few meters a second.
 PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
 PRIOR_SPEED: Final = 1.0  # [m/s]
 SPEED_BOUND_SHARE: Final = 0.02  # of max_speed: its noise as a measurement. Derived: a hard bound
@@ -133,7 +133,7 @@ WEAK_LEAST_ARM: Final = 0.3  # [m] however near the points are
 # the slope changes no ATE by more than its spread
 # (tests/l2lidar_proc/odometry/test_alignment.py).
 RANGE_NOISE_SLOPE: Final = 0.0011  # [m/m]
-RANGE_NOISE_FACTOR: Final = 2.0  # on the standard deviation: neighbours err together
+RANGE_NOISE_FACTOR: Final = 2.0  # on the standard deviation: neighbors err together
 
 # ---- odometry: map of surfaces
 
@@ -202,7 +202,7 @@ KISS_SIGMA: Final = (0.03, 0.15)  # [rad, m] of KISS-ICP's registration on its o
 # 0.19 m off, the odometry jumped, then slid along the corridor by 5 m.
 MAP_WAY: Final = 30.0  # [m]
 MAP_WAY_STEP: Final = 2.0  # [m] between the times that this is looked after
-PRUNE_SHARE: Final = 0.2  # of the map's radius travelled before far cells are dropped
+PRUNE_SHARE: Final = 0.2  # of the map's radius traveled before far cells are dropped
 
 # ---- odometry: relocalization
 

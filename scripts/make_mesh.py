@@ -75,7 +75,7 @@ def stl_bytes(triangles: Triangles) -> bytes:
     # Rounded, so that the last bit of a square root cannot differ between machines.
     records["normal"] = np.round(normals / np.linalg.norm(normals, axis=1, keepdims=True), 5) + 0.0
     records["corners"] = triangles + 0.0  # adding zero turns -0 into 0
-    header = b"Unitree L2 outline, metres, z up, cable at -x".ljust(80)
+    header = b"Unitree L2 outline, meters, z up, cable at -x".ljust(80)
     return header + np.array([len(records)], "<u4").tobytes() + records.tobytes()
 
 
@@ -106,9 +106,9 @@ def _rounded_square(half: float, corner: float, z: float) -> Vertices:
     direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     reach = half / np.abs(direction).max(axis=1)
     # Where the ray leaves through a corner it meets the corner's circle: |t d - c| = corner.
-    centre = np.sign(np.round(direction, 9)) * (half - corner)
-    along = (direction * centre).sum(axis=1)
-    inside = along**2 - (centre**2).sum(axis=1) + corner**2
+    center = np.sign(np.round(direction, 9)) * (half - corner)
+    along = (direction * center).sum(axis=1)
+    inside = along**2 - (center**2).sum(axis=1) + corner**2
     in_corner = (np.abs(direction) * reach[:, None] > half - corner).all(axis=1) & (inside >= 0)
     reach = np.where(in_corner, along + np.sqrt(np.maximum(inside, 0.0)), reach)
     return np.column_stack([direction * reach[:, None], np.full(_SIDES, z)])

@@ -256,7 +256,7 @@ _STEADY_TILT_RAD: Final = np.deg2rad(0.3)
 
 
 @dataclass(frozen=True, slots=True)
-class Whirl:
+class Precession:
     """Tilt of the housing in step with the head.
 
     Attributes
@@ -290,7 +290,7 @@ class Whirl:
 
     @property
     def correction(self) -> F64:
-        """What the whirl adds to the parameters of the beams, shape (8,)."""
+        """What the precession adds to the parameters of the beams, shape (8,)."""
         found = np.zeros(len(NAMES))
         found[[ALPHA, BETA, ROCK_COS, ROCK_SIN]] = (
             self.tilt_a, self.tilt_b, self.rock_cos, self.rock_sin,
@@ -298,8 +298,8 @@ class Whirl:
         return found
 
 
-def demodulated(place: Place) -> Whirl | None:
-    """Return the whirl of a place; None without enough IMU samples."""
+def demodulated(place: Place) -> Precession | None:
+    """Return the precession of a place; None without enough IMU samples."""
     gyro = place.gyro
     if len(gyro) < _FEWEST or place.head_rate <= 0:
         return None
@@ -307,7 +307,7 @@ def demodulated(place: Place) -> Whirl | None:
     parts = np.stack([_lines(part, place.head_rate) for part in np.array_split(gyro, _PARTS)])
     sd = float(np.sqrt(np.mean(parts.var(axis=0, ddof=1)) / _PARTS))
     tilt_a, tilt_b, rock_cos, rock_sin = whole.tolist()
-    return Whirl(tilt_a, tilt_b, rock_cos, rock_sin, sd, _is_at_rest(gyro))
+    return Precession(tilt_a, tilt_b, rock_cos, rock_sin, sd, _is_at_rest(gyro))
 
 
 def _lines(gyro: NDArray[np.void], head_rate: float) -> F64:

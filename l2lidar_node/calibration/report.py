@@ -61,7 +61,7 @@ def calibration_of(
         for name, item in result.estimates.items()
         if item.verdict is not Verdict.UNKNOWN
     }
-    has_imu = all(place.whirl is not None for place in result.places)
+    has_imu = all(place.precession is not None for place in result.places)
     about: dict[str, Any] = {
         "tool": f"l2lidar {__version__}",
         "date": date,

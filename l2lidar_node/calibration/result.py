@@ -7,7 +7,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from l2lidar_node.calibration.model import Block
-from l2lidar_node.calibration.observation import Whirl
+from l2lidar_node.calibration.observation import Precession
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.solver import Scene
 from l2lidar_node.types import F64
@@ -80,7 +80,7 @@ class PlaceReport:
     planes : int
     xi, beta, alpha : float
         [rad]
-    whirl : Whirl or None
+    precession : Precession or None
         None without IMU data.
     """
 
@@ -91,7 +91,7 @@ class PlaceReport:
     xi: float
     beta: float
     alpha: float
-    whirl: Whirl | None
+    precession: Precession | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,7 @@ from l2lidar_node.calibration.model import (
     B,
     beams,
 )
-from l2lidar_node.calibration.observation import Place, Whirl, demodulated
+from l2lidar_node.calibration.observation import Place, Precession, demodulated
 from l2lidar_node.calibration.planes import Planes
 from l2lidar_node.calibration.result import (
     Estimate,
@@ -46,8 +46,8 @@ _LARGEST_B_M: Final = 0.005
 _LEAST_GAIN: Final = 0.1  # by which the planes must become thinner
 _CONTRADICTION: Final = 0.1 * DEG  # between two places
 _REPEATABLE: Final = 0.05 * DEG  # alpha between places and power-ups
-_WHIRL_WORST: Final = 0.5 * DEG
-_WHIRL: Final = 0.03 * DEG  # smaller rocking is left in alpha and beta
+_PRECESSION_WORST: Final = 0.5 * DEG
+_PRECESSION: Final = 0.03 * DEG  # smaller rocking is left in alpha and beta
 _LARGEST_DRIFT_M: Final = 5e-3  # noise alone makes 1 to 2 mm of it
 _DIRTIEST: Final = 5.0  # [%]
 _MODEL_SD: Final = np.array([0.02 * DEG, 0.02 * DEG, 0.005 * DEG, 0.15e-3])
@@ -96,11 +96,11 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     """
     refusals = [refusal for place in places for refusal in problems(place)]
     refusals += _between(places)
-    whirls = [demodulated(place) for place in places]
+    precessions = [demodulated(place) for place in places]
     scene = _scene(places, [None] * len(places))
     try:
         coarse = _started(scene, len(places))
-        taken, notes, refused = _whirl(scene, coarse, places, whirls)
+        taken, notes, refused = _precession(scene, coarse, places, precessions)
         refusals += refused
         scene = _scene(places, taken)
         solution = solver.solve(scene, _unknowns(len(places)), coarse.values)
@@ -112,7 +112,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
             "there are too few flat surfaces that both halves of the fan see; calibrate in a "
             "furnished room of 4 to 10 m with a flat ceiling and free walls"
         ) from None
-    reports = _alone(scene, solution, places, whirls)
+    reports = _alone(scene, solution, places, precessions)
     sd, scatter, together = _uncertainty(scene, solution)
     corrections = solution.per_group(len(places))
     before, after = _qualities(scene, solution, corrections)
@@ -139,7 +139,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
         "b": with_b if verdict is Verdict.CORRECTED else _unstored(with_b),
         "bias": Estimate(np.nan, np.nan, Verdict.UNKNOWN, reason) if bias is None else bias,
     }
-    if any(whirl is None for whirl in whirls):
+    if any(precession is None for precession in precessions):
         notes.append(
             "no IMU data: rocking of the mount cannot be told from alpha and beta, so the result "
             "is valid for this mount only"
@@ -207,7 +207,7 @@ def _between(places: Sequence[Place]) -> list[Refusal]:
 
 
 def _scene(
-    places: Sequence[Place], whirls: Sequence[Whirl | None], most: int = _MOST_RETURNS
+    places: Sequence[Place], precessions: Sequence[Precession | None], most: int = _MOST_RETURNS
 ) -> Scene:
     nothing = np.zeros(len(NAMES))
     share = max(most // len(places), _LEAST_RETURNS)
@@ -215,7 +215,12 @@ def _scene(
     return Scene(
         np.concatenate(returns),
         np.repeat(np.arange(len(places)), [len(part) for part in returns]),
-        np.stack([nothing if whirl is None else whirl.correction for whirl in whirls]),
+        np.stack(
+            [
+                nothing if precession is None else precession.correction
+                for precession in precessions
+            ]
+        ),
         places[0].block,
     )
 
@@ -263,18 +268,18 @@ def _thinned(scene: Scene) -> Scene:
     return scene.part(np.asarray(numbers % every == 0))
 
 
-def _whirl(
+def _precession(
     scene: Scene,
     coarse: Solution,
     places: Sequence[Place],
-    whirls: Sequence[Whirl | None],
-) -> tuple[list[Whirl | None], list[str], list[Refusal]]:
-    """Return the whirl to take out of each place, what to say, and why to refuse.
+    precessions: Sequence[Precession | None],
+) -> tuple[list[Precession | None], list[str], list[Refusal]]:
+    """Return the precession to take out of each place, what to say, and why to refuse.
 
     A gyro may show a line at the head's frequency that is not a motion. A real rocking is hardly
     ever a circle: its part against the turning of the head shows in the cloud too.
     """
-    taken: list[Whirl | None] = []
+    taken: list[Precession | None] = []
     notes: list[str] = []
     refusals: list[Refusal] = []
     groups = len(scene.known)
@@ -282,49 +287,53 @@ def _whirl(
         Unknown(parameter, group) for group in range(groups) for parameter in (ROCK_COS, ROCK_SIN)
     ]
     rocks = None
-    if any(whirl is not None and max(whirl.forward, whirl.backward) > _WHIRL for whirl in whirls):
+    if any(
+        precession is not None and max(precession.forward, precession.backward) > _PRECESSION
+        for precession in precessions
+    ):
         rocks = solver.widened(_thinned(scene), coarse, more)
-    for group, whirl in enumerate(whirls):
-        if whirl is None:
+    for group, precession in enumerate(precessions):
+        if precession is None:
             taken.append(None)
             continue
         name = places[group].name
-        if not whirl.is_at_rest:
+        if not precession.is_at_rest:
             refusals.append(
                 Refusal(f"{name}: the IMU says that the sensor moved", "clamp it and record again")
             )
-        if whirl.forward > _WHIRL_WORST or whirl.backward > _WHIRL_WORST:
+        if precession.forward > _PRECESSION_WORST or precession.backward > _PRECESSION_WORST:
             refusals.append(
                 Refusal(
-                    f"{name}: the mount rocks by {whirl.forward / DEG:.2f} degrees with the head",
+                    f"{name}: the mount rocks by {precession.forward / DEG:.2f} degrees with "
+                    "the head",
                     "screw or clamp the sensor to something heavy",
                 )
             )
-        if rocks is None or max(whirl.forward, whirl.backward) <= _WHIRL:
+        if rocks is None or max(precession.forward, precession.backward) <= _PRECESSION:
             taken.append(None)
             continue
         at = len(coarse.values) + 2 * group
-        away = rocks.values[at : at + 2] - (whirl.rock_cos, whirl.rock_sin)
+        away = rocks.values[at : at + 2] - (precession.rock_cos, precession.rock_sin)
         differs = float(np.hypot(*away))
         unsure = float(np.hypot(*rocks.sd[at : at + 2]))
-        is_motion = differs < max(_WHIRL, 0.3 * whirl.backward, 3.0 * unsure)
+        is_motion = differs < max(_PRECESSION, 0.3 * precession.backward, 3.0 * unsure)
         if is_motion:
             notes.append(
-                f"{name}: the mount rocks by {whirl.forward / DEG:.3f} degrees with the head; the "
-                "gyro's figure is taken out of alpha and beta"
+                f"{name}: the mount rocks by {precession.forward / DEG:.3f} degrees with the "
+                "head; the gyro's figure is taken out of alpha and beta"
             )
-            taken.append(whirl)
+            taken.append(precession)
             continue
         taken.append(None)
         text = (
-            f"{name}: the gyro shows a rocking of {whirl.backward / DEG:.2f} degrees against the "
-            "head that the points do not"
+            f"{name}: the gyro shows a rocking of {precession.backward / DEG:.2f} degrees against "
+            "the head that the points do not"
         )
-        if whirl.forward > _WHIRL:
+        if precession.forward > _PRECESSION:
             refusals.append(
                 Refusal(
-                    f"{text}, so its {whirl.forward / DEG:.2f} degrees with the head cannot be "
-                    "trusted either",
+                    f"{text}, so its {precession.forward / DEG:.2f} degrees with the head cannot "
+                    "be trusted either",
                     "screw or clamp the sensor to something heavy, so that the gyro is quiet",
                 )
             )
@@ -337,13 +346,13 @@ def _alone(
     scene: Scene,
     solution: Solution,
     places: Sequence[Place],
-    whirls: Sequence[Whirl | None],
+    precessions: Sequence[Precession | None],
 ) -> list[PlaceReport]:
     """Return what each place alone says: one step from the common solution."""
     group = scene.group[solution.planes.member]
     owner = group[solution.planes.first]
     reports = []
-    for number, (place, whirl) in enumerate(zip(places, whirls, strict=True)):
+    for number, (place, precession) in enumerate(zip(places, precessions, strict=True)):
         values = solution.values
         if len(places) > 1 and np.count_nonzero(owner == number) > 10:
             values = solver.repeated(scene, solution, group == number)
@@ -356,7 +365,7 @@ def _alone(
                 float(values[0]),
                 float(values[1]),
                 float(values[2 + number]),
-                whirl,
+                precession,
             )
         )
     return reports

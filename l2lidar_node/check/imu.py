@@ -51,16 +51,16 @@ def _check_acceleration(acceleration: F64, consumer: Consumer) -> Finding:
         return ok(_SUBJECT, "acceleration", f"{text}: m/s^2 with gravity")
     if 0.9 < norm < 1.1:
         level = Level.WARN if consumer.any_acceleration_unit else Level.ERROR
-        why, fix = "that is g, demanded is m/s^2", "multiply by 9.80665; the driver does"
+        why, fix = "that is g, but m/s^2 is required", "multiply by 9.80665; the driver does"
     elif 17.0 < norm < 23.0:
         level = Level.WARN if consumer.any_acceleration_unit else Level.ERROR
         why = "twice gravity, a fault of L2s that were switched on while tilted"
         fix = "switch the L2 off and on while it stands upright and still"
     elif norm < 0.5:
-        level, why = Level.ERROR, "there is no gravity in it, which is demanded"
+        level, why = Level.ERROR, "it lacks gravity, which is required"
         fix = "publish what the accelerometer measures, +9.81 upwards at rest"
     else:
-        level, why = Level.WARN, "demanded is 9.81 m/s^2 at rest"
+        level, why = Level.WARN, "9.81 m/s^2 is required at rest"
         fix = "was it moving hard? else switch the L2 off and on while it stands upright and still"
     return Finding(level, _SUBJECT, "acceleration", f"{text}: {why}", fix)
 
@@ -73,7 +73,7 @@ def _check_rate(rates: F64) -> Finding:
             _SUBJECT,
             "gyro",
             f"rates are up to {greatest:.4g}, more than the gyro can measure in rad/s "
-            "(2000 deg/s are 34.9); demanded is rad/s",
+            "(2000 deg/s are 34.9); rad/s is required",
             "multiply by pi / 180; the driver publishes rad/s",
         )
     if greatest == 0.0:
@@ -164,7 +164,7 @@ def check_orientation(seen: Observation, consumer: Consumer) -> Iterator[Finding
             _SUBJECT,
             "orientation-norm",
             f"{int((norms < _USABLE_NORM).sum())} of {len(imu)} orientations are (near) 0; "
-            f"{consumer.title} demands unit quaternions"
+            f"{consumer.title} requires unit quaternions"
             + (" and shuts down" if consumer.orientation is Use.NEEDED else ""),
             "use the driver's IMU topic, which has the L2's own orientation",
         )
@@ -204,7 +204,7 @@ def _check_gravity(imu: NDArray[np.void], consumer: Consumer) -> Finding:
         level,
         _SUBJECT,
         "orientation-gravity",
-        f"{text}; " + (f"it fits if {guess}" if fits else "demanded is IMU to a z-up world"),
+        f"{text}; " + (f"it fits if {guess}" if fits else "IMU to a z-up world is required"),
         "use the driver's IMU topic"
         if fits
         else "switch the L2 off and on while it stands upright and still",
@@ -244,7 +244,7 @@ def _check_rates(imu: NDArray[np.void]) -> Iterator[Finding]:
             Level.ERROR,
             _SUBJECT,
             "gyro-unit",
-            f"{text}: they are deg/s, demanded is rad/s",
+            f"{text}: they are deg/s, but rad/s is required",
             "multiply by pi / 180; the driver publishes rad/s",
         )
     else:

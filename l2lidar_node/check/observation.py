@@ -249,7 +249,7 @@ class Observation:
         Parent and child of each transform.
     cloud_qos, imu_qos : tuple of Qos
         Of the publishers; empty where they are not known.
-    is_levelled : bool or None
+    is_leveled : bool or None
         The publisher's own word on ``imu_adjust``.
     """
 
@@ -259,7 +259,7 @@ class Observation:
     transforms: frozenset[tuple[str, str]] = frozenset()
     cloud_qos: tuple[Qos, ...] = ()
     imu_qos: tuple[Qos, ...] = ()
-    is_levelled: bool | None = None
+    is_leveled: bool | None = None
 
 
 class Gathering:
@@ -331,7 +331,7 @@ class Gathering:
         self,
         cloud_qos: tuple[Qos, ...] = (),
         imu_qos: tuple[Qos, ...] = (),
-        is_levelled: bool | None = None,
+        is_leveled: bool | None = None,
     ) -> Observation:
         """Return everything so far."""
         return Observation(
@@ -341,7 +341,7 @@ class Gathering:
             transforms=frozenset(self._transforms),
             cloud_qos=cloud_qos,
             imu_qos=imu_qos,
-            is_levelled=is_levelled,
+            is_leveled=is_leveled,
         )
 
 

@@ -100,12 +100,12 @@ def _check_fields(form: Format, wanted: Input, consumer: Consumer) -> Iterator[F
     when = f" with {wanted.when}" if wanted.when else ""
     faults = 0
     for name, codes in wanted.fields.items():
-        demand = f"{consumer.title} reads it as {' or '.join(codes)}{when}"
+        required = f"{consumer.title} reads it as {' or '.join(codes)}{when}"
         if name not in fields:
-            text = f"field '{name}' is missing; {demand}"
+            text = f"field '{name}' is missing; {required}"
             yield Finding(Level.ERROR, _SUBJECT, "field-missing", text, fix)
         elif fields[name].code not in codes:
-            text = f"field '{name}' is {fields[name].code}; {demand}"
+            text = f"field '{name}' is {fields[name].code}; {required}"
             yield Finding(Level.ERROR, _SUBJECT, "field-type", text, fix)
         else:
             continue
@@ -351,7 +351,7 @@ _MOST: Final = 200
 
 
 def check_leveling(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
-    """Yield whether the clouds are levelled, where the consumer deskews by itself.
+    """Yield whether the clouds are leveled, where the consumer deskews by itself.
 
     An L2 sees nothing below its own horizon. Where it is tilted, points below the cloud's horizon
     that are above it once they are turned back by the orientation tell that they were turned.
@@ -366,7 +366,7 @@ def check_leveling(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
             Level.ERROR if consumer.imu is Use.NEEDED else Level.WARN,
             _SUBJECT_LEVELED,
             "levelled",
-            f"the clouds are turned into a levelled frame ({why}); {consumer.title} deskews by "
+            f"the clouds are turned into a leveled frame ({why}); {consumer.title} deskews by "
             "itself and needs them as measured",
             "set imu_adjust: false",
         )
@@ -375,8 +375,8 @@ def check_leveling(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
 
 
 def _verdict(seen: Observation) -> tuple[bool | None, str]:
-    if seen.is_levelled is not None:
-        return seen.is_levelled, f"imu_adjust is {str(seen.is_levelled).lower()}"
+    if seen.is_leveled is not None:
+        return seen.is_leveled, f"imu_adjust is {str(seen.is_leveled).lower()}"
     imu = seen.imu[np.isfinite(seen.imu["orientation_wxyz"]).all(axis=1)]
     imu = imu[np.argsort(imu["stamp"], kind="stable")]
     imu = imu[np.linalg.norm(imu["orientation_wxyz"], axis=1) > 0.1]

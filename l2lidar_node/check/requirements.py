@@ -22,7 +22,7 @@ class Finding(NamedTuple):
     check : str
         Name of the check, for programs.
     text : str
-        What was found and what is demanded; one line.
+        What was found and what is required; one line.
     fix : str
         What to do; empty where nothing is to be done.
     """
@@ -146,7 +146,7 @@ class Input:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consumer:
-    """What one consumer demands.
+    """What one consumer requires.
 
     Attributes
     ----------

@@ -237,7 +237,7 @@ def _check_origin(times: Timing, consumer: Consumer) -> Iterator[Finding]:
             _SUBJECT,
             "time-origin",
             f"the first point is {_signed(worst)} the stamp in {late} of {total} clouds, read as "
-            f"{times.unit}; demanded are times from 0 at the stamp",
+            f"{times.unit}; times from 0 at the stamp are required",
             "stamp the cloud at its first point, as the filters of deskew_node do",
         )
     else:
@@ -283,7 +283,7 @@ def _check_spread(clouds: Sequence[Cloud], times: Timing, consumer: Consumer) ->
             "sweep-long",
             f"the points of a cloud span {longest:.4g} s as {consumer.title} takes them; it "
             f"relies on less than {consumer.max_sweep_s:g} s",
-            "set sweep_cut: turn, and point_layout as demanded if the unit is wrong",
+            "set sweep_cut: turn, and point_layout as required if the unit is wrong",
         )
         return
     stamps = np.array([cloud.stamp for cloud in clouds], np.int64)

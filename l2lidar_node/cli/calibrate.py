@@ -413,8 +413,8 @@ def _show(result: StillResult) -> None:
     for place in result.places:
         rocks = (
             "no IMU data"
-            if place.whirl is None
-            else f"mount rocks by {place.whirl.forward / DEG:.3f} degrees"
+            if place.precession is None
+            else f"mount rocks by {place.precession.forward / DEG:.3f} degrees"
         )
         say(
             f"{place.name}: xi {place.xi / DEG:+.3f}, beta {place.beta / DEG:+.3f}, alpha "

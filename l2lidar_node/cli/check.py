@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from l2lidar_node.check.observation import Observation
 
 
-_COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
+_COLORS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "red"}
 _LISTEN_S: Final = 10.0
 _TOPIC: Final = re.compile(r"[~/]?[A-Za-z_]\w*(/[A-Za-z_]\w*)*")
 
@@ -116,13 +116,13 @@ def _observe(
 def _print(findings: list[Finding], consumer: Consumer) -> None:
     width = max(len(item.subject) for item in findings)
     for item in findings:
-        line = Text(f"{item.level.name:5} ", style=_COLOURS[item.level])
+        line = Text(f"{item.level.name:5} ", style=_COLORS[item.level])
         line.append(f"{item.subject:{width}}  ", style="cyan")
         line.append(item.text, style="default")
         if item.fix:
             line.append(f"; {item.fix}", style="bold default")
         out.print(line, soft_wrap=True)
     out.print(
-        Text(verdict(findings, consumer), style=f"bold {_COLOURS[worst(findings)]}"),
+        Text(verdict(findings, consumer), style=f"bold {_COLORS[worst(findings)]}"),
         soft_wrap=True,
     )

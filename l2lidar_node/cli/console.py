@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from l2lidar_node.types import Check
 
 out: Final = Console(highlight=False)
-_COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "dim"}
+_COLORS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "dim"}
 
 
 def say(text: str) -> None:
@@ -49,9 +49,9 @@ def judgement(checks: Iterable[Check]) -> Table:
     for heading in ("", "level", "message", "figures"):
         table.add_column(heading, overflow="fold")
     for check in checks:
-        colour = _COLOURS[check.level.name]
+        color = _COLORS[check.level.name]
         figures = "  ".join(f"{name} [bold]{value}[/]" for name, value in _plain(check.values))
-        table.add_row(check.name, f"[{colour}]{check.level.name}[/]", check.message, figures)
+        table.add_row(check.name, f"[{color}]{check.level.name}[/]", check.message, figures)
     return table
 
 

@@ -111,7 +111,7 @@ def observe_capture(
     observation = gathering.observation(
         cloud_qos=(Qos(topics.qos_reliability, _CLOUD_DEPTH),),
         imu_qos=(Qos(topics.qos_reliability, _IMU_DEPTH),),
-        is_levelled=config.imu.adjust,
+        is_leveled=config.imu.adjust,
     )
     return observation, Topics(topics.point_cloud_topic_id, topics.imu_topic_id)
 

@@ -109,15 +109,15 @@ def save_cloud(points: NDArray[np.void], path: Path, title: str) -> None:
     """
     figure = _figure(path)
     figure.suptitle(title)
-    colour: dict[str, Any] = {"c": points["range"], "cmap": "turbo", "vmin": 0.0, "linewidths": 0}
-    colour["vmax"] = float(np.percentile(points["range"], 99))
+    color: dict[str, Any] = {"c": points["range"], "cmap": "turbo", "vmin": 0.0, "linewidths": 0}
+    color["vmax"] = float(np.percentile(points["range"], 99))
     space = figure.add_subplot(1, 2, 1, projection="3d")
-    space.scatter(points["x"], points["y"], points["z"], s=1.5, **colour)
+    space.scatter(points["x"], points["y"], points["z"], s=1.5, **color)
     space.set_aspect("equal")
     space.view_init(elev=38, azim=-60)
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     plan = figure.add_subplot(1, 2, 2)
-    dots = plan.scatter(points["x"], points["y"], s=1.5, **colour)
+    dots = plan.scatter(points["x"], points["y"], s=1.5, **color)
     plan.set_aspect("equal")
     plan.set(xlabel="x [m]", ylabel="y [m]", title="from above")
     figure.colorbar(dots, ax=plan, label="range [m]")

@@ -1,4 +1,4 @@
-"""Turns a batch of point packets into POINT records: closed form, in double, one vectorised call.
+"""Turns a batch of point packets into POINT records: closed form, in double, one vectorized call.
 
 The model is the one of Unitree's BSD-3 header for a 3D packet's slot j::
 

@@ -270,6 +270,8 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
         values[f"damaged: {name}"] = str(number)
     for name, number in sorted(new.rejected.items()):
         values[f"rejected: {name}"] = str(number)
+    values["bytes outside packets"] = str(new.skipped_octets)
+    values["stray acknowledgements"] = str(new.stray_acks)
     values["foreign datagrams"] = str(after.foreign)
     values["kernel drops"] = str(after.kernel_drops)
     damaged = sum((new.faults - old.faults).values()) + sum((new.rejected - old.rejected).values())
@@ -362,9 +364,9 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
         "empty sweeps": str(new.empty_sweeps),
         "fragments of turns left out": str(new.fragments),
         "packets in fragments": str(new.fragment_packets),
-        "points without orientation": str(new.unlevelled),
+        "points without orientation": str(new.is_leveled),
     }
-    if new.unlevelled > old.unlevelled:
+    if new.is_leveled > old.is_leveled:
         message = "imu_adjust drops points for want of IMU data"
         return Check("points", Level.WARN, message, values)
     if not slots and new.fragments > old.fragments:

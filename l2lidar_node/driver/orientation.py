@@ -59,7 +59,7 @@ class GravityAlignment:
         self._count = 0
 
     def __call__(self, starts: list[HostNs]) -> NDArray[np.float64]:
-        """Return the rotations of packets from the cloud frame into the levelled frame.
+        """Return the rotations of packets from the cloud frame into the leveled frame.
 
         Parameters
         ----------

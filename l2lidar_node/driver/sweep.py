@@ -156,14 +156,14 @@ class SweepAssembler:
         How sweeps are cut; may be replaced while running through :meth:`configure`.
     level : callable, optional
         Returns a rotation for the start of every packet of a sweep, by which its points are turned
-        into a levelled frame: shape (P, 3, 3), NaN for packets that cannot be.
+        into a leveled frame: shape (P, 3, 3), NaN for packets that cannot be.
     blocks : BlockChoice, optional
         Which calibration blocks to use; those that the unit reports if left out.
 
     Attributes
     ----------
-    unlevelled : int
-        Points left out because their packet could not be levelled.
+    is_leveled : int
+        Points left out because their packet could not be leveled.
     fragments, fragment_packets : int
         Parts of a turn or half turn that were left out, and their packets: the first one after a
         start, a gap or a change of the cut, and the last one before a stop or a gap.
@@ -176,7 +176,7 @@ class SweepAssembler:
         blocks: BlockChoice | None = None,
     ) -> None:
         self.blocks = BlockChoice(config) if blocks is None else blocks
-        self.unlevelled = 0
+        self.is_leveled = 0
         self.fragments = 0
         self.fragment_packets = 0
         self._begins_at_boundary = False
@@ -309,7 +309,7 @@ class SweepAssembler:
             None if self._level is None else self._level(starts),
             self.blocks.used if self.blocks.is_needed else None,
         )
-        self.unlevelled += batch.left_out
+        self.is_leveled += batch.left_out
         batch.points.flags.writeable = False
         last = packets[-1]
         sweep = Sweep(

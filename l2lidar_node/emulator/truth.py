@@ -262,7 +262,7 @@ def undistorted(
     measured : bool
         True: the measured points (range noise and quantisation included) at their true places, so
         a deskewed cloud differs from them by the error of the deskewing alone. False: the
-        noise-free surface points of the beams' centre rays.
+        noise-free surface points of the beams' center rays.
 
     Returns
     -------

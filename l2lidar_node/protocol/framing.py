@@ -1,4 +1,4 @@
-"""Turns a byte stream cut anywhere into frames and frame errors; bounded and resynchronising.
+"""Turns a byte stream cut anywhere into frames and frame errors; bounded and resynchronizing.
 
 The stream is what one sender puts into datagrams (or onto a serial line). Frames may be coalesced,
 split at any byte, damaged, or have garbage between them. The rules:

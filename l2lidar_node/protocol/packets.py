@@ -237,7 +237,7 @@ def _parameters(payload: bytes) -> Parameters | DecodeError:
     if len(payload) < fields["work_mode"][1] + 4:
         return DecodeError(wire.PacketType.PARAMETERS, "length")
 
-    def metres(name: str) -> float | None:
+    def meters(name: str) -> float | None:
         offset = fields[name][1]
         if len(payload) < offset + 4:
             return None
@@ -245,8 +245,8 @@ def _parameters(payload: bytes) -> Parameters | DecodeError:
 
     return Parameters(
         work_mode=struct.unpack_from("<I", payload, fields["work_mode"][1])[0],
-        range_min=metres("range_min"),
-        range_max=metres("range_max"),
+        range_min=meters("range_min"),
+        range_max=meters("range_max"),
         payload=payload,
     )
 

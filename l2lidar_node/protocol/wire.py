@@ -1,6 +1,6 @@
 """States the wire format of the Unitree L2 once: numbers, layouts, sizes, and the frame.
 
-Facts come from Unitree's BSD-3 headers (unilidar_sdk2) and from the behaviour of its client. All
+Facts come from Unitree's BSD-3 headers (unilidar_sdk2) and from the behavior of its client. All
 numbers are little-endian and packed. Sizes called ``size`` include the 12-byte header and the
 12-byte tail; a ``payload`` is what stands between them. The CRC-32 covers the payload only.
 """

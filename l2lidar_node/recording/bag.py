@@ -63,7 +63,7 @@ def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
 
 
 class BagFile:
-    """A bag that serialised messages are written into; use it in a ``with``.
+    """A bag that serialized messages are written into; use it in a ``with``.
 
     It gets its name when it is finished. Until then it grows in a folder beside it that ends in
     ``.unfinished``; what a killed run left there neither blocks the next one nor is lost.
@@ -145,7 +145,7 @@ class BagFile:
         )
 
     def write(self, topic: str, now: int, data: bytes | memoryview) -> None:
-        """Append a serialised (CDR) message that was received at an instant [ns]."""
+        """Append a serialized (CDR) message that was received at an instant [ns]."""
         self._is_used = True
         self._writer.write(self._connections[topic], now, data)
 

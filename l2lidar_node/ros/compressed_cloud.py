@@ -37,7 +37,7 @@ def on_grid(points: NDArray[np.void]) -> NDArray[np.void]:
 
 
 class CompressedCloudTemplate:
-    """Makes serialised compressed clouds of one layout and frame.
+    """Makes serialized compressed clouds of one layout and frame.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Turns plain values into ROS messages and back; changes units and order, nothing else.
 
-Clouds and IMU samples are published hundreds of times a second, so both are made as serialised
-(CDR) messages: a template lets rclpy serialise one message and then only replaces what changes.
+Clouds and IMU samples are published hundreds of times a second, so both are made as serialized
+(CDR) messages: a template lets rclpy serialize one message and then only replaces what changes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NUMBERS: Final = {code: number for number, code in DATATYPES.items()}
 
 NS: Final = 1_000_000_000
 
-_STAMP_AT: Final = 4  # in a serialised message, after its encapsulation
+_STAMP_AT: Final = 4  # in a serialized message, after its encapsulation
 _STAMP: Final = struct.Struct("<iI")
 _QUATERNION: Final = struct.Struct("<4d")
 _VECTOR: Final = struct.Struct("<3d")
@@ -100,7 +100,7 @@ def to_cloud(points: NDArray[np.void], stamp: HostNs, frame: str) -> PointCloud2
 
 
 class CloudTemplate:
-    """Makes serialised clouds of one layout and frame.
+    """Makes serialized clouds of one layout and frame.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class CloudTemplate:
 
 
 class ImuTemplate:
-    """Makes serialised IMU messages.
+    """Makes serialized IMU messages.
 
     Parameters
     ----------

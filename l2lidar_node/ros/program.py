@@ -37,7 +37,7 @@ _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 
 
 def make_room() -> None:
-    """Have Fast DDS use :data:`PROFILE`; must come before rclpy is initialised.
+    """Have Fast DDS use :data:`PROFILE`; must come before rclpy is initialized.
 
     Where a profile or transports are named in the environment, or a file that Fast DDS looks for
     lies in the working directory, those count.
@@ -66,7 +66,7 @@ def wants_help(argv: list[str]) -> bool:
 
 
 def start_rclpy(argv: list[str]) -> None:
-    """Initialise rclpy with a node's command line, the program's name first.
+    """Initialize rclpy with a node's command line, the program's name first.
 
     Signals are left as they are.
 

@@ -68,7 +68,7 @@ def _observe(
         gathering.observation(
             cloud_qos=_offers(node, topics.cloud),
             imu_qos=_offers(node, topics.imu),
-            is_levelled=imu_adjust.answer,
+            is_leveled=imu_adjust.answer,
         ),
         topics,
     )
@@ -177,7 +177,7 @@ class ViewerNode(Node):
 def view(rerun: Any, topics: dict[str, str], seconds: float | None) -> int:
     """Show topics until interrupted, or for some seconds; return how many messages were shown.
 
-    rclpy has to be initialised, without handlers of signals.
+    rclpy has to be initialized, without handlers of signals.
 
     Parameters
     ----------

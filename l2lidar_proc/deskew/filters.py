@@ -2,7 +2,7 @@
 
 The L2 measures along a line: 300 slots of one packet follow each other 8 us and 0.6 degrees apart,
 then comes the dark half of the mirror's turn. The next line is 7 degrees away, so in space even
-good points are lonely, and neighbours have to be looked for on the line: in time.
+good points are lonely, and neighbors have to be looked for on the line: in time.
 
 A filter takes points, shape (N,), and settings, and returns a mask, shape (N,). It moves and
 changes nothing. Points need ``x``, ``y`` and ``z`` [m]; a filter that needs more says so when it
@@ -45,7 +45,7 @@ def slot_time(times: NDArray[np.float32]) -> float:
 
 
 def on_a_line(points: Points, config: FilterConfig) -> Mask:
-    """Keep points with enough neighbours on their own scan line.
+    """Keep points with enough neighbors on their own scan line.
 
     Parameters
     ----------
@@ -59,21 +59,21 @@ def on_a_line(points: Points, config: FilterConfig) -> Mask:
     reach = (config.isolated_slots + 0.5) * slot_time(points["time"])
     distance = np.linalg.norm(xyz, axis=1)
     allowed = config.isolated_distance + config.isolated_ratio * distance
-    neighbours = np.zeros(len(points), dtype=np.int64)
+    neighbors = np.zeros(len(points), dtype=np.int64)
     for step in range(1, min(config.isolated_slots, len(points) - 1) + 1):
         near = times[step:] - times[:-step] <= reach
         apart = np.linalg.norm(xyz[step:] - xyz[:-step], axis=1)
         near &= apart <= np.minimum(allowed[step:], allowed[:-step])
-        neighbours[step:] += near
-        neighbours[:-step] += near
-    keep = neighbours >= config.isolated_neighbours
+        neighbors[step:] += near
+        neighbors[:-step] += near
+    keep = neighbors >= config.isolated_neighbours
     if "intensity" in (points.dtype.names or ()):
         keep |= points["intensity"] > config.isolated_intensity
     return np.asarray(keep)
 
 
 def statistical(points: Points, config: FilterConfig) -> Mask:
-    """Keep points whose distance to their neighbours is not far above average (open3d)."""
+    """Keep points whose distance to their neighbors is not far above average (open3d)."""
     cloud = _open3d(points)
     _, kept = cloud.remove_statistical_outlier(
         nb_neighbors=config.statistical_neighbours, std_ratio=config.statistical_ratio

@@ -315,7 +315,7 @@ def of_period(
     motion: TwistFilter | None,
     refused: dict[str, int],
     *,
-    is_levelled: bool,
+    is_leveled: bool,
     untied: str = "",
 ) -> Check:
     """Return what there is to say about the time between two looks.
@@ -329,8 +329,8 @@ def of_period(
     motion : TwistFilter or None
     refused : dict
         Clouds that could not be used, by reason.
-    is_levelled : bool
-        Whether the clouds come levelled, which they must not.
+    is_leveled : bool
+        Whether the clouds come leveled, which they must not.
     untied : str
         Why velocities that came are not used; empty if they are.
     """
@@ -346,6 +346,7 @@ def of_period(
         "IMU samples put in order": str(imu.reordered),
         "IMU samples refused: duplicate": str(imu.duplicate),
         "IMU samples refused: impossible": str(imu.invalid),
+        "IMU samples refused: outlier": str(imu.outlier),
         "IMU samples refused: too old": str(imu.stale),
         **{f"clouds refused: {reason}": str(count) for reason, count in refused.items()},
         **({f"last: {name}": value for name, value in last.values.items()} if last else {}),
@@ -353,8 +354,8 @@ def of_period(
     if motion is not None:
         values["gyro bias uncertainty [rad/s]"] = f"{motion.gyro_bias_sigma:.4f}"
         values["gravity [m/s^2]"] = f"{motion.gravity:.2f}"
-    if is_levelled:
-        text = "the clouds come levelled (imu_adjust), so deskewing makes them wrong"
+    if is_leveled:
+        text = "the clouds come leveled (imu_adjust), so deskewing makes them wrong"
         return Check("deskew", Level.ERROR, text, values)
     if not sweeps:
         return Check("deskew", Level.WARN, "no clouds", values)

@@ -23,7 +23,7 @@ class ImuConfig:
     )
     imu_time_offset_ms: float = setting(
         0.0,
-        "lateness of the stamps of IMU samples; subtracted before they are used, never on a topic",
+        "delay of the stamps of IMU samples; subtracted before use, not from published messages",
         unit="ms",
         lo=-100.0,
         hi=100.0,

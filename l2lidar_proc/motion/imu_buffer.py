@@ -110,7 +110,7 @@ class ImuBuffer:
         self._suspect = None
 
     def between(self, start: HostNs, end: HostNs) -> Samples:
-        """Return a copy of the samples of a span with a neighbour on either side, shape (M,)."""
+        """Return a copy of the samples of a span with a neighbor on either side, shape (M,)."""
         stamps = self.samples["stamp"]
         first = max(int(np.searchsorted(stamps, start, side="right")) - 1, 0)
         last = int(np.searchsorted(stamps, end, side="left")) + 1

@@ -1,4 +1,4 @@
-"""What is corrected in IMU samples: unit and sign, rotation, lateness of stamps, gyro scale.
+"""What is corrected in IMU samples: unit and sign, rotation, delay of stamps, gyro scale.
 
 :class:`ImuConvention` recognizes accelerometers that measure in g, or with the opposite sign.
 :class:`ImuExtrinsics` is what a calibration file and the settings say of an IMU beside its place.

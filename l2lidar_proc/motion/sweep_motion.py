@@ -56,10 +56,10 @@ class SweepTrajectory:
             Place of the IMU in the cloud frame [m], whose axes are the sensor's.
         """
         dt = ((preintegrated.stamps - preintegrated.stamps[preintegrated.anchor]) * 1e-9)[:, None]
-        travelled = (dt * state.velocity + 0.5 * dt * dt * state.gravity) @ state.rotation
+        traveled = (dt * state.velocity + 0.5 * dt * dt * state.gravity) @ state.rotation
         q = preintegrated.rotations_wxyz
         arms = lever - rotations.rotate(q, lever)
-        positions = travelled + preintegrated.positions + arms
+        positions = traveled + preintegrated.positions + arms
         return cls(preintegrated.stamps, q, positions, preintegrated.rates)
 
     @property

@@ -16,7 +16,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift
-from l2lidar_proc.recording.outputs import StampedPoses, levelled_start
+from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
 
 
 class Status(Enum):
@@ -276,7 +276,7 @@ class BaseFrame:
         The first pose that is given decides.
         """
         if self._T_odom_map is None:
-            self._T_odom_map = levelled_start(T_map_lidar @ self.T_lidar_base)
+            self._T_odom_map = leveled_start(T_map_lidar @ self.T_lidar_base)
         return self._T_odom_map
 
     def pose(self, T_map_lidar: F64) -> F64:

@@ -197,7 +197,7 @@ def _thinned(points: F64, size: float) -> F64:
     return np.asarray(voxel_down_sample(points, size))
 
 
-_UNKNOWN = 1.0  # KISS-ICP gives no covariance: a metre and a radian
+_UNKNOWN = 1.0  # KISS-ICP gives no covariance: a meter and a radian
 
 
 class PlainOdometry:

@@ -1,7 +1,7 @@
 """Keeps the map of small surfaces: points binned into cells, a plane fitted to each cell.
 
 A surface averages the range noise of every point that ever fell into its cell, which
-nearest-neighbour methods cannot do. Cells come in several sizes; the finest flat one speaks for a
+nearest-neighbor methods cannot do. Cells come in several sizes; the finest flat one speaks for a
 place. Where none is flat (foliage, rock, trunks, cables) a cell still tells where its points are
 across the directions in which they are few: less sharply, by their scatter.
 """

@@ -59,7 +59,7 @@ def kitti(poses: StampedPoses) -> str:
     )
 
 
-def levelled_start(pose: F64) -> F64:
+def leveled_start(pose: F64) -> F64:
     """Return what takes a first pose (4, 4) to the origin with yaw 0; roll and pitch stay."""
     forward = pose[:3, 0]
     yaw = np.arctan2(forward[1], forward[0])

@@ -334,14 +334,14 @@ class DeskewNode(ManagedNode):
             self._publish(item)
 
     def _publish(self, item: Deskewed) -> None:
-        self._output.publish(self._serialised(item.points, item.stamp))
+        self._output.publish(self._serialized(item.points, item.stamp))
         self._scan.publish(item, self._cloud_frame, self.pipeline.tracker)
         self._last = of_sweep(item.quality, item.waited_ns)
         if self._statistics.get_subscription_count():
             name = self.get_fully_qualified_name().lstrip("/")
             self._statistics.publish(diagnostic_status(self._last, name))
 
-    def _serialised(self, points: NDArray[np.void], stamp: HostNs) -> bytes | PointCloud2:
+    def _serialized(self, points: NDArray[np.void], stamp: HostNs) -> bytes | PointCloud2:
         """Return a cloud to publish; a plain one is put together as bytes, three times as fast."""
         if points.ndim == 2:
             return to_cloud(points, stamp, self._cloud_frame)
@@ -372,7 +372,7 @@ class DeskewNode(ManagedNode):
             tracker.buffer.counts,
             tracker.filter,
             self._inputs.refused,
-            is_levelled=bool(self._imu_adjust.answer),
+            is_leveled=bool(self._imu_adjust.answer),
             untied=self._untied,
         )
         self._before = self.pipeline.counts

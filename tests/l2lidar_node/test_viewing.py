@@ -77,7 +77,7 @@ def odometry(stamp: int, x: float, sigma: tuple[float, float, float]) -> Any:
 
 
 def diagnostics(stamp: int, level: int, message: str, share: str) -> Any:
-    value = T["diagnostic_msgs/msg/KeyValue"]("weakest direction [%]", share)
+    value = T["diagnostic_msgs/msg/KeyValue"]("degeneracy ratio [%]", share)
     status = T["diagnostic_msgs/msg/DiagnosticStatus"](
         level, "odometry_node: odometry", message, "L2", [value]
     )

@@ -316,7 +316,7 @@ def _matching(
 ) -> NDArray[np.bool_]:
     """Return which recorded points have a range: a few may belong to no whole packet.
 
-    The distance from the optical centre tells, since the axes are known.
+    The distance from the optical center tells, since the axes are known.
     """
     expected = ranges[np.isfinite(ranges)]
     matching = np.ones(len(recorded), np.bool_)
@@ -332,7 +332,7 @@ def _matching(
 def sweeps(
     datagrams: Iterable[Datagram], values: Mapping[str, object] | None = None
 ) -> list[Sweep]:
-    """Return the sweeps of 3D packets whose true starts are known: no clock, no levelling."""
+    """Return the sweeps of 3D packets whose true starts are known: no clock, no leveling."""
     framer, assembler = Framer(), SweepAssembler(settings.build(SweepConfig, values or {}))
     made: list[Sweep] = []
     start = EPOCH_NS

@@ -68,7 +68,7 @@ class RangeSensor:
             Moves the sensor's frame.
         k, seed : int
         particles : float
-            Drops or grains that a beam meets per metre, see :func:`returns.particles`.
+            Drops or grains that a beam meets per meter, see :func:`returns.particles`.
         """
         from l2lidar_node.emulator.unit.returns import particle_distances
 

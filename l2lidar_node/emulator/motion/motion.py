@@ -50,7 +50,7 @@ class PoseSpline:
     positions : ndarray, shape (N, 3)
         [m], world frame.
     quaternions_wxyz : ndarray, shape (N, 4)
-        Unit, body to world, neighbours less than half a turn apart; the sign of each does not
+        Unit, body to world, neighbors less than half a turn apart; the sign of each does not
         matter.
     periodic : bool
         The last pose equals the first and the curve goes on smoothly from there.
@@ -117,7 +117,7 @@ class PoseSpline:
 
 
 def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Choose signs so that neighbours lie on the same side."""
+    """Choose signs so that neighbors lie on the same side."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.where(np.r_[0, np.cumsum(flips)] % 2, -1.0, 1.0)
     return quaternions * signs[:, None]
@@ -186,10 +186,10 @@ class Kinematics:
             [m/s^2]; a level sensor at rest measures it on +z.
         """
         arm = np.asarray(lever_arm)
-        felt = _into_body(self.quaternion_wxyz, self.acceleration + np.array([0.0, 0.0, gravity]))
+        force = _into_body(self.quaternion_wxyz, self.acceleration + np.array([0.0, 0.0, gravity]))
         spin = self.angular_velocity
         return (
-            felt + np.cross(self.angular_acceleration, arm) + np.cross(spin, np.cross(spin, arm))
+            force + np.cross(self.angular_acceleration, arm) + np.cross(spin, np.cross(spin, arm))
         )
 
 

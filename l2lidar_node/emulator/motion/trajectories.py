@@ -266,7 +266,7 @@ class Style:
     bob : float
         Vertical amplitude of steps while under way [m].
     tremor : float
-        Amplitude of what a hand or a chassis does all the time [rad]; a tenth of it in metres.
+        Amplitude of what a hand or a chassis does all the time [rad]; a tenth of it in meters.
     glance : float
         Amplitude of slow looking up, down and around [rad].
     pause_s : float
@@ -354,7 +354,7 @@ def tour(
 
 
 def hit(motion: Motion, seconds: float, instants: Sequence[float], seed: int = 0) -> Motion:
-    """Return a motion with blows that push the sensor by a centimetre and turn it by 4 degrees.
+    """Return a motion with blows that push the sensor by a centimeter and turn it by 4 degrees.
 
     A blow lasts 120 ms; at its height the sensor accelerates by some 30 m/s^2.
 

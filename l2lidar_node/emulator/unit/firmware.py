@@ -283,7 +283,7 @@ class PowerState(Enum):
     SPINNING_UP = (
         "spinning up"  # sends IMU packets or waits for a start, no point packet produced yet
     )
-    INITIALISED = "initialised"  # has produced a point packet since it booted
+    INITIALIZED = "initialized"  # has produced a point packet since it booted
 
 
 class Power:
@@ -304,7 +304,7 @@ class Power:
         config = self._config
         self._link_ns = now_ns + self._ns(config.link_s)
         self._awake_ns = now_ns + self._ns(config.imu_s)
-        self._initialised_ns: int | None = None
+        self._initialized_ns: int | None = None
         self.imu_from_ns: int | None = None if waits else self._awake_ns
         self.points_from_ns: int | None = None if waits else now_ns + self._ns(config.points_s)
 
@@ -333,15 +333,15 @@ class Power:
             return PowerState.DEAF
         if now_ns < self._awake_ns:
             return PowerState.BOOTING
-        return PowerState.SPINNING_UP if self._initialised_ns is None else PowerState.INITIALISED
+        return PowerState.SPINNING_UP if self._initialized_ns is None else PowerState.INITIALIZED
 
     def _note(self, now_ns: int) -> None:
         if (
-            self._initialised_ns is None
+            self._initialized_ns is None
             and self.points_from_ns is not None
             and now_ns >= self.points_from_ns
         ):
-            self._initialised_ns = self.points_from_ns
+            self._initialized_ns = self.points_from_ns
 
     def _ns(self, seconds: float) -> int:
         return round(seconds * self._config.boot_scale * 1e9)

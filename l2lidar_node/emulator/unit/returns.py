@@ -35,7 +35,7 @@ _SLOT_DRAWS = 6
 
 # rain and dust: a beam that meets a particle comes back from it as from a dark surface, and only
 # from nearby (Goodin et al. 2019, "Predicting the influence of rain on lidar": most false returns
-# come from the first ten metres)
+# come from the first ten meters)
 _PARTICLE_REFLECTIVITY: Final = 0.3
 _PARTICLE_FARTHEST_M: Final = 12.0
 
@@ -53,7 +53,7 @@ class RangeNoise:
     head_wobble: float = setting(1.0, "factor on the measured wobble of the head", lo=0.0, hi=20.0)
     particles: float = setting(
         0.0,
-        "drops or grains of dust that a beam meets per metre; heavy rain 0.02, dense dust 0.2",
+        "drops or grains of dust that a beam meets per meter; heavy rain 0.02, dense dust 0.2",
         unit="1/m",
         lo=0.0,
         hi=10.0,
@@ -82,7 +82,7 @@ def particle_distances(
     uniform : ndarray, any shape
         Random numbers, 0 to 1.
     particles : float
-        Particles that a beam meets per metre, on average.
+        Particles that a beam meets per meter, on average.
     """
     free = -np.log1p(-np.asarray(uniform, np.float64)) / particles
     return np.where(free < _PARTICLE_FARTHEST_M, free, np.inf)

@@ -208,7 +208,7 @@ RAY: Final = np.dtype(
         (
             "distance",
             "<f8",
-        ),  # [m] noise-free distance of the beam's centre ray, inf = nothing there
+        ),  # [m] noise-free distance of the beam's center ray, inf = nothing there
         ("measured", "<f8"),  # [m] what the packet's raw count decodes to, 0 = no return
     ]
 )

@@ -46,11 +46,11 @@ class UnitErrors:
         What the range of black is long by, and that of white short [m].
     head_wave : float
         Amplitude of the once-per-turn error of the reported head angle [rad].
-    whirl : tuple of float
+    precession : tuple of float
         Tilt of the housing in step with the head, in the head frame about e_A and e_B [rad].
-    whirl_back : tuple of float
+    precession_back : tuple of float
         Tilt that turns against the head, where the head's angle is 0 about x and y [rad].
-    whirl_pivot : float
+    precession_pivot : float
         How far below the mounting face the housing is tilted [m].
     imu_rotation : tuple of float
         Rotation vector of the IMU in the cloud frame [rad].
@@ -77,9 +77,9 @@ class UnitErrors:
     incidence: float = 0.0
     intensity: float = 0.0
     head_wave: float = 0.0
-    whirl: tuple[float, float] = (0.0, 0.0)
-    whirl_back: tuple[float, float] = (0.0, 0.0)
-    whirl_pivot: float = 0.0
+    precession: tuple[float, float] = (0.0, 0.0)
+    precession_back: tuple[float, float] = (0.0, 0.0)
+    precession_pivot: float = 0.0
     imu_rotation: Vector = (0.0, 0.0, 0.0)
     imu_position: Vector = (0.0, 0.0, 0.0)
     imu_time_offset: float = 0.0
@@ -95,7 +95,7 @@ class UnitErrors:
     @property
     def rocks(self) -> bool:
         """Whether the mount moves with the head."""
-        return any((*self.whirl, *self.whirl_back))
+        return any((*self.precession, *self.precession_back))
 
     def powered_up(self, seed: int, number: int) -> UnitErrors:
         """Return the errors after a power-up: the phase of mirror and laser is drawn anew."""
@@ -175,8 +175,8 @@ def drawn(seed: int, size: float = 1.0) -> UnitErrors:
         incidence=abs(scalar(0.003)),
         intensity=scalar(0.003),
         head_wave=scalar(0.05 * _DEG),
-        whirl=(scalar(0.03 * _DEG), scalar(0.03 * _DEG)),
-        whirl_back=(scalar(0.02 * _DEG), scalar(0.02 * _DEG)),
+        precession=(scalar(0.03 * _DEG), scalar(0.03 * _DEG)),
+        precession_back=(scalar(0.02 * _DEG), scalar(0.02 * _DEG)),
         imu_rotation=vector(0.4 * _DEG),
         imu_position=vector(0.002),
         imu_time_offset=scalar(0.002),
@@ -198,8 +198,8 @@ TYPICAL: Final = UnitErrors(
     incidence=0.002,
     intensity=0.002,
     head_wave=0.03 * _DEG,
-    whirl=(0.03 * _DEG, -0.02 * _DEG),
-    whirl_back=(0.015 * _DEG, 0.01 * _DEG),
+    precession=(0.03 * _DEG, -0.02 * _DEG),
+    precession_back=(0.015 * _DEG, 0.01 * _DEG),
     imu_rotation=(0.3 * _DEG, -0.4 * _DEG, 0.5 * _DEG),
     imu_position=(0.001, -0.001, 0.002),
     imu_time_offset=0.0015,
@@ -292,15 +292,19 @@ class RockingMotion(Motion):
     def _tilt(self, t: F64, order: int) -> F64:
         """Return a derivative of the tilt's rotation vector in the cloud frame, shape (N, 3)."""
         angle = self._start + self._rate * t
-        forward = complex(*self._errors.whirl) * (1j * self._rate) ** order * np.exp(1j * angle)
+        forward = (
+            complex(*self._errors.precession) * (1j * self._rate) ** order * np.exp(1j * angle)
+        )
         backward = (
-            complex(*self._errors.whirl_back) * (-1j * self._rate) ** order * np.exp(-1j * angle)
+            complex(*self._errors.precession_back)
+            * (-1j * self._rate) ** order
+            * np.exp(-1j * angle)
         )
         both = forward + backward
         return np.stack((both.real, both.imag, np.zeros(len(t))), axis=-1)
 
     def _shift(self, quaternion: F64, tilt: F64) -> F64:
-        arm = np.array([0.0, 0.0, self._errors.whirl_pivot])
+        arm = np.array([0.0, 0.0, self._errors.precession_pivot])
         return np.asarray(
             np.einsum("nij,nj->ni", rotations.matrices(quaternion), np.cross(tilt, arm))
         )

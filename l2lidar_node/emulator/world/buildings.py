@@ -40,7 +40,7 @@ def pierced(
     reflectivity: float,
     gaps: tuple[Gap, ...] = (),
 ) -> None:
-    """Add a wall of some thickness along x or y, centred on its line, with holes through it.
+    """Add a wall of some thickness along x or y, centered on its line, with holes through it.
 
     Parameters
     ----------

@@ -36,11 +36,11 @@ def box(
         ]
     )
     if yaw:
-        centre = corners.mean(axis=0)
+        center = corners.mean(axis=0)
         c, s = np.cos(yaw), np.sin(yaw)
-        corners = (corners - centre) @ np.array(
+        corners = (corners - center) @ np.array(
             [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
-        ) + centre
+        ) + center
     return np.concatenate([quad(*corners[list(face)]) for face in _CUBE_FACES])
 
 
@@ -81,7 +81,7 @@ def cone(
 
 
 def ellipsoid(
-    centre: tuple[float, float, float],
+    center: tuple[float, float, float],
     radii: tuple[float, float, float],
     roughness: float = 0.0,
     sides: int = 14,
@@ -90,11 +90,11 @@ def ellipsoid(
     longitude = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     latitude = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
     lon, lat = np.meshgrid(longitude, latitude, indexing="ij")
-    ripple = 1.0 + roughness * np.sin(3.0 * lon + centre[0]) * np.cos(lat) * np.sin(
-        4.0 * lat + centre[1]
+    ripple = 1.0 + roughness * np.sin(3.0 * lon + center[0]) * np.cos(lat) * np.sin(
+        4.0 * lat + center[1]
     )
     unit = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
-    return grid(unit * ripple[..., None] * np.asarray(radii) + np.asarray(centre))
+    return grid(unit * ripple[..., None] * np.asarray(radii) + np.asarray(center))
 
 
 def placed(triangles: Triangles, position: tuple[float, float, float], yaw: float) -> Triangles:

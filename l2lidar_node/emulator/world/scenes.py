@@ -405,7 +405,7 @@ def _path(rng: np.random.Generator) -> NDArray[np.float64]:
 def _places(
     rng: np.random.Generator, route: NDArray[np.float64], count: int, free: float
 ) -> list[tuple[float, float]]:
-    """Return places at least ``free`` metres from a closed way."""
+    """Return places at least ``free`` meters from a closed way."""
     start, end = route, np.roll(route, -1, axis=0)
     way = np.concatenate([a + (b - a) * np.linspace(0.0, 1.0, 20)[:, None]
                           for a, b in zip(start, end, strict=True)])  # fmt: skip

@@ -85,7 +85,7 @@ class World:
     def load(cls, path: str | Path, *, threads: int = 1) -> World:
         """Return the world of a mesh file in any format open3d reads (PLY, STL, OBJ, OFF, glTF).
 
-        Vertex colours, where present, become reflectivity (mean of the channels, at least 0.05).
+        Vertex colors, where present, become reflectivity (mean of the channels, at least 0.05).
 
         Raises
         ------
@@ -197,10 +197,10 @@ def _read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | f
         )
     if indices.min() < 0 or indices.max() >= len(vertices):
         raise ValueError(f"{path}: a face refers to a missing vertex")
-    colours = np.asarray(mesh.vertex_colors)
-    if len(colours) != len(vertices):
+    colors = np.asarray(mesh.vertex_colors)
+    if len(colors) != len(vertices):
         return vertices[indices], DEFAULT_REFLECTIVITY
-    return vertices[indices], np.maximum(colours[indices].mean(axis=(1, 2)), 0.05)
+    return vertices[indices], np.maximum(colors[indices].mean(axis=(1, 2)), 0.05)
 
 
 Poses = Callable[[F64], tuple[F64, F64]]
@@ -342,10 +342,10 @@ def _passes(
     """Return which rays pass the sphere around a body, whose way is taken as straight pieces."""
     knots = mover.poses(span)[0]
     if span[-1] > span[0]:
-        centre = np.stack([np.interp(when, span, knots[:, axis]) for axis in range(3)], axis=1)
+        center = np.stack([np.interp(when, span, knots[:, axis]) for axis in range(3)], axis=1)
     else:
-        centre = np.repeat(knots[:1], len(when), axis=0)
-    to = centre - origins
+        center = np.repeat(knots[:1], len(when), axis=0)
+    to = center - origins
     along = np.maximum(np.einsum("ni,ni->n", to, directions), 0.0)
     missed = np.linalg.norm(to - along[:, None] * directions, axis=1)
     # straight pieces: a body turning back within 1/16 of a batch is still inside this margin
@@ -416,12 +416,12 @@ def crowd(
 def _crossing(way: F64, t: F64, rng: np.random.Generator) -> F64:
     """Return the places of someone who walks across the sensor's way, there and back."""
     speed, half = rng.uniform(0.8, 1.5), 12.0
-    travelled = np.abs(np.mod(rng.uniform(0.0, 4 * half) + speed * t, 4 * half) - 2 * half) - half
+    traveled = np.abs(np.mod(rng.uniform(0.0, 4 * half) + speed * t, 4 * half) - 2 * half) - half
     side = rng.uniform(-3.0, 3.0) + np.sin(rng.uniform(0.05, 0.2) * t)
     angle = rng.uniform(0.0, 2.0 * np.pi)
     ahead = np.array([np.cos(angle), np.sin(angle)])
     left = np.array([-ahead[1], ahead[0]])
-    return np.asarray(way + travelled[:, None] * ahead + side[:, None] * left)
+    return np.asarray(way + traveled[:, None] * ahead + side[:, None] * left)
 
 
 def _apart(place: F64, sensor: F64) -> F64:

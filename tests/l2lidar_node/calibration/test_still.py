@@ -20,7 +20,7 @@ from l2lidar_node.emulator.unit.units import UNITS, UnitErrors
 DEG = np.pi / 180
 ERRORS = UnitErrors(
     xi=0.4 * DEG, beta=-0.3 * DEG, alpha=0.3 * DEG, range_bias=0.05,
-    whirl=(0.1 * DEG, -0.05 * DEG), whirl_back=(0.06 * DEG, 0.02 * DEG),
+    precession=(0.1 * DEG, -0.05 * DEG), precession_back=(0.06 * DEG, 0.02 * DEG),
 )  # fmt: skip
 POSES = ("upright", "tilted", "on its side")
 
@@ -66,10 +66,14 @@ def test_the_halves_come_together(recovered: Any) -> None:
 
 def test_rocking_of_the_mount_is_taken_out(recovered: Any) -> None:
     for report in recovered.places:
-        assert report.whirl.tilt_a == pytest.approx(ERRORS.whirl[0], abs=0.02 * DEG)
-        assert report.whirl.tilt_b == pytest.approx(ERRORS.whirl[1], abs=0.02 * DEG)
-        assert report.whirl.rock_cos == pytest.approx(ERRORS.whirl_back[0], abs=0.02 * DEG)
-        assert report.whirl.rock_sin == pytest.approx(ERRORS.whirl_back[1], abs=0.02 * DEG)
+        assert report.precession.tilt_a == pytest.approx(ERRORS.precession[0], abs=0.02 * DEG)
+        assert report.precession.tilt_b == pytest.approx(ERRORS.precession[1], abs=0.02 * DEG)
+        assert report.precession.rock_cos == pytest.approx(
+            ERRORS.precession_back[0], abs=0.02 * DEG
+        )
+        assert report.precession.rock_sin == pytest.approx(
+            ERRORS.precession_back[1], abs=0.02 * DEG
+        )
     assert sum("taken out" in note for note in recovered.notes) == len(POSES)
 
 
@@ -114,7 +118,7 @@ def test_a_sensor_that_turned_is_refused() -> None:
 
 
 def test_a_strong_rocking_is_refused() -> None:
-    strong = replace(ERRORS, whirl=(0.6 * DEG, 0.0))
+    strong = replace(ERRORS, precession=(0.6 * DEG, 0.0))
     result = calibrate(thinned(places(strong, poses=("tilted",))))
     assert any("rocks" in item.reason for item in result.refusals)
 
@@ -123,7 +127,7 @@ def test_without_an_imu_the_result_is_for_this_mount() -> None:
     made = [replace(place, gyro=np.empty(0, GYRO)) for place in thinned(places(poses=("tilted",)))]
     result = calibrate(made)
     assert any("this mount only" in note for note in result.notes)
-    assert result.places[0].whirl is None
+    assert result.places[0].precession is None
 
 
 def test_alpha_that_differs_between_power_ups_is_shown_not_stored() -> None:

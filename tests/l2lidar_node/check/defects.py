@@ -232,7 +232,7 @@ def levelled(made: Recording) -> None:
 
 @defect("lio_sam", ERROR, "cloud.levelled")
 def says_that_it_levels(made: Recording) -> None:
-    made.is_levelled = True
+    made.is_leveled = True
 
 
 # Times

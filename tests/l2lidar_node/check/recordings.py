@@ -43,7 +43,7 @@ class Recording:
     )
     reliability: str = "best_effort"
     imu_reliability: str = ""
-    is_levelled: bool | None = None
+    is_leveled: bool | None = None
     depth: int = 0
 
     def points(self, change: Callable[[np.ndarray], np.ndarray | None]) -> None:
@@ -65,7 +65,7 @@ class Recording:
         return gathering.observation(
             (Qos(self.reliability, self.depth),),
             (Qos(self.imu_reliability or self.reliability, self.depth),),
-            self.is_levelled,
+            self.is_leveled,
         )
 
     def write(self, path: Path, storage: StoragePlugin = StoragePlugin.MCAP) -> Path:

@@ -92,10 +92,10 @@ def test_without_time_only_the_time_is_missing(name: Any, points: Any) -> None:
 
 
 def test_ranges_are_in_the_consumers_unit(points: Any) -> None:
-    millimetres = LAYOUTS["ouster_legacy"].convert(points, START)["range"]
-    np.testing.assert_allclose(millimetres / 1e3, points["range"], atol=5.1e-4)
-    metres = LAYOUTS["autoware"].convert(points, START)["distance"]
-    np.testing.assert_array_equal(metres, points["range"])
+    millimeters = LAYOUTS["ouster_legacy"].convert(points, START)["range"]
+    np.testing.assert_allclose(millimeters / 1e3, points["range"], atol=5.1e-4)
+    meters = LAYOUTS["autoware"].convert(points, START)["distance"]
+    np.testing.assert_array_equal(meters, points["range"])
 
 
 def test_angles_of_autoware_lead_back_to_the_point(points: Any) -> None:

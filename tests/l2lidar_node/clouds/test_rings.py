@@ -52,7 +52,7 @@ def test_an_arc_climbs_all_rings_and_descends() -> None:
     payload = build.points_3d(ranges=5000, calibration=calibration)
     points = Projector(PacketType.POINTS_3D).points([payload], np.zeros(1)).points
     numbers = rings(points).astype(int)
-    # Slots sit on the rings' edges here, so a few fall into a neighbour.
+    # Slots sit on the rings' edges here, so a few fall into a neighbor.
     assert len(set(numbers)) > 0.9 * RINGS
     assert (np.diff(numbers[:150]) >= 0).all()
     assert (np.diff(numbers[151:]) <= 0).all()

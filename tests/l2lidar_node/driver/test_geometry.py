@@ -1,4 +1,4 @@
-"""The vectorised projection against the model written out slot by slot."""
+"""The vectorized projection against the model written out slot by slot."""
 
 from __future__ import annotations
 

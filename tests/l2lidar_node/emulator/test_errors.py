@@ -72,7 +72,9 @@ def test_the_range_finder_is_not_linear_when_near() -> None:
 @pytest.mark.parametrize("motion", ["still", "walk"])
 def test_the_gyro_feels_the_mount_rock(motion: str) -> None:
     errors = UnitErrors(
-        whirl=(0.3 * DEG, -0.1 * DEG), whirl_back=(0.05 * DEG, 0.1 * DEG), whirl_pivot=0.2
+        precession=(0.3 * DEG, -0.1 * DEG),
+        precession_back=(0.05 * DEG, 0.1 * DEG),
+        precession_pivot=0.2,
     )
     made = physics(errors, motion)
     t = np.linspace(4.0, 5.0, 101)

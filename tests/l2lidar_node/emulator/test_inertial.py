@@ -59,7 +59,7 @@ def test_clean_samples_integrate_to_the_true_pose(motion: str, mount: str) -> No
     force = samples["linear_acceleration"].astype(float)
     turned, velocity, place_now = truth[0], np.zeros(3), place[0].copy()
     for k in range(count - 1):
-        # the mean of neighbours, and the second-order coning term
+        # the mean of neighbors, and the second-order coning term
         step = dt * (rate[k] + rate[k + 1]) / 2 + dt**2 / 12 * np.cross(rate[k], rate[k + 1])
         after = turned * Rotation.from_rotvec(step)
         felt = (turned.apply(force[k]) + after.apply(force[k + 1])) / 2

@@ -19,7 +19,7 @@ CONSUMERS = ("lio_sam", "fast_lio", "nav2")
 
 @pytest.fixture(scope="module")
 def rig() -> Iterator[Rig]:
-    """A driver that streams as LIO-SAM wants it, but for the levelling."""
+    """A driver that streams as LIO-SAM wants it, but for the leveling."""
     with open_rig() as rig:
         rig.driver(point_layout="velodyne", ring_count=75, sweep_cut="turn", imu_adjust=True)
         rig.emulator("--boot-scale", "0.02")

@@ -41,11 +41,11 @@ def test_a_sweep(flags: Any, level: Any) -> None:
 
 
 def period(
-    before: int, after: int, last: Any, *, is_levelled: bool = False, untied: str = ""
+    before: int, after: int, last: Any, *, is_leveled: bool = False, untied: str = ""
 ) -> Check:
     return pipeline.of_period(
         PipelineCounts(sweeps=before), PipelineCounts(sweeps=after), last, ImuCounts(), None,
-        {"no time field": 3}, is_levelled=is_levelled, untied=untied,
+        {"no time field": 3}, is_leveled=is_leveled, untied=untied,
     )  # fmt: skip
 
 
@@ -71,6 +71,6 @@ def test_a_velocity_that_cannot_be_used_is_told_unless_worse_is() -> None:
 
 
 def test_levelled_clouds_are_an_error_whatever_else() -> None:
-    told = period(3, 8, pipeline.of_sweep(quality(), 0), is_levelled=True)
+    told = period(3, 8, pipeline.of_sweep(quality(), 0), is_leveled=True)
     assert told.level == Level.ERROR
     assert "imu_adjust" in told.message

@@ -6,7 +6,7 @@ import numpy as np
 
 from l2lidar_node import rotations
 from l2lidar_node.types import HostNs
-from l2lidar_proc.recording.outputs import Trajectory, kitti, levelled_start, tum
+from l2lidar_proc.recording.outputs import Trajectory, kitti, leveled_start, tum
 
 
 def test_trajectory_files_keep_nanoseconds() -> None:
@@ -31,7 +31,7 @@ def test_the_start_keeps_roll_and_pitch_only() -> None:
         rotations.multiply(rotations.exp((0.0, 0.0, 1.0)), rotations.exp((0.1, 0.0, 0.0)))
     )
     pose[:3, 3] = [3.0, 2.0, 1.0]
-    begun = levelled_start(pose) @ pose
+    begun = leveled_start(pose) @ pose
     np.testing.assert_allclose(begun[:3, 3], 0.0, atol=1e-12)
     np.testing.assert_allclose(
         begun[:3, :3], rotations.matrices(rotations.exp((0.1, 0.0, 0.0))), atol=1e-12
