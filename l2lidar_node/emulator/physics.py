@@ -209,11 +209,13 @@ class RayCastWorker:
 
     def _end(self, grace_s: float = 0.0) -> None:
         workers = [*(self._pool._processes or {}).values()]  # nobody else tells which they are
+        manager: Any = self._pool._executor_manager_thread  # forgotten by not waiting for it
         self._pool.shutdown(wait=False, cancel_futures=True)
         if len(wait([worker.sentinel for worker in workers], grace_s)) < len(workers):
             for worker in workers:
                 worker.kill()
-        self._pool.shutdown()
+        if manager is not None:
+            manager.join()  # else it closes what the interpreter writes to at its end
 
     def points(self, mode: WorkMode) -> WorkerScanner:
         """Return the source of point packets in a work mode (field of view, 2D or 3D)."""
