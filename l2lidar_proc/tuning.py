@@ -250,6 +250,7 @@ STILL_TESTED: Final = 12  # of these up to so many of the latest with all before
 STILL_DRIFT: Final = 160.0  # squared Mahalanobis distance of a drift (6) that is not chance
 STILL_DRIFT_S: Final = 0.5  # [s] how quickly a drift may have come about
 STILL_IMU_NS: Final = 250_000_000  # [ns] in which the IMU shows that rest has ended
+STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have begun to end
 RETRY_NS: Final = 4_000_000_000  # [ns] until then a rest that was none is begun again, as motion,
 RETRY_FARTHEST_M: Final = 0.5  # [m] if that went no farther
 

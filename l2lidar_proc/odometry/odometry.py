@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from enum import Enum
 
 import numpy as np
@@ -81,6 +82,7 @@ class Odometry:
         self.phase = Phase.INITIALIZING
         self.motion: SweepMotion | None = None
         self._belief: tuple[InertialState, F64] | None = None  # state and covariance to go on from
+        self._at_rest: deque[tuple[InertialState, F64]] = deque()  # the same in the latest rest
         self.matcher = SweepMatcher(self.config, self._lever)
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()
@@ -256,9 +258,10 @@ class Odometry:
         if self._stays_at_rest(sweep):
             rested = self._predictor.static_update(state, covariance, predicted.state.stamp)
             motion = predicted.at_rest(*rested)
+            self._keep_at_rest(motion)
         else:
             motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
-        self._keep(motion)
+            self._keep(motion)
         quality = self._consistency(self.matcher.quality(len(sweep.points), None))
         return self._estimate(sweep, motion, status, quality)
 
@@ -378,7 +381,7 @@ class Odometry:
             self._first_sweeps = []
             still = self._return(back, still)
             status.append(Status.RETURNED)
-        self._keep(still)
+        self._keep_at_rest(still)
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
@@ -391,6 +394,9 @@ class Odometry:
             return False
         samples = self._predictor.samples(sweep.end - tuning.STILL_IMU_NS, sweep.end)
         if not self._zero_velocity.holds(samples):
+            if self._at_rest:
+                # the onset of the motion is in samples that passed for rest
+                self._belief = self._at_rest[0]
             self._leave_rest()
             return False
         if self._first_sweeps:
@@ -399,6 +405,7 @@ class Odometry:
 
     def _leave_rest(self) -> None:
         self._first_sweeps = []
+        self._at_rest.clear()
         self.phase = Phase.TRACKING
 
     def _retry_in_motion(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
@@ -433,6 +440,14 @@ class Odometry:
         self._predictor.steady_rate = motion.rate
         self._belief = belief
         self.motion = motion
+
+    def _keep_at_rest(self, motion: SweepMotion) -> None:
+        """Remember a motion at rest, and those before it that motion cannot have begun in."""
+        self._keep(motion)
+        recent = self._at_rest
+        recent.append((motion.state, motion.covariance))
+        while len(recent) > 1 and motion.state.stamp - recent[1][0].stamp >= tuning.STILL_ONSET_NS:
+            recent.popleft()
 
     def _begin_time_line(self, reference: HostNs) -> None:
         """Keep pose and map after a jump of time; the motion is unknown."""

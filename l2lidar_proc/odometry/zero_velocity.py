@@ -27,7 +27,7 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.static import StaticReference, static_reference
-from l2lidar_proc.odometry.alignment import Alignment, degeneracy_ratio
+from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 
 
 class ZeroVelocityTest:
@@ -123,10 +123,13 @@ class ZeroVelocityTest:
         """
         assert self.anchor is not None
         deviation = found.state.boxminus(self.anchor)[POSE]
-        if degeneracy_ratio(found.claimed) < tuning.DEGENERATE_SHARE:
-            # along a bare corridor rest looks like motion
-            self.clear()
-            return False
+        free = unobserved_directions(found.claimed)
+        if free.size:
+            # along a bare corridor rest looks like motion: there it is up to the IMU
+            if self._reference is None:
+                self.clear()
+                return False
+            deviation[3:] -= free @ (free.T @ deviation[3:])
         if (np.abs(deviation) > _both(*tuning.STILL_FAR)).any():
             self._drift = deviation
             self._doubt()

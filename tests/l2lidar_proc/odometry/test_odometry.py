@@ -261,6 +261,17 @@ def test_corridor_tells_its_weak_direction() -> None:
     axis = rotations.matrices(q)[1].T @ [1.0, 0.0, 0.0]
     assert along @ np.abs(axis) > 0.8
     assert any(Status.DEGENERATE in one.status for one in estimates)
+    # it begins with 2 s of rest, which the IMU vouches for along the corridor; what it measured
+    # before the motion was noticed is not lost
+    stamps = np.array([one.stamp for one in estimates])
+    places = np.array([one.T_map_lidar[:3, 3] for one in estimates])
+    true, _ = truth(run, stamps)
+    way, true_way = (np.linalg.norm(some - some[0], axis=1) for some in (places, true))
+    since = (stamps - run.imu["stamp"][0]) * 1e-9
+    assert way[since < 1.9].max() < 1e-9
+    walked = (since > 3.2) & (since < 3.8)
+    assert true_way[walked].min() > 0.3
+    assert np.abs(way - true_way)[walked].max() < 0.004
 
 
 def test_no_estimate_is_faster_than_its_carrier_and_it_says_so() -> None:

@@ -225,12 +225,25 @@ def test_a_far_deviation_ends_rest_at_once_and_widens_what_is_known() -> None:
     np.testing.assert_array_equal(tested.widened(before), before)
 
 
-def test_where_the_scene_fixes_no_place_rest_is_not_claimed() -> None:
-    tested = anchored()
+def test_along_a_direction_that_nothing_fixes_rest_is_up_to_the_imu() -> None:
     share = 0.9 * tuning.DEGENERATE_SHARE
-    assert not tested.stays(found_at(0.23, np.zeros(6), (share, 0.5, 0.5 - share)))
+    corridor = (share, 0.5, 0.5 - share)
+    tested = anchored()
+    assert not tested.stays(found_at(0.23, np.zeros(6), corridor))
     assert tested.anchor is None
     assert not tested.drifted
+    quiet = resting(1.0, 0.01)
+    state = dataclasses.replace(ORIGIN, gyro_bias=quiet["angular_velocity"].mean(axis=0))
+    for axis, stands in ((3, True), (4, False)):  # along the corridor, across it
+        drifts = np.zeros((60, 6))
+        drifts[:, axis] = 0.01 * 0.23 * np.arange(60)
+        tested = ZeroVelocityTest()
+        assert tested.anchored(state, quiet)
+        sweeps = iter(enumerate(drifts, 1))
+        while tested.anchor is not None and (sweep := next(sweeps, None)) is not None:
+            tested.stays(found_at(0.23 * sweep[0], sweep[1], corridor))
+        assert (tested.anchor is not None) == stands
+        assert tested.drifted != stands
 
 
 def test_under_test_nothing_but_the_pose_may_differ() -> None:
