@@ -158,7 +158,7 @@ DRIFT_MOST_FRESH: Final = 0.9  # share of a sweep that counts as new map at most
 UNIT_SHARE: Final = 0.004  # of the distance from the map's origin, each axis
 UNIT_WAY_SHARE: Final = 0.002  # of the way, around and back. Tuned on: as MAP_WAY, 0.19 of 80 m
 UNIT_TURN: Final = 0.005  # [rad] each axis
-UNIT_SHIFT: Final = 0.006  # [m] each axis
+UNIT_SHIFT: Final = 0.005  # [m] each axis
 UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
 # The map bends where it grows, so the vertical where it began is not quite that of its other end.
 # Tuned on: corridors with narrow views, where 0.01 m/s^2 (0.06 degrees) made 1 to 5 m.
