@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from typing import Final
 
-STANDARD_GRAVITY: Final = 9.80665  # [m/s^2] source: CGPM 1901
-
 # ---- IMU samples
 
 IMU_PERIOD_S: Final = 0.004  # [s] derived: 250 Hz; the noise parameters are stated for it

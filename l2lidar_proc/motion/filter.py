@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from l2lidar_node import rotations
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration
@@ -500,7 +500,7 @@ def with_gravity_of_known_size(state: InertialState, covariance: F64) -> tuple[I
     covariance : ndarray, shape (18, 18)
     """
     size = float(np.linalg.norm(state.gravity))
-    excess = size - tuning.STANDARD_GRAVITY
+    excess = size - STANDARD_GRAVITY
     if size == 0.0 or abs(excess) <= tuning.GRAVITY_SIZE_SIGMA:
         return state, covariance
     jacobian = np.zeros((1, ERRORS))

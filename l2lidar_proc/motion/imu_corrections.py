@@ -15,8 +15,7 @@ import numpy as np
 from l2lidar_node import records, rotations
 from l2lidar_node.calibration.file import CalibrationFileError, load
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
-from l2lidar_proc import tuning
+from l2lidar_node.types import F64, IMU_SAMPLE, STANDARD_GRAVITY, HostNs
 from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import unmixing
 from l2lidar_proc.motion.imu_buffer import Samples, earlier
@@ -79,7 +78,7 @@ class ImuConvention:
         if not self.in_g and not self.reversed:
             return samples
         samples = samples.copy()
-        factor = tuning.STANDARD_GRAVITY if self.in_g else 1.0
+        factor = STANDARD_GRAVITY if self.in_g else 1.0
         samples["linear_acceleration"] *= -factor if self.reversed else factor
         return samples
 

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from l2lidar_node import rotations
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
@@ -283,7 +283,7 @@ def initial_state(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Ini
     if trusted:
         rotation = rotations.matrices(rotations.between(force, (0.0, 0.0, 1.0)))
     # at rest the excess of the force over gravity is bias; its direction remains ambiguous
-    g = tuning.STANDARD_GRAVITY
+    g = STANDARD_GRAVITY
     excess = force * (1.0 - g / norm) if trusted and at_rest else np.zeros(3)
     state = InertialState(
         stamp,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from l2lidar_node import rotations
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, GYRO_BIAS, POSITION, ROTATION, VELOCITY
@@ -111,7 +111,7 @@ class TwistFilter:
     def gravity(self) -> float:
         """Size of gravity as this accelerometer reads it [m/s^2]."""
         if self._state is None:
-            return tuning.STANDARD_GRAVITY
+            return STANDARD_GRAVITY
         return float(np.linalg.norm(self._state.rest_force + self._state.accel_bias))
 
     @property

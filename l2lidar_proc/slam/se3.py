@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64
+from l2lidar_proc.motion.filter import skew
 
 TURN: Final = slice(0, 3)
 SHIFT: Final = slice(3, 6)
@@ -74,7 +75,7 @@ def adjoint(transform: F64) -> F64:
     turn, shift = transform[..., :3, :3], transform[..., :3, 3]
     out = np.zeros((*transform.shape[:-2], 6, 6))
     out[..., TURN, TURN] = out[..., SHIFT, SHIFT] = turn
-    out[..., SHIFT, TURN] = _skew(shift) @ turn
+    out[..., SHIFT, TURN] = skew(shift) @ turn
     return out
 
 
@@ -92,11 +93,3 @@ def interpolated(first: F64, second: F64, share: F64) -> F64:
 def magnitude(errors: F64) -> tuple[float, float]:
     """Return the size of an error (6,): angle [rad], distance [m]."""
     return float(np.linalg.norm(errors[TURN])), float(np.linalg.norm(errors[SHIFT]))
-
-
-def _skew(vectors: F64) -> F64:
-    out = np.zeros((*vectors.shape[:-1], 3, 3))
-    x, y, z = (vectors[..., axis] for axis in range(3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
-    return out

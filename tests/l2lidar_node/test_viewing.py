@@ -140,7 +140,7 @@ def test_a_status_is_logged_when_it_changes(shown: Shown) -> None:
         viewer.diagnostics(diagnostics(START + number * STEP, level, text, "12.5"))
     assert len(shown.logged["health"]) == 2
     assert len(shown.logged["status"]) == 3
-    assert values(shown.logged["odometry/weakest_direction"][0]) == [12.5]
+    assert values(shown.logged["odometry/degeneracy_ratio"][0]) == [12.5]
     levels = [values(item)[0] for item in shown.logged["levels/odometry_node__odometry"]]
     assert levels == [0, 0, 1]
 

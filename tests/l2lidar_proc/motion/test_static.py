@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.static import (
     gravity_is_plausible,
@@ -96,6 +96,6 @@ def test_the_first_state_is_level_and_calls_the_excess_over_gravity_bias() -> No
     assert found.gravity_trusted
     force = samples["linear_acceleration"].mean(axis=0)
     np.testing.assert_allclose(found.state.rotation @ force, (0.0, 0.0, 9.9), atol=1e-9)
-    excess = 1.0 - tuning.STANDARD_GRAVITY / 9.9
+    excess = 1.0 - STANDARD_GRAVITY / 9.9
     np.testing.assert_allclose(found.state.accel_bias, excess * force, atol=1e-9)
     np.testing.assert_allclose(found.state.gyro_bias, BIAS, atol=1e-3)
