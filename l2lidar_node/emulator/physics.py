@@ -210,10 +210,12 @@ class RayCastWorker:
     def _end(self, grace_s: float = 0.0) -> None:
         workers = [*(self._pool._processes or {}).values()]  # nobody else tells which they are
         manager: Any = self._pool._executor_manager_thread  # forgotten by not waiting for it
+        results: Any = self._pool._result_queue
         self._pool.shutdown(wait=False, cancel_futures=True)
         if len(wait([worker.sentinel for worker in workers], grace_s)) < len(workers):
             for worker in workers:
                 worker.kill()
+            results._writer.close()  # nobody waits for the rest of a block that was cut off
         if manager is not None:
             manager.join()  # else it closes what the interpreter writes to at its end
 

@@ -8,8 +8,11 @@ import os
 import re
 import signal
 import socket
+import struct
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +24,7 @@ import pytest
 from l2lidar_node.emulator.cli import main
 from l2lidar_node.emulator.config import DeviceConfig
 from l2lidar_node.emulator.motion import tum
-from l2lidar_node.emulator.physics import PhysicsConfig, assemble
+from l2lidar_node.emulator.physics import PhysicsConfig, RayCastWorker, assemble
 from l2lidar_node.emulator.truth import Fault, Results
 from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.protocol import wire
@@ -171,6 +174,28 @@ def test_it_does_not_wait_for_a_measuring_process_that_is_held_up(
     out, err = process.communicate(timeout=LIMIT_S)
     assert err == ""
     assert process.returncode == (0 if is_ready or out else 130)  # it greets once it is ready
+
+
+def half_a_block(path: Path) -> None:
+    """Send the beginning of an answer of 1 MB, from within the measuring process."""
+    answers = sys._getframe(1).f_locals["result_queue"]
+    os.write(answers._writer.fileno(), struct.pack("!i", 1 << 20) + bytes(10))
+    path.touch()
+    signal.pause()
+
+
+@needs_rays
+def test_the_rest_of_a_block_that_was_cut_off_is_not_waited_for(tmp_path: Path) -> None:
+    worker = RayCastWorker(PhysicsConfig(world="box"))
+    worker._pool.submit(half_a_block, tmp_path / "sent")
+    deadline = time.monotonic() + LIMIT_S
+    while not (tmp_path / "sent").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    closing = threading.Thread(target=worker.close, daemon=True)
+    closing.start()
+    closing.join(LIMIT_S)
+    assert not closing.is_alive()
 
 
 @needs_rays
