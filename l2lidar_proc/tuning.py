@@ -120,10 +120,6 @@ DEGENERATE_SHARE: Final = 0.01  # of the points; with fewer a direction is hardl
 # Weak directions. Tuned on: camera in the room, corridor with a view of 80 degrees, rosette lidar
 WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals may prevail
 WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off in the finest cells
-# A wider plane shows how a wall really lies. Tuned on: corridor with a view of 120 degrees, where
-# an imperfect unit doubles walls by 2 to 4 cm, and one of 80 degrees, where doors 5 cm deep count
-WIDE_PLANE: Final = 6.0  # times as wide as thick, at least
-WIDE_MOST: Final = 0.6  # [m] edge of the largest cells asked
 WEAK_AGE: Final = 8  # sweeps since a surface was opened: until then it is a rim of the view
 WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above the noise
 WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller

@@ -8,9 +8,7 @@ pose stays where it was predicted, and velocity, biases and gravity are learned 
 direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
 * only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
-  them for some sweeps: the rim of what has just been seen moves along with the view; and only if
-  the wider plane around them faces it too: where a unit's halves of a turn see a wall some
-  centimeters apart, the small cells between the layers are turned by 20 degrees and more;
+  them for some sweeps: the rim of what has just been seen moves along with the view;
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
@@ -25,7 +23,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
@@ -126,7 +123,7 @@ def align(
         found = correspondences(prior, at, source, surfaces, config, reach)
         if len(found.index) < least:
             break
-        step = _step(prior, covariance, at, found, surfaces, weak, number + 1)
+        step = _step(prior, covariance, at, found, weak, number + 1)
         done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
 
@@ -134,11 +131,11 @@ def align(
                 seen = [(moved, source.some(some)) for moved, some in views]
                 return correspondences_of(seen, prior, surfaces, config, reach)
 
-            weak = weak_directions(at, found, surfaces, match_again)
+            weak = weak_directions(at, found, match_again)
             if weak is None:
                 break
             before = step.state
-            step = _step(prior, covariance, at, found, surfaces, weak, number + 1)
+            step = _step(prior, covariance, at, found, weak, number + 1)
             done = _is_small(step.state.boxminus(before))
             last = number + tuning.WEAK_STEPS
         if done:
@@ -181,15 +178,13 @@ def _step(
     covariance: F64,
     at: InertialState,
     found: Correspondences,
-    surfaces: SurfelMap,
     weak: WeakDirections | None,
     number: int,
 ) -> _Step:
     """Return the posterior of correspondences found from a state."""
     pose = pose_jacobian(found, at.rotation)
     if weak is not None:
-        axes = weak.scale[:, None] * weak.axes
-        pose = weak.reduced(pose, facing_along(pose @ axes, found, at, surfaces, axes))
+        pose = weak.reduced(pose, found.is_settled)
     h = residual_jacobian(pose, found.times, at.rotation)
     weighted = h * found.weights[:, None]
     information = weighted.T @ h
@@ -233,53 +228,23 @@ class WeakDirections:
     axes: F64
     shares: F64
 
-    def reduced(self, pose: F64, facing: NDArray[np.bool_]) -> F64:
+    def reduced(self, pose: F64, is_settled: NDArray[np.bool_]) -> F64:
         """Return derivatives (M, 6) by turn and place, of residuals that claim no more than so.
 
-        ``facing`` (M, K) tells whose surfaces face which direction: no others count.
+        ``is_settled`` (M,) tells whose surfaces are no longer new.
 
         A residual of which the share f is real measures 1/f times as coarsely: information falls
         by f^2 and the gradient by f, so that where it is zero stays.
         """
         scaled = pose * self.scale
         along = scaled @ self.axes
+        facing = (np.abs(along) > tuning.WEAK_FACING) & is_settled[:, None]
         lost = along * np.where(facing, 1.0 - self.shares, 1.0)
         return np.asarray((scaled - lost @ self.axes.T) / self.scale)
 
 
-def facing_along(
-    levers: F64,
-    found: Correspondences,
-    state: InertialState,
-    surfaces: SurfelMap,
-    axes: F64,
-) -> NDArray[np.bool_]:
-    """Return which correspondences (M,) face some directions (K,), shape (M, K).
-
-    Parameters
-    ----------
-    levers : ndarray, shape (M, K)
-        Derivatives of the residuals along the directions.
-    found : Correspondences
-    state : InertialState
-        From which they were found.
-    surfaces : SurfelMap
-    axes : ndarray, shape (6, K)
-        The directions [rad, m].
-    """
-    facing = (np.abs(levers) > tuning.WEAK_FACING) & found.is_settled[:, None]
-    some = np.flatnonzero(facing.any(axis=1))
-    if len(some):
-        points = found.points[some]
-        places = points @ state.rotation.T + state.position
-        normals = surfaces.wide_normals(places, found.normals[some])
-        wide = np.hstack([rotations.cross(points, normals @ state.rotation), normals]) @ axes
-        facing[some] &= np.abs(wide) > tuning.WEAK_FACING
-    return np.asarray(facing)
-
-
 def weak_directions(
-    state: InertialState, found: Correspondences, surfaces: SurfelMap, match_again: MatchAgain
+    state: InertialState, found: Correspondences, match_again: MatchAgain
 ) -> WeakDirections | None:
     """Return the directions that a sweep hardly fixes, None where it fixes all.
 
@@ -288,7 +253,6 @@ def weak_directions(
     state : InertialState
         From which the correspondences were found.
     found : Correspondences
-    surfaces : SurfelMap
     match_again : callable
     """
     pose = pose_jacobian(found, state.rotation)
@@ -301,7 +265,7 @@ def weak_directions(
     if not weak.any():
         return None
     axes = axes[:, weak]
-    trials = [_Trial(state, found, surfaces, scaled @ axis, scale * axis) for axis in axes.T]
+    trials = [_Trial(state, found, scaled @ axis, scale * axis) for axis in axes.T]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
     return WeakDirections(scale, axes, shares)
@@ -314,15 +278,10 @@ class _Trial:
     """
 
     def __init__(
-        self,
-        state: InertialState,
-        found: Correspondences,
-        surfaces: SurfelMap,
-        levers: F64,
-        axis: F64,
+        self, state: InertialState, found: Correspondences, levers: F64, axis: F64
     ) -> None:
-        self._axis, self._surfaces = axis, surfaces
-        facing = np.flatnonzero(self._faces(levers, found, state))
+        self._axis = axis
+        facing = np.flatnonzero((np.abs(levers) > tuning.WEAK_FACING) & found.is_settled)
         self._facing = levers[facing], found.distances[facing], found.scales[facing]
         self._variances = found.variances[facing]
         self._some = np.unique(found.index[facing])
@@ -348,19 +307,13 @@ class _Trial:
             )
             along = pose_jacobian(seen, moved.rotation) @ self._axis
             pulls = seen.weights * along * seen.distances
-            pulls = pulls[self._faces(along, seen, moved)]
+            pulls = pulls[(np.abs(along) > tuning.WEAK_FACING) & seen.is_settled]
             pulled += step * float(pulls.sum())
             noise += step**2 * float((pulls**2).sum())
         if claimed <= 0.0:
             return 0.0
         share = (pulled - tuning.WEAK_SIGMAS * np.sqrt(noise)) / claimed
         return float(np.clip(share, 0.0, 1.0))
-
-    def _faces(
-        self, levers: F64, found: Correspondences, state: InertialState
-    ) -> NDArray[np.bool_]:
-        axis = self._axis[:, None]
-        return facing_along(levers[:, None], found, state, self._surfaces, axis)[:, 0]
 
 
 def degeneracy_ratio(information: F64) -> float:

@@ -330,30 +330,6 @@ class SurfelMap:
             self._kind[row],
         )
 
-    def wide_normals(self, points: F64, normals: F64) -> F64:
-        """Return the normals of wider planes around points, shape (N, 3).
-
-        A wall that the halves of a turn see some centimeters apart makes small cells whose normals
-        are 20 degrees off and more, all the same way, however many points they have. A wide plane
-        is not bent by that. Where there is none, as at a corner or a post, the normal stays. Cells
-        larger than :data:`tuning.WIDE_MOST` do not count: in them a door is part of the wall.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 3)
-            [m], map frame.
-        normals : ndarray, shape (N, 3)
-            Of the surfaces that they were matched with.
-        """
-        wide = normals.copy()
-        most = int(np.searchsorted(self._sizes, tuning.WIDE_MOST, side="right"))
-        for rows in self._rows(points, slice(1, most)) if most > 1 else ():
-            cells = self._cells[rows]
-            spread = cells["spread"]
-            plane = (cells["fitted"] > 0) & (spread[:, 1] > tuning.WIDE_PLANE**2 * spread[:, 0])
-            wide[plane] = cells["axes"][plane, 0]
-        return wide
-
     def _rows(self, points: F64, levels: slice) -> I64:
         """Return the rows of the cells of some levels that points (N, 3) lie in, (L, N)."""
         keys = self._keys(points, levels)
