@@ -52,6 +52,7 @@ TESTS: Final = (
     *(f"tests/l2lidar_proc/odometry/test_{name}.py" for name in (
         "alignment", "estimate", "kiss", "matcher", "prediction", "surfel_map", "zero_velocity",
     )),
+    "tests/benchmarks/test_deskew.py",
     "tests/l2lidar_proc/test_hostile_input.py",
     "tests/l2lidar_node/test_frames.py",
     "tests/l2lidar_node/test_rotations.py",

@@ -56,6 +56,13 @@ def test_the_pure_core_opens_no_files(module: str) -> None:
     assert "\n".join(found) == ""
 
 
+def test_only_tests_of_benchmarks_import_benchmarks() -> None:
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        if "benchmarks" not in path.relative_to(ROOT).parts:
+            found = re.findall(r"^(?:from|import) benchmarks.*", path.read_text(), re.MULTILINE)
+            assert not found, f"{path}: {found[0]}; what tests need stands in tests/support"
+
+
 def test_every_exception_to_a_checker_carries_its_reason() -> None:
     """A reason stands after a second ``#``, or after the codes."""
     marker = re.compile(r"#\s*(?:noqa|type:\s*ignore|pragma)(?P<rest>.*)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from benchmarks import bench_calibration, calibration_units
 from benchmarks.bench_calibration import Case, Kept
 from benchmarks.results import at_most
 from l2lidar_node.calibration.file import CalibrationFile, ImuCalibration, load
+from l2lidar_node.calibration.result import Verdict
+from l2lidar_node.calibration.still import calibrate
 
 
 def row(case: str, seed: int, **values: object) -> dict[str, object]:
@@ -112,3 +115,24 @@ def test_a_calibrated_recording_is_that_of_an_imu_as_drawn(tmp_path: Path) -> No
     x, y = plain.imu["linear_acceleration"][:, 0], plain.imu["linear_acceleration"][:, 1]
     expected = np.cos(0.2) * x - np.sin(0.2) * y
     np.testing.assert_allclose(turned.imu["linear_acceleration"][:, 0], expected, atol=1e-6)
+
+
+@pytest.mark.skipif(
+    not calibration_units.REAL_FOLDER.exists(), reason="the recordings are not here"
+)
+def test_real_captures() -> None:
+    degree = np.pi / 180
+    both = [
+        calibration_units.place(calibration_units.REAL_FOLDER / f"{name}.npy", number)
+        for number, name in enumerate(calibration_units.CAPTURES)
+    ]
+    result = calibrate([replace(place, returns=place.returns[::3]) for place in both])
+    for report in result.places:
+        assert 0.34 < (report.xi - 0.7 * report.beta) / degree < 0.42
+    first, second = result.places
+    assert abs(first.xi - second.xi) < 0.06 * degree
+    assert abs(first.beta - second.beta) < 0.06 * degree
+    assert result.estimates["alpha"].verdict is Verdict.SHOWN
+    assert "not repeatable" in result.estimates["alpha"].reason
+    assert result.estimates["bias"].verdict is Verdict.UNKNOWN
+    assert result.after.thickness < 0.018 < result.before.thickness

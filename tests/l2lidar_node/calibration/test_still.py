@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import calibration_units
 from l2lidar_node.calibration import still
 from l2lidar_node.calibration.observation import GYRO, Gathering, Place, demodulated
 from l2lidar_node.calibration.result import Verdict
@@ -161,26 +160,6 @@ def test_a_place_without_points_is_an_error() -> None:
     gathering.flat()
     with pytest.raises(ValueError, match="set the unit to 3D"):
         gathering.place()
-
-
-@pytest.mark.skipif(
-    not calibration_units.REAL_FOLDER.exists(), reason="the recordings are not here"
-)
-def test_real_captures() -> None:
-    both = [
-        calibration_units.place(calibration_units.REAL_FOLDER / f"{name}.npy", number)
-        for number, name in enumerate(calibration_units.CAPTURES)
-    ]
-    result = calibrate(thinned(both))
-    for report in result.places:
-        assert 0.34 < (report.xi - 0.7 * report.beta) / DEG < 0.42
-    first, second = result.places
-    assert abs(first.xi - second.xi) < 0.06 * DEG
-    assert abs(first.beta - second.beta) < 0.06 * DEG
-    assert result.estimates["alpha"].verdict is Verdict.SHOWN
-    assert "not repeatable" in result.estimates["alpha"].reason
-    assert result.estimates["bias"].verdict is Verdict.UNKNOWN
-    assert result.after.thickness < 0.018 < result.before.thickness
 
 
 def test_a_cloud_that_moved_is_refused_without_an_imu() -> None:
