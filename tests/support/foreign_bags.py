@@ -104,7 +104,7 @@ def ouster(cloud: Cloud, stamp: int) -> Cloud:
 def hesai(cloud: Cloud, stamp: int) -> Cloud:
     """``timestamp`` float64 absolute seconds."""
     made = _xyz(cloud, [("intensity", "<f4"), ("ring", "<u2"), ("timestamp", "<f8")])
-    made["timestamp"] = stamp * 1e-9 + cloud["time"]
+    made["timestamp"] = stamp * 1e-9 + cloud["time"].astype(np.float64)
     return made
 
 

@@ -57,7 +57,7 @@ def test_each_maker_s_time_field(name: str, tmp_path: Path) -> None:
     found = run_bag(tmp_path / "bag", OdometryNodeConfig())
     assert found.refused == {}
     assert len(found.poses) == len(given.clouds)
-    assert off_by(found, given) < 0.025
+    assert off_by(found, given) < 0.015  # 0.025 where the times are not used
 
 
 def test_livox_s_own_messages(tmp_path: Path) -> None:
