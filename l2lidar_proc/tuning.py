@@ -115,7 +115,7 @@ SCATTER_SHARED: Final = 3.0  # points in a cell that is not flat err together. T
 # A smaller step is the last. At 2e-4 it takes a third more steps, and no ATE is better.
 CONVERGED: Final = 5e-4  # [rad, m]
 # Without an IMU it is the velocity that has to settle. Tuned on: bushes, poles
-CONVERGED_MOTION: Final = 5e-3  # [m/s, rad/s]
+CONVERGED_TWIST: Final = 5e-3  # [m/s, rad/s]
 DEGENERATE_SHARE: Final = 0.01  # of the points; with fewer a direction is hardly observed
 # Weak directions. Tuned on: camera in the room, corridor with a view of 80 degrees, rosette lidar
 WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals may prevail

@@ -68,7 +68,7 @@ class Counters:
         Slots measured in all sweeps, with a return or without.
     stray_acks : int
         ACKs that belong to no command that waits for one.
-    is_leveled : int
+    unleveled : int
         Points left out because ``imu_adjust`` had no orientation for them.
     """
 
@@ -89,7 +89,7 @@ class Counters:
     points: int = 0
     slots: int = 0
     stray_acks: int = 0
-    is_leveled: int = 0
+    unleveled: int = 0
 
     def snapshot(self) -> Counters:
         """Return a copy that does not change any more."""
@@ -413,7 +413,7 @@ class Driver:
             self._count_fragments()  # of a turn that a stop or a gap cut short
             return []
         self.counters.sweeps += 1
-        self.counters.is_leveled = self._assembler.is_leveled
+        self.counters.unleveled = self._assembler.unleveled
         self.counters.points += len(sweep.points)
         is_3d = self._config.sweep.frame3d
         slots = wire.POINTS_PER_3D_PACKET if is_3d else wire.POINTS_PER_2D_PACKET

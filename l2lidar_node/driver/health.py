@@ -364,9 +364,9 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
         "empty sweeps": str(new.empty_sweeps),
         "fragments of turns left out": str(new.fragments),
         "packets in fragments": str(new.fragment_packets),
-        "points without orientation": str(new.is_leveled),
+        "points without orientation": str(new.unleveled),
     }
-    if new.is_leveled > old.is_leveled:
+    if new.unleveled > old.unleveled:
         message = "imu_adjust drops points for want of IMU data"
         return Check("points", Level.WARN, message, values)
     if not slots and new.fragments > old.fragments:

@@ -162,7 +162,7 @@ class SweepAssembler:
 
     Attributes
     ----------
-    is_leveled : int
+    unleveled : int
         Points left out because their packet could not be leveled.
     fragments, fragment_packets : int
         Parts of a turn or half turn that were left out, and their packets: the first one after a
@@ -176,7 +176,7 @@ class SweepAssembler:
         blocks: BlockChoice | None = None,
     ) -> None:
         self.blocks = BlockChoice(config) if blocks is None else blocks
-        self.is_leveled = 0
+        self.unleveled = 0
         self.fragments = 0
         self.fragment_packets = 0
         self._begins_at_boundary = False
@@ -309,7 +309,7 @@ class SweepAssembler:
             None if self._level is None else self._level(starts),
             self.blocks.used if self.blocks.is_needed else None,
         )
-        self.is_leveled += batch.left_out
+        self.unleveled += batch.left_out
         batch.points.flags.writeable = False
         last = packets[-1]
         sweep = Sweep(

@@ -31,7 +31,7 @@ GYRO_BIAS: Final = slice(9, 12)
 ACCEL_BIAS: Final = slice(12, 15)
 GRAVITY: Final = slice(15, 18)
 POSE: Final = slice(ROTATION.start, POSITION.stop)
-MOTION: Final = slice(VELOCITY.start, GYRO_BIAS.stop)
+TWIST: Final = slice(VELOCITY.start, GYRO_BIAS.stop)  # an error of the bias is one of the rate
 ERRORS: Final = 18
 
 
@@ -229,8 +229,7 @@ def transition(rotation: F64, turn: F64, force: F64, dt: ArrayLike) -> F64:
     h = np.asarray(dt)[..., None, None]
     lean = -rotation @ skew(force)
     eye = np.eye(3)
-    f = np.zeros((*h.shape[:-2], ERRORS, ERRORS))
-    f[..., range(ERRORS), range(ERRORS)] = 1.0
+    f = np.zeros((*h.shape[:-2], ERRORS, ERRORS)) + np.eye(ERRORS)
     f[..., ROTATION, ROTATION] = np.swapaxes(turn, -1, -2)
     f[..., ROTATION, GYRO_BIAS] = -h * eye
     f[..., VELOCITY, ROTATION] = h * lean

@@ -154,7 +154,7 @@ class MotionTracker:
         samples : ndarray, shape (N,), dtype IMU_SAMPLE
         is_needed : bool
             False where an odometry knows the motion: then the filter follows every five seconds.
-            What it has not followed when the odometry ends it does then.
+            It catches up when the odometry ends.
         """
         jumps = self.buffer.counts.jumps
         self.buffer.push(turned(samples, self._T_cloud_imu[:3, :3]))

@@ -27,9 +27,9 @@ from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ERRORS,
-    MOTION,
     POSE,
     POSITION,
+    TWIST,
     InertialState,
     update_with_information,
 )
@@ -195,9 +195,9 @@ def _step(
 
 
 def _is_small(change: F64) -> bool:
-    """Return whether a step moves neither the pose nor, by its motion, the points any more."""
-    motion = np.abs(change[MOTION]).max()
-    return bool(np.abs(change[POSE]).max() < tuning.CONVERGED and motion < tuning.CONVERGED_MOTION)
+    """Return whether a step hardly changes the pose, nor the twist that deskews the points."""
+    twist = np.abs(change[TWIST]).max()
+    return bool(np.abs(change[POSE]).max() < tuning.CONVERGED and twist < tuning.CONVERGED_TWIST)
 
 
 Views = Sequence[tuple[InertialState, NDArray[np.int64]]]

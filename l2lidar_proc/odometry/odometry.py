@@ -82,7 +82,7 @@ class Odometry:
         self.phase = Phase.INITIALIZING
         self.motion: SweepMotion | None = None
         self._belief: tuple[InertialState, F64] | None = None  # state and covariance to go on from
-        self._at_rest: deque[tuple[InertialState, F64]] = deque()  # the same in the latest rest
+        self._at_rest: deque[tuple[InertialState, F64]] = deque()  # beliefs of late, oldest first
         self.matcher = SweepMatcher(self.config, self._lever)
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()

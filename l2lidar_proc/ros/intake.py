@@ -260,7 +260,7 @@ class SensorIntake:
         """Hand out the IMU samples that have come."""
         self._take()
         taken = [self._taken.popleft() for _ in range(len(self._taken))]
-        # what came in several batches is handed out as one: each costs as much as its samples
+        # listeners work per batch, hardly per sample: join what came in several
         for frame, batches in groupby(taken, key=attrgetter("frame")):
             samples = records.joined([batch.samples for batch in batches])
             for feed in self._feeds:

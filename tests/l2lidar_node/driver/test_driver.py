@@ -251,7 +251,7 @@ def test_gravity_alignment_turns_the_cloud(played: Run, datagrams: list[Datagram
             np.stack([sweep.points[axis] for axis in "xyz"], axis=1) for sweep in (flat, turned)
         )
         np.testing.assert_allclose(after, tilt.apply(before), atol=1e-5)
-    assert run.driver.counters.is_leveled == 0
+    assert run.driver.counters.unleveled == 0
 
 
 def test_gravity_alignment_without_imu_publishes_nothing_and_says_so(
@@ -261,7 +261,7 @@ def test_gravity_alignment_without_imu_publishes_nothing_and_says_so(
     assert run.of(Sweep) == []
     counters = run.driver.counters
     assert counters.empty_sweeps == counters.sweeps > 5
-    assert counters.is_leveled > 10_000 * counters.sweeps
+    assert counters.unleveled > 10_000 * counters.sweeps
 
 
 def test_live_settings(datagrams: list[Datagram]) -> None:

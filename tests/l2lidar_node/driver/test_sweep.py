@@ -383,7 +383,7 @@ def test_gravity_alignment_sees_every_packets_start_and_turns_its_points() -> No
     points = sweeps[0].points
     assert seen == [[START, START + PERIOD, START + 2 * PERIOD]]
     assert len(points) == 600
-    assert assembler.is_leveled == 300
+    assert assembler.unleveled == 300
     for name, sign in (("x", 1), ("y", -1), ("z", -1)):
         np.testing.assert_array_equal(points[name][300:], sign * points[name][:300])
 

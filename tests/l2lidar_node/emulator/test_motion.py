@@ -122,7 +122,7 @@ def test_no_motion_collides_with_a_scene(scene_name: str) -> None:
     for name in trajectories.MOTIONS:
         for seed in (0, 1):
             motion = trajectories.make(name, scene, seed=seed)
-            positions, _ = motion.poses(np.arange(0.0, lap_of(motion), 0.2))
+            positions, _ = motion.poses(np.arange(0.0, lap_of(motion), 0.1))
             assert world.clearance(positions).min() > 0.2, (name, seed)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.stats import chi2
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
+from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState, Noise
 from l2lidar_proc.motion.preintegration import integrate, segment
@@ -70,6 +72,42 @@ def test_the_transition_is_the_derivative_of_the_prediction() -> None:
     found = eskf.transition(state.rotation, turn, gained / dt, dt)
     # first order in the turn within a step: 0.04 s at 1 rad/s
     np.testing.assert_allclose(found, measured, atol=0.05 * dt)
+
+
+def test_the_covariance_is_that_of_one_step_after_the_other() -> None:
+    """With a gap in the samples, so that the noise differs between the steps."""
+    state, p = some_state(), np.diag(np.linspace(0.1, 1.0, eskf.ERRORS)) ** 2
+    samples = Motion(turn=1.0, nod=0.2, speed=1.0).imu(0.0, 0.31)
+    samples = samples[(samples["stamp"] < at(0.1)) | (samples["stamp"] > at(0.19))]
+    imu = segment(samples, [at(0.0), at(0.3)], 50_000_000, np.zeros(3))
+    sums = integrate(
+        imu,
+        0,
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        rest_force=state.rest_force,
+    )
+    noise, knot = Noise(0.005, 0.02, 1e-4, 1e-3), len(imu.stamps) - 1
+    found = eskf.predict(state, p, imu, sums, knot, noise)[1]
+    edges = np.linspace(0, knot, tuning.COVARIANCE_STEPS + 1).astype(int).tolist()
+    shares = []
+    for first, last in pairwise(edges):
+        one, other = state.at(sums, first), state.at(sums, last)
+        dt = (other.stamp - one.stamp) * 1e-9
+        gained = other.velocity - one.velocity - dt * state.gravity
+        f = eskf.transition(
+            one.rotation, one.rotation.T @ other.rotation, one.rotation.T @ gained / dt, dt
+        )
+        spans = np.diff(imu.stamps[first : last + 1])
+        blind = float(spans[imu.missing[first:last]].sum() / spans.sum())
+        held = np.abs(sums.rates[first : last + 1]).max()
+        unmeasured = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
+        gyro2 = (1.0 - blind) * noise.gyro**2 + blind * unmeasured
+        accel2 = (1.0 - blind) * noise.accel**2 + blind * tuning.BLIND_ACCEL**2
+        p = f @ p @ f.T + eskf.process_noise(gyro2, accel2, noise, dt)
+        shares.append(blind)
+    assert min(shares) == 0.0 < max(shares)
+    np.testing.assert_allclose(found, p, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
