@@ -22,7 +22,6 @@ from benchmarks import chain
 from benchmarks.chain import CLOUDS, DESKEWED, ODOMETRY, TopicWatch
 from l2lidar_node.demo.processes import Programs, assigned, free_udp_ports
 from l2lidar_node.protocol import wire
-from l2lidar_node.ros.program import make_room
 from l2lidar_node.types import F64
 from tests.support import odometry_runs
 from tests.support.cpu import process_cpu_s
@@ -158,7 +157,8 @@ def thread_times(pid: int) -> dict[str, float]:
 def start_s(module: str, topic: str, folder: Path) -> tuple[float, float]:
     """Return the time from a node's start until others see its publisher of a topic.
 
-    Others are nodes of this package that are starting as well, which announce themselves often. A
+    Others are nodes of this package that are starting as well, which announce themselves often:
+    the caller has had :func:`~l2lidar_node.ros.program.make_room` before anything of rclpy. A
     program with Fast DDS as it comes does so every 3 s, and until then a newcomer may not know it.
 
     Returns
@@ -167,7 +167,6 @@ def start_s(module: str, topic: str, folder: Path) -> tuple[float, float]:
         Time, and the CPU time that the node has used by then [s]: how long it takes by itself on
         an idle machine.
     """
-    make_room()
     rclpy.init()
     node = rclpy.create_node("start_watch")
     arguments = []
