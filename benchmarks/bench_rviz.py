@@ -33,7 +33,7 @@ from benchmarks.chain import CLOUDS, TopicWatch
 from benchmarks.results import at_least, publish
 from l2lidar_node.demo import report
 from l2lidar_node.demo.processes import Programs, isolate_ros
-from l2lidar_proc.ros.intake import NeverExecuted, waiting
+from l2lidar_proc.ros.subscriptions import NeverExecuted, waiting
 
 LAYOUTS: Final = Path(__file__).resolve().parent.parent / "rviz"
 _CACHE_NS: Final = 10 * 10**9  # what tf2's buffer keeps

@@ -15,7 +15,7 @@ from l2lidar_proc.ros.odometry_node import OdometryNode
 
 
 def make_nodes() -> list[Node]:
-    """Return the odometry and, fed by its intake and motion, the deskew."""
+    """Return the odometry, and the deskew that shares its subscriptions and motion."""
     odometry = OdometryNode()
     try:
         return [odometry, DeskewNode(odometry)]

@@ -40,7 +40,12 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, MotionTracker, carried_over
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, load_libraries, steady_timer
-from l2lidar_proc.ros.intake import IMU_DEPTH, RELIABILITY, OneCloud, SensorIntake
+from l2lidar_proc.ros.subscriptions import (
+    IMU_DEPTH,
+    RELIABILITY,
+    ReceivedCloud,
+    SensorSubscriptions,
+)
 
 if TYPE_CHECKING:
     from l2lidar_proc.ros.odometry_node import OdometryNode  # brings kiss-icp along
@@ -132,14 +137,14 @@ class ScanPublisher:
 
 
 class DeskewNode(ManagedNode):
-    """Publishes every cloud as a sensor at rest would have seen it.
+    """Publishes deskewed and filtered clouds.
 
     Parameters
     ----------
     companion : OdometryNode, optional
-        An odometry in the same process. Where it follows the same clouds and IMU, its intake is
-        shared; where the velocities would be its own, each sweep is deskewed with the motion that
-        it has estimated for that very sweep.
+        An odometry in the same process. If it uses the same clouds and IMU, its subscriptions are
+        shared. If the velocities would come from it as well, each sweep is deskewed with the
+        motion that it has estimated for that sweep.
 
     Raises
     ------
@@ -152,8 +157,8 @@ class DeskewNode(ManagedNode):
         self._pipeline: Pipeline | None = None
         self._settings = ParameterSet(self, DeskewNodeConfig, self._configure)
         topics = self._settings.value.topics
-        shared = companion.intake_of(self, topics) if companion is not None else None
-        self._intake = shared or SensorIntake(
+        shared = companion.shared_subscriptions(self, topics) if companion is not None else None
+        self._sensors = shared or SensorSubscriptions(
             self, topics.cloud_topic, topics.imu_topic, topics.input_reliability
         )
         self._odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
@@ -187,7 +192,7 @@ class DeskewNode(ManagedNode):
     def begin(self) -> None:
         """Listen."""
         topics = self._settings.value.topics
-        self._intake.add(self, self._guarded)
+        self._sensors.add(self, self._guarded)
         guarded, hear = self._guarded, self.create_subscription
         velocities = QoSProfile(depth=IMU_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if topics.velocity_type == "odometry":
@@ -202,19 +207,19 @@ class DeskewNode(ManagedNode):
 
     def pause(self) -> None:
         """Listen no more; publish what still waits, and forget how the sensor moved."""
-        self._intake.remove(self)
+        self._sensors.remove(self)
         for item in self.pipeline.finish(time.monotonic_ns()):
             self._publish(item)
         self.pipeline.reset()
 
     def tear_down(self) -> None:
         """Forget everything."""
-        self._intake.remove(self)
+        self._sensors.remove(self)
         self._pipeline = None
 
     def shared_entities(self) -> list[Any]:
-        """Return those of the intake."""
-        return self._intake.entities
+        """Return those of the subscriptions."""
+        return self._sensors.entities
 
     @property
     def pipeline(self) -> Pipeline:
@@ -253,7 +258,7 @@ class DeskewNode(ManagedNode):
             if T_cloud_imu is not None and self._cloud_frame != imu_frame:
                 self.pipeline.mount(T_cloud_imu)
 
-    def take_cloud(self, item: OneCloud) -> None:
+    def take_cloud(self, item: ReceivedCloud) -> None:
         """Take a cloud; one without usable times is passed on as it came."""
         points, stamp, frame = item.cloud
         if not self._inputs.clouds.takes(frame):

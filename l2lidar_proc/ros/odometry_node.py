@@ -46,7 +46,7 @@ from l2lidar_proc.ros.inputs import (
     load_libraries,
     steady_timer,
 )
-from l2lidar_proc.ros.intake import SLOW_LOOK_S, OneCloud, SensorIntake
+from l2lidar_proc.ros.subscriptions import SLOW_LOOK_S, ReceivedCloud, SensorSubscriptions
 from l2lidar_proc.ros.pose_broadcaster import PoseBroadcaster
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
@@ -67,7 +67,7 @@ class OdometryNode(ManagedNode):
         self._settings = ParameterSet(self, OdometryNodeConfig, self._configure)
         topics = self._settings.value.topics
         period_s = 1.0 / topics.imu_rate if topics.imu_rate > 0.0 else SLOW_LOOK_S
-        self.intake = SensorIntake(
+        self.sensors = SensorSubscriptions(
             self, topics.cloud_topic, topics.imu_topic, "best_effort", period_s
         )
         self.start(self._settings.value.lifecycle.autostart)
@@ -104,7 +104,7 @@ class OdometryNode(ManagedNode):
         # A deskew uses what the odometry finds.
         is_fast = self._settings.value.topics.imu_rate > 0.0
         fast = self._inputs.guarded(self.take_fast, self._poses.reset) if is_fast else None
-        self.intake.add(self, self._guarded, is_first=True, fast=fast)
+        self.sensors.add(self, self._guarded, is_first=True, fast=fast)
         guarded = self._guarded
         steady_timer(self, 1.0, guarded(self._diagnose))
         map_period_s = self._settings.value.topics.map_period_s
@@ -122,16 +122,16 @@ class OdometryNode(ManagedNode):
 
     def pause(self) -> None:
         """Listen no more."""
-        self.intake.remove(self)
+        self.sensors.remove(self)
 
     def tear_down(self) -> None:
         """Forget map and path."""
-        self.intake.remove(self)
+        self.sensors.remove(self)
         self._pipeline = None
 
     def shared_entities(self) -> list[Any]:
-        """Return those of the intake."""
-        return self.intake.entities
+        """Return those of the subscriptions."""
+        return self.sensors.entities
 
     @property
     def pipeline(self) -> OdometryPipeline:
@@ -173,8 +173,8 @@ class OdometryNode(ManagedNode):
         if self._pipeline is not None:
             self._pipeline.configure(config.odometry)
 
-    def intake_of(self, node: Node, topics: DeskewTopics) -> SensorIntake | None:
-        """Return the intake if it has just what a deskew node listens to."""
+    def shared_subscriptions(self, node: Node, topics: DeskewTopics) -> SensorSubscriptions | None:
+        """Return the subscriptions if a deskew node wants exactly these."""
         own = self._settings.value.topics
         same = (
             topics.input_reliability == "best_effort"
@@ -182,7 +182,7 @@ class OdometryNode(ManagedNode):
             == self.resolve_topic_name(own.cloud_topic)
             and node.resolve_topic_name(topics.imu_topic) == self.resolve_topic_name(own.imu_topic)
         )
-        return self.intake if same else None
+        return self.sensors if same else None
 
     def publishes(self, node: Node, topics: DeskewTopics) -> bool:
         """Return whether this is the odometry whose velocities a deskew node takes.
@@ -221,12 +221,12 @@ class OdometryNode(ManagedNode):
             self._say(f"{frame}: {note}")
 
     def take_fast(self, samples: Samples, frame: str) -> None:
-        """Publish poses at IMU samples (N,) that have just come, in the intake's thread."""
+        """Publish poses at new IMU samples (N,); called in the subscriptions' thread."""
         pipeline = self._pipeline
         if pipeline is not None and frame == self._inputs.imu.name:
             self._poses.take(pipeline.corrected(samples[in_range(samples)]))
 
-    def take_cloud(self, item: OneCloud) -> None:
+    def take_cloud(self, item: ReceivedCloud) -> None:
         """Take a cloud; one that cannot be read is counted and left out."""
         frame = item.cloud.frame
         if not self._inputs.clouds.takes(frame):

@@ -1,4 +1,4 @@
-"""Deskew and odometry in one process: one intake, and each sweep deskewed with its own motion."""
+"""Deskew and odometry in one process: shared subscriptions, each sweep deskewed with its own motion."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_each_cloud_comes_in_once_and_out_of_both(bench: CompanionBench) -> None
     assert [node.get_name() for node in bench.nodes] == ["odometry_node", "deskew_node"]
     assert bench.clouds_out.get_subscription_count() == 1
     assert bench.imu_out.get_subscription_count() == 1
-    assert deskew._intake is odometry.intake
+    assert deskew._sensors is odometry.sensors
     assert deskew._pipeline.tracker.buffer.counts.accepted > 1000
     assert deskew._last.values["velocity source"] == "odometry"
     assert deskew._last.values["velocity age [ms]"] == "0"
@@ -115,7 +115,9 @@ def test_one_goes_on_while_a_manager_takes_the_other_out_and_back(bench: Compani
     odometry.trigger_deactivate()
     odometry.trigger_cleanup()
     assert odometry.state_label == "unconfigured"
-    assert bench.clouds_out.get_subscription_count() == 1  # the deskew's, on the same intake
+    assert (
+        bench.clouds_out.get_subscription_count() == 1
+    )  # the deskew's, on the same subscriptions
     bench.poses.clear()
     bench.clouds.clear()
     play(bench, run, 1.0)
@@ -134,9 +136,9 @@ def test_one_goes_on_while_a_manager_takes_the_other_out_and_back(bench: Compani
 
 
 @pytest.mark.parametrize("bench", [("deskew_node:imu_topic:=/other/imu",)], indirect=True)
-def test_other_topics_have_an_intake_of_their_own(bench: CompanionBench) -> None:
+def test_other_topics_have_subscriptions_of_their_own(bench: CompanionBench) -> None:
     odometry, deskew = bench.nodes
-    assert deskew._intake is not odometry.intake
+    assert deskew._sensors is not odometry.sensors
     assert deskew._pipeline.odometry_motion is None
     assert odometry.get_parameter("imu_topic").value == "/imu/data"
 
@@ -147,7 +149,7 @@ WHEELS = ("deskew_node:velocity_type:=twist", "deskew_node:velocity_topic:=wheel
 @pytest.mark.parametrize("bench", [WHEELS], indirect=True)
 def test_another_source_of_velocity_is_respected(bench: CompanionBench) -> None:
     odometry, deskew = bench.nodes
-    assert deskew._intake is odometry.intake
+    assert deskew._sensors is odometry.sensors
     assert deskew._pipeline.odometry_motion is None
 
 

@@ -1,9 +1,9 @@
-"""Intake of clouds and IMU samples: received, parsed and read once, for one node or two.
+"""Subscriptions to clouds and IMU samples, parsed once for one node or two.
 
 The IMU subscription stays out of the executor's wait set: at 250 messages a second, waking up for
-each costs more than all the work on them. Its queue is drained when a cloud comes, on a slow
-timer, and quickly while a sweep waits for its last samples. Where a listener wants samples even
-while the executor is busy with a cloud, a thread drains the queue as well.
+each costs more than all the work on them. Its queue is drained when a cloud arrives, on a
+slow timer, and on a fast one while a sweep waits for its last samples. A thread drains it as well
+if a listener wants samples while the executor is busy with a cloud.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ RELIABILITY: Final = {
 }
 
 
-class OneCloud:
+class ReceivedCloud:
     """A cloud, turned into a sweep at most once per unit of its times.
 
     Attributes
@@ -82,7 +82,7 @@ class OneCloud:
 
 
 class Listener(Protocol):
-    """What an intake feeds."""
+    """What receives the clouds and samples."""
 
     @property
     def is_waiting(self) -> bool:
@@ -91,7 +91,7 @@ class Listener(Protocol):
     def take_samples(self, samples: Samples, frame: str) -> None:
         """Take IMU samples (N,) of a frame."""
 
-    def take_cloud(self, item: OneCloud) -> None:
+    def take_cloud(self, item: ReceivedCloud) -> None:
         """Take a cloud."""
 
     def refuse_cloud(self, error: ValueError) -> None:
@@ -131,7 +131,7 @@ class _Feed(NamedTuple):
 
 
 class _Entities(NamedTuple):
-    """What an intake listens with."""
+    """Subscriptions and timers."""
 
     imu: Subscription
     clouds: Subscription
@@ -139,8 +139,8 @@ class _Entities(NamedTuple):
     soon: Timer
 
 
-class SensorIntake:
-    """Clouds and IMU samples of a pair of topics, subscribed to as long as somebody listens.
+class SensorSubscriptions:
+    """Subscriptions to a cloud topic and an IMU topic, held while there is a listener.
 
     Parameters
     ----------
@@ -328,7 +328,7 @@ class SensorIntake:
 
     def _hand_out(self, message: bytes) -> None:
         try:
-            item = OneCloud(serialized.cloud(message), len(self._clouds))
+            item = ReceivedCloud(serialized.cloud(message), len(self._clouds))
         except ValueError as error:
             for feed in self._feeds:
                 feed.refusal(error)

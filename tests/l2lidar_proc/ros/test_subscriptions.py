@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import Int32
 
-from l2lidar_proc.ros.intake import waiting
+from l2lidar_proc.ros.subscriptions import waiting
 
 pytestmark = pytest.mark.ros
 LIMIT_S = 120.0
