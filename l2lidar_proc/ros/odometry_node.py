@@ -46,8 +46,8 @@ from l2lidar_proc.ros.inputs import (
     load_libraries,
     steady_timer,
 )
-from l2lidar_proc.ros.subscriptions import SLOW_LOOK_S, ReceivedCloud, SensorSubscriptions
 from l2lidar_proc.ros.pose_broadcaster import PoseBroadcaster
+from l2lidar_proc.ros.subscriptions import SLOW_LOOK_S, ReceivedCloud, SensorSubscriptions
 
 _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
 

@@ -1,4 +1,4 @@
-"""Deskew and odometry in one process: shared subscriptions, each sweep deskewed with its own motion."""
+"""Deskew and odometry in one process: shared subscriptions, and one motion for each sweep."""
 
 from __future__ import annotations
 
@@ -115,9 +115,7 @@ def test_one_goes_on_while_a_manager_takes_the_other_out_and_back(bench: Compani
     odometry.trigger_deactivate()
     odometry.trigger_cleanup()
     assert odometry.state_label == "unconfigured"
-    assert (
-        bench.clouds_out.get_subscription_count() == 1
-    )  # the deskew's, on the same subscriptions
+    assert bench.clouds_out.get_subscription_count() == 1  # the same subscription
     bench.poses.clear()
     bench.clouds.clear()
     play(bench, run, 1.0)

@@ -25,9 +25,9 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 from l2lidar_node.ros.conversions import from_cloud, from_time  # noqa: E402
 from l2lidar_node.types import Sweep  # noqa: E402
 from l2lidar_proc.odometry.estimate import OdometryEstimate  # noqa: E402
-from l2lidar_proc.ros.subscriptions import NeverExecuted, waiting  # noqa: E402
 from l2lidar_proc.ros.odometry_messages import matrix  # noqa: E402
 from l2lidar_proc.ros.odometry_node import OdometryNode  # noqa: E402
+from l2lidar_proc.ros.subscriptions import NeverExecuted, waiting  # noqa: E402
 from tests.l2lidar_proc.odometry.odometry_world import recording  # noqa: E402
 from tests.l2lidar_proc.ros.bench import FRAME, LATCHED, Bench  # noqa: E402
 from tests.support.odometry_runs import sweeps, truth  # noqa: E402
