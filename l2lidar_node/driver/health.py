@@ -308,7 +308,7 @@ def _of_strangers(count: int, seconds: float, stranger: str) -> str:
     if stranger:
         text += f", the last seen from {stranger}"
     if count / seconds > _FLOOD_HZ:
-        text += "; it is a flood: shut it out with a firewall"
+        text += "; this is a flood: block it with a firewall"
     return text
 
 
@@ -367,7 +367,7 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
         "points without orientation": str(new.unleveled),
     }
     if new.unleveled > old.unleveled:
-        message = "imu_adjust drops points for want of IMU data"
+        message = "imu_adjust drops points for lack of IMU data"
         return Check("points", Level.WARN, message, values)
     if not slots and new.fragments > old.fragments:
         message = "no turn was whole, and parts of turns are left out"

@@ -179,8 +179,8 @@ def test_a_flood_is_named_with_its_sender_and_what_to_do() -> None:
     level, message = watched.verdict("link")
     assert level is Level.WARN
     assert message == (
-        "50000 datagrams of other senders refused, the last seen from 10.0.0.7; it is a flood: "
-        "shut it out with a firewall"
+        "50000 datagrams of other senders refused, the last seen from 10.0.0.7; this is a flood: "
+        "block it with a firewall"
     )
     watched = streaming(3.0)  # the last two seconds are judged; a second L2 sends 500 a second
     for foreign, is_flood in ((1_800, False), (2_200, True)):
@@ -239,7 +239,7 @@ def test_where_no_cloud_is_made_nothing_is_said_of_its_slots() -> None:
 def test_gravity_alignment_without_imu() -> None:
     watched = streaming(keep=lambda item: not is_imu(item), imu_adjust=True)
     assert watched.verdict("points") == (
-        Level.WARN, "imu_adjust drops points for want of IMU data",
+        Level.WARN, "imu_adjust drops points for lack of IMU data",
     )  # fmt: skip
 
 
