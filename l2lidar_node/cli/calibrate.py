@@ -35,6 +35,7 @@ from l2lidar_node.cli.console import JsonOption, YesOption, out, print_json, say
 from l2lidar_node.cli.device import Device
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import NetworkConfig
+from l2lidar_node.protocol.wire import MIRROR_PERIOD_S
 
 _POSES: Final = (
     "upright, in the middle of the room",
@@ -53,6 +54,7 @@ _WITHIN: Final = (
     "longer way tells more"
 )
 _RIGHT: Final = "the block that the unit reports is right: nothing to correct"
+_HELD_UP_S: Final = 10.0  # that a place may take longer than it was to be recorded
 
 app = typer.Typer(
     help="Estimate what the unit is off by, and write its calibration file.",
@@ -363,9 +365,15 @@ def _recorded(
             files.wait_for_points(device, quiet=quiet)
             with Progress(*columns, console=out, disable=quiet) as progress:
                 task = progress.add_task("recording", total=seconds)
-                files.pass_time(
-                    seconds, failures, lambda passed: progress.update(task, completed=passed)
-                )
+                before = device.ask(files.mirror_turns)
+
+                def is_done(_: float) -> bool:
+                    measured = MIRROR_PERIOD_S * (device.ask(files.mirror_turns) - before)
+                    progress.update(task, completed=min(measured, seconds))
+                    return measured >= seconds
+
+                # What this machine or the network holds up is waited for.
+                files.pass_time(seconds + _HELD_UP_S, failures, is_done)
     finally:
         recorder.close()
     if failures:

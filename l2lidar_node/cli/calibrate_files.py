@@ -245,8 +245,13 @@ def pass_time(seconds: float, failures: list[str], told: Callable[[float], bool 
     told(seconds)
 
 
+def mirror_turns(driver: Driver) -> int:
+    """Return of how many turns of the mirror the points have come, a 3D packet each."""
+    return driver.counters.frames[PacketType.POINTS_3D]
+
+
 def _sends_points(driver: Driver) -> bool:
-    return driver.counters.frames[PacketType.POINTS_3D] > 0
+    return mirror_turns(driver) > 0
 
 
 def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
