@@ -296,7 +296,7 @@ def report(
             f"IMU stamps {spacing.mean():.4f} ms apart (standard deviation {spacing.std():.4f}), "
             f"off the truth by {np.median(errors):.3f} ms, p99 {np.percentile(errors, 99):.3f} ms"
         )
-    console.print(f"lost packets: {_lost(observer.checks.get('link', {}))}")
+    console.print(f"lost packets: {_lost(observer)}")
     if observer.cloud is not None:
         if mount is None:
             save_cloud(observer.cloud, folder / "cloud.png", "one cloud, as measured")
@@ -385,11 +385,16 @@ def _troubles(observer: Observer) -> list[str]:
             )
     if not observer.diagnostics:
         return [*troubles, "/diagnostics: nothing received"]
-    lost = _lost(observer.checks.get("link", {}))
-    if lost:
-        troubles.append(f"{lost} packets lost")
+    lost = _lost(observer)
+    if lost != "0":
+        troubles.append(f"packets lost: {lost}")
     return troubles
 
 
-def _lost(link: dict[str, str]) -> int:
-    return sum(int(link.get(f"{stream} lost", 0)) for stream in ("points", "imu"))
+def _lost(observer: Observer) -> str:
+    """Return how many packets were lost, and whether the driver did not get to them."""
+    link = observer.checks.get("link", {})
+    lost = sum(int(link.get(f"{stream} lost", 0)) for stream in ("points", "imu"))
+    if 0 < lost <= int(link.get("kernel drops", 0)):
+        return f"{lost}, dropped by the kernel while the driver waited for a processor"
+    return str(lost)

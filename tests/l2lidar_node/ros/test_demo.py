@@ -23,14 +23,16 @@ COMMAND = [sys.executable, "-m", "l2lidar_node.demo"]
 TIMEOUT_S = 300  # generous: only a failure waits that long
 
 
-PACE = re.compile(r" ms apart, expected |/odometry: \d poses, expected ")
+DROPPED = r"\d+, dropped by the kernel"
+PACE = re.compile(rf" ms apart, expected |/odometry: \d poses, expected |packets lost: {DROPPED}")
 
 
 def run(*options: str) -> tuple[str, bool]:
     """Run the demo, in which nothing may be wrong; return what it says.
 
-    But for the pace: where the machine is too slow, most clouds do not come through, or the demo
-    says that nobody can tell. Return as well whether they did.
+    But for the pace: where the machine is too slow, most clouds do not come through, packets wait
+    until the kernel has no room for more, or the demo says that nobody can tell. Return as well
+    whether it kept up.
     """
     done = subprocess.run(
         [*COMMAND, *options],
@@ -54,7 +56,7 @@ def test_a_driver_whose_sensor_looks_ahead_shows_an_upright_world(tmp_path: Path
         "--forward", "--driver-only", "--duration", "4", "--folder", str(tmp_path),
         "--record", str(bag),
     )  # fmt: skip
-    assert "lost packets: 0" in said
+    assert re.search(rf"lost packets: (0$|{DROPPED})", said, re.MULTILINE)
     assert "in base_link the floor is at z = -0." in said
     assert (tmp_path / "cloud.png").stat().st_size > 20_000
     with AnyReader([bag]) as reader:
@@ -76,7 +78,7 @@ def test_a_driver_whose_sensor_looks_ahead_shows_an_upright_world(tmp_path: Path
 
 def test_the_whole_chain_is_judged_against_the_truth(tmp_path: Path) -> None:
     said, keeps_pace = run("--duration", "6", "--folder", str(tmp_path))
-    assert "lost packets: 0" in said
+    assert re.search(rf"lost packets: (0$|{DROPPED})", said, re.MULTILINE)
     assert ("mm RMS off the truth" in said) or not keeps_pace
     for name in ("cloud.png", "deskew.png", "track.png") if keeps_pace else ("cloud.png",):
         assert (tmp_path / name).stat().st_size > 20_000
