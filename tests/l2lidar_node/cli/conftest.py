@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from l2lidar_node.cli import device, discover, status
 from l2lidar_node.cli.main import main
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.emulator.config import (
@@ -90,6 +91,38 @@ def make_unit() -> Iterator[Callable[..., Unit]]:
 @pytest.fixture
 def unit(make_unit: Callable[..., Unit]) -> Unit:
     return make_unit()
+
+
+class UnitTime:
+    """Stands in for :mod:`time` in a verb: a busy machine that holds the unit up stops it.
+
+    Parameters
+    ----------
+    device : VirtualL2
+    """
+
+    def __init__(self, device: VirtualL2) -> None:
+        self._device = device
+
+    def monotonic(self) -> float:
+        return self._device.now_ns / 1e9
+
+    def sleep(self, seconds: float) -> None:
+        end, deadline = self.monotonic() + seconds, time.monotonic() + LIMIT_S
+        while self.monotonic() < end:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def timed_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[Unit], None]:
+    """Have the verbs count seconds by what a unit has measured."""
+
+    def use(unit: Unit) -> None:
+        for module in (device, discover, status):
+            monkeypatch.setattr(module, "time", UnitTime(unit.device))
+
+    return use
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import struct
@@ -14,6 +15,7 @@ import time
 from collections import Counter
 from dataclasses import replace
 from decimal import Decimal
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -423,27 +425,41 @@ class Listener:
         while not self._stopping.is_set():
             self.data += [item.data for item in self._transport.receive(0.05)]
 
-    def stop(self) -> list[bytes]:
+    def stop(self) -> None:
         self._stopping.set()
         self._thread.join(LIMIT_S)
+        self._take_the_rest()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:  # tells of drops before it
+            last.sendto(b"end", ("127.0.0.1", self.port))
+            while self.data[-1:] != [b"end"]:
+                self._take_the_rest()
+        self.data.pop()
+        self._transport.close()
+
+    def _take_the_rest(self) -> None:
         while rest := self._transport.receive(0.05):
             self.data += [item.data for item in rest]
-        self._transport.close()
-        return self.data
+
+    def has_heard(self, sent: list[Received]) -> bool:
+        """Tell whether all came in its order, but for what the kernel had no room for."""
+        rest = iter([entry.data for entry in sent])
+        is_in_order = all(data in rest for data in self.data)
+        return is_in_order and len(sent) == len(self.data) + self._transport.kernel_drops
 
 
-def replayed(run: Run, path: Path, *options: str) -> tuple[list[bytes], str]:
+def replayed(run: Run, path: Path, *options: str) -> tuple[Listener, str]:
     listener = Listener()
     outcome = run("replay", str(path), "--to", f"127.0.0.1:{listener.port}", *options)
+    listener.stop()
     assert (outcome.code, outcome.err) == (0, "")
-    return listener.stop(), outcome.out
+    return listener, outcome.out
 
 
 def test_replay_sends_what_was_received(run: Run, capture: tuple[Path, list[Received]]) -> None:
     path, entries = capture
     begun = time.monotonic()
-    data, said = replayed(run, path, "--rate", "2")
-    assert data == [entry.data for entry in entries]
+    listener, said = replayed(run, path, "--rate", "2")
+    assert listener.has_heard(entries)
     lasted = (entries[-1].time - entries[0].time) / 1e9
     assert time.monotonic() - begun > lasted / 2
     assert f"{len(entries)} datagrams sent" in said
@@ -455,10 +471,12 @@ def test_replay_seeks_and_stops(run: Run, capture: tuple[Path, list[Received]]) 
     # Between two of its packets: a pause of this machine may be anywhere.
     start = f"{seconds[len(entries) // 4 :][:2].mean():.7f}"
     duration = f"{seconds[len(entries) // 2 :][:2].mean() - float(start):.7f}"
-    data, _ = replayed(run, path, "--rate", "3", "--start", start, "--duration", duration)
+    listener, _ = replayed(run, path, "--rate", "3", "--start", start, "--duration", duration)
     within = (seconds >= float(start)) & (seconds <= float(start) + float(duration))
     assert 0.2 < within.mean() < 0.3
-    assert data == [entry.data for entry, is_in in zip(entries, within, strict=True) if is_in]
+    assert listener.has_heard(
+        [entry for entry, is_in in zip(entries, within, strict=True) if is_in]
+    )
 
 
 def test_replay_from_beyond_the_end_says_so(
@@ -523,10 +541,13 @@ def test_ctrl_c_ends_a_loop(run: Run, capture: tuple[Path, list[Received]]) -> N
     wait_until(lambda: len(listener.data) > 2 * len(entries), process)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=LIMIT_S)
-    data = listener.stop()
+    listener.stop()
     assert (process.returncode, err) == (0, "")
-    assert "datagrams sent" in out
-    assert data[: len(entries)] == data[len(entries) : 2 * len(entries)]
+    said = re.search(r"(\d+) datagrams sent", out)
+    assert said is not None
+    loops = list(islice(cycle(entries), int(said[1]) + 1))
+    # The interrupt may come when one is sent and not counted yet.
+    assert listener.has_heard(loops[:-1]) or listener.has_heard(loops)
 
 
 def repeated(entries: list[Received], path: Path, times: int, first: int | None = None) -> None:
@@ -563,8 +584,8 @@ def test_times_that_no_stamp_can_hold_are_explained(
     assert outcome.code == 1
     assert "2038" in outcome.err
     assert not (tmp_path / "late.mcap").exists()
-    data, _ = replayed(run, path, "--rate", "0")
-    assert data == [entry.data for entry in capture[1]]  # it carries no stamps
+    listener, _ = replayed(run, path, "--rate", "0")
+    assert listener.has_heard(capture[1])  # it carries no stamps
 
 
 def test_bags_of_packets_and_captures_hold_the_same(
@@ -590,10 +611,8 @@ def test_bags_of_packets_and_captures_hold_the_same(
             for file in (path, packets)]  # fmt: skip
     assert [outcome.code for outcome in said] == [0, 0]
     assert said[0].out.partition(": ")[2] == said[1].out.partition(": ")[2]
-    sent, _ = replayed(run, packets, "--rate", "0")
-    rest = iter([entry.data for entry in received])  # a busy machine may drop some
-    assert sent
-    assert all(data in rest for data in sent)
+    listener, _ = replayed(run, packets, "--rate", "0")
+    assert listener.has_heard(received)
     outcome = run("replay", str(tmp_path / f"{clouds}run"))
     assert outcome.code == 1
     assert "no packets of an L2 in this bag" in outcome.err
@@ -667,12 +686,3 @@ def test_check_judges_a_capture_as_the_consumer_would_get_it(
     assert any("imu_adjust is false" in text for text in texts)
     outcome = run("check", str(capture[0]), "--for", "kiss_icp")
     assert "KISS-ICP" in outcome.out.splitlines()[-1]
-
-
-def test_figures_are_numbers_in_json(run: Run, unit: Unit) -> None:
-    about = json.loads(run("info", *unit.options, "--json").out)
-    device = about["health"]["device"]
-    assert isinstance(device["point packets [1/s]"], float)
-    assert isinstance(about["health"]["link"]["points lost"], int)
-    assert device["state"] == "streaming"
-    assert about["firmware"] == "2.8.11.1"

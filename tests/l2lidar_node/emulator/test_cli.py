@@ -95,6 +95,13 @@ def port_of(item: socket.socket) -> str:
     return str(item.getsockname()[1])
 
 
+def dropped(item: socket.socket) -> int:
+    """Return how many datagrams the kernel had no room for."""
+    port = f":{item.getsockname()[1]:04X}"
+    lines = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()]
+    return sum(int(line[-1]) for line in lines[1:] if line[1].endswith(port))
+
+
 def lidar_of(process: subprocess.Popen[str]) -> tuple[str, int]:
     """Read the greeting up to the line that says where the unit listens."""
     assert process.stdout is not None
@@ -357,7 +364,10 @@ def test_the_truth_of_a_run(host: socket.socket, tmp_path: Path) -> None:
     packets = results.packets[results.packets["type"] == 102]
     whole = packets[packets["copies"] > 0]
     assert len(whole) < len(packets)
-    assert [int(row["info"]["seq"]) for row in got] == whole["seq"].tolist()
+    numbers = {seq: number for number, seq in enumerate(whole["seq"].tolist())}
+    arrived = [numbers[int(row["info"]["seq"])] for row in got]
+    assert arrived == sorted(set(arrived))
+    assert len(whole) - len(arrived) <= 2 * dropped(host)  # a piece may belong to two packets
     bad = {
         (event.packet_type, event.ordinal)
         for event in results.faults
@@ -378,7 +388,7 @@ def test_the_truth_of_a_run(host: socket.socket, tmp_path: Path) -> None:
     hits = scan.hits[whole["index"][:60]]
     np.testing.assert_allclose(points["hit"], hits, atol=1e-5)
     sent = np.stack([row["ranges"] for row in got[:60]])
-    assert (sent == scan.packets["ranges"][whole["index"][:60]]).all()
+    assert (sent == scan.packets["ranges"][whole["index"][arrived[:60]]]).all()
 
     poses = results.trajectory()
     at = np.searchsorted(poses["stamp"], results.run["power_on_ns"] + 1_000_000_000)

@@ -58,21 +58,28 @@ def test_topics_have_the_rates_fields_frames_and_stamps_that_users_rely_on(rig: 
     rig.wait_for(are_enough, "twelve clouds")
     assert rig.observer.fields == ["x", "y", "z", "intensity", "range", "time"]
     assert (clouds.frame, imu.frame) == ("l2lidar_link", "l2lidar_imu")
-    # Every cloud has 38 packets, unless it was handed out early because nothing came for 200 ms.
-    spans = np.array(lengths) * PERIOD_S
-    is_whole = np.array(lengths) == 38
-    assert (is_whole | (np.array(clouds.ages_s) - spans > MAX_GAP_NS / 1e9)).all()
-    # Each begins where the one before ended; a best-effort topic may lose one meanwhile.
+    # Every cloud has 38 packets, unless it was handed out early because nothing came for 200 ms,
+    # or is longer by what the kernel dropped while the driver was held up.
+    packets = np.array(lengths)
+    spans = packets * PERIOD_S
+    is_short = packets < 38
+    assert (~is_short | (np.array(clouds.ages_s) - spans > MAX_GAP_NS / 1e9)).all()
+    # Each begins where the one before ended, but for clouds that a best-effort topic lost.
     steps = clouds.intervals_ms / 1e3
     gaps = (steps - spans[:-1]) / PERIOD_S
     assert (gaps > -0.5).all()
     np.testing.assert_allclose(gaps, np.round(gaps), atol=0.4)
-    assert np.count_nonzero(np.round(gaps)) <= 1 + np.count_nonzero(~is_whole)
     # Stamped at the first point, received after the last one.
     assert (np.array(clouds.ages_s) > spans - PERIOD_S).all()
     # An L2 sends pairs of samples 2.6 to 4.7 ms apart, 4 ms on average.
     assert imu.backward_steps == 0
     assert np.median(imu.intervals_ms) == pytest.approx(4.0, abs=0.05)
+    # What is missing within and between clouds, the driver has counted.
+    rig.observer.diagnostics.clear()
+    rig.wait_for(lambda: rig.observer.diagnostics, "diagnostics")
+    dropped = int(rig.observer.checks["link"]["points lost"])
+    missing = np.maximum(packets - 38, 0).sum() + (np.round(gaps) % 38).sum()
+    assert is_short.any() or missing <= dropped
 
 
 def test_qos_is_upstreams(rig: Rig) -> None:
