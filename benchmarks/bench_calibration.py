@@ -482,9 +482,9 @@ PAGE: Final = Path("docs") / "results" / "calibration.md"
 ODOMETRY: Final = Path("docs") / "odometry.md"
 _HEAD: Final = """# Calibration of units
 
-Written by `make bench-calibration BENCH_ARGS="--page"`; [calibration](../calibration.md) says what
-the parameters are. Of virtual units the tables hold what is left of an error, estimate minus
-truth; of real ones what was found. The figure after +- is the stated deviation. Thickness is the
+Written by `make bench-calibration BENCH_ARGS="--page"`; [calibration](../calibration.md)
+explains the parameters. For virtual units the tables show the remaining error, estimate minus
+truth; for real units the estimate. The figure after +- is the stated deviation. Thickness is the
 median over flat patches, gap the distance of the two halves of a turn on them.
 """
 
@@ -497,9 +497,9 @@ def write(rows: list[Row], targets: list[Target]) -> Path:
         verdicts(targets),
         "## Beams",
         table(rows),
-        *_words(rows, "imu", "IMU: what is left, and its deviation"),
+        *_words(rows, "imu", "IMU: remaining error, and its deviation"),
         "[Odometry](../odometry.md#units-that-are-not-perfect) and "
-        "[deskew](../deskew.md#what-it-achieves) have what calibration is worth to them.",
+        "[deskew](../deskew.md#what-it-achieves) show how much they gain from calibration.",
         measured_on(),
     ]
     PAGE.parent.mkdir(parents=True, exist_ok=True)

@@ -370,26 +370,26 @@ _HEAD: Final = """# Error of the stamps
 
 Written by `make bench-clock BENCH_ARGS="--docs"`; [clock](../clock.md) explains the estimator.
 The driver runs against the virtual L2 in simulated time, and every published stamp is compared
-with the time at which the emulator measured.
+with the emulator's time of measurement.
 """
 _ROWS: Final = """## Ratios, sync modes and faults
 
-One minute per row. Errors are in ms, after the constant path delay (one median for both streams)
-is set aside; for the other two methods one median per stream is set aside. `upstream` is
-`t' = (t - last_sync) * 2 + last_sync` with the value of the last sync *sent*; `arrival` stamps
-with the time of arrival. Drift: 50 ppm over 300 s. `everything`: 20 ms tail, bursts, loss,
+One minute per row. Errors are in ms, after subtracting the constant path delay (one median for
+both streams; for the other two methods one median per stream). `upstream` is
+`t' = (t - last_sync) * 2 + last_sync` with the value of the last sync *sent*; `arrival` uses the
+arrival time as the stamp. Drift: 50 ppm over 300 s. `everything`: 20 ms tail, bursts, loss,
 reordering and a reboot at once.
 """
 _LOADS: Final = """## Under load and after it
 
-A load delays all packets. `path` is what it adds to the least delay of the path: the largest, over
-the load, of the least delay in half a second. A clock that sees arrivals alone cannot know it when
-a load lasts since the start. `during` is the largest error until the load ends, `unsaid` by how
-much an error was at most beyond the uncertainty in the status and the least delay seen so far,
-`after` the errors from one second after its end. The constant delay of the unloaded path is set
-aside. Largest values of all seeds, in ms; `held` counts packets that got no stamp, all seeds
-together. A queue that fills evenly from the start is no load to a clock but another ratio, and
-stamps go with it: nobody can say so, and the target leaves it out.
+A load delays all packets. `path` is what it adds to the path's least delay: the largest value,
+over the load, of the least delay in half a second. If a load has lasted since the start, a clock
+that sees only arrivals cannot know this delay. `during` is the largest error until the load ends.
+`unsaid` is the largest excess of an error over the uncertainty in the status plus the least delay
+seen so far. `after` is the error from one second after the end of the load. The constant delay of
+the unloaded path is subtracted. Values are the largest of all seeds, in ms; `held` counts packets
+without a stamp, over all seeds. To a clock, a queue that fills evenly from the start looks like
+another ratio, and stamps follow it. Nothing can detect this, so the target excludes it.
 `tests/support/clock_loads.py` defines the shapes.
 """
 

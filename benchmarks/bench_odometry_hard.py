@@ -289,13 +289,13 @@ _OURS: Final = "ours"
 _HEAD: Final = """# Hard runs of the odometry
 
 Written by `make bench-odometry-hard BENCH_ARGS="--page"`; [odometry](../odometry.md) explains the
-estimator, `benchmarks/hard_scenarios.py` what is in each scene. A run has *failed* when its last
-pose is more than 1 % of the way and more than 0.3 m off; it was *silent* when a pose without any
-status was off by more than 3 sigma and 0.1 m. NEES is the share of poses (position and attitude,
-6) and of velocities (3) whose normalized squared error is within the bound that 95 % should keep.
-ATE is after an SE(3) alignment; ends and NEES are relative to the first pose. A unit called
-*imperfect* has beam angles 0.4 degrees off, ranges 0.2 % off, an IMU turned by 0.5 degrees and
-2 ms late, vibration, lost packets and gaps in its IMU samples.
+estimator, and `benchmarks/hard_scenarios.py` the scenes. A run *failed* if its last pose is off by
+more than 1 % of the distance and more than 0.3 m. It was *silent* if a pose without any status was
+off by more than 3 sigma and 0.1 m. NEES is the share of poses (position and attitude, 6) and of
+velocities (3) whose normalized squared error is within the bound that 95 % should keep. ATE is
+after an SE(3) alignment; ends and NEES are relative to the first pose. A unit called *imperfect*
+has beam angles 0.4 degrees off, ranges 0.2 % off, an IMU rotated by 0.5 degrees and 2 ms late,
+vibration, lost packets and gaps in its IMU samples.
 """
 
 
@@ -321,8 +321,8 @@ def _setting(rows: list[Row]) -> str:
     lengths = sorted({row["seconds"] for row in ours})
     spans = " and ".join(f"{length:g} s" for length in lengths)
     return (
-        f"{len(ours)} runs of {spans}, {sum(row['way_m'] for row in ours):.0f} m in all; the "
-        "others on as many of the same recordings as their column says."
+        f"{len(ours)} runs of {spans}, {sum(row['way_m'] for row in ours):.0f} m in all. The "
+        "other methods ran on the number of recordings in their column."
     )
 
 
@@ -361,7 +361,7 @@ def _cell(found: list[Row]) -> str:
 
 def _consistency(rows: list[Row]) -> str:
     lines = [
-        "## What ours says of itself",
+        "## What ours reports",
         "",
         "| Scene | end off, median / largest [m] | lost | silent | largest error / sigma "
         "without a status | NEES pose | NEES velocity |",
@@ -392,7 +392,7 @@ def _failures(rows: list[Row]) -> str:
     lines = [
         "## Runs that failed",
         "",
-        "Ours, the worst first; with what it said in order.",
+        "Ours, worst first, with the status of their sweeps in order.",
         "",
         "| Scene, seed | way [m] | end off [m] | largest [m] | silent poses | status |",
         "|---|---|---|---|---|---|",

@@ -288,7 +288,7 @@ def main() -> int:
 _PAGE: Final = """# Over a slow network
 
 Written by `make bench-wifi BENCH_ARGS=--page` (as root). [On a robot](../robot.md) says what to
-make of it.
+do about it.
 
 ## Sizes
 
@@ -300,8 +300,8 @@ one core of a PC.
 ## What arrives
 
 Driver and listener under Fast DDS in two network namespaces, with 20 Mbit/s, 2 % loss and 30 ms
-each way between them (`benchmarks/wifi_link.py`), {seconds:.0f} s for each line once the
-first message has come, or after 60 s. *Late* counts from the last point of a cloud.
+each way between them (`benchmarks/wifi_link.py`), {seconds:.0f} s for each line after the
+first message, or after 60 s without one. *Late* counts from the last point of a cloud.
 
 {link}
 """

@@ -318,12 +318,12 @@ def report(rows: list[dict[str, Any]], options: str) -> str:
         f"killed ({100.0 * killed / max(len(rows), 1):.1f} %); of the {len(lived)} that lived, "
         f"{len(explained)} are explained.",
         "",
-        "A mutant is one small change of the code: an operator, a condition, a comparison (turned "
-        "round; of counts by one), a constant (counts up to 16 by one, others twice as large, "
-        "those of a module ten times). It is killed when a test fails or does not end. The sample "
-        "is spread over the modules by their size. Each mutant meets the tests that call its "
-        f"function, at most {_TESTS_S[-1]:.0f} s of them. What lived before an assertion was "
-        "added is counted as killed.",
+        "A mutant is one small change of the code: an operator, a condition, a comparison "
+        "(inverted, or off by one for counts), a constant (counts up to 16 plus one, others "
+        "doubled, those of a module times ten). It is killed if a test fails or does not end. The "
+        "sample is spread over the modules by their size. Each mutant runs the tests that call "
+        f"its function, at most {_TESTS_S[-1]:.0f} s of them. Mutants killed by assertions that "
+        "were added for them count as killed.",
         "",
         "| Module | Killed | Tried |",
         "|---|---|---|",

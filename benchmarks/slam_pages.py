@@ -19,24 +19,24 @@ PLACED: Final = (0.5, 0.05)  # [deg, m] a kidnapped start is found this well
 _HEAD: Final = """# The SLAM back end
 
 Written by `make bench-slam BENCH_ARGS="--resume --page"`; [maps](../mapping.md) explains the
-back end. All of it is simulation: true poses with a drift that is drawn (its rate is the error
-over 20 m of way, root mean square), and 4000 of the 15000 rays of each turn, one turn every
-0.4 m. No real loop of an L2 has been measured.
+back end. All of it is simulation: true poses with random drift (its rate is the root mean square
+error over 20 m of travel), and 4000 of the 15000 rays of each turn, one turn every 0.4 m. No real
+loop of an L2 has been measured.
 
-A loop is *wrong* when it is more than 0.3 m or 3 degrees from the truth, in the directions it
-claims to know. ATE is the root mean square distance from the truth after the best rigid alignment.
-A submap that comes back to a place (3 m) is *tied* when the way to it through the graph is below
-20 m. Rates have their 95 % bound beside them (Clopper and Pearson; with no failure in N runs that
-is about 3/N)."""
+A loop is *wrong* if it is more than 0.3 m or 3 degrees from the truth, in the directions it
+constrains. ATE is the root mean square distance from the truth after the best rigid alignment. A
+submap that returns to a place (3 m) is *tied* if the path to it through the graph is below 20 m.
+Rates have their 95 % bound beside them (Clopper and Pearson; with no failure in N runs about
+3/N)."""
 _STARTS: Final = """\
-At a random place of a saved map, either way round, 20 m at 0.5 % of drift. Found: announced, then
-off by 5 cm and 0.5 degrees at most (medians of what follows). `ring` has identical doors and is
-symmetric: there is nothing to find, and nothing may be announced that is not so. `outside` starts
-in another world."""
+At a random place of a saved map, in either direction, 20 m at 0.5 % of drift. Found: announced,
+then off by at most 5 cm and 0.5 degrees (medians of the poses that follow). `ring` has identical
+doors and is symmetric, so the place cannot be found, and no wrong place may be announced.
+`outside` starts in another world."""
 _KISS: Final = """\
-With its own KISS-ICP, and with the drifting odometry that ours is given; with its own settings,
-and with finer ones for rooms (local maps of 10 m, images of 0.2 m). It knows neither IMU nor
-gravity. Its loops count as wrong beyond 1 m or 10 degrees."""
+With its own KISS-ICP or the drifting odometry that ours gets; with its default settings or finer
+ones for rooms (local maps of 10 m, images of 0.2 m). It uses neither IMU nor gravity. Its loops
+count as wrong beyond 1 m or 10 degrees."""
 
 
 def upper_bound(failures: int, runs: int) -> float:
@@ -61,7 +61,7 @@ def targets(rows: list[Row]) -> Iterator[Target]:
     street = [r for r in mapping if r["scene"] == "street" and r["drift_percent"] == 0.5]
     if street:
         ratio = max(row["ate_m"] / row["odometry_ate_m"] for row in street)
-        yield at_most("street, 0.5 %: largest ATE by that of odometry alone", ratio, 0.25)
+        yield at_most("street, 0.5 %: largest ATE over that of odometry alone", ratio, 0.25)
         yield at_most("street, 0.5 %: largest ATE, m", max(r["ate_m"] for r in street), 0.15)
         tied = sum(r["tied"] for r in street) / max(sum(r["revisits"] for r in street), 1)
         yield at_least("street, 0.5 %: revisits tied", tied, 0.8)
@@ -84,8 +84,8 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         yield at_most("cores, largest of any walk", max(r["cores"] for r in mapping), 0.3)
         solves = [r["solve_s"] for r in (*mapping, *hour) if "solve_s" in r]
         if solves:
-            yield at_most("optimization of the whole graph, s of processor", max(solves), 0.5)
-        yield at_most("longest step, s of processor", max(r["longest_s"] for r in mapping), 5.0)
+            yield at_most("optimization of the whole graph, CPU s", max(solves), 0.5)
+        yield at_most("longest step, CPU s", max(r["longest_s"] for r in mapping), 5.0)
         yield at_most("map, MB per km, largest", max(r["mb_per_km"] for r in mapping), 60.0)
     starts = [r for r in rows if r["kind"] == "kidnapped"]
     inside = [r for r in starts if r["scene"] in ("street", "office")]
@@ -99,12 +99,12 @@ def targets(rows: list[Row]) -> Iterator[Target]:
         bound = upper_bound(int(wrong), len(starts))
         yield at_most("their rate, 95 % upper bound", bound, 0.03)
         cores = max(row["cores"] for row in starts)
-        yield at_most("cores while searching and keeping the place, largest", cores, 0.3)
+        yield at_most("cores while searching and tracking, largest", cores, 0.3)
     if len(hour) > 2:
         cores = max(row["cores"] for row in hour)
         yield at_most("cores of the long run, largest of a lap", cores, 0.3)
         peak = hour[-1]["rss_mb"] / hour[1]["rss_mb"]
-        yield at_most("its peak memory by that of the second lap", peak, 1.25)
+        yield at_most("its peak memory over that of the second lap", peak, 1.25)
         grown = (hour[-1]["megabytes"] - hour[1]["megabytes"]) / (
             (hour[-1]["way_m"] - hour[1]["way_m"]) / 1000.0
         )
@@ -251,7 +251,7 @@ def _refused(rows: list[Row]) -> str:
     for row in rows:
         counts.update(row.get("refused", {}))
     reasons = ", ".join(f"{reason} {count}" for reason, count in counts.most_common())
-    return f"Candidates that were refused, by reason: {reasons}." if reasons else ""
+    return f"Rejected candidates, by reason: {reasons}." if reasons else ""
 
 
 def _total(rows: list[Row], name: str) -> int:
