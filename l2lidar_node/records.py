@@ -27,6 +27,19 @@ def selected(records: Records, index: NDArray[np.integer[Any]] | NDArray[np.bool
     return _opaque(records)[index].view(records.dtype)
 
 
+def assign(records: Records, index: NDArray[np.integer[Any]], values: Records) -> None:
+    """Overwrite the records at some places, as ``records[index] = values`` does.
+
+    Parameters
+    ----------
+    records : ndarray, shape (N,)
+    index : ndarray, shape (M,)
+    values : ndarray, shape (M,)
+        Of the same dtype.
+    """
+    _opaque(records)[index] = _opaque(values)
+
+
 def joined(parts: Sequence[Records]) -> Records:
     """Return arrays of records one after the other.
 

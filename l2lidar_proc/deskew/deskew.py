@@ -93,9 +93,9 @@ def _table(trajectory: SweepTrajectory, knots: F32, reference: HostNs) -> F32:
     by row (9); position (3) [m].
     """
     q_reference, p_reference = trajectory.pose(reference)
-    back = rotations.conjugate(q_reference)
-    turn = rotations.matrices(rotations.multiply(back, trajectory.rotations_wxyz[:-1])) - np.eye(3)
-    position = rotations.rotate(back, trajectory.positions - p_reference)
+    R_reference = rotations.matrices(q_reference)
+    turn = R_reference.T @ rotations.matrices(trajectory.rotations_wxyz[:-1]) - np.eye(3)
+    position = (trajectory.positions - p_reference) @ R_reference
     seconds = np.diff(trajectory.stamps)[:, None] * 1e-9
     slope = np.diff(trajectory.rates, axis=0) / seconds
     velocity = np.diff(position, axis=0) / seconds

@@ -293,16 +293,27 @@ def update(
     return Update(state.boxplus(np.asarray(error)), symmetric, nis)
 
 
+def square_root(covariance: F64) -> F64:
+    """Return a matrix whose product with its transpose is a covariance (N, N), singular or not."""
+    variances, directions = np.linalg.eigh(covariance)
+    return np.asarray(directions * np.sqrt(np.maximum(variances, 0.0)))
+
+
 def update_with_information(
-    prior: InertialState, covariance: F64, at: InertialState, information: F64, gradient: F64
+    prior: InertialState, root: F64, at: InertialState, information: F64, gradient: F64
 ) -> tuple[InertialState, F64]:
-    """Return the posterior of one iteration of the iterated Kalman update.
+    """Return the posterior of one iteration of the iterated Kalman update, and its covariance.
+
+    Thousands of residuals are given as the information that they sum to. The information form
+    of the update is computed with a square root of the covariance, so that the posterior is
+    symmetric and positive however certain it is (Bierman, "Factorization Methods for Discrete
+    Sequential Estimation", 1977).
 
     Parameters
     ----------
     prior : InertialState
-    covariance : ndarray, shape (18, 18)
-        Of the prior.
+    root : ndarray, shape (18, 18)
+        :func:`square_root` of the prior's covariance, the same in all iterations.
     at : InertialState
         Where the measurement was linearized.
     information : ndarray, shape (18, 18)
@@ -310,15 +321,12 @@ def update_with_information(
     gradient : ndarray, shape (18,)
         Sum of -h^T w r over all residuals r.
     """
-    # thousands of residuals carry no more than these 18 with unit noise (a square root of the
-    # information)
-    strength, directions = np.linalg.eigh(information)
-    observed = strength > 1e-9 * max(float(strength[-1]), 1e-300)
-    root = np.sqrt(strength[observed])
-    h = root[:, None] * directions[:, observed].T
-    z = (directions[:, observed].T @ gradient) / root
-    error, posterior = kalman().update(-at.boxminus(prior), covariance, z, np.eye(len(z)), h)
-    return at.boxplus(np.asarray(error)), 0.5 * (posterior + posterior.T)
+    left = np.linalg.cholesky(np.eye(ERRORS) + root.T @ information @ root)
+    whitened = np.linalg.solve(left, root.T)
+    posterior = whitened.T @ whitened
+    error = -at.boxminus(prior)
+    error += posterior @ (gradient - information @ error)
+    return at.boxplus(error), posterior
 
 
 def twist_jacobian(state: InertialState, lever: F64) -> F64:
@@ -413,7 +421,7 @@ def update_static(
         innovation[6:] = force - state.accel_bias - state.rest_force
     weighted = jacobian.T * worth
     better, covariance = update_with_information(
-        state, covariance, state, weighted @ jacobian, weighted @ innovation
+        state, square_root(covariance), state, weighted @ jacobian, weighted @ innovation
     )
     return (
         dataclasses.replace(

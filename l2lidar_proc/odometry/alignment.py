@@ -31,6 +31,7 @@ from l2lidar_proc.motion.filter import (
     POSITION,
     TWIST,
     InertialState,
+    square_root,
     update_with_information,
 )
 from l2lidar_proc.odometry.config import SurfaceConfig
@@ -114,6 +115,7 @@ def align(
         Where to begin instead of the prior.
     """
     at = prior if start is None else start
+    root = square_root(covariance)
     step, weak = None, None
     last = config.iterations - 1
     for number in range(config.iterations + tuning.WEAK_STEPS):
@@ -123,7 +125,7 @@ def align(
         found = correspondences(prior, at, source, surfaces, config, reach)
         if len(found.index) < least:
             break
-        step = _step(prior, covariance, at, found, weak, number + 1)
+        step = _step(prior, root, at, found, weak, number + 1)
         done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
 
@@ -135,7 +137,7 @@ def align(
             if weak is None:
                 break
             before = step.state
-            step = _step(prior, covariance, at, found, weak, number + 1)
+            step = _step(prior, root, at, found, weak, number + 1)
             done = _is_small(step.state.boxminus(before))
             last = number + tuning.WEAK_STEPS
         if done:
@@ -175,7 +177,7 @@ class _Step(NamedTuple):
 
 def _step(
     prior: InertialState,
-    covariance: F64,
+    root: F64,
     at: InertialState,
     found: Correspondences,
     weak: WeakDirections | None,
@@ -189,7 +191,7 @@ def _step(
     weighted = h * found.weights[:, None]
     information = weighted.T @ h
     state, posterior = update_with_information(
-        prior, covariance, at, information, -(weighted.T @ found.distances)
+        prior, root, at, information, -(weighted.T @ found.distances)
     )
     return _Step(state, posterior, information, pose[:, 3:], found, number)
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node import rotations
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
@@ -25,6 +24,7 @@ from l2lidar_proc.motion.filter import (
     ROTATION,
     VELOCITY,
     InertialState,
+    skew,
 )
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.surfel_map import SurfelMap
@@ -257,7 +257,13 @@ def _joined(parts: list[F64]) -> F64:
 
 def pose_jacobian(found: Correspondences, rotation: F64) -> F64:
     """Return the derivatives (M, 6) of the residuals by the errors of turn and place."""
-    return np.hstack([rotations.cross(found.points, found.normals @ rotation), found.normals])
+    normals = found.normals.T
+    jacobian = np.empty((6, len(found.points)))
+    x, y, z = found.points.T
+    nx, ny, nz = rotation.T @ normals
+    jacobian[0], jacobian[1], jacobian[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+    jacobian[3:] = normals
+    return jacobian.T
 
 
 def residual_jacobian(pose: F64, since: F64, rotation: F64) -> F64:
@@ -272,16 +278,16 @@ def residual_jacobian(pose: F64, since: F64, rotation: F64) -> F64:
     rotation : ndarray, shape (3, 3)
         Sensor axes to map axes.
     """
-    dt = since[:, None]
-    turn, place = pose[:, :3], pose[:, 3:]
-    h = np.empty((len(pose), ERRORS))
-    h[:, ROTATION] = turn
-    h[:, POSITION] = place
-    h[:, VELOCITY] = dt * place
-    h[:, GYRO_BIAS] = -dt * turn
-    h[:, ACCEL_BIAS] = -0.5 * dt * dt * (place @ rotation)
-    h[:, GRAVITY] = 0.5 * dt * dt * place
-    return h
+    turn, place = pose[:, :3].T, pose[:, 3:].T
+    half = 0.5 * since * since
+    h = np.empty((ERRORS, len(pose)))
+    h[ROTATION] = turn
+    h[POSITION] = place
+    h[VELOCITY] = since * place
+    h[GYRO_BIAS] = -since * turn
+    h[ACCEL_BIAS] = -half * (rotation.T @ place)
+    h[GRAVITY] = half * place
+    return h.T
 
 
 def robust_weights(distances: F64, scales: F64) -> F64:
@@ -292,8 +298,7 @@ def robust_weights(distances: F64, scales: F64) -> F64:
 def _deskewed_again(source: Source, error: F64, rotation: F64) -> F64:
     """Return the points (N, 3) as a corrected motion deskews them, to first order."""
     since = source.times[:, None]
-    turned = rotations.cross(-error[GYRO_BIAS] * since, source.points)
-    moved = since * error[VELOCITY] + 0.5 * since**2 * error[GRAVITY]
-    return np.asarray(
-        source.points + turned + moved @ rotation - 0.5 * since**2 * error[ACCEL_BIAS]
-    )
+    velocity = error[VELOCITY] @ rotation
+    acceleration = error[GRAVITY] @ rotation - error[ACCEL_BIAS]
+    moved = source.points @ skew(-error[GYRO_BIAS]).T + velocity + (0.5 * since) * acceleration
+    return np.asarray(source.points + since * moved)

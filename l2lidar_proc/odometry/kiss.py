@@ -194,7 +194,8 @@ def _thinned(points: F64, size: float) -> F64:
     """Return one of the points (N, 3) in each voxel of a size [m]."""
     from kiss_icp.voxelization import voxel_down_sample
 
-    return np.asarray(voxel_down_sample(points, size))
+    # other layouts it converts number by number, in ten times the time
+    return np.asarray(voxel_down_sample(np.ascontiguousarray(points), size))
 
 
 _UNKNOWN = 1.0  # KISS-ICP gives no covariance: a meter and a radian

@@ -22,6 +22,7 @@ from l2lidar_proc.motion.filter import (
     ROTATION,
     VELOCITY,
     InertialState,
+    square_root,
     update_with_information,
 )
 from l2lidar_proc.motion.sweep_motion import SweepMotion
@@ -190,7 +191,8 @@ class SweepMatcher:
         """
         state = motion.state
         points = xyz(moved) - self.lever
-        fresh = self.surfaces.add(points @ state.rotation.T + state.position, self._sweeps)
+        placed = (state.rotation @ points.T + state.position[:, None]).T
+        fresh = self.surfaces.add(placed, self._sweeps)
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
         self.kiss.update(points, _pose(state), _pose(guess))
         self._walk(state.position)
@@ -320,7 +322,7 @@ class SweepMatcher:
         information[POSITION, POSITION] = np.eye(3) / tuning.KISS_SIGMA[1] ** 2
         still = np.zeros(len(information))
         state, covariance = update_with_information(
-            motion.state, motion.covariance, place, information, still
+            motion.state, square_root(motion.covariance), place, information, still
         )
         nobody = np.empty(0, np.int64), np.empty(0)
         claimed = information[POSITION, POSITION]
@@ -345,8 +347,11 @@ def pose_covariance(motion: SweepMotion) -> F64:
 
 
 def xyz(points: NDArray[np.void]) -> F64:
-    """Return the coordinates of structured points (N,) as float64, shape (N, 3)."""
-    return np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    """Return the coordinates of structured points (N,) as float64, shape (N, 3).
+
+    Each axis is contiguous: that is how the maps compute with them.
+    """
+    return np.stack([points[axis] for axis in "xyz"], dtype=np.float64).T
 
 
 def _pose(state: InertialState) -> F64:

@@ -26,7 +26,11 @@ def some(layout: np.dtype[Any]) -> st.SearchStrategy[Any]:
 def test_they_are_equal_to_numpys_own(found: Any, step: int, data: st.DataObject) -> None:
     found = found[::step]  # also where it is not contiguous
     mask = data.draw(arrays.arrays(np.bool_, len(found)))
+    written, expected = records.copied(found), found.copy()
+    records.assign(written, np.flatnonzero(mask), found[::-1][mask])
+    expected[mask] = found[::-1][mask]
     for mine, theirs in (
+        (written, expected),
         (records.copied(found), found.copy()),
         (records.selected(found, mask), found[mask]),
         (records.selected(found, np.flatnonzero(mask)), found[np.flatnonzero(mask)]),

@@ -230,11 +230,40 @@ def test_information_form_equals_the_ordinary_update() -> None:
     jacobian, residual = rng.normal(0, 1, (40, eskf.ERRORS)), rng.normal(0, 0.01, 40)
     weight = 1.0 / 0.05**2
     plain = eskf.update(state, covariance, residual, jacobian, np.eye(40) / weight)
+    # iterated: where the residuals are linearized is not the prior
+    off = rng.normal(0, 0.02, eskf.ERRORS)
+    at = state.boxplus(off)
+    root = eskf.square_root(covariance)
+    np.testing.assert_allclose(root @ root.T, covariance, atol=1e-18)
     found, posterior = eskf.update_with_information(
-        state, covariance, state, weight * jacobian.T @ jacobian, weight * jacobian.T @ residual
+        state,
+        root,
+        at,
+        weight * jacobian.T @ jacobian,
+        weight * jacobian.T @ (residual - jacobian @ at.boxminus(state)),
     )
-    np.testing.assert_allclose(found.boxminus(plain.state), 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.boxminus(plain.state), 0.0, atol=2e-4)  # turns do not commute
     np.testing.assert_allclose(posterior, plain.covariance, atol=1e-12)
+
+
+def test_the_information_form_keeps_what_is_certain_and_is_never_negative() -> None:
+    """Of a singular covariance, and of information that is a million million times stronger."""
+    state, rng = some_state(), np.random.default_rng(6)
+    sigma = rng.uniform(0.01, 0.1, eskf.ERRORS)
+    sigma[eskf.POSITION] = 0.0
+    jacobian = rng.normal(0, 1, (40, eskf.ERRORS))
+    found, posterior = eskf.update_with_information(
+        state,
+        eskf.square_root(np.diag(sigma**2)),
+        state,
+        1e12 * jacobian.T @ jacobian,
+        1e12 * jacobian.T @ rng.normal(0, 0.01, 40),
+    )
+    np.testing.assert_allclose(found.position, state.position, atol=1e-12)
+    np.testing.assert_allclose(posterior[eskf.POSITION], 0.0, atol=1e-18)
+    np.testing.assert_array_equal(posterior, posterior.T)
+    assert np.linalg.eigvalsh(posterior).min() > -1e-24
+    assert (np.diag(posterior)[eskf.VELOCITY] < 1e-10).all()
 
 
 def simulated_nees(seed: int, accel_scale: float = 1.0) -> F64:
