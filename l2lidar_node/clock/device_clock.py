@@ -297,6 +297,16 @@ class DeviceClock:
         self._ends[stream] = result + duration_ns
         return HostNs(result)
 
+    def interchangeable_until(self) -> DeviceNs:
+        """Return up to which stamp it does not matter which stream's packets are observed first.
+
+        As long as no stamp falls, and each stream's come in order. 0 where it does matter.
+        """
+        base = self._device.common_base
+        if base is None or not self._host.ready:
+            return DeviceNs(0)
+        return DeviceNs(self._host.due + base)
+
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Take note that a time-sync command with this value left the host at ``sent``."""
         self._schedule.sent(value, sent)

@@ -31,6 +31,7 @@ _NUMBERS_HOLD_NS: Final = 150 * _MS  # disagreement with arrivals up to which nu
 # A sync cannot take effect before it is sent. The margin covers the host line's error under load.
 _BEFORE_SENT_NS: Final = 20 * _MS
 _SHORTEST_STANDBY_NS: Final = 50 * _MS  # [device] the numbers do not count while it lasts
+_SYNC_DELAY_NS: Final = 2_000 * _MS  # a sync that has not taken effect by then was lost
 # Gains of the loops: the IMU's sampler has a constant period, the mirror's motor has not.
 _IMU_GAIN: Final = 0.02
 _POINTS_GAIN: Final = 0.5
@@ -126,6 +127,22 @@ class DeviceClockModel:
         self._newest_sync = _NO_SYNC  # the latest one that is known to have taken effect
         self._imu = _StreamState(_IMU_GAIN)
         self._points = _StreamState(_POINTS_GAIN)
+
+    @property
+    def common_base(self) -> int | None:
+        """The ``base`` of the epoch that both streams are in, or the only one that there is.
+
+        None while they are in two, or a sync may be about to begin another one.
+        """
+        imu, points = self._imu.epoch, self._points.epoch
+        if points is None or (imu is not None and imu is not points):
+            return None
+        if self._syncs:
+            last = self._syncs[-1]
+            is_in_force = last is self._newest_sync
+            if not is_in_force and self._points.arrival - last.sent < _SYNC_DELAY_NS:
+                return None
+        return points.base
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Take note of a sync that left this host; whether it arrives is not known."""

@@ -207,7 +207,7 @@ class HostClockModel:
             return
         height = (arrival - self._host) - (u - self._u) * self._slope
         low = self._low
-        if low is None or height < low:
+        if low is None or height < low or (height == low and arrival < self._low_at[1]):
             self._low = height
             self._low_at = (u, arrival)
 

@@ -16,9 +16,10 @@ from typing import Final, NamedTuple
 from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.clock import ClockEvent, ClockStatus, DeviceClock
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.driver.deferred import DeferredPoints
 from l2lidar_node.driver.device import Answer, CommandClient, DeviceState, QuerySchedule, Watchdog
 from l2lidar_node.driver.orientation import GravityAlignment, GravityMonitor
-from l2lidar_node.driver.reorder import Released, ReorderBuffer, SequenceCounts
+from l2lidar_node.driver.reorder import REORDER_NS, Released, ReorderBuffer, SequenceCounts
 from l2lidar_node.driver.sweep import MAX_GAP_NS, BlockChoice, SweepAssembler, calibration_file
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.commands import Command
@@ -108,6 +109,7 @@ _POINTS_PERIOD_NS: Final = round(wire.MIRROR_PERIOD_S * 1e9)
 _IMU_PERIOD_NS: Final = round(1e9 / wire.IMU_RATE_HZ)
 # Looking up a member of an Enum takes long.
 _IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
+_IMU_SIZE: Final = wire.FRAME_SIZES[wire.PacketType.IMU]
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +156,9 @@ class Driver:
         self._imu_wait_ns = config.network.receive_interval_ms * 1_000_000
         self._framer = Framer()
         self._reorder_buffer = ReorderBuffer(config.sweep.reorder_window)
+        self._deferred = DeferredPoints()
+        self._points_size = _points_size(config)
+        self._owed: list[Event] = []  # made where nothing could be returned
         self.counters.sequence = self._reorder_buffer.counts
         self._clock = DeviceClock(config.clock)
         self._gravity_alignment = GravityAlignment(config.imu.roll_pitch_only)
@@ -182,7 +187,36 @@ class Driver:
         counters = self.counters
         counters.datagrams += 1
         counters.octets += len(data)
-        events = [] if self._reorder_buffer.is_flowing(arrival) else self.settle(arrival)
+        if len(data) != self._points_size:
+            events = self._take(data, arrival)
+        elif self._deferred.takes(data, arrival):
+            return []
+        else:
+            events = self._take(data, arrival)
+            self._defer_next()
+        if self._owed:
+            events = self.catch_up() + events
+        return events
+
+    def catch_up(self) -> list[Event]:
+        """Return what the packets of points make that have been put off.
+
+        What the driver returns is the same whenever, and however often, this is called; but
+        counters and states are those of now only after it.
+        """
+        events, self._owed = self._owed, []
+        for data, arrival in self._deferred.taken():
+            events += self._take(data, arrival)
+        return events
+
+    def _take(self, data: bytes, arrival: HostNs) -> list[Event]:
+        events: list[Event] = []
+        deferred, counters = self._deferred, self.counters
+        # An IMU sample shows by its stamp and number whether it can go first.
+        if deferred.waiting and (len(data) != _IMU_SIZE or arrival - deferred.newest > REORDER_NS):
+            events = self.catch_up()
+        if not deferred.waiting and not self._reorder_buffer.is_flowing(arrival):
+            events += self.settle(arrival)
         for item in self._framer.feed(data):
             if isinstance(item, FrameError):
                 counters.faults[item.fault.value] += 1
@@ -207,6 +241,8 @@ class Driver:
         """
         events = self.settle(now if heard_until is None else heard_until)
         events += self._send_due(now)
+        if self._deferred.waiting:
+            self._watchdog.heard(_POINTS, self._deferred.newest)
         if self._watchdog.expired(now):
             events.append(Silence(self._watchdog.silence_ns(now)))
         return events
@@ -217,7 +253,10 @@ class Driver:
         Packets that waited :data:`~l2lidar_node.driver.reorder.REORDER_NS` for an earlier one, and
         the sweep of a stream of points that paused for :data:`MAX_GAP_NS`, unless it is a turn.
         """
-        events = self._released(self._reorder_buffer.settle(until))
+        if not self.is_overdue(until):
+            return self.catch_up() if self._owed else []
+        events = self.catch_up()
+        events += self._released(self._reorder_buffer.settle(until))
         if self._has_stalled(until):
             events += self._finished(self._assembler.flush())
         return events
@@ -227,8 +266,9 @@ class Driver:
 
         A step of 0 says that steps will be told. Where nobody tells they are inferred.
         """
+        events = self.catch_up()
         self._clock.host_stepped(by_ns, at)
-        return [*self._clock.events()]
+        return events + self._clock.events()
 
     def host_slewed(self, by_ns: int, at: HostNs) -> None:
         """Take note of how far slewing has moved the clock of arrivals since a fixed instant.
@@ -236,10 +276,13 @@ class Driver:
         To be called whenever the last two calls do not predict it; see
         :meth:`DeviceClock.host_slewed`.
         """
+        self._owed = self.catch_up()
         self._clock.host_slewed(by_ns, at)
 
     def is_overdue(self, until: HostNs) -> bool:
         """Tell whether :meth:`settle` would do anything."""
+        if self._deferred.waiting:
+            return until - self._deferred.newest > REORDER_NS
         return self._reorder_buffer.is_overdue(until) or self._has_stalled(until)
 
     def awaited(self) -> HostNs:
@@ -249,7 +292,10 @@ class Driver:
         next IMU sample is, if samples are published. Something else may wait longer.
         """
         points, imu = self._reorder_buffer.last_arrivals
-        awaited = points + self._assembler.packets_left * _POINTS_PERIOD_NS
+        if self._deferred.is_open:
+            awaited = int(self._deferred.due)
+        else:
+            awaited = points + self._assembler.packets_left * _POINTS_PERIOD_NS
         if self._config.imu.enable_publishing:
             awaited = min(awaited, imu + _IMU_PERIOD_NS + self._imu_wait_ns)
         return HostNs(awaited)
@@ -272,27 +318,28 @@ class Driver:
         The driver calls it for everything it sends. Whoever replays a recording calls it for the
         commands in there.
         """
+        if command.is_latency:
+            self._requests.add(command, at, tries=1)
+            return []
+        events = self.catch_up()
         if command.time is not None:
             self._clock.synced(command.time, at)
-        elif command.is_latency:
-            self._requests.add(command, at, tries=1)
         elif command.is_start:
             self._watchdog.started(at)
             self._reorder_buffer.forget()
         elif command.is_standby:
             self._watchdog.stopped(at)
-            return self.flush()
+            events += self.flush()
         elif command.is_reset:
             self._watchdog.started(at)
-            events = self.flush()
+            events += self.flush()
             self._reorder_buffer.forget()
             self._forget_device()
-            return events
-        return []
+        return events
 
     def start_rotation(self, now: HostNs) -> int:
         """Queue the command to leave standby; return its ticket."""
-        self.sent(commands.start(), now)
+        self._owed = self.sent(commands.start(), now)
         return self.send(commands.start(), now)
 
     def stop_rotation(self, now: HostNs) -> tuple[int, list[Event]]:
@@ -306,12 +353,15 @@ class Driver:
 
     def flush(self) -> list[Event]:
         """Return everything that is still being collected."""
-        events = self._released(self._reorder_buffer.flush())
+        events = self.catch_up()
+        events += self._released(self._reorder_buffer.flush())
         return events + self._finished(self._assembler.flush())
 
     def configure(self, config: DriverConfig) -> None:
         """Use other live settings from the next packet on."""
+        self._owed = self.catch_up()
         self._config = config
+        self._points_size = _points_size(config)
         self._gravity_alignment.roll_pitch_only = config.imu.roll_pitch_only
         self._assembler.configure(config.sweep, self._level())
         self._clock.configure(config.clock)
@@ -338,9 +388,15 @@ class Driver:
     def _handle(self, packet: Packet, arrival: HostNs) -> list[Event]:
         if isinstance(packet, ImuPacket):
             self._watchdog.heard(_IMU, arrival)
+            deferred = self._deferred
+            events = []
+            if deferred.waiting and packet.stamp >= deferred.until:
+                events = self.catch_up()
             if self._reorder_buffer.follows(_IMU, packet, arrival):
-                return self._imu(packet, arrival)
-            return self._reordered(_IMU, packet, arrival)
+                return events + self._imu(packet, arrival)
+            if deferred.waiting:
+                events += self.catch_up()
+            return events + self._reordered(_IMU, packet, arrival)
         if isinstance(packet, PointPacket):
             self._watchdog.heard(_POINTS, arrival)
             if (packet.packet_type == _POINTS_3D) != self._config.sweep.frame3d:
@@ -360,6 +416,18 @@ class Driver:
         if isinstance(packet, DecodeError):
             self.counters.rejected[f"{packet.packet_type}.{packet.reason}"] += 1
         return []
+
+    def _defer_next(self) -> None:
+        """Put off the packets of points from the next one on, as long as nobody misses them.
+
+        That is until one may complete a sweep, or the clock has to know what has arrived. None if
+        they come out of order.
+        """
+        left = self._assembler.packets_left
+        last = self._reorder_buffer.last_in_order(_POINTS)
+        if left > 1 and last is not None:
+            due = HostNs(last.arrival + left * _POINTS_PERIOD_NS)
+            self._deferred.begin(last, left, due, self._clock.interchangeable_until())
 
     def _reordered(
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
@@ -455,3 +523,9 @@ class Driver:
         self._gravity_alignment.clear()
         self.version = None
         self.parameters = None
+
+
+def _points_size(config: DriverConfig) -> int:
+    """Return the size of the datagrams of points that are asked for [B]."""
+    is_3d = config.sweep.frame3d
+    return wire.FRAME_SIZES[_POINTS_3D if is_3d else wire.PacketType.POINTS_2D]

@@ -402,6 +402,18 @@ class ReorderBuffer:
             return _bounded(lane, order.resume(packet.seq, timed))
         return _bounded(lane, order.push(packet.seq, timed))
 
+    def last_in_order(self, stream: Stream) -> Timed | None:
+        """Return the last packet of a stream if the next number is the only one to come now.
+
+        None before there was a packet, and while anything waits or is withheld in either stream.
+        """
+        lane = self._lanes[stream]
+        if any(one.order.waiting or one.suspects for one in self._lanes.values()):
+            return None
+        if lane.newest is None or lane.released is not None:
+            return None
+        return Timed(lane.newest, HostNs(lane.arrival))
+
     def is_flowing(self, until: HostNs) -> bool:
         """Tell whether points came a moment ago and nothing waits: so nothing can be overdue."""
         return (

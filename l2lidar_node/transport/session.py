@@ -85,6 +85,7 @@ class Loop(ABC):
             if not future.set_running_or_notify_cancel():
                 return
             try:
+                self._hand_out(self.driver.catch_up())
                 future.set_result(function(self.driver, self._now()))
             except Exception as error:  # the caller gets whatever it was
                 future.set_exception(error)

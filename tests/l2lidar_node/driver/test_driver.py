@@ -93,6 +93,7 @@ def _same(one: Event, other: Event) -> bool:
 def test_sweeps_and_samples_come_once_the_clock_is_locked(
     played: Run, datagrams: list[Datagram]
 ) -> None:
+    assert played.driver.catch_up() == []
     counters = played.driver.counters
     unlocked = counters.unlocked
     assert 0 < unlocked[Stream.IMU] < 250

@@ -32,6 +32,7 @@ class Watched:
         self.before = self.period()
 
     def period(self) -> Period:
+        self.run.events += self.run.driver.catch_up()
         return observe(self.run.driver, self.link, HostNs(self.run.now))
 
     def begin(self) -> None:
