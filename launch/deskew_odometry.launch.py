@@ -10,6 +10,7 @@ from launch_ros.substitutions import FindPackageShare
 from l2lidar_node.ros.launching import (
     DRIVER_REMAPPINGS,
     RESPAWN_DELAY_S,
+    file_for,
     file_given,
     parameters_given,
     required,
@@ -26,20 +27,20 @@ def launch_setup(context):
     known = parameters_given(context, ["calibration_file"])
     if known:
         parameters.append(known)
-    ros_arguments = ["--log-level", LaunchConfiguration("log_level")]
     name = {"executable": "deskew_node", "name": "deskew_node"}
     if given["odometry"] == "true":
         # Without a name: the process hosts deskew_node and odometry_node.
         name = {"executable": "companion_node"}
-        for frame, value in parameters_given(context, ["odom_frame", "base_frame"]).items():
-            ros_arguments += ["-p", f"odometry_node:{frame}:={value}"]
+        frames = parameters_given(context, ["odom_frame", "base_frame"])
+        if frames:
+            parameters.append(file_for("odometry_node", frames))
     return [
         Node(
             package="l2lidar_node",
             namespace=LaunchConfiguration("namespace"),
             parameters=parameters,
             remappings=DRIVER_REMAPPINGS,
-            ros_arguments=ros_arguments,
+            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
             respawn=is_respawned,
             respawn_delay=RESPAWN_DELAY_S,

@@ -29,7 +29,7 @@ def launch_setup(context):
     sensors = {
         name.rpartition("/")[0].strip("/"): values
         for name, values in parameters_by_node(file).items()
-        if name.rpartition("/")[2] == "l2lidar_node" and name.count("/") > 1
+        if name.rpartition("/")[2] == "l2lidar_node" and name.count("/") > 1 and "*" not in name
     }
     if not sensors:
         raise RuntimeError(

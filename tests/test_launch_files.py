@@ -168,7 +168,8 @@ def test_xml_names_what_exists(path: Any) -> None:
 
 def test_example_of_several_sensors_is_what_drivers_take() -> None:
     path = ROOT / "config" / "multi.yaml"
-    sensors = [name for name in parameters_by_node(path) if name.endswith("/l2lidar_node")]
+    shared, *sensors = parameters_by_node(path)
+    assert shared == "/**/l2lidar_node"
     assert sensors == ["/front/l2lidar_node", "/rear/l2lidar_node"]
     built = [build(DriverConfig, parameters_for(path, "any", name)) for name in sensors]
     assert len({config.network.host_port for config in built}) == len(built)
@@ -258,9 +259,13 @@ class Started:
     @property
     def parameters(self) -> Any:
         """What the node takes from its files, as ROS reads them."""
+        return self.parameters_of(self.name)
+
+    def parameters_of(self, name: Any) -> Any:
+        """What the node with this full name in the process takes from its files."""
         values = {}
         for path in self.files:
-            values.update(parameters_for(path, "no stock name", self.name))
+            values.update(parameters_for(path, "no stock name", name))
         return values
 
 
@@ -509,14 +514,13 @@ def test_one_file_starts_several_sensors(launched: Any) -> None:
     ]
     assert len({port for pair in ports for port in pair}) == 4
     assert len(made.processes) == 2
-    odoms = [
-        text
-        for node in made.nodes
-        if node.executable == "companion_node"
-        for text in node.words
-        if "odom_frame" in text
-    ]
-    assert odoms == [f"odometry_node:odom_frame:={side}_odom" for side in ("front", "rear")]
+    hosts = [node for node in made.nodes if node.executable == "companion_node"]
+    for host, side in zip(hosts, ("front", "rear"), strict=True):
+        assert host.parameters_of(f"/{side}/odometry_node")["odom_frame"] == f"{side}_odom"
+        assert "odom_frame" not in host.parameters_of(f"/{side}/deskew_node")
+        # what only the driver knows does not reach the others, which would warn of it
+        for name in ("odometry_node", "deskew_node"):
+            assert "enable_IMU_publishing" not in host.parameters_of(f"/{side}/{name}")
 
 
 @needs_launch
@@ -530,7 +534,7 @@ def test_deskew_gets_points_of_the_sensors_own_frame_with_an_imu(launched: Any) 
     alone = launched("deskew_odometry", odometry="false").executables
     assert alone == ["l2lidar_node", "deskew_node"]
     framed = launched("deskew_odometry", base_frame="base_link").node("companion_node")
-    assert "odometry_node:base_frame:=base_link" in framed.words
+    assert framed.parameters_of("/odometry_node")["base_frame"] == "base_link"
 
 
 @needs_launch

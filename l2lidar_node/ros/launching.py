@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, Final
 
 import yaml
@@ -36,6 +37,25 @@ def file_given(context: LaunchContext, argument: str) -> str:
     if not path.is_file():
         raise FileNotFoundError(f"{argument}:={given}: there is no such file")
     return str(path)
+
+
+def file_for(node: str, values: dict[str, Any]) -> str:
+    """Return the path of a new parameter file for one node of a process, in any namespace.
+
+    What launch is given as a dict goes to every node of a process, and what goes after ``-p`` as
+    ``NODE:NAME:=VALUE`` to none in a namespace. The file stays, as those that launch writes do.
+
+    Parameters
+    ----------
+    node : str
+        Name without namespace.
+    values : dict
+        Parameters.
+    """
+    content = {f"/**/{node}": {"ros__parameters": values}}
+    with NamedTemporaryFile("w", prefix="launch_params_", suffix=".yaml", delete=False) as file:
+        yaml.safe_dump(content, file)
+    return file.name
 
 
 def parameters_given(
