@@ -354,7 +354,7 @@ class SurfelMap:
         begins = np.flatnonzero(np.diff(keys, prepend=-1))
         lengths = np.diff(begins, append=len(keys))
         distinct, group = np.unique(keys[begins], return_inverse=True)
-        counts: F64 = np.bincount(group, lengths.astype(np.float64), len(distinct))
+        counts = np.bincount(group, lengths, len(distinct)).astype(np.float64)
         return _Groups(np.repeat(group, lengths), distinct, self._middles(distinct), counts)
 
     def _cells_of(self, groups: _Groups) -> tuple[I64, I64]:
