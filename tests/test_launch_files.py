@@ -708,7 +708,7 @@ def test_launch_ends_with_its_parts_and_leaves_none_behind(
         "from launch import LaunchDescription, LaunchService\n"
         "from launch.actions import IncludeLaunchDescription\n"
         "path, *given = sys.argv[1:]\n"
-        "service = LaunchService()\n"
+        "service = LaunchService(noninteractive=True)\n"  # so it hands the signal on itself
         "service.include_launch_description(LaunchDescription([IncludeLaunchDescription(path,\n"
         "    launch_arguments=[tuple(word.split(':=')) for word in given])]))\n"
         "sys.exit(service.run())\n"
