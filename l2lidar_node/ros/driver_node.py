@@ -37,6 +37,7 @@ from l2lidar_node.ros.diagnostics import HealthPublisher
 from l2lidar_node.ros.managed_node import ManagedNode, NextTurn
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
+from l2lidar_node.ros.topics import DRIVER_TOPICS
 from l2lidar_node.transport import session
 from l2lidar_node.transport.session import Loop, Session, Tap, Taps
 from l2lidar_node.transport.udp import TransportError
@@ -267,11 +268,25 @@ class DriverNode(ManagedNode):
             self._imu_publisher = self.create_lifecycle_publisher(
                 Imu, topics.imu_topic_id, QoSProfile(depth=_IMU_DEPTH, reliability=reliability)
             )
+        self._warn_of_absolute_topics()
         if config.frames.publish_tf:
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._tf_publisher = self.create_publisher(TFMessage, "/tf_static", latched)
             now = HostNs(self.get_clock().now().nanoseconds)
             self._tf_publisher.publish(TFMessage(transforms=[imu_transform(config.frames, now)]))
+
+    def _warn_of_absolute_topics(self) -> None:
+        """Warn where the node is in a namespace and upstream's absolute topic names are not."""
+        publishers = (self._cloud_publisher, self._imu_publisher)
+        names = [item.topic_name for item in publishers if item is not None]
+        outside = [name for name in names if name in DRIVER_TOPICS]
+        if outside and self.get_namespace() != "/":
+            remaps = " ".join(f"-r {name}:={name.removeprefix('/')}" for name in outside)
+            self.get_logger().warning(
+                f"{' and '.join(outside)} stay outside of the namespace {self.get_namespace()}, "
+                "since upstream's names begin with '/'; to have them in it, use the launch files "
+                f"or add '{remaps}'"
+            )
 
     def _open_compressed(self, config: DriverConfig, reliability: ReliabilityPolicy) -> None:
         try:

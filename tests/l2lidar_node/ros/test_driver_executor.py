@@ -21,7 +21,7 @@ from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
-from l2lidar_node.demo.processes import free_udp_ports  # noqa: E402
+from l2lidar_node.demo.processes import assigned, free_udp_ports  # noqa: E402
 from l2lidar_node.driver import driver  # noqa: E402
 from l2lidar_node.protocol import wire  # noqa: E402
 from l2lidar_node.ros import driver_node  # noqa: E402
@@ -213,3 +213,29 @@ def test_a_destroyed_node_leaves_the_graph_and_may_be_destroyed_twice(rig: Rig) 
     rig.node.destroy_node()
     rig.until(lambda: "l2lidar_node" not in rig.peer.get_node_names())
     rig.node.destroy_node()
+
+
+def test_names_that_stay_outside_of_the_namespace_are_warned_of(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Upstream's names are absolute, so a namespace alone does not keep two sensors apart."""
+    hints = ["-r", "/points:=points", "-r", "/imu/data:=imu/data"]
+
+    def said(*given: str) -> str:
+        port = free_udp_ports(1)[0]
+        values = assigned(
+            {"l2_ip": "127.0.0.1", "host_ip": "127.0.0.1", "host_port": port,
+             "enable_IMU_publishing": True}
+        )  # fmt: skip
+        rclpy.init(args=["test", *values, *given])
+        try:
+            DriverNode().destroy_node()
+        finally:
+            rclpy.shutdown()
+        return capfd.readouterr().err
+
+    alone = said("-r", "__ns:=/front")
+    assert "/points and /imu/data stay outside of the namespace /front" in alone
+    assert " ".join(hints) in alone
+    assert "outside" not in said("-r", "__ns:=/front", *hints)
+    assert "outside" not in said()
