@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from benchmarks.results import Target, at_least, at_most, markdown, measured_on, verdicts
 
@@ -41,7 +41,7 @@ count as wrong beyond 1 m or 10 degrees."""
 
 def upper_bound(failures: int, runs: int) -> float:
     """Return the 95 % upper bound (Clopper and Pearson) of a rate."""
-    return 1.0 if failures >= runs else float(beta.ppf(0.95, failures + 1, runs - failures))
+    return 1.0 if failures >= runs else float(betaincinv(failures + 1, runs - failures, 0.95))
 
 
 def lower_bound(successes: int, runs: int) -> float:

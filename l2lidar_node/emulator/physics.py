@@ -271,14 +271,16 @@ class WorkerInertial:
 _state: dict[str, Any] = {}  # of the measuring process
 
 
-def _settle() -> None:
-    """Leave signals, which often go to the whole group, to the parent; go when it is gone.
-
-    Nobody draws in a notebook here: without Dash open3d is imported in half of the time.
-    """
+def leave_out_dash() -> None:
+    """Have open3d imported in half of the time, without what draws in notebooks."""
     dash = ModuleType("dash")
     dash.__dict__.update(dict.fromkeys(("Dash", "dcc", "html")))
     sys.modules["dash"] = dash
+
+
+def _settle() -> None:
+    """Leave signals, which often go to the whole group, to the parent; go when it is gone."""
+    leave_out_dash()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
