@@ -19,7 +19,7 @@ WAY = 3.0
 def ends() -> list[Place]:
     errors = UnitErrors(range_scale=0.004, range_bias=0.04)
     places = slide(replace(UNITS["a"], errors=errors), WAY, seconds=3.0)
-    return [replace(place, returns=place.returns[::2]) for place in places]
+    return [replace(place, returns=place.returns[::3]) for place in places]
 
 
 def test_the_scale_is_found_whatever_the_bias(ends: list[Place]) -> None:

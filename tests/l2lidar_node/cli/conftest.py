@@ -38,7 +38,9 @@ def free_port() -> int:
 class Unit:
     """A virtual L2 that runs in a thread; what it stores can be looked at."""
 
-    def __init__(self, faults: FaultConfig, power: PowerConfig, mode: int) -> None:
+    def __init__(
+        self, faults: FaultConfig, power: PowerConfig, mode: int, scanner: PatternScanner
+    ) -> None:
         self.host_port = free_port()
         addresses = AddressConfig(lidar_port=free_port(), host_port=self.host_port)
         config = DeviceConfig(
@@ -51,7 +53,7 @@ class Unit:
         self.port = UdpPort(flash.network)
         self.lidar_port = self.port.address[1]
         self.device = VirtualL2(
-            config, PatternScanner(), StillInertial(), flash=flash, power_on_ns=time.time_ns()
+            config, scanner, StillInertial(), flash=flash, power_on_ns=time.time_ns()
         )
         self.server = Server(self.device, self.port)
         self._thread = threading.Thread(target=self.server.run)
@@ -78,9 +80,14 @@ class Unit:
 def make_unit() -> Iterator[Callable[..., Unit]]:
     units: list[Unit] = []
 
-    def make(mode: int = 0, faults: FaultConfig | None = None, **power: Any) -> Unit:
+    def make(
+        mode: int = 0,
+        faults: FaultConfig | None = None,
+        scanner: PatternScanner | None = None,
+        **power: Any,
+    ) -> Unit:
         settings = dataclasses.replace(PowerConfig(boot_scale=0.0), **power)
-        units.append(Unit(faults or FaultConfig(), settings, mode))
+        units.append(Unit(faults or FaultConfig(), settings, mode, scanner or PatternScanner()))
         return units[-1]
 
     yield make

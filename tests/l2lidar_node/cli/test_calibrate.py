@@ -11,6 +11,7 @@ import pytest
 
 from l2lidar_node.calibration.file import CalibrationFile, load
 from l2lidar_node.emulator.physics import PhysicsConfig, assemble
+from l2lidar_node.emulator.unit.stream import PatternScanner
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType, WorkMode
 from l2lidar_node.recording.capture import Endpoint
@@ -23,11 +24,11 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def capture(path: Path, rpy: tuple[float, ...], seconds: float = 2.2, seed: int = 0) -> Path:
-    """Write what a typical unit sends at a still place; two beams in three return nothing."""
+    """Write what a typical unit sends at a still place; one beam in six returns something."""
     physics = assemble(PhysicsConfig(motion="still", mount_rpy_deg=rpy, unit="typical", seed=seed))
     packets, starts = physics.scanner.packets(430, round(seconds / 0.004639))
-    for gone in (1, 2):  # the estimate takes as long as there are points
-        packets["ranges"][:, gone::3] = 0
+    for gone in range(1, 6):  # the estimate takes as long as there are points
+        packets["ranges"][:, gone::6] = 0
     samples, times = physics.inertial.samples(500, round(seconds * 250))
     items = [(t, PacketType.POINTS_3D, packets[i]) for i, t in enumerate(starts.tolist())]
     items += [(t, PacketType.IMU, samples[i]) for i, t in enumerate(times.tolist())]
@@ -120,7 +121,7 @@ def test_a_virtual_unit_must_be_known(run: Run) -> None:
 def test_the_scale_of_a_virtual_unit_is_written(run: Run, tmp_path: Path) -> None:
     output = tmp_path / "unit.yaml"
     done = run(
-        "calibrate", "scale", "--length", "3", "--emulator", "typical", "--seconds", "4",
+        "calibrate", "scale", "--length", "3", "--emulator", "typical", "--seconds", "2",
         "-o", str(output),
     )  # fmt: skip
     assert done.code == 0
@@ -128,8 +129,11 @@ def test_the_scale_of_a_virtual_unit_is_written(run: Run, tmp_path: Path) -> Non
     assert output.exists() == ("give it to the driver" in done.out)
 
 
-def test_live_places_are_recorded_and_kept(run: Run, unit: Unit, tmp_path: Path) -> None:
-    """The unit sends a pattern without surfaces: it is measured, kept, and refused."""
+def test_live_places_are_recorded_and_kept(
+    run: Run, make_unit: Callable[..., Unit], tmp_path: Path
+) -> None:
+    """The unit sees nothing: its place is measured, kept, and refused."""
+    unit = make_unit(scanner=PatternScanner(empty=True))
     done = run(
         "calibrate", "still", "--places", "1", "--seconds", "1", "--keep", str(tmp_path),
         "--yes", *unit.options,

@@ -330,7 +330,7 @@ def test_record_writes_bags(run: Run, unit: Unit, tmp_path: Path) -> None:
 
 
 def test_odometry_of_a_capture(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "run.pcap").write_bytes(live_run(2.5)[2].stream.getvalue())
+    (tmp_path / "run.pcap").write_bytes(live_run(1.2)[2].stream.getvalue())
     outcome = run("odometry", str(tmp_path / "run.pcap"), str(tmp_path / "out"))
     assert (outcome.code, outcome.err) == (0, "")
     assert (tmp_path / "out" / "map.ply").exists()
