@@ -186,11 +186,13 @@ USUAL_OUTLIERS: Final = 2.5
 USUAL_BLEND: Final = 0.1  # share of each newer sweep in what is usual
 USUAL_LEAST: Final = 0.75  # inliers needed whatever is usual
 OVERLAP: Final = (0.0, 0.25)  # likewise, share of the points that must meet the map
-MATCHED: Final = (0, 50)  # and how many: a few fit in many places
-# A place farther from the predicted one than the robust kernel reaches has to be fixed, along the
-# way there, by so many points. Tuned on: camera looking into rooms (4 at wrong places, 11 to 19 at
-# the right one)
+# A pose farther from the predicted one than the robust kernel reaches needs so many points, as a
+# few fit in many places (tuned on: camera on stairs, where 30 at the right place were refused for
+# 6 s), and so many that fix the place along the way there. Tuned on: camera looking into rooms (4
+# at wrong places, 11 to 19 at the right one)
 FAR_MOVE: Final = 0.1  # [m]
+FAR_TURN: Final = 0.03  # [rad]
+FAR_MATCHED: Final = 50
 FAR_POINTS: Final = 10.0
 MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
 YOUNG_SWEEPS: Final = 12  # in a map before a sweep without surfaces around is remarkable

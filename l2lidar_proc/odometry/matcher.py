@@ -260,23 +260,26 @@ class SweepMatcher:
         return (
             found is not None
             and found.inlier_ratio >= self._needed_inliers(strict)
-            and found.matched
-            >= max(tuning.OVERLAP[strict] * len(source.points), tuning.MATCHED[strict])
+            and found.matched >= tuning.OVERLAP[strict] * len(source.points)
             and not (strict and self._is_far_fetched(found, motion))
         )
 
     def _is_far_fetched(self, found: Alignment, motion: SweepMotion) -> bool:
         """Return whether a place far from the predicted one rests on a few points.
 
-        A handful of points that face a direction find a surface somewhere along it, if the
-        prediction leaves enough room; the others agree with every place along it.
+        A few points fit in many places. A handful that face a direction find a surface somewhere
+        along it, if the prediction leaves enough room; the others agree with every place along it.
         """
         move = found.state.position - motion.state.position
         far = float(np.linalg.norm(move))
-        if far < tuning.FAR_MOVE:
+        turn = found.state.boxminus(motion.state)[ROTATION]
+        if far < tuning.FAR_MOVE and np.linalg.norm(turn) < tuning.FAR_TURN:
             return False
         points = self.config.surfaces.point_noise**2 * found.information[POSITION, POSITION]
-        return float(move @ points @ move) < tuning.FAR_POINTS * far**2
+        facing = float(move @ points @ move)
+        return found.matched < tuning.FAR_MATCHED or (
+            far >= tuning.FAR_MOVE and facing < tuning.FAR_POINTS * far**2
+        )
 
     def _needed_inliers(self, strict: bool) -> float:
         """Return the inlier ratio that a result needs.

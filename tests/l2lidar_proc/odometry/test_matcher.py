@@ -127,6 +127,15 @@ def test_a_few_points_do_not_move_a_loose_prediction_far(grown: SweepMatcher, co
         assert place is None or place == pytest.approx(-0.2, abs=0.01)
 
 
+@pytest.mark.parametrize("error", [0.03, 0.3])
+def test_forty_points_confirm_a_loose_prediction_but_do_not_move_it_far(
+    grown: SweepMatcher, seen: Source, error: float
+) -> None:
+    cloud = seen.some(np.linspace(0, len(seen.points) - 1, 40).astype(int))
+    match = grown.match(cloud, motion(LOOSE, PLACE + np.array((error, 0.0, 0.0))))
+    assert match.alignment is None if error > tuning.FAR_MOVE else off(match) < 0.015
+
+
 def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
     rng = np.random.default_rng(13)
     cloud = source(rng.uniform((-3.5, -2.5, -1.0), (3.5, 2.5, 1.5), (1500, 3)))
