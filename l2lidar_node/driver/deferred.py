@@ -37,7 +37,7 @@ class DeferredPoints:
     until : int
         Stamps of the device from which on nothing is put off [ns].
     due : HostNs
-        When the packet is expected that may not be put off.
+        When the packet is expected that may not be put off; 0 where none may be.
     """
 
     __slots__ = ("_header", "_left", "_next", "_stamp", "due", "newest", "until", "waiting")
@@ -48,11 +48,6 @@ class DeferredPoints:
         self.until = 0
         self._header = b""
         self._next = self._left = self._stamp = 0
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the next packet may be put off."""
-        return self._left > 0
 
     def begin(self, last: Timed, left: int, due: HostNs, until: int) -> None:
         """Put off what follows a packet from now on.
@@ -102,5 +97,6 @@ class DeferredPoints:
     def taken(self) -> list[Datagram]:
         """Return what has been put off; nothing more is until :meth:`begin`."""
         self._left = 0
+        self.due = HostNs(0)
         waiting, self.waiting = self.waiting, []
         return waiting

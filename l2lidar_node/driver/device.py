@@ -107,7 +107,10 @@ class Watchdog:
 
     def expired(self, now: HostNs) -> bool:
         """Tell, once per silence, that it has lasted too long; to be asked regularly."""
-        self._follow_clock(now)
+        step = 0 if self._checked is None else now - self._checked
+        self._checked = now
+        if not 0 <= step <= MAX_STEP_NS:
+            self._follow_clock(now)
         over = self.silence_ns(now) > self._timeout_ns
         if over and not self._reported:
             self._reported = True
@@ -116,15 +119,11 @@ class Watchdog:
         return False
 
     def _follow_clock(self, now: HostNs) -> None:
-        """Begin to count anew when the host's clock was set or the host slept.
+        """Begin to count anew: the host's clock was set, or the host slept.
 
         A board without a battery starts in the past and jumps when it finds a time server: that
         is no silence of the device.
         """
-        step = 0 if self._checked is None else now - self._checked
-        self._checked = now
-        if 0 <= step <= MAX_STEP_NS:
-            return
         self._last = dict.fromkeys(self._last, now)
         if self._watching_since is not None:
             self._watching_since = now

@@ -20,7 +20,13 @@ from l2lidar_node.driver.deferred import DeferredPoints
 from l2lidar_node.driver.device import Answer, CommandClient, DeviceState, QuerySchedule, Watchdog
 from l2lidar_node.driver.orientation import GravityAlignment, GravityMonitor
 from l2lidar_node.driver.reorder import REORDER_NS, Released, ReorderBuffer, SequenceCounts
-from l2lidar_node.driver.sweep import MAX_GAP_NS, BlockChoice, SweepAssembler, calibration_file
+from l2lidar_node.driver.sweep import (
+    MAX_GAP_NS,
+    BlockChoice,
+    Level,
+    SweepAssembler,
+    calibration_file,
+)
 from l2lidar_node.protocol import commands, wire
 from l2lidar_node.protocol.commands import Command
 from l2lidar_node.protocol.framing import FrameError, Framer
@@ -34,7 +40,7 @@ from l2lidar_node.protocol.packets import (
     Version,
     decode,
 )
-from l2lidar_node.types import HostNs, ImuSample, Stream, Sweep, new_tuple
+from l2lidar_node.types import F64, HostNs, ImuSample, Stream, Sweep, new_tuple
 
 
 @dataclass(slots=True)
@@ -107,8 +113,10 @@ class Counters:
 _ROUND_TRIPS: Final = 60  # the last minute's
 _POINTS_PERIOD_NS: Final = round(wire.MIRROR_PERIOD_S * 1e9)
 _IMU_PERIOD_NS: Final = round(1e9 / wire.IMU_RATE_HZ)
+_FOREVER_NS: Final = 1 << 62
 # Looking up a member of an Enum takes long.
 _IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
+_SAMPLES_AT_ONCE: Final = 64  # are handed on, at most
 _IMU_SIZE: Final = wire.FRAME_SIZES[wire.PacketType.IMU]
 
 
@@ -149,11 +157,12 @@ class Driver:
         self.version: Version | None = None
         self.parameters: Parameters | None = None
         self.last_points: bytes | None = None
-        self.last_imu: ImuSample | None = None
-        self.gravity = GravityMonitor()
+        self._gravity = GravityMonitor()
+        self._samples: list[ImuSample] = []  # not yet with those that use them
+        self._last_imu: ImuSample | None = None
         self.round_trips: deque[int] = deque(maxlen=_ROUND_TRIPS)
         self._config = config
-        self._imu_wait_ns = config.network.receive_interval_ms * 1_000_000
+        self._imu_wait_ns = _imu_wait_ns(config)
         self._framer = Framer()
         self._reorder_buffer = ReorderBuffer(config.sweep.reorder_window)
         self._deferred = DeferredPoints()
@@ -173,6 +182,18 @@ class Driver:
     def config(self) -> DriverConfig:
         """The settings in force."""
         return self._config
+
+    @property
+    def last_imu(self) -> ImuSample | None:
+        """The latest sample; None before there was one."""
+        self._hand_on()
+        return self._last_imu
+
+    @property
+    def gravity(self) -> GravityMonitor:
+        """What the samples say of gravity."""
+        self._hand_on()
+        return self._gravity
 
     def receive(self, data: bytes, arrival: HostNs) -> list[Event]:
         """Return what the bytes of one datagram complete.
@@ -253,8 +274,12 @@ class Driver:
         Packets that waited :data:`~l2lidar_node.driver.reorder.REORDER_NS` for an earlier one, and
         the sweep of a stream of points that paused for :data:`MAX_GAP_NS`, unless it is a turn.
         """
-        if not self.is_overdue(until):
-            return self.catch_up() if self._owed else []
+        if self._deferred.waiting:
+            is_flowing = until - self._deferred.newest <= REORDER_NS
+        else:
+            is_flowing = self._reorder_buffer.is_flowing(until)
+        if is_flowing and not self._owed:
+            return []
         events = self.catch_up()
         events += self._released(self._reorder_buffer.settle(until))
         if self._has_stalled(until):
@@ -292,13 +317,11 @@ class Driver:
         next IMU sample is, if samples are published. Something else may wait longer.
         """
         points, imu = self._reorder_buffer.last_arrivals
-        if self._deferred.is_open:
-            awaited = int(self._deferred.due)
-        else:
-            awaited = points + self._assembler.packets_left * _POINTS_PERIOD_NS
-        if self._config.imu.enable_publishing:
-            awaited = min(awaited, imu + _IMU_PERIOD_NS + self._imu_wait_ns)
-        return HostNs(awaited)
+        due = self._deferred.due
+        if not due:
+            due = HostNs(points + self._assembler.packets_left * _POINTS_PERIOD_NS)
+        sample = imu + self._imu_wait_ns
+        return HostNs(sample) if sample < due else due
 
     def outbox(self) -> list[Outgoing]:
         """Return the frames to send now, in order, once."""
@@ -382,20 +405,19 @@ class Driver:
         """Return the seconds until points can be expected."""
         return self._watchdog.spin_up_left_s(now)
 
-    def _level(self) -> GravityAlignment | None:
-        return self._gravity_alignment if self._config.imu.adjust else None
+    def _level(self) -> Level | None:
+        return self._leveled if self._config.imu.adjust else None
 
     def _handle(self, packet: Packet, arrival: HostNs) -> list[Event]:
         if isinstance(packet, ImuPacket):
             self._watchdog.heard(_IMU, arrival)
             deferred = self._deferred
-            events = []
             if deferred.waiting and packet.stamp >= deferred.until:
                 events = self.catch_up()
+                return events + self._handle(packet, arrival)
             if self._reorder_buffer.follows(_IMU, packet, arrival):
-                return events + self._imu(packet, arrival)
-            if deferred.waiting:
-                events += self.catch_up()
+                return self._imu(packet, arrival)
+            events = self.catch_up() if deferred.waiting else []
             return events + self._reordered(_IMU, packet, arrival)
         if isinstance(packet, PointPacket):
             self._watchdog.heard(_POINTS, arrival)
@@ -454,10 +476,22 @@ class Driver:
             return []
         sample = new_tuple(ImuSample, (stamp, *packet[2:]))
         self.counters.samples += 1
-        self.last_imu = sample
-        self._gravity_alignment.add(sample)
-        self.gravity.add(sample)
+        self._samples.append(sample)
+        if len(self._samples) >= _SAMPLES_AT_ONCE:
+            self._hand_on()
         return [sample]
+
+    def _hand_on(self) -> None:
+        """Give the latest samples to those that use them."""
+        samples, self._samples = self._samples, []
+        if samples:
+            self._last_imu = samples[-1]
+            self._gravity_alignment.add(samples)
+            self._gravity.add(samples)
+
+    def _leveled(self, starts: list[HostNs]) -> F64:
+        self._hand_on()
+        return self._gravity_alignment(starts)
 
     def _points(self, packet: PointPacket, arrival: HostNs, missing: int = 0) -> list[Event]:
         start = self._clock.observe(_POINTS, packet.seq, packet.stamp, arrival, packet.duration_ns)
@@ -520,6 +554,7 @@ class Driver:
 
     def _forget_device(self) -> None:
         """Ask again who the device is: it may have another version or work mode after a reboot."""
+        self._hand_on()
         self._gravity_alignment.clear()
         self.version = None
         self.parameters = None
@@ -529,3 +564,10 @@ def _points_size(config: DriverConfig) -> int:
     """Return the size of the datagrams of points that are asked for [B]."""
     is_3d = config.sweep.frame3d
     return wire.FRAME_SIZES[_POINTS_3D if is_3d else wire.PacketType.POINTS_2D]
+
+
+def _imu_wait_ns(config: DriverConfig) -> int:
+    """Return how long after an IMU sample it is worth while to look for the next ones [ns]."""
+    if not config.imu.enable_publishing:
+        return _FOREVER_NS
+    return _IMU_PERIOD_NS + config.network.receive_interval_ms * 1_000_000

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
+from l2lidar_node.records import joined, selected
 from l2lidar_node.types import F64, POINT
 
 _TAYLOR_LIMIT_RAD: Final = 2e-3  # third-order remainder below 2e-9, 0.1 um at 50 m
@@ -76,8 +77,9 @@ class _Table(NamedTuple):
     """What all packets of one calibration share; arrays over slots, shape (n,)."""
 
     alpha: F64  # [rad]
-    u: F64  # multiplies D on the radial axis
-    v: F64  # multiplies D on the tangential axis
+    j: F64  # from the middle slot
+    j_complex: NDArray[np.complex128]  # the same
+    uv: NDArray[np.complex128]  # multiplies D, radial + i tangential
     w: F64  # multiplies D on z
     a: float
     b: float
@@ -158,9 +160,9 @@ class Projector:
             Points with a return whose range is within both the packet's and the user's limits.
         """
         raw = np.frombuffer(b"".join(payloads), self._layout)
-        points = np.empty(len(raw) * self._slots, POINT)
+        parts: list[NDArray[np.void]] = []
         counts = np.empty(len(raw), np.intp)
-        total = left_out = 0
+        left_out = 0
         first_s: float | None = None
         for block, constants in self._blocks(raw):
             packets, starts = raw[block], start_s[block]
@@ -172,9 +174,9 @@ class Projector:
             _fill_ranges(packets, table, limits or RangeLimits(), override, work)
             if rotations is not None:
                 left_out += _leave_out(np.isnan(rotations[block, 0, 0]), work.keep)
-            kept = np.flatnonzero(work.keep)
             counts[block] = np.count_nonzero(work.keep, axis=1)
-            if not len(kept):
+            first = int(work.keep.argmax())
+            if not work.keep.flat[first]:
                 continue
             place = _place_3d if self._is_3d else _place_2d
             weights, basis = place(packets, table)
@@ -183,13 +185,12 @@ class Projector:
             _fill_positions(weights, basis, work)
             increment = packets["time_increment"].astype(np.float64)
             if first_s is None:
-                packet, slot = divmod(int(kept[0]), self._slots)
+                packet, slot = divmod(first, self._slots)
                 first_s = float(starts[packet] + slot * increment[packet])
             _fill_times(starts - first_s, increment, work)
-            part = points[total : total + len(kept)]
-            work.grid.reshape(-1).take(kept, out=part, mode="clip")  # "raise" would copy twice
-            total += len(kept)
-        return PointBatch(points[:total], first_s or 0.0, counts, left_out)
+            parts.append(selected(work.grid.reshape(-1), work.keep.reshape(-1)))
+        points = parts[0] if len(parts) == 1 else joined([np.empty(0, POINT), *parts])
+        return PointBatch(points, first_s or 0.0, counts, left_out)
 
     def _blocks(self, raw: NDArray[np.void]) -> Iterator[tuple[slice, bytes]]:
         """Yield packets that can be projected at once and their calibration and limits.
@@ -224,12 +225,15 @@ def _table(constants: bytes, count: int) -> _Table:
         constants, "<f4", 4, wire.CALIBRATION.itemsize
     ).astype(np.float64)
     alpha = angle_min + calibration["alpha_angle_bias"] + np.arange(count) * increment
+    j: F64 = np.arange(count, dtype=np.float64) - (count - 1) / 2
     cos_beta, sin_beta = np.cos(calibration["beta_angle"]), np.sin(calibration["beta_angle"])
     cos_xi, sin_xi = np.cos(calibration["xi_angle"]), np.sin(calibration["xi_angle"])
     return _Table(
         alpha=alpha,
-        u=-cos_beta * sin_xi + sin_beta * cos_xi * np.sin(alpha),
-        v=np.cos(alpha) * cos_xi,
+        j=j,
+        j_complex=j.astype(np.complex128),
+        uv=(-cos_beta * sin_xi + sin_beta * cos_xi * np.sin(alpha))
+        + 1j * (np.cos(alpha) * cos_xi),
         w=sin_beta * sin_xi + cos_beta * cos_xi * np.sin(alpha),
         a=float(calibration["a_axis_dist"]),
         b=float(calibration["b_axis_dist"]),
@@ -292,18 +296,17 @@ def _place_3d(raw: NDArray[np.void], table: _Table) -> tuple[F64, F64]:
     """
     step = raw["com_horizontal_angle_step"].astype(np.float64)
     start = raw["com_horizontal_angle_start"].astype(np.float64) + table.theta_bias
-    middle = (len(table.u) - 1) / 2
-    j: F64 = np.arange(len(table.u), dtype=np.float64) - middle
+    middle = (len(table.j) - 1) / 2
     mean = float(step.mean())
     delta = step - mean
 
-    series = np.empty((3, 2, len(j)), np.complex128)
-    series[0, 1] = np.exp(1j * mean * j)
-    series[0, 0] = (table.u + 1j * table.v) * series[0, 1]
+    series = np.empty((3, 2, len(table.j)), np.complex128)
+    np.exp(1j * mean * table.j, out=series[0, 1])
+    np.multiply(table.uv, series[0, 1], out=series[0, 0])
     series[0, 1] *= table.b
-    np.multiply(series[0], j, out=series[1])
-    np.multiply(series[1], j, out=series[2])
-    basis = np.empty((7, 2, len(j)))
+    np.multiply(series[0], table.j_complex, out=series[1])
+    np.multiply(series[1], table.j_complex, out=series[2])
+    basis = np.empty((7, 2, len(table.j)))
     basis[:3], basis[3:6] = series.real, series.imag
     basis[6, 0], basis[6, 1] = table.w, table.a
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -46,13 +47,14 @@ class GravityAlignment:
         """Return the number of samples."""
         return self._count
 
-    def add(self, sample: ImuSample) -> None:
-        """Remember a sample; they come in ascending order."""
-        if self._count == _CAPACITY:
-            self._forget(_CAPACITY // 2)
-        at = self._count * _PACKED.size
-        _PACKED.pack_into(self._octets, at, sample.stamp, *sample.orientation_wxyz)
-        self._count += 1
+    def add(self, samples: Sequence[ImuSample]) -> None:
+        """Remember samples; they come in ascending order."""
+        for sample in samples:
+            if self._count == _CAPACITY:
+                self._forget(_CAPACITY // 2)
+            at = self._count * _PACKED.size
+            _PACKED.pack_into(self._octets, at, sample.stamp, *sample.orientation_wxyz)
+            self._count += 1
 
     def clear(self) -> None:
         """Forget all samples, for example because the time line began anew."""
@@ -121,21 +123,22 @@ class GravityReport:
 
 
 class GravityMonitor:
-    """Averages samples; cheap enough for every one of them."""
+    """Averages samples."""
 
     def __init__(self) -> None:
         self._count = 0
         self._x = self._y = self._z = 0.0
         self._last: ImuSample | None = None
 
-    def add(self, sample: ImuSample) -> None:
-        """Take one sample."""
-        x, y, z = sample.linear_acceleration
-        self._count += 1
-        self._x += x
-        self._y += y
-        self._z += z
-        self._last = sample
+    def add(self, samples: Sequence[ImuSample]) -> None:
+        """Take samples, at least one."""
+        for sample in samples:
+            x, y, z = sample.linear_acceleration
+            self._x += x
+            self._y += y
+            self._z += z
+        self._count += len(samples)
+        self._last = samples[-1]
 
     def take(self) -> GravityReport | None:
         """Return the report of the samples since the last call; None without any."""

@@ -193,19 +193,29 @@ def _imu(payload: bytes) -> ImuPacket | DecodeError:
     if len(payload) != _IMU.size:
         return DecodeError(wire.PacketType.IMU, "length")
     seq, _, sec, nsec, w, x, y, z, p, q, r, ax, ay, az = _IMU.unpack(payload)
-    if nsec >= NS:
-        return DecodeError(wire.PacketType.IMU, "stamp")
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not math.isfinite(norm + p + q + r + ax + ay + az):
-        return DecodeError(wire.PacketType.IMU, "not_finite")
-    if norm < _MIN_QUATERNION_NORM:
-        return DecodeError(wire.PacketType.IMU, "quaternion_norm")
-    fastest = max(p, q, r, -p, -q, -r)
-    strongest = max(ax, ay, az, -ax, -ay, -az)
-    if fastest > _MAX_RATE or strongest > _MAX_ACCELERATION:
-        return DecodeError(wire.PacketType.IMU, "implausible")
+    if not (
+        nsec < NS
+        and _MIN_QUATERNION_NORM <= norm < math.inf
+        and -_MAX_RATE <= p <= _MAX_RATE
+        and -_MAX_RATE <= q <= _MAX_RATE
+        and -_MAX_RATE <= r <= _MAX_RATE
+        and -_MAX_ACCELERATION <= ax <= _MAX_ACCELERATION
+        and -_MAX_ACCELERATION <= ay <= _MAX_ACCELERATION
+        and -_MAX_ACCELERATION <= az <= _MAX_ACCELERATION
+    ):
+        return DecodeError(wire.PacketType.IMU, _wrong_with(nsec, norm, p, q, r, ax, ay, az))
     attitude = w / norm, x / norm, y / norm, z / norm
     return new_tuple(ImuPacket, (seq, sec * NS + nsec, attitude, (p, q, r), (ax, ay, az)))
+
+
+def _wrong_with(nsec: int, norm: float, *components: float) -> str:
+    """Return why an IMU packet is not believed, the first reason that applies."""
+    if nsec >= NS:
+        return "stamp"
+    if not math.isfinite(norm + sum(components)):
+        return "not_finite"
+    return "quaternion_norm" if norm < _MIN_QUATERNION_NORM else "implausible"
 
 
 def _version(payload: bytes) -> Version | DecodeError:

@@ -22,12 +22,14 @@ from sensor_msgs.msg import Imu, PointCloud2, PointField
 from l2lidar_node.clouds import DATATYPES, points_of
 from l2lidar_node.config import FrameConfig, ImuConfig
 from l2lidar_node.protocol import wire
-from l2lidar_node.types import Check, HostNs, ImuSample, split_stamp
+from l2lidar_node.types import FIRST_STAMP, LAST_STAMP, Check, HostNs, ImuSample, split_stamp
 
 _NUMBERS: Final = {code: number for number, code in DATATYPES.items()}
 
 NS: Final = 1_000_000_000
 
+_FIRST_S: Final = FIRST_STAMP // NS
+_LAST_S: Final = LAST_STAMP // NS
 _STAMP_AT: Final = 4  # in a serialized message, after its encapsulation
 _STAMP: Final = struct.Struct("<iI")
 _QUATERNION: Final = struct.Struct("<4d")
@@ -186,11 +188,14 @@ class ImuTemplate:
 
     def serialize(self, sample: ImuSample) -> bytes:
         """Return the CDR message of a sample."""
-        stamp, (w, x, y, z), rate, acceleration = sample
+        stamp, (w, x, y, z), (p, q, r), (ax, ay, az) = sample
+        seconds, nanoseconds = divmod(stamp, NS)
+        if not _FIRST_S <= seconds <= _LAST_S:
+            split_stamp(stamp)  # raises
         head, frame, after_orientation, after_rate, end = self._constant
         return self._message.pack(
-            head, *split_stamp(stamp), frame, x, y, z, w, after_orientation, *rate,
-            after_rate, *acceleration, end,
+            head, seconds, nanoseconds, frame, x, y, z, w, after_orientation, p, q, r,
+            after_rate, ax, ay, az, end,
         )  # fmt: skip
 
 

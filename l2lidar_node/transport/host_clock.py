@@ -68,7 +68,8 @@ class HostClock:
     def _read_slewing(self) -> tuple[int, int, int] | None:
         """Return an instant, how far the clock was slewed, and how far that may be off [ns].
 
-        The best of a few readings; None where other programs always intervene.
+        The best of a few readings, or the first that is good enough; None where other programs
+        always intervene.
         """
         best: tuple[int, int, int] | None = None
         for _ in range(_TRIES):
@@ -77,6 +78,8 @@ class HostClock:
             elapsed = time.clock_gettime_ns(time.CLOCK_MONOTONIC) - before
             if elapsed < 2 * _SLEW_SURE_NS and (best is None or elapsed < 2 * best[2]):
                 best = before, before + elapsed // 2 - raw, elapsed // 2 + 1
+            if elapsed <= _SLEW_ERROR_NS:
+                break
         return best
 
 

@@ -34,7 +34,7 @@ _CONTROL_SIZE: Final = _ORIGIN.size - _NAME_SIZE
 # No power of two: the beginnings of all datagrams would share a few lines of the cache.
 _STRIDE: Final = _LARGEST + 1_088
 
-_recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
+_recvmmsg = ctypes.CDLL(None).recvmmsg
 _recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
 
 

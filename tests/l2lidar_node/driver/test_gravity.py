@@ -21,7 +21,7 @@ def sample(acceleration: Any = UP, rotation: Rotation | None = None) -> ImuSampl
 def report(*samples: ImuSample) -> GravityReport | None:
     monitor = GravityMonitor()
     for item in samples:
-        monitor.add(item)
+        monitor.add([item])
     return monitor.take()
 
 
@@ -49,13 +49,13 @@ def test_an_orientation_that_is_off(degrees: int) -> None:
 def test_vibration_is_averaged_and_a_period_begins_anew() -> None:
     monitor = GravityMonitor()
     for sign in (1, -1) * 50:
-        monitor.add(sample((3.0 * sign, -2.0 * sign, STANDARD_GRAVITY + sign)))
+        monitor.add([sample((3.0 * sign, -2.0 * sign, STANDARD_GRAVITY + sign))])
     found = monitor.take()
     assert found is not None
     assert found.samples == 100
     assert found.norm == pytest.approx(STANDARD_GRAVITY)
     assert monitor.take() is None
-    monitor.add(sample((0.0, 0.0, 18.0)))
+    monitor.add([sample((0.0, 0.0, 18.0))])
     found = monitor.take()
     assert found is not None
     assert (found.samples, found.norm) == (1, 18.0)

@@ -42,7 +42,7 @@ def sample(stamp: int, rotation: Rotation) -> ImuSample:
 def gravity_alignment(*samples: ImuSample, roll_pitch_only: bool = False) -> GravityAlignment:
     result = GravityAlignment(roll_pitch_only)
     for item in samples:
-        result.add(item)
+        result.add([item])
     return result
 
 
@@ -152,7 +152,7 @@ def test_memory_is_bounded_while_nobody_asks() -> None:
     level = GravityAlignment(False)
     item = sample(START, Rotation.identity())
     for number in range(40_000):
-        level.add(item._replace(stamp=HostNs(START + number * 4_000_000)))
+        level.add([item._replace(stamp=HostNs(START + number * 4_000_000))])
         assert len(level) < 20_000
     longest_sweep = [HostNs(START + (40_000 - ago * 250) * 4_000_000) for ago in (20, 10, 1)]
     np.testing.assert_array_equal(level(longest_sweep), [np.eye(3)] * 3)
