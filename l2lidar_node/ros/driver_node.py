@@ -268,6 +268,9 @@ class DriverNode(ManagedNode):
             self._imu_publisher = self.create_lifecycle_publisher(
                 Imu, topics.imu_topic_id, QoSProfile(depth=_IMU_DEPTH, reliability=reliability)
             )
+            # What its publish() does beside costs more than the message, when 250 come a second:
+            # nobody destroys the publisher while the session runs.
+            self._publish_imu = self._imu_publisher.handle.publish_raw
         self._warn_of_absolute_topics()
         if config.frames.publish_tf:
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -320,9 +323,7 @@ class DriverNode(ManagedNode):
             if isinstance(event, ImuSample):
                 imu = self._imu_publisher
                 if imu and imu.is_activated and next(self._samples) % self._publish_every == 0:
-                    # What its publish() does beside costs more than the message, when 250 come a
-                    # second: nobody destroys the publisher while the session runs.
-                    imu.handle.publish_raw(self._imu_template.serialize(event))
+                    self._publish_imu(self._imu_template.serialize(event))
             elif isinstance(event, Sweep):
                 if not self._cloud_publisher.is_activated:
                     return

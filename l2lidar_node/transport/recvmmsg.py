@@ -12,7 +12,7 @@ import struct
 import time
 from typing import Final
 
-from l2lidar_node.types import Datagram, HostNs, new_tuple
+from l2lidar_node.types import Datagram, new_tuple
 
 SO_TIMESTAMPNS: Final = 35
 """Has the kernel note arrivals (asm-generic/socket.h); Python's socket module lacks it."""
@@ -78,7 +78,8 @@ class DatagramReader:
         self._headers = headers
         self._fresh = bytes(headers)  # the kernel writes sizes into what it is given
         self._at = _address(headers)
-        self._view = memoryview(self._payloads)
+        whole = memoryview(self._payloads)
+        self._slots = [whole[at : at + _LARGEST] for at in range(0, len(whole), _STRIDE)]
 
     def read(self, *, wait: bool = True) -> int:
         """Add what has arrived to :attr:`datagrams`; return how many were taken.
@@ -90,19 +91,20 @@ class DatagramReader:
         count: int = _recvmmsg(self._link.fileno(), self._at, MOST, flags, None)
         if count <= 0:
             return 0
-        view, headers, origins, sender = self._view, self._headers, self._origins, self._sender
-        for number in range(count):
-            told, _, size = _FILLED.unpack_from(headers, number * _HEADER.size)
-            address, seconds, nanoseconds = _ORIGIN.unpack_from(origins, number * _ORIGIN.size)
-            if address != sender:
+        used = count * _HEADER.size
+        taken = zip(
+            _FILLED.iter_unpack(self._headers[:used]),
+            _ORIGIN.iter_unpack(self._origins[: count * _ORIGIN.size]),
+            self._slots,
+            strict=False,
+        )
+        for (told, _, size), (address, seconds, nanoseconds), slot in taken:
+            if address != self._sender:
                 self.strangers.append(address)
                 continue
             arrival = seconds * 1_000_000_000 + nanoseconds if told else time.time_ns()
-            begin = number * _STRIDE
-            data = bytes(view[begin : begin + size])
-            self.datagrams.append(new_tuple(Datagram, (data, HostNs(arrival))))
-        used = count * _HEADER.size
-        headers[:used] = self._fresh[:used]
+            self.datagrams.append(new_tuple(Datagram, (bytes(slot[:size]), arrival)))
+        self._headers[:used] = self._fresh[:used]
         return count
 
 
