@@ -15,11 +15,32 @@ import pytest
 from l2lidar_node.config import NetworkConfig
 from l2lidar_node.demo.processes import free_udp_ports
 from l2lidar_node.transport import udp
+from l2lidar_node.transport.recvmmsg import SO_TIMESTAMPNS, DatagramReader
 from l2lidar_node.transport.udp import TransportError, UdpTransport
 from l2lidar_node.types import Datagram, HostNs
 
 DEVICE, FOREIGNER, HOST = "127.0.0.1", "127.0.0.2", "127.0.0.3"
 LIMIT_S = 60.0  # generous: only a failure waits that long
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _stamping_kernel() -> Iterator[None]:
+    """Have the kernel stamp arrivals: it begins a little after the first socket asks for it.
+
+    Until then a datagram is stamped when it is read.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        link.bind((HOST, 0))
+        reader = DatagramReader(link, HOST)
+        deadline = time.monotonic() + LIMIT_S
+        while time.monotonic() < deadline:
+            link.sendto(b"", link.getsockname())
+            sent = time.time_ns()
+            reader.read()
+            if reader.datagrams[-1].arrival <= sent:
+                break
+        yield
 
 
 @pytest.fixture
