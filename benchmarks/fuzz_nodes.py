@@ -560,8 +560,10 @@ class Outcome:
         return {name: some[-1] - some[len(some) // 2] for name, some in self.sizes_mb.items()}
 
 
-def fuzz(seconds: float, seed: int, attacks: int, least: int = _CALM_EVERY) -> Outcome:
-    """Run rounds for a time, and at least so many; the first is calm."""
+def fuzz(
+    seconds: float, seed: int, attacks: int, least: int = _CALM_EVERY, *, begin_calm: bool = True
+) -> Outcome:
+    """Run rounds for a time, and at least so many; the first is calm, or else the fourth."""
     isolate_ros()
     run = record("room", "walk", 1, _RUN_S)
     rclpy.init()
@@ -578,7 +580,7 @@ def fuzz(seconds: float, seed: int, attacks: int, least: int = _CALM_EVERY) -> O
             load.begin()
             deadline = time.monotonic() + seconds
             while time.monotonic() < deadline or campaign.rounds < least:
-                is_calm = campaign.rounds % _CALM_EVERY == 0
+                is_calm = (campaign.rounds + (not begin_calm)) % _CALM_EVERY == 0
                 campaign.round(0 if is_calm else attacks)
                 if is_calm:
                     for name, pid in pids.items():

@@ -137,15 +137,15 @@ def test_every_packet_is_received_or_counted_as_dropped() -> None:
 
 @pytest.mark.ros
 def test_nodes_survive_hostile_neighbors() -> None:
-    """A short run of ``make fuzz-nodes``: calm, then attacks over DDS on five processes."""
+    """A short run of ``make fuzz-nodes``: attacks over DDS on five processes, then good data."""
     pytest.importorskip("rclpy")
     pytest.importorskip("gtsam")
     from benchmarks.fuzz_nodes import fuzz
 
-    outcome = fuzz(seconds=0.0, seed=7, attacks=200, least=2)
+    outcome = fuzz(seconds=0.0, seed=7, attacks=200, least=1, begin_calm=False)
     assert outcome.ended == ""
     campaign = outcome.campaign
     assert campaign.stuck == []
     assert campaign.fuzzer.errors == []
     assert campaign.fuzzer.sent >= 200
-    assert campaign.rounds == 2
+    assert campaign.rounds == 1
