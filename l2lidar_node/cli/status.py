@@ -284,17 +284,19 @@ def judged(seen: list[tuple[int, int]], ratio: float) -> dict[str, float]:
     Returns
     -------
     dict
-        ``rate_hz``; ``ratio`` of the line below all arrivals, since packets come late but never
-        early; ``jitter_p50_us``, ``jitter_p99_us`` and ``jitter_max_us`` above that line;
-        ``interval_std_us`` of the stamps, in true time.
+        ``rate_hz`` by the stamps, since arrivals come in bunches; ``ratio`` of the line below all
+        arrivals, since packets come late but never early; ``jitter_p50_us``, ``jitter_p99_us``
+        and ``jitter_max_us`` above that line; ``interval_std_us`` of the stamps, in true time.
     """
     line = supporting_line(sorted(seen), ratio)
     late = [arrival - line.at(stamp) for stamp, arrival in seen] if line else [0]
-    stamps, arrivals = np.array(seen, np.int64).T
+    stamps = np.array([stamp for stamp, _ in seen], np.int64)
     p50, p99, most = np.percentile(np.array(late) - min(late), [50, 99, 100]) / 1e3
     return {
         "packets": len(seen),
-        "rate_hz": float((len(seen) - 1) * 1e9 / (arrivals[-1] - arrivals[0])),
+        "rate_hz": float(
+            (len(seen) - 1) * 1e9 / (max(int(stamps.max() - stamps.min()), 1) * ratio)
+        ),
         "ratio": line.ratio if line else math.nan,
         "jitter_p50_us": float(p50),
         "jitter_p99_us": float(p99),
