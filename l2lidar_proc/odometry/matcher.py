@@ -18,6 +18,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.deskew.deskew import coordinates, deskew
 from l2lidar_proc.motion.filter import (
     ERRORS,
+    POSE,
     POSITION,
     ROTATION,
     VELOCITY,
@@ -155,7 +156,8 @@ class SweepMatcher:
         strict = loose and not initial and not young
         found = self._align(source, motion, motion.state)
         is_good = self._is_believable(found, source, motion, strict)
-        if is_good and (strict or not loose):
+        near = found is not None and not is_far(found, motion)
+        if is_good and (not loose or (strict and near)):
             return self._believed(found)
         if not loose:
             return Match(None, young and found is None)
@@ -169,6 +171,8 @@ class SweepMatcher:
             if other and self._is_believable(other, source, motion, strict)
         ]
         best = max(good, key=lambda other: other.inlier_ratio * other.matched, default=None)
+        if strict and best is not None and is_ambiguous(best, others, motion):
+            best = None
         if best is None and motion.imu.missing.all():
             # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
             best = self._placed(source, motion, np.inf)
@@ -270,11 +274,10 @@ class SweepMatcher:
         A few points fit in many places. A handful that face a direction find a surface somewhere
         along it, if the prediction leaves enough room; the others agree with every place along it.
         """
+        if not is_far(found, motion):
+            return False
         move = found.state.position - motion.state.position
         far = float(np.linalg.norm(move))
-        turn = found.state.boxminus(motion.state)[ROTATION]
-        if far < tuning.FAR_MOVE and np.linalg.norm(turn) < tuning.FAR_TURN:
-            return False
         points = self.config.surfaces.point_noise**2 * found.information[POSITION, POSITION]
         facing = float(move @ points @ move)
         return found.matched < tuning.FAR_MATCHED or (
@@ -339,6 +342,27 @@ class SweepMatcher:
         if better is None:
             return guess
         return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
+
+
+def is_far(found: Alignment, motion: SweepMotion) -> bool:
+    """Return whether an alignment ended farther away than the robust kernel reaches."""
+    turn, way = np.split(found.state.boxminus(motion.state)[POSE], 2)
+    return bool(np.linalg.norm(way) >= tuning.FAR_MOVE or np.linalg.norm(turn) >= tuning.FAR_TURN)
+
+
+def is_ambiguous(best: Alignment, others: list[Alignment | None], motion: SweepMotion) -> bool:
+    """Return whether a place far from the predicted one is one of several that fit.
+
+    What little of a new room is seen at first fits in an old one, and not only in one place.
+    """
+    matched, worse = tuning.FAR_UNIQUE
+    return is_far(best, motion) and any(
+        other.matched > matched * best.matched
+        and other.inlier_ratio > best.inlier_ratio - worse
+        and np.linalg.norm(other.state.position - best.state.position) > tuning.FAR_MOVE
+        for other in others
+        if other is not None
+    )
 
 
 def pose_covariance(motion: SweepMotion) -> F64:

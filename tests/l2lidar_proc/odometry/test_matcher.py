@@ -136,6 +136,29 @@ def test_forty_points_confirm_a_loose_prediction_but_do_not_move_it_far(
     assert match.alignment is None if error > tuning.FAR_MOVE else off(match) < 0.015
 
 
+@pytest.mark.parametrize(("plates", "believed"), [((2.0, 2.8), False), ((2.0,), True)])
+def test_a_place_far_from_the_prediction_is_the_only_one_that_fits(
+    plates: tuple[float, ...], believed: bool
+) -> None:
+    """Of a new room a floor and a wall are seen at first: two walls of an old one are like it."""
+    rng, matcher = np.random.default_rng(19), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def plate(x: float, count: int) -> F64:
+        return np.asarray(rng.uniform((x, -1.5, -1.2), (x, 1.5, 1.0), (count, 3)))
+
+    def floor(count: int) -> F64:
+        return np.asarray(rng.uniform((-1.0, -2.0, -1.2), (4.0, 2.0, -1.2), (count, 3)))
+
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        points = np.vstack((floor(3000), *(plate(x, 1500) for x in plates)))
+        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
+    cloud = source(np.vstack((floor(90), plate(2.0, 90))))
+    match = matcher.match(cloud, motion(LOOSE, np.array([0.4, 0.0, 0.0])))
+    assert (match.alignment is not None) == believed
+    if match.alignment is not None:
+        assert match.alignment.state.position[0] == pytest.approx(0.0, abs=0.01)
+
+
 def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
     rng = np.random.default_rng(13)
     cloud = source(rng.uniform((-3.5, -2.5, -1.0), (3.5, 2.5, 1.5), (1500, 3)))
