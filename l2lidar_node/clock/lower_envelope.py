@@ -123,10 +123,21 @@ def supporting_line(packets: list[tuple[int, int]], guess: float) -> Line | None
     hull = _lower_hull(points)
     if len(hull) < 2:
         return None
-    mean = sum(x for x, _ in points) / len(points)
+    mean = sum([x for x, _ in points]) / len(points)
     base, slope = _edge(hull, mean)
     heights = sorted(y - base - slope * x for x, y in points)
     return Line(u0, h0 + round(base), guess + slope, heights[len(heights) // 2])
+
+
+def _is_within(above: list[tuple[float, int]], lo: float, hi: float) -> bool:
+    """Tell whether the slope of the supporting line of points (y, x) lies within bounds.
+
+    Seen along a line that is too steep, the lowest point is behind their mean; too flat, before.
+    """
+    mean = sum([x for _, x in above]) / len(above)
+    steep = min([(y - hi * x, x) for y, x in above])[1]
+    flat = min([(y - lo * x, x) for y, x in above])[1]
+    return flat <= mean <= steep
 
 
 def _above_lowest(packets: list[tuple[int, int]], ratio: float) -> list[float]:
@@ -293,15 +304,19 @@ class LowerEnvelope:
         Where slewing is told, all that is left is what two crystals can differ by.
         """
         most = _KNOWN if self.is_slewing_told else _UNTOLD_WIDTH
+        guess = self.line.ratio
+        blocks = list(self._blocks)[-_TRENDS[-1] :]
+        u0, h0 = blocks[0]
+        above = [(h - h0 - guess * (u - u0), u - u0) for u, h in blocks]
         for count in _TRENDS:
-            recent = sorted(list(self._blocks)[-count:])
-            if len(recent) < count:
+            if len(blocks) < count:
                 return
-            line = supporting_line(recent, self.line.ratio)
-            if line is None or abs(line.ratio - self.line.ratio) > most * line.ratio:
-                continue
-            if self._lo <= line.ratio <= self._hi:
+            if _is_within(above[-count:], self._lo - guess, self._hi - guess):
                 continue  # nothing to follow
+            recent = sorted(blocks[-count:])
+            line = supporting_line(recent, guess)
+            if line is None or abs(line.ratio - guess) > most * line.ratio:
+                continue
             u0, h0 = recent[0]
             points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]
             error = self._error(points, float(line.host - h0), 0.0)
