@@ -35,7 +35,7 @@ class DeferredPoints:
     newest : HostNs
         When the last one came.
     until : int
-        Stamps of the device from which on nothing is put off [ns].
+        Stamp of the device from which on an IMU sample has to wait for what has been put off [ns].
     due : HostNs
         When the packet is expected that may not be put off; 0 where none may be.
     """
@@ -61,7 +61,7 @@ class DeferredPoints:
         due : HostNs
             When that one is expected.
         until : int
-            Stamp of the device from which on nothing may be put off [ns].
+            Stamp of the device up to which it does not matter which stream comes first [ns].
         """
         packet, arrival = last
         assert isinstance(packet, PointPacket)
@@ -82,11 +82,13 @@ class DeferredPoints:
         stamp = seconds * NS + nanoseconds
         if (
             seq != self._next
-            or not self._stamp < stamp < self.until
+            or stamp <= self._stamp
             or arrival - self.newest > REORDER_NS
             or not data.startswith(self._header)
         ):
             return False
+        if stamp >= self.until:
+            self.until = 0
         self.waiting.append(new_tuple(Datagram, (data, arrival)))
         self._next = seq + 1
         self._stamp = stamp

@@ -414,7 +414,9 @@ class Driver:
             deferred = self._deferred
             if deferred.waiting and packet.stamp >= deferred.until:
                 events = self.catch_up()
-                return events + self._handle(packet, arrival)
+                events += self._handle(packet, arrival)
+                self._defer_next()
+                return events
             if self._reorder_buffer.follows(_IMU, packet, arrival):
                 return self._imu(packet, arrival)
             events = self.catch_up() if deferred.waiting else []
@@ -447,9 +449,10 @@ class Driver:
         """
         left = self._assembler.packets_left
         last = self._reorder_buffer.last_in_order(_POINTS)
-        if left > 1 and last is not None:
+        until = self._clock.interchangeable_until()
+        if left > 1 and last is not None and until:
             due = HostNs(last.arrival + left * _POINTS_PERIOD_NS)
-            self._deferred.begin(last, left, due, self._clock.interchangeable_until())
+            self._deferred.begin(last, left, due, until)
 
     def _reordered(
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs
