@@ -157,6 +157,10 @@ UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
 # The map bends where it grows, so the vertical where it began is not quite that of its other end.
 # Tuned on: corridors with narrow views, where 0.01 m/s^2 (0.06 degrees) made 1 to 5 m.
 MAP_BEND: Final = 0.0008  # [rad/sqrt(m)] of the way
+# Gravity is known, as a direction, when it is known as well as at rest, where it cannot be told
+# from a bias (ACCEL_BIAS_SIGMA, 0.9 degrees); as much of what it turns later may be that bias.
+LEAN_KNOWN: Final = 0.02  # [rad]
+LEAN_FROM: Final = 0.015  # [rad]
 
 # ---- odometry: innovation consistency
 

@@ -242,6 +242,8 @@ class Odometry:
         way = float(np.linalg.norm(posterior[0].position - before.position))
         lean = way * tuning.MAP_BEND**2
         posterior = posterior[0], eskf.with_leaning_gravity(*posterior, lean)
+        gravity = posterior[1][eskf.GRAVITY, eskf.GRAVITY]
+        self.matcher.drift.lean(posterior[0].gravity, gravity)
         bounded = eskf.bound_speed(*posterior, self.config.max_speed)
         if bounded[0] is not posterior[0] or self._is_suspect(predicted):
             status.append(Status.SUSPECT)

@@ -26,6 +26,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import POSE, POSITION, ROTATION, VELOCITY, InertialState, skew
@@ -52,6 +53,8 @@ class MapDrift:
         self._current = np.zeros((6, 6))
         self._way, self._before = 0.0, np.zeros(3)
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
+        self._vertical: F64 | None = None  # gravity when it was first known [m/s^2]
+        self._lean: F64 = np.zeros(3)  # by which the map has bent since, as gravity shows [rad]
 
     def meet(
         self,
@@ -153,6 +156,29 @@ class MapDrift:
         self._history[self._known : row + 1] = self._current + moved @ covariance @ moved.T
         self._known = max(self._known, row + 1)
 
+    def lean(self, gravity: F64, covariance: F64) -> None:
+        """Take the vertical as the filter has it: by what it has turned the map has bent.
+
+        Registered against itself the map does not show that, nor is it taken back. What an
+        accelerometer's bias may have feigned at the beginning does not count.
+
+        Parameters
+        ----------
+        gravity : ndarray, shape (3,)
+            Map axes [m/s^2]; zero where it is not trusted.
+        covariance : ndarray, shape (3, 3)
+        """
+        squared = float(gravity @ gravity)
+        if squared == 0.0:
+            return
+        if self._vertical is None:
+            if np.linalg.eigvalsh(covariance)[-1] < tuning.LEAN_KNOWN**2 * squared:
+                self._vertical = gravity
+            return
+        turn = rotations.cross(self._vertical, gravity) / squared
+        angle = float(np.linalg.norm(turn))
+        self._lean = turn * max(1.0 - tuning.LEAN_FROM / max(angle, 1e-12), 0.0)
+
     def at(self, place: F64) -> F64:
         """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m].
 
@@ -167,6 +193,7 @@ class MapDrift:
         shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
         bend = tuning.MAP_BEND**2 * max(away, self._behind)
         unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
+        unit[3:, 3:] += np.outer(self._lean, self._lean)
         return np.asarray(moved @ self._current @ moved.T + unit)
 
 

@@ -76,6 +76,23 @@ def test_around_and_back_only_the_first_map_of_the_place_holds_it() -> None:
     np.testing.assert_allclose(drift.at(ZERO), SURE, atol=1e-9)
 
 
+def test_what_gravity_has_turned_in_the_map_the_attitude_may_be_wrong_by() -> None:
+    """Gravity counts from when it is known, and only by more than a bias may feign."""
+    known, unknown = 0.01 * np.eye(3), 0.1 * np.eye(3)
+    drift = MapDrift()
+    drift.lean(ZERO, known)  # not trusted
+    drift.lean(np.array([0.6, 0.0, -9.8]), unknown)
+    drift.lean(np.array([0.0, 0.0, -9.8]), known)
+    for lean, counts in ((0.5 * tuning.LEAN_FROM, 0.0), (0.1, 0.1 - tuning.LEAN_FROM)):
+        # rolled by a map that twists: to the sensor gravity seems to turn about x
+        drift.lean(9.8 * np.array([0.0, np.sin(lean), -np.cos(lean)]), unknown)
+        expected = np.zeros((6, 6))
+        expected[3, 3] = counts**2
+        np.testing.assert_allclose(drift.at(ZERO), expected, rtol=0.01, atol=1e-12)
+    drift.clear()
+    np.testing.assert_array_equal(drift.at(ZERO), np.zeros((6, 6)))
+
+
 def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
     drift = MapDrift()
     step = np.diag([1e-4] * 3 + [0.0] * 3)
