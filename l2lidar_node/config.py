@@ -1,6 +1,6 @@
-"""Declares every setting of the driver, once: name, default, unit, range and meaning.
+"""Settings of the driver, each declared once: name, default, unit, range and meaning.
 
-Names and defaults that upstream has are upstream's, so its YAML file works unchanged.
+Settings that upstream has keep its names and defaults, so its YAML file works unchanged.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class NetworkConfig:
     )
     receive_interval_ms: int = setting(
         4,
-        "longest that an IMU sample waits in the socket, so that several datagrams are read at "
-        "once; the kernel stamps arrivals, so that it costs latency only; 0 reads each datagram "
-        "as it comes",
+        "longest time that an IMU sample waits in the socket, so that several datagrams are read "
+        "at once; the kernel stamps arrivals, so this costs only latency; 0 reads each datagram "
+        "as it arrives",
         unit="ms",
         lo=0,
         hi=100,
@@ -64,7 +64,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockConfig:
-    """How device stamps become host stamps."""
+    """Conversion of device stamps to host stamps."""
 
     enable_l2_time_correction: bool = setting(True, "correct the scale of device stamps")
     enable_l2_host_sync: bool = setting(
@@ -114,7 +114,7 @@ class ClockConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepConfig:
-    """How packets become clouds."""
+    """Conversion of packets to clouds."""
 
     frame3d: bool = setting(True, "publish 3D packets; false publishes 2D packets")
     packets: int = setting(
@@ -128,7 +128,7 @@ class SweepConfig:
     cut: str = setting(
         "packets",
         "what ends a cloud: a number of packets, a full or half turn of the head (fragments are "
-        "left out), or a duration; 2D packets carry no head angle and are cut by duration",
+        "dropped), or a duration; 2D packets carry no head angle and are cut by duration",
         name="sweep_cut",
         choices=("packets", "turn", "half_turn", "duration"),
         live=True,
@@ -239,13 +239,13 @@ class SweepConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuConfig:
-    """The IMU topic and what the onboard orientation is used for."""
+    """The IMU topic, and the use of the onboard orientation."""
 
     enable_publishing: bool = setting(False, "publish IMU data", name="enable_IMU_publishing")
     publish_every: int = setting(
         1,
-        "publish every n-th IMU sample only, for consumers that cannot take 250 a second; deskew "
-        "and odometry need all",
+        "publish only every n-th IMU sample, for consumers that cannot handle 250 a second; "
+        "deskew and odometry need all",
         name="imu_publish_every",
         lo=1,
         hi=250,
@@ -304,7 +304,7 @@ class FrameConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicConfig:
-    """What the topics are called and how they are sent."""
+    """Names and QoS of the topics."""
 
     point_cloud_topic_id: str = setting("/points", "topic for point clouds", form=TOPIC)
     imu_topic_id: str = setting("/imu/data", "topic for IMU samples", form=TOPIC)
@@ -317,11 +317,11 @@ class TopicConfig:
     )
     compressed_clouds: str = setting(
         "none",
-        "publish clouds on <point_cloud_topic_id>/zstd as well, while somebody subscribes, for "
-        "point_cloud_transport: all fields, or x, y, z in steps of 1 mm and intensity",
+        "also publish clouds on <point_cloud_topic_id>/zstd for point_cloud_transport, while "
+        "there is a subscriber: all fields, or x, y, z in steps of 1 mm and intensity",
         choices=("none", "lossless", "millimeter"),
     )
-    zstd_level: int = setting(1, "effort of compressed_clouds", lo=1, hi=19)
+    zstd_level: int = setting(1, "compression level of compressed_clouds", lo=1, hi=19)
     qos_reliability: str = setting(
         "best_effort",
         "QoS reliability of clouds and IMU samples; every subscriber can receive reliable",
@@ -338,7 +338,7 @@ class TopicConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatchdogConfig:
-    """What happens when the device falls silent."""
+    """Reaction to a silent device."""
 
     timeout_ms: int = setting(
         35_000,
@@ -369,8 +369,8 @@ class FileConfig:
     )
     calibration_file: str = setting(
         "",
-        "calibration of the unit, written by l2lidar calibrate; used for packets whose reported "
-        "calibration block is the file's, and ignored for others",
+        "calibration of the unit, written by l2lidar calibrate; applies only to packets whose "
+        "reported calibration block equals that in the file",
     )
     replay_rate: float = setting(1.0, "replay speed; 0 is as fast as possible", lo=0.0, hi=1000.0)
     replay_loop: bool = setting(False, "start over at the end, with stamps that continue")
@@ -379,7 +379,7 @@ class FileConfig:
     )
 
     def __post_init__(self) -> None:
-        """Check that nothing is recorded that is a recording already."""
+        """Check that a replay is not recorded."""
         if self.record_file and self.replay_file:
             raise SettingError(
                 f"parameter 'record_file': {self.record_file!r} cannot be combined with "
@@ -400,7 +400,7 @@ class LifecycleConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriverConfig:
-    """Everything the driver can be told."""
+    """All settings of the driver."""
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
@@ -413,7 +413,7 @@ class DriverConfig:
     lifecycle: LifecycleConfig = field(default_factory=LifecycleConfig)
 
     def __post_init__(self) -> None:
-        """Check what concerns several groups."""
+        """Check settings of several groups against each other."""
         if self.topics.publish_packets and self.files.replay_file:
             raise SettingError(
                 "parameter 'publish_packets': true cannot be combined with replay_file "

@@ -10,9 +10,7 @@ from l2lidar_node.settings import FRAME, TOPIC, SettingError, setting
 from l2lidar_proc.motion.config import MotionConfig
 
 AS_INPUT = "as_input"
-
-"""Choice of a layout: whatever the input has."""
-
+"""Choice of a layout: that of the input."""
 
 FILTERS = (
     "range",
@@ -26,13 +24,12 @@ FILTERS = (
     "statistical",
     "radius",
 )
-
 """Names of the filters."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeskewConfig:
-    """How a sweep is put together."""
+    """How a sweep is assembled."""
 
     reference: str = setting(
         "start",
@@ -67,7 +64,7 @@ class DeskewConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterConfig:
-    """Which points are left out. Angles and boxes are in the cloud frame."""
+    """Which points are removed. Angles and boxes are in the cloud frame."""
 
     filters_before: tuple[str, ...] = setting(
         ("range",),
@@ -187,22 +184,28 @@ class FilterConfig:
     )
 
     def __post_init__(self) -> None:
-        """Check what a single setting cannot."""
+        """Check settings against each other."""
         for low, high in (
             ("range_min", "range_max"),
             ("vertical_min", "vertical_max"),
             ("intensity_min", "intensity_max"),
         ):
             if getattr(self, low) > getattr(self, high):
-                raise SettingError(f"parameter '{low}': {getattr(self, low)} is above {high}")
+                raise SettingError(
+                    f"parameter '{low}': {getattr(self, low)} is out of range, expected at most "
+                    f"{high} ({getattr(self, high)})"
+                )
         for name in ("keep_boxes", "remove_boxes"):
             if len(getattr(self, name)) % 6:
-                raise SettingError(f"parameter '{name}': a box is six numbers, x y z x y z")
+                raise SettingError(
+                    f"parameter '{name}': {len(getattr(self, name))} numbers are not valid, "
+                    "expected six per box: x y z x y z"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcConfig:
-    """Everything the deskew can be told."""
+    """All settings of the deskew."""
 
     motion: MotionConfig = field(default_factory=MotionConfig)
     deskew: DeskewConfig = field(default_factory=DeskewConfig)
@@ -211,7 +214,7 @@ class ProcConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeskewTopics:
-    """Where a deskew node listens and speaks."""
+    """Topics of a deskew node."""
 
     cloud_topic: str = setting("/points", "input clouds with per-point times", form=TOPIC)
     imu_topic: str = setting("/imu/data", "IMU samples", form=TOPIC)
@@ -252,15 +255,16 @@ class ScanConfig:
 
     publish: str = setting(
         "subscribed",
-        "when to publish scans: while somebody subscribes, always, or never",
+        "when to publish scans: while there is a subscriber, always, or never",
         name="publish_scan",
         choices=("subscribed", "always", "never"),
     )
     topic: str = setting("scan", "LaserScan of the deskewed clouds", name="scan_topic", form=TOPIC)
     frame: str = setting(
         "",
-        "frame of the scan, tied to the cloud's by /tf_static, its z axis up, such as base_link; "
-        "empty means <l2_name>_level: at the sensor, level by gravity, published on /tf",
+        "frame of the scan with its z axis up, such as base_link; /tf_static must connect it to "
+        "the cloud frame; empty means <l2_name>_level: at the sensor, level with gravity, "
+        "published on /tf",
         name="scan_frame",
         form=FRAME,
     )
@@ -284,7 +288,7 @@ class ScanConfig:
     )
     angle_increment: float = setting(
         0.0174533,
-        "angle between two ranges of the scan; made to divide a full turn",
+        "angle between two ranges of the scan; rounded so that it divides a full turn",
         name="scan_angle_increment",
         unit="rad",
         lo=0.001,
@@ -301,7 +305,7 @@ class ScanConfig:
     )  # fmt: skip
     sweeps: int = setting(
         4,
-        "sweeps in a scan: one sees about every fourth degree, the ones before fill the rest",
+        "sweeps in a scan: one sweep covers about every fourth degree, earlier ones fill gaps",
         name="scan_sweeps",
         lo=1,
         hi=40,
@@ -320,7 +324,7 @@ class ScanConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeskewNodeConfig:
-    """Everything the deskew node can be told."""
+    """All settings of the deskew node."""
 
     topics: DeskewTopics = field(default_factory=DeskewTopics)
     scan: ScanConfig = field(default_factory=ScanConfig)

@@ -1,4 +1,4 @@
-"""Settings of what deskew and odometry know of the sensor's motion."""
+"""Settings of the motion core: IMU, mount and static detection."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from l2lidar_node.types import F64
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuConfig:
-    """Where the IMU is, and what is known of it."""
+    """Mount and calibration of the IMU."""
 
     imu_xyz: tuple[float, ...] = setting(
         (-0.007698, -0.014655, 0.00667), "position of the IMU in the cloud frame", unit="m"
@@ -30,13 +30,13 @@ class ImuConfig:
     )
     calibration_file: str = setting(
         "",
-        "file of l2lidar calibrate imu for this unit: rotation of the IMU (in place of that in "
-        "/tf_static), time offset, gyro scale; imu_rpy and imu_time_offset_ms count more if set; "
-        "without a part imu the IMU is used as drawn",
+        "file of l2lidar calibrate imu for this unit: rotation of the IMU (replaces that in "
+        "/tf_static), time offset, gyro scale; imu_rpy and imu_time_offset_ms win if set; a file "
+        "without a section imu has no effect",
     )
 
     def __post_init__(self) -> None:
-        """Check what a single setting cannot."""
+        """Check the number of coordinates."""
         for name in ("imu_xyz", "imu_rpy"):
             value = getattr(self, name)
             if len(value) != 3:
@@ -46,7 +46,7 @@ class ImuConfig:
 
     @property
     def T_cloud_imu(self) -> F64:
-        """IMU coordinates to cloud coordinates where nothing else says it, shape (4, 4)."""
+        """IMU coordinates to cloud coordinates by these settings, shape (4, 4)."""
         pose = np.eye(4)
         pose[:3, :3] = rotations.from_rpy(np.deg2rad(self.imu_rpy))
         pose[:3, 3] = self.imu_xyz
@@ -55,7 +55,7 @@ class ImuConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionConfig(ImuConfig):
-    """What is known about the sensor's motion and how far it is trusted."""
+    """How the motion is estimated without odometry."""
 
     max_gyro_bias: float = setting(
         0.1,

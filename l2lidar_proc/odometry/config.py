@@ -13,7 +13,7 @@ from l2lidar_proc.motion.config import ImuConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InertialConfig:
-    """How far the IMU is trusted between sweeps."""
+    """Noise model of the IMU."""
 
     gyro_noise: float = setting(
         0.1,
@@ -138,7 +138,7 @@ class KissConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryConfig:
-    """Everything that can be said to the odometry."""
+    """All settings of the odometry."""
 
     mode: str = setting(
         "inertial",
@@ -168,8 +168,8 @@ class OdometryConfig:
     )
     max_speed: float = setting(
         30.0,
-        "largest speed of the carrier; a faster estimate is bounded and SUSPECT. 3 suits a sensor "
-        "held by hand",
+        "largest speed of the carrier; a faster estimate is bounded and SUSPECT; 3 suits a "
+        "handheld sensor",
         unit="m/s",
         lo=0.1,
         hi=1000.0,
@@ -190,7 +190,7 @@ class OdometryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryTopics(ImuConfig):
-    """Where an odometry node listens and speaks, and which frames it names."""
+    """Topics and frames of an odometry node."""
 
     cloud_topic: str = setting(
         "/points", "input clouds with per-point times, not deskewed", form=TOPIC
@@ -225,7 +225,8 @@ class OdometryTopics(ImuConfig):
     odom_frame: str = setting("odom", "frame of the poses", form=FRAME)
     base_frame: str = setting(
         "",
-        "frame whose pose is published, connected by /tf_static; empty: the cloud frame",
+        "frame whose pose is published, connected to the cloud frame by /tf_static; empty means "
+        "the cloud frame",
         form=FRAME,
     )
     publish_tf: bool = setting(True, "publish the transform between odom_frame and base_frame")
@@ -238,8 +239,8 @@ class OdometryTopics(ImuConfig):
     )
     max_skipped: int = setting(
         3,
-        "most sweeps in a row that the IMU carries, not aligned, while two or more clouds wait; "
-        "0 aligns every sweep, however far the poses fall behind",
+        "largest number of consecutive sweeps that are not aligned while two or more clouds wait; "
+        "the IMU carries the pose; 0 aligns every sweep, even if the poses fall behind",
         lo=0,
         hi=10,
     )
@@ -262,7 +263,7 @@ class OdometryTopics(ImuConfig):
     )
 
     def __post_init__(self) -> None:
-        """Check what a single setting cannot."""
+        """Check the frames."""
         ImuConfig.__post_init__(self)  # slots leave no place for super()
         if self.odom_frame in ("", self.base_frame):
             raise SettingError(
@@ -273,7 +274,7 @@ class OdometryTopics(ImuConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataConfig:
-    """Files that services write, all of them in one folder."""
+    """Files that services write, all in one folder."""
 
     data_dir: str = setting(
         DATA_DIR, "folder for the files of services; nothing is written outside it", form=FOLDER
@@ -289,7 +290,7 @@ class DataConfig:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check the suffixes, which name the formats."""
+        """Check the suffixes, which select the formats."""
         if not self.map_file.endswith((".ply", ".pcd")):
             raise SettingError(
                 f"parameter 'map_file': '{self.map_file}' is not valid; expected .ply or .pcd"
@@ -303,7 +304,7 @@ class DataConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNodeConfig:
-    """Everything the odometry node can be told."""
+    """All settings of the odometry node."""
 
     topics: OdometryTopics = field(default_factory=OdometryTopics)
     files: DataConfig = field(default_factory=DataConfig)

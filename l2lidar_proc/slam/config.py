@@ -12,109 +12,122 @@ from l2lidar_node.settings import FOLDER, FRAME, TOPIC, SettingError, setting
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubmapConfig:
-    """How the odometry's sweeps become submaps."""
+    """How sweeps are joined to submaps."""
 
     submap_length_m: float = setting(
-        5.0, "way after which a submap is closed", unit="m", lo=1.0, hi=50.0
+        5.0, "distance traveled after which a submap is closed", unit="m", lo=1.0, hi=50.0
     )
     map_voxel_m: float = setting(
-        0.1, "edge of the cubes of which a submap keeps one point each", unit="m", lo=0.02, hi=1.0
+        0.1, "voxel size of a submap; one point per voxel is kept", unit="m", lo=0.02, hi=1.0
     )
     map_range_m: float = setting(
-        30.0, "farther points do not enter the map", unit="m", lo=2.0, hi=60.0
+        30.0, "largest range of points that enter the map", unit="m", lo=2.0, hi=60.0
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftConfig:
-    """What the odometry is trusted with between submaps."""
+    """Assumed drift of the odometry between submaps."""
 
     drift_percent: float = setting(
-        0.5, "standard deviation of an edge, part of its way", unit="%", lo=0.01, hi=10.0
+        0.5,
+        "standard deviation of an edge's translation, relative to its length",
+        unit="%",
+        lo=0.01,
+        hi=10.0,
     )
     turn_drift_deg: float = setting(
         0.05,
-        "standard deviation of an edge's rotation, per 10 m of way",
+        "standard deviation of an edge's rotation, per 10 m of its length",
         unit="deg",
         lo=0.001,
         hi=5.0,
     )
     systematic_percent: float = setting(
         1.0,
-        "drift in plan that may add up over the whole way since a place",
+        "horizontal drift that may add up over the whole distance since a place",
         unit="%",
         lo=0.0,
         hi=10.0,
     )
     systematic_height_percent: float = setting(
-        0.3, "drift in height that may add up likewise", unit="%", lo=0.0, hi=10.0
+        0.3, "vertical drift that may add up over that distance", unit="%", lo=0.0, hi=10.0
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopConfig:
-    """When a loop is looked for, and what it needs to be accepted."""
+    """When to search for a loop, and when to accept it."""
 
-    loops: bool = setting(True, "whether loops are closed; without, gtsam is not needed")
+    loops: bool = setting(True, "close loops; false needs no gtsam")
     loop_min_way_m: float = setting(
-        20.0, "way since a place before it is looked for again", unit="m", lo=5.0, hi=1000.0
+        20.0, "distance traveled before a place is searched for again", unit="m", lo=5.0, hi=1000.0
     )
     min_overlap: float = setting(
-        0.4, "part of each submap that must lie in the space the other one saw", lo=0.1, hi=1.0
+        0.4,
+        "fraction of each submap that must lie in the space that the other one observed",
+        lo=0.1,
+        hi=1.0,
     )
     min_agreement: float = setting(
-        0.85, "part of that which must lie on surfaces of the other one", lo=0.3, hi=1.0
+        0.85,
+        "fraction of the overlap that must lie on surfaces of the other submap",
+        lo=0.3,
+        hi=1.0,
     )
     max_free_space: float = setting(
-        0.04, "part of it that may lie where the other one saw through", lo=0.0, hi=0.5
+        0.04,
+        "fraction of the overlap that may lie in space that the other submap saw as free",
+        lo=0.0,
+        hi=0.5,
     )
     max_second_best: float = setting(
         0.5,
-        "how much like the best place the second best may be: what contradicts the best, by what "
-        "contradicts the other",
+        "largest ambiguity: points that contradict the best pose, divided by those that "
+        "contradict the second best",
         lo=0.05,
         hi=1.0,
     )
     loop_votes: int = setting(
-        3, "submaps whose loops must agree with each other before one is accepted", lo=2, hi=20
+        3, "submaps whose loops must agree with each other before any is accepted", lo=2, hi=20
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizationConfig:
-    """How a place in a saved map is found and kept."""
+    """How the pose in a saved map is found and tracked."""
 
     relocalize: str = setting(
         "auto",
-        "auto: the place is searched for whenever it is unknown; service: on ~/relocalize; never: "
-        "only from an initial pose",
+        "search for the pose: auto, whenever it is unknown; service, on ~/relocalize; never, only "
+        "around an initial pose",
         choices=("auto", "service", "never"),
     )
     query_step_m: float = setting(
-        2.0, "way between two looks at the map", unit="m", lo=0.5, hi=20.0
+        2.0, "distance traveled between two matches with the map", unit="m", lo=0.5, hi=20.0
     )
     max_jump_m: float = setting(
-        1.0, "a larger correction needs two looks that agree", unit="m", lo=0.05, hi=100.0
+        1.0, "a larger correction needs two matches that agree", unit="m", lo=0.05, hi=100.0
     )
     dead_reckoning_m: float = setting(
         20.0,
-        "way without a look that fits before DEAD_RECKONING is said",
+        "distance without a match after which the state is DEAD_RECKONING",
         unit="m",
         lo=2.0,
         hi=1000.0,
     )
     lost_sigma_m: float = setting(
-        2.0, "uncertainty of the place at which LOST is said", unit="m", lo=0.1, hi=100.0
+        2.0, "position uncertainty above which the state is LOST", unit="m", lo=0.1, hi=100.0
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlamConfig:
-    """Everything the back end can be told."""
+    """All settings of the back end."""
 
     mode: str = setting(
         "mapping",
-        "mapping: the map grows; localization: it stays as it was saved",
+        "mapping: the map grows; localization: the saved map stays as it is",
         choices=("mapping", "localization"),
     )
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
@@ -132,10 +145,10 @@ class SlamTopics:
         "deskewed_points", "deskewed clouds in the body frame, stamped as the odometry", form=TOPIC
     )
     odometry_status_topic: str = setting(
-        "odometry_status", "what odometry_node remarks about each sweep", form=TOPIC
+        "odometry_status", "status of each sweep from odometry_node", form=TOPIC
     )
     initial_pose_topic: str = setting(
-        "/initialpose", "where the sensor is in the map, as RViz sends it", form=TOPIC
+        "/initialpose", "pose estimate in the map, as RViz sends it", form=TOPIC
     )
     pose_topic: str = setting("pose", "pose of the body in map_frame", form=TOPIC)
     map_topic: str = setting("map_points", "points of the whole map in map_frame", form=TOPIC)
@@ -144,8 +157,8 @@ class SlamTopics:
     status_topic: str = setting("slam_status", "state of the back end", form=TOPIC)
     keyframe_topic: str = setting(
         "keyframes",
-        "pose in the odometry frame of each submap that was closed, with the covariance of the "
-        "motion since the one before; for other back ends",
+        "pose of each finished submap in the odometry frame, with the covariance of the motion "
+        "since the one before; for other back ends",
         form=TOPIC,
     )
     keyframe_points_topic: str = setting(
@@ -158,39 +171,39 @@ class SlamTopics:
     )
     transform_tolerance: float = setting(
         0.5,
-        "how far ahead of the newest odometry the transform is stamped; a correction reaches "
-        "others so much later (AMCL's own default is 1 s)",
+        "how far ahead of the newest odometry the transform is stamped; corrections take effect "
+        "later by this time (AMCL's default is 1 s)",
         unit="s",
         lo=0.0,
         hi=2.0,
     )
     blend_s: float = setting(
         0.0,
-        "time over which the transform follows a correction; 0 = at once",
+        "time over which the transform follows a correction; 0 applies it at once",
         unit="s",
         lo=0.0,
         hi=30.0,
         live=True,
     )
     map_period_s: float = setting(
-        5.0, "time between publications of map and path, 0 = none", unit="s", lo=0.0, hi=3600.0
+        5.0, "period of map and path; 0 turns them off", unit="s", lo=0.0, hi=3600.0
     )
     data_dir: str = setting(
         DATA_DIR,
-        "folder in which maps are saved and looked for; nothing is written outside it",
+        "folder of saved maps; nothing is written outside it",
         form=FOLDER,
     )
     map_name: str = setting("map", "folder of the map within data_dir", live=True)
-    load_map: bool = setting(False, "begin with the saved map")
+    load_map: bool = setting(False, "start with the saved map")
     autosave_s: float = setting(
-        60.0, "time between saves of a growing map, 0 = none", unit="s", lo=0.0, hi=86400.0
+        60.0, "time between saves of a growing map; 0 turns them off", unit="s", lo=0.0, hi=86400.0
     )
     initial_pose: tuple[float, ...] = setting(
         (), "x, y [m] and yaw [deg] in the saved map at the start; empty if unknown"
     )
 
     def __post_init__(self) -> None:
-        """Check what a single setting cannot."""
+        """Check the initial pose and the name of the map."""
         if len(self.initial_pose) not in (0, 3):
             raise SettingError(
                 f"parameter 'initial_pose': {list(self.initial_pose)} has "
@@ -201,7 +214,7 @@ class SlamTopics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlamNodeConfig:
-    """Everything slam_node can be told."""
+    """All settings of slam_node."""
 
     topics: SlamTopics = field(default_factory=SlamTopics)
     slam: SlamConfig = field(default_factory=SlamConfig)
