@@ -148,7 +148,7 @@ def main() -> int:
     else:
         left = sum(map(_work, orders))
     if left:
-        print(f"{left} cases were left out, for want of time", file=sys.stderr)
+        print(f"{left} cases were left out for lack of time", file=sys.stderr)
     done = kept.read()
     found = [item for case in cases for item in done.get(case, [])]
     for path in given.capture:

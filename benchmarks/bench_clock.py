@@ -302,7 +302,7 @@ def carry_out(
     pool: ProcessPoolExecutor,
     until: float,
 ) -> int:
-    """Measure and keep one row after the other; return how many were left out for want of time."""
+    """Measure and keep one row after the other; return how many were left out for lack of time."""
     waiting = list(todo)[::-1]
     running: set[Future[Row]] = set()
     while running or (waiting and time.monotonic() < until):

@@ -229,7 +229,7 @@ def main(arguments: list[str] | None = None) -> int:
         left = sum(map(_work, orders))
     rows = [row for row in kept.read() if plan.has(row)]
     if left:
-        print(f"{left} runs were left out, for want of time", file=sys.stderr)
+        print(f"{left} runs were left out for lack of time", file=sys.stderr)
     reached = list(targets(rows))
     publish("odometry", "Odometry against the virtual L2's truth", rows, reached)
     if given.page:

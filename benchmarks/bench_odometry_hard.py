@@ -274,7 +274,7 @@ def main(arguments: list[str] | None = None) -> int:
         and row["method"] in given.methods
     ]
     if left:
-        print(f"{left} runs were left out, for want of time", file=sys.stderr)
+        print(f"{left} runs were left out for lack of time", file=sys.stderr)
     reached = list(targets(rows))
     show(rows, reached)
     path = keep("odometry_hard", rows, reached)

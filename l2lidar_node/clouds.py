@@ -283,7 +283,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         ),
         _layout(
             "hesai",
-            "whoever reads Hesai; timestamp is absolute",
+            "readers of Hesai clouds; timestamp is absolute",
             f"{_XYZ} intensity:f4@12 ring:u2@16 timestamp:f8@18",
             26,
         ),
@@ -295,7 +295,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
             32,
         ),
         _layout(
-            "xyzi", "costmaps and everything that wants no time", f"{_XYZ} intensity:f4@12", 16
+            "xyzi", "costmaps and everything that needs no time", f"{_XYZ} intensity:f4@12", 16
         ),
     )
 }

@@ -53,7 +53,7 @@ def split_stamp(stamp: int) -> tuple[int, int]:
     """
     if not is_ros_time(stamp):
         raise StampError(
-            f"the time {stamp / 1e9:.3f} s after 1970 is out of range: stamps of ROS 2 hold "
+            f"the time {stamp / 1e9:.3f} s after 1970 is out of range: ROS 2 stamps cover "
             "1901-12-13 to 2038-01-19"
         )
     return divmod(int(stamp), 1_000_000_000)

@@ -276,7 +276,7 @@ def open_viewer(web: bool, save: Path | None) -> Any:
 
 def _open_window(rerun: Any, layout: Any) -> None:
     if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)):
-        raise ViewerError("there is no display to open a window on; try --web or --save")
+        raise ViewerError("no display for a window; try --web or --save")
     # Its program stands beside Python's, in a virtual environment that need not be activated.
     folders = [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
     os.environ["PATH"] = os.pathsep.join(folders)

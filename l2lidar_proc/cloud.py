@@ -72,7 +72,7 @@ def to_sweep(
     if not len(cloud):
         raise CloudError("no point is finite")
     if not is_ros_time(stamp):
-        raise CloudError("its time is out of range: stamps of ROS 2 hold 1901 to 2038")
+        raise CloudError("its time is out of range: ROS 2 stamps cover 1901 to 2038")
     if snapshots and (not name or cloud[name].min() == cloud[name].max()):
         points = _with_time(cloud, name, np.zeros(len(cloud)))
         points.flags.writeable = False
@@ -91,7 +91,7 @@ def to_sweep(
         )
     before = min(int(times[0]), 0)
     if not is_ros_time(stamp + before) or not is_ros_time(stamp + int(times[-1])):
-        raise CloudError("its time is out of range: stamps of ROS 2 hold 1901 to 2038")
+        raise CloudError("its time is out of range: ROS 2 stamps cover 1901 to 2038")
     points = _with_time(cloud, name, np.asarray((times - before) * 1e-9))
     points.flags.writeable = False
     return Sweep(HostNs(stamp + before), HostNs(stamp + int(times[-1])), points, 0, 0)

@@ -75,19 +75,19 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "odom_frame",
                 default_value="",
-                description="frame in which poses are given; empty for what proc_params_file says",
+                description="frame in which poses are given; empty uses proc_params_file",
             ),
             DeclareLaunchArgument(
                 "base_frame",
                 default_value="",
-                description="frame whose pose is given, tied to the cloud's by /tf_static; empty "
-                "for what proc_params_file says",
+                description="frame whose pose is given, tied to the cloud frame by /tf_static; "
+                "empty uses proc_params_file",
             ),
             DeclareLaunchArgument(
                 "calibration_file",
                 default_value="",
                 description="file of l2lidar calibrate for this unit, for the driver, deskew and "
-                "odometry; empty for what params_file and proc_params_file say",
+                "odometry; empty uses params_file and proc_params_file",
             ),
             DeclareLaunchArgument(
                 "use_sim_time",

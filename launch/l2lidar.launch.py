@@ -72,7 +72,7 @@ def virtual_l2(options, parameters):
         )
     ]
     if "--ready" not in words:
-        text = "the virtual L2 spins up first: points come after 25 s times --boot-scale"
+        text = "the virtual L2 spins up first: points arrive after 25 s times --boot-scale"
         actions.insert(0, LogInfo(msg=text))
     return actions
 
@@ -80,7 +80,7 @@ def virtual_l2(options, parameters):
 def generate_launch_description():
     """Return the driver, or with ``emulator:=true`` the driver and a virtual L2."""
     share = FindPackageShare("l2lidar_node")
-    from_file = "empty for what params_file says"
+    from_file = "empty uses params_file"
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -99,7 +99,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "override_params_file",
                 default_value="",
-                description="parameters of the driver that go over those of params_file",
+                description="driver parameters that override params_file",
             ),
             DeclareLaunchArgument(
                 "l2_name",
@@ -172,13 +172,13 @@ def generate_launch_description():
                 "emulator_options",
                 default_value="--ready",
                 description="command line options of the virtual L2, in one string; with "
-                "--boot-scale 1 instead of --ready it spins up, and points come after 25 s",
+                "--boot-scale 1 instead of --ready it spins up, and points arrive after 25 s",
             ),
             DeclareLaunchArgument(
                 "respawn",
                 default_value="true",
                 choices=["true", "false"],
-                description="whether a node that died is started again; else the launch ends",
+                description="whether to restart a node that died; if not, the launch ends",
             ),
             DeclareLaunchArgument(
                 "log_level",

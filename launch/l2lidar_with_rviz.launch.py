@@ -34,8 +34,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "l2_name",
                 default_value="",
-                description="prefix of the frames, one for each sensor; empty for what "
-                "params_file says",
+                description="prefix of the frames, one for each sensor; empty uses params_file",
             ),
             SetLaunchConfiguration(
                 "fixed_frame",

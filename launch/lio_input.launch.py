@@ -16,7 +16,7 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                "consumer", choices=CONSUMERS, description="what the clouds are for"
+                "consumer", choices=CONSUMERS, description="consumer of the clouds"
             ),
             DeclareLaunchArgument(
                 "rviz",

@@ -41,7 +41,7 @@ def check_packages(context):
         except PackageNotFoundError:
             raise RuntimeError(
                 f"package '{package}' is not installed or not sourced; docs/slam.md of "
-                "l2lidar_node tells how to build LIO-SAM"
+                "l2lidar_node says how to build LIO-SAM"
             ) from None
 
 
@@ -111,21 +111,21 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "base_frame",
                 default_value="base_link",
-                description="frame that LIO-SAM moves in odom; not the cloud's own, or its TF has "
-                "an empty frame",
+                description="frame that LIO-SAM moves in odom; must differ from the cloud frame, "
+                "or its TF has an empty frame",
             ),
             DeclareLaunchArgument(
                 "publish_base_tf",
                 default_value="true",
                 choices=["true", "false"],
-                description="whether to put the sensor at the origin of base_frame; false where a "
-                "robot's description says where it sits",
+                description="whether to put the sensor at the origin of base_frame; false if "
+                "a robot's description has its mount",
             ),
             DeclareLaunchArgument(
                 "calibration_file",
                 default_value="",
                 description="file of l2lidar calibrate for this unit, for the driver and deskew; "
-                "empty for what their parameter files say",
+                "empty uses their parameter files",
             ),
             DeclareLaunchArgument(
                 "lio_sam_params_file",
@@ -140,12 +140,12 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "deskew_params_file",
                 default_value=PathJoinSubstitution([consumer, "deskew.yaml"]),
-                description="parameters of deskew that go over those of proc_params_file",
+                description="deskew parameters that override proc_params_file",
             ),
             DeclareLaunchArgument(
                 "fastdds_profile",
                 default_value=PathJoinSubstitution([share, "config", "fastdds_lio_sam.xml"]),
-                description="profile of Fast DDS, unless the environment names one",
+                description="Fast DDS profile, unless the environment sets one",
             ),
             DeclareLaunchArgument(
                 "rviz_config",

@@ -33,7 +33,7 @@ def launch_setup(context):
     }
     if not sensors:
         raise RuntimeError(
-            f"sensors_file:={given['sensors_file']} names no driver; expected sections headed "
+            f"sensors_file:={given['sensors_file']} has no driver; expected sections "
             "'/<namespace>/l2lidar_node', below them 'ros__parameters:'"
         )
     follows = given["deskew_odometry"] == "true"
@@ -76,7 +76,7 @@ def generate_launch_description():
                 "emulator",
                 default_value="false",
                 choices=["true", "false"],
-                description="whether to start a virtual L2 for each, and listen to that",
+                description="whether to start a virtual L2 for each and listen to it",
             ),
             OpaqueFunction(function=launch_setup),
         ]

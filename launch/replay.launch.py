@@ -26,8 +26,8 @@ def launch_setup(context):
     is_followed = given["deskew_odometry"] == "true"
     if is_followed and given["loop"] == "true":
         raise RuntimeError(
-            "loop:=true takes the sensor back to where the recording began, "
-            "which no odometry can follow; add deskew_odometry:=false"
+            "loop:=true jumps back to the start of the recording, which "
+            "no odometry can follow; add deskew_odometry:=false"
         )
     common = {
         "package": "l2lidar_node",
@@ -85,7 +85,7 @@ def generate_launch_description():
                 "loop",
                 default_value="false",
                 choices=["true", "false"],
-                description="whether to begin again at the end, without odometry",
+                description="whether to start over at the end, without odometry",
             ),
             DeclareLaunchArgument(
                 "deskew_odometry",
@@ -104,13 +104,12 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "l2_name",
                 default_value="",
-                description="prefix of the frames, one for each sensor; empty for what "
-                "params_file says",
+                description="prefix of the frames, one for each sensor; empty uses params_file",
             ),
             DeclareLaunchArgument(
                 "l2_ip",
                 default_value="",
-                description="address of the L2 in the capture; empty for what params_file says",
+                description="address of the L2 in the capture; empty uses params_file",
             ),
             DeclareLaunchArgument(
                 "params_file",
@@ -126,7 +125,7 @@ def generate_launch_description():
                 "calibration_file",
                 default_value="",
                 description="file of l2lidar calibrate for this unit, for the driver, deskew and "
-                "odometry; empty for what params_file and proc_params_file say",
+                "odometry; empty uses params_file and proc_params_file",
             ),
             DeclareLaunchArgument(
                 "log_level",

@@ -47,7 +47,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "fixed_frame",
                 default_value="",
-                description="RViz's fixed frame; empty for that of the layout",
+                description="RViz's fixed frame; empty uses that of the layout",
             ),
             DeclareLaunchArgument(
                 "use_sim_time",

@@ -49,23 +49,24 @@ def generate_launch_description():
                 "mode",
                 default_value="",
                 choices=["", "mapping", "localization"],
-                description="whether the map grows or stays; empty for what slam_params_file says",
+                description="mapping: the map grows; localization: it stays; empty uses "
+                "slam_params_file",
             ),
             DeclareLaunchArgument(
                 "load_map",
                 default_value="",
                 choices=["", "true", "false"],
-                description="whether to begin with the saved map; localization always does",
+                description="whether to start with the saved map; localization always does",
             ),
             DeclareLaunchArgument(
                 "data_dir",
                 default_value="",
-                description="folder of the maps; empty for what slam_params_file says",
+                description="folder of the maps; empty uses slam_params_file",
             ),
             DeclareLaunchArgument(
                 "map_name",
                 default_value="",
-                description="name of the map in data_dir; empty for what slam_params_file says",
+                description="name of the map in data_dir; empty uses slam_params_file",
             ),
             DeclareLaunchArgument(
                 "slam_params_file",

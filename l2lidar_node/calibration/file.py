@@ -143,9 +143,9 @@ class CalibrationFile:
         content["about"] = self.about
         head = (
             "# Calibration of one L2, written by `l2lidar calibrate`; give it to the driver as\n"
-            "# calibration_file, and to deskew and odometry too where it has a part `imu`.\n"
+            "# calibration_file, and to deskew and odometry too if it has a section `imu`.\n"
             "# SI units; range_bias in meters, range_scale relative.\n"
-            "# Used for packets whose calibration block equals `block` to the bit.\n"
+            "# Used for packets whose calibration block equals `block`, bit for bit.\n"
         )
         return head + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
@@ -164,7 +164,7 @@ def load(path: Path) -> CalibrationFile:
     except OSError as error:
         raise CalibrationFileError(f"{path}: {error.strerror}") from None
     if len(text) > _LARGEST_FILE:
-        raise CalibrationFileError(f"{path}: larger than any calibration file (1 MB)")
+        raise CalibrationFileError(f"{path}: too large for a calibration file (1 MB at most)")
     try:
         content = yaml.safe_load(text)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
@@ -262,8 +262,8 @@ def _number(given: object, name: str, limit: float) -> float:
         raise CalibrationFileError(f"{name} is {given!r:.80}, expected a number")
     if abs(given) > limit:
         raise CalibrationFileError(
-            f"{name} is {given:g}, expected {-limit:.4g} to {limit:.4g}: more is not a "
-            "calibration error"
+            f"{name} is {given:g}, expected {-limit:.4g} to {limit:.4g}: larger errors are "
+            "not calibration errors"
         )
     return float(given)
 

@@ -67,7 +67,8 @@ def calibration_of(
         "date": date,
         "firmware": firmware,
         "mode": "3D, standard field of view",
-        "valid": "for this unit" if has_imu else "for this mount only: there was no IMU data",
+        "valid": "for this unit" if has_imu else "valid for this mount only, because there was "
+            "no IMU data",
         "parameters": {
             name: {
                 "correction": round(item.value * UNITS[name][1], 4),
@@ -186,7 +187,7 @@ def save(result: StillResult, path: Path) -> None:
         axes[0, column].set_title(f"{title}: {_words(quality)}")
         _draw_plan(axes[1, column], cloud, scene.is_far_half, scene.group == group, edge)
     name = result.places[group].name
-    figure.suptitle(f"a wall seen from its edge, and a slice of '{name}' from above")
+    figure.suptitle(f"a wall seen edge-on, and a slice of '{name}' from above")
     with whole(path) as part:
         figure.savefig(part)
 
@@ -223,7 +224,7 @@ def save_turns(before: tuple[F64, F64], after: tuple[F64, F64], path: Path) -> N
             axes[row, column].grid(visible=True, alpha=0.3)
             axes[row, 0].set_ylabel(f"about {name} [deg]")
         axes[2, column].set_xlabel("time [s]")
-    figure.suptitle("turns of the gyro against those of the clouds")
+    figure.suptitle("rotation by the gyro against rotation by the clouds")
     with whole(path) as part:
         figure.savefig(part)
 

@@ -111,11 +111,13 @@ def by_tape(
     """
     if length < _SHORTEST_M:
         raise CalibrationError(
-            f"{length:g} m between the places is too short; slide the sensor by 3 m: 2 mm are "
-            "0.07 % of that"
+            f"{length:g} m between the positions is too short; slide the sensor by 3 m, of which "
+            "2 mm are 0.07 %"
         )
     if first.block != second.block:
-        raise CalibrationError("the places are of different units; use one unit for both")
+        raise CalibrationError(
+            "the positions were recorded with different units; use one unit for both"
+        )
     used = np.zeros(len(NAMES)) if correction is None else correction
     one, other = (beams(place.returns, place.block, used) for place in (first, second))
     group = np.zeros(len(one.points), np.int64)
@@ -131,7 +133,7 @@ def by_tape(
     if abs(scale) > _WORST_SCALE:
         raise CalibrationError(
             f"the sensor moved by {measured:.3f} m by its own ranges and {length:.3f} m by the "
-            f"tape: {100 * scale:+.1f} % is not a range scale; read the tape again"
+            f"tape: {100 * scale:+.1f} % is too much for a range scale; read the tape again"
         )
     along = found.shift / measured
     sd = float(np.sqrt(along @ own @ along + _MODEL_SD_M**2 + length_sd**2)) / length
@@ -242,6 +244,6 @@ def _joined(one: Beams, other: Beams, way: _Way, bias: float) -> Beams:
 
 def _not_found(shift: F64) -> CalibrationError:
     return CalibrationError(
-        f"the surfaces of the first place are not found again {np.linalg.norm(shift):.2f} m on; "
-        "slide the sensor straight towards a flat wall, without turning it"
+        f"the surfaces of the first position were not found again {np.linalg.norm(shift):.2f} m "
+        "on; slide the sensor straight towards a flat wall, without turning it"
     )

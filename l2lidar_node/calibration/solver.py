@@ -173,7 +173,7 @@ def solve(
             points(scene, spread(unknowns, values, groups)), scene.is_far_half, scene.group
         )
         if len(found.first) < _FEWEST_PLANES:
-            raise FewPlanesError("the scene has hardly any flat surfaces")
+            raise FewPlanesError("the scene has too few flat surfaces")
         members, own = scene.part(found.member), found.at()
         for _ in range(_ITERATIONS):
             here, own = _linearized(members, unknowns, values, own, information)

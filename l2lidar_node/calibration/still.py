@@ -109,8 +109,8 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
         bias, reason = range_bias(whole, angles)
     except FewPlanesError:
         raise CalibrationError(
-            "there are too few flat surfaces that both halves of the fan see; calibrate in a "
-            "furnished room of 4 to 10 m with a flat ceiling and free walls"
+            "too few flat surfaces are seen by both halves of the fan; calibrate in a furnished "
+            "room of 4 to 10 m with a flat ceiling and bare stretches of wall"
         ) from None
     reports = _alone(scene, solution, places, precessions)
     sd, scatter, together = _uncertainty(scene, solution)
@@ -126,7 +126,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     is_corrected |= bool((np.abs(alphas) > _SIGNIFICANT * sd[2:]).any())
     if is_corrected and not is_better and not refusals:
         notes.append(
-            f"planes became {100 * (1 - after.thickness / before.thickness):.0f} % thinner only: "
+            f"planes became only {100 * (1 - after.thickness / before.thickness):.0f} % thinner: "
             "the reported block is as good"
         )
         is_corrected = False
@@ -141,8 +141,8 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     }
     if any(precession is None for precession in precessions):
         notes.append(
-            "no IMU data: rocking of the mount cannot be told from alpha and beta, so the result "
-            "is valid for this mount only"
+            "no IMU data: rocking of the mount cannot be separated from alpha and beta, so the "
+            "result is valid for this mount only"
         )
     mean = corrections.mean(axis=0)
     return StillResult(
@@ -172,7 +172,7 @@ def problems(place: Place) -> list[Refusal]:
             Refusal(
                 f"{place.name}: {place.turns:.1f} turns of the head, at least "
                 f"{_FEWEST_TURNS:.0f} are needed",
-                "record 10 s at each place",
+                "record 10 s at each placement",
             )
         )
     if place.blocks > 1:
@@ -185,7 +185,7 @@ def problems(place: Place) -> list[Refusal]:
     if place.is_wide:
         found.append(
             Refusal(
-                f"{place.name}: wide field of view, which has a block of its own",
+                f"{place.name}: wide field of view, which has its own block",
                 "set the standard field of view (l2lidar set work-mode -- -wide_fov) and record "
                 "again",
             )
@@ -199,7 +199,7 @@ def _between(places: Sequence[Place]) -> list[Refusal]:
     if len({place.block for place in places}) > 1:
         return [
             Refusal(
-                "the places were measured under different calibration blocks",
+                "the placements were recorded with different calibration blocks",
                 "calibrate one unit at a time",
             )
         ]
@@ -299,7 +299,9 @@ def _precession(
         name = places[group].name
         if not precession.is_at_rest:
             refusals.append(
-                Refusal(f"{name}: the IMU says that the sensor moved", "clamp it and record again")
+                Refusal(
+                    f"{name}: the sensor moved, according to the IMU", "clamp it and record again"
+                )
             )
         if precession.forward > _PRECESSION_WORST or precession.backward > _PRECESSION_WORST:
             refusals.append(
@@ -320,14 +322,14 @@ def _precession(
         if is_motion:
             notes.append(
                 f"{name}: the mount rocks by {precession.forward / DEG:.3f} degrees with the "
-                "head; the gyro's figure is taken out of alpha and beta"
+                "head; this is subtracted from alpha and beta"
             )
             taken.append(precession)
             continue
         taken.append(None)
         text = (
             f"{name}: the gyro shows a rocking of {precession.backward / DEG:.2f} degrees against "
-            "the head that the points do not"
+            "the head that the points do not show"
         )
         if precession.forward > _PRECESSION:
             refusals.append(
@@ -338,7 +340,7 @@ def _precession(
                 )
             )
         else:
-            notes.append(f"{text}: a line of the gyro, not a motion")
+            notes.append(f"{text}: a spectral line of the gyro, not a motion")
     return taken, notes, refusals
 
 
@@ -414,26 +416,26 @@ def _judged(
 ) -> list[Refusal]:
     """Return why the angles cannot be believed."""
     found = []
-    room = "calibrate in a furnished room of 4 to 10 m with a flat ceiling and free walls"
+    room = (
+        "calibrate in a furnished room of 4 to 10 m with a flat ceiling and bare stretches of wall"
+    )
     planes = len(solution.planes.first)
     if planes < _FEWEST_PLANES:
         found.append(
-            Refusal(
-                f"{planes} flat patches that both halves see, {_FEWEST_PLANES} are needed", room
-            )
+            Refusal(f"{planes} flat patches that both halves see, expected {_FEWEST_PLANES}", room)
         )
     if directions < FEWEST_DIRECTIONS:
         found.append(
             Refusal(
-                f"the surfaces face {directions} directions, {FEWEST_DIRECTIONS} are needed", room
+                f"the surfaces face {directions} directions, expected {FEWEST_DIRECTIONS}", room
             )
         )
     if together > _LARGEST_SD_TOGETHER:
         found.append(
             Refusal(
                 f"xi and beta moved together are uncertain by {together / DEG:.2f} degrees: "
-                "surfaces near the horizon and near the zenith tell them apart",
-                f"{room}, and add a place with the sensor tilted or on its side",
+                "surfaces near the horizon and near the zenith separate them",
+                f"{room}, and add a placement with the sensor tilted or on its side",
             )
         )
     side = np.array([1.0, -0.7])
@@ -459,17 +461,17 @@ def _judged(
     if (np.abs(solution.values) > _LARGEST).any():
         found.append(
             Refusal(
-                "a correction of more than 1 degree: not a calibration error",
-                "check the mount, the cover, and that nothing hides half of the view",
+                "a correction of more than 1 degree is not a calibration error",
+                "check the mount and the cover, and that nothing blocks half of the view",
             )
         )
     sides = [report.xi - 0.7 * report.beta for report in reports]
     if max(sides) - min(sides) > _CONTRADICTION:
         found.append(
             Refusal(
-                f"the places contradict each other by {(max(sides) - min(sides)) / DEG:.2f} "
+                f"the placements contradict each other by {(max(sides) - min(sides)) / DEG:.2f} "
                 "degrees in xi - 0.7 beta",
-                "clamp the sensor at every place and record again",
+                "clamp the sensor at every placement and record again",
             )
         )
     return found
@@ -503,14 +505,14 @@ def _alpha(
     spread = float(alphas.max() - alphas.min())
     power_ups = {place.power_up for place in places}
     if spread > _REPEATABLE:
-        where = "from power-up to power-up" if len(power_ups) > 1 else "from place to place"
+        where = "between power-ups" if len(power_ups) > 1 else "between placements"
         reason = (
             f"not repeatable: it differs by {spread / DEG:.2f} degrees {where}, so it is not a "
             "constant of the unit"
         )
         return Estimate(value, max(uncertain, spread / 2.0), Verdict.SHOWN, reason)
     if verdict is Verdict.CORRECTED and len(power_ups) < 2 and not keep:
-        reason = "seen after one power-up only; switch the unit off and on and record once more"
+        reason = "seen after only one power-up; power-cycle the unit and record once more"
         return Estimate(value, uncertain, Verdict.SHOWN, reason)
     return Estimate(value, uncertain, verdict)
 
@@ -535,7 +537,9 @@ def _axis_distance(angles: Solution) -> Estimate:
     value = float(angles.values[-1])
     sd = float(np.hypot(angles.sd[-1], _MODEL_SD[3]))
     if abs(value) > _LARGEST_B_M:
-        return Estimate(value, sd, Verdict.SHOWN, "more than 5 mm: not the distance of the axes")
+        return Estimate(
+            value, sd, Verdict.SHOWN, "more than 5 mm, which cannot be the distance of the axes"
+        )
     return significant(value, sd)
 
 
@@ -584,7 +588,7 @@ def _weakest(solution: Solution) -> str:
         if worst[0] * worst[1] > 0:
             return (
                 f"xi and beta moved together (0.7 of each: {sd:.3f} degrees); surfaces near the "
-                "horizon and near the zenith tell them apart"
+                "horizon and near the zenith separate them"
             )
         return f"xi against beta ({sd:.3f} degrees)"
     return f"alpha ({sd:.3f} degrees)"
@@ -599,7 +603,7 @@ def range_bias(scene: Scene, angles: Solution) -> tuple[Estimate | None, str]:
     angles : Solution
         Of the beams and b, which are known from cells far better than from large surfaces.
     """
-    room = "large flat walls and a ceiling, seen from steep to shallow, tell it; a room has them"
+    room = "it needs large flat walls and a ceiling, seen from steep to shallow, as in a room"
     begin = np.append(angles.values, 0.0)
     prior = np.zeros((len(begin),) * 2)
     prior[:-1, :-1] = np.linalg.inv(angles.covariance)
@@ -623,7 +627,7 @@ def range_bias(scene: Scene, angles: Solution) -> tuple[Estimate | None, str]:
         return None, f"uncertain by {1e3 * own:.0f} mm; {room}"
     changes = value * free.values[-2] < 0 or value * near[-1] < 0
     if abs(value) > _BIAS_SIGNIFICANT * sd and changes:
-        return None, f"near surfaces or another mirror step turn its sign; {room}"
+        return None, f"near surfaces or another mirror step change its sign; {room}"
     return significant(value, sd), ""
 
 

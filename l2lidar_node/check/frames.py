@@ -21,11 +21,14 @@ def check_frames(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
     faults = 0
     for topic, names, fix in (
         ("cloud", clouds, "set cloud_frame"),
-        ("imu", imus, "set cloud_frame, from which the IMU's is made"),
+        ("imu", imus, "set cloud_frame; the IMU frame is derived from it"),
     ):
         text = ""
         if len(names) > 1:
-            text, check = f"frames of one topic change: {', '.join(map(repr, names))}", "changes"
+            text, check = (
+                f"the frame of one topic changes: {', '.join(map(repr, names))}",
+                "changes",
+            )
         elif names and not names[0]:
             text, check = "the frame has no name", "empty"
         elif names and names[0].startswith("/"):
@@ -48,7 +51,7 @@ def check_frames(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
 
 def _check_mount(cloud: str, imu: str, seen: Observation, consumer: Consumer) -> Finding:
     if imu in _reachable(cloud, seen.transforms):
-        return ok(_FRAMES, "tf-imu", "the IMU's place is known")
+        return ok(_FRAMES, "tf-imu", "the mount of the IMU is known")
     return Finding(
         consumer.tf.level,
         _FRAMES,
@@ -69,8 +72,8 @@ def _check_parent(cloud: str, seen: Observation, consumer: Consumer) -> Finding:
         _FRAMES,
         "tf-parent",
         f"'{cloud}' has the parent '{parents[0]}' in TF; {consumer.title} as we configure it "
-        "would be a second one, and TF allows one",
-        f"name '{parents[0]}' or its topmost frame as base frame in {consumer.title}'s own file",
+        "would add a second one, and TF allows only one",
+        f"set '{parents[0]}' or its topmost frame as base frame in {consumer.title}'s own file",
     )
 
 
@@ -83,7 +86,7 @@ def _check_tree(
         f"{cloud.removesuffix('_link')}_imu",
     }
     if others:
-        return ok(_FRAMES, "tf", f"'{cloud}' is in the tree with {', '.join(sorted(others)[:4])}")
+        return ok(_FRAMES, "tf", f"'{cloud}' is in one tree with {', '.join(sorted(others)[:4])}")
     return Finding(
         Level.WARN,
         _FRAMES,
@@ -122,7 +125,7 @@ def _check_offer(
         level = Level.ERROR if asked.reliability == "reliable" else Level.WARN
         why = {
             "reliable": "is reliable: nothing arrives",
-            "default": "is the system's default, which some middlewares take for reliable",
+            "default": "is the system's default, which some middlewares treat as reliable",
             "varies": "is reliable in some versions: nothing arrives there",
         }[asked.reliability]
         text = f"{topic}: published best effort; {consumer.title}'s subscription {why}"
@@ -130,10 +133,10 @@ def _check_offer(
     depths = [offer.depth for offer in offers if offer.depth and offer.reliability == "reliable"]
     if depths and min(depths) < _MIN_DEPTH[topic]:
         text = (
-            f"{topic}: published reliable with a queue of {min(depths)}, which overflows when the "
+            f"{topic}: published reliable with a queue of {min(depths)}, which overflows if the "
             f"consumer falls behind; {_MIN_DEPTH[topic]} is enough"
         )
         return Finding(Level.WARN, _QOS, f"qos-{topic}", text, "publish with a deeper queue")
     words = " and ".join(sorted(known)).replace("_", " ")
     ask = asked.reliability.replace("_", " ")
-    return ok(_QOS, f"qos-{topic}", f"{topic}: published {words}, asked for is {ask}")
+    return ok(_QOS, f"qos-{topic}", f"{topic}: published {words}, requested {ask}")

@@ -34,7 +34,7 @@ def check(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
             _SUBJECT,
             "values",
             f"{int((~finite).sum())} of {len(imu)} samples have NaN or infinite values",
-            "the publisher has to be mended",
+            "fix the publisher",
         )
         imu = imu[finite]
     if not len(imu):
@@ -51,17 +51,17 @@ def _check_acceleration(acceleration: F64, consumer: Consumer) -> Finding:
         return ok(_SUBJECT, "acceleration", f"{text}: m/s^2 with gravity")
     if 0.9 < norm < 1.1:
         level = Level.WARN if consumer.any_acceleration_unit else Level.ERROR
-        why, fix = "that is g, but m/s^2 is required", "multiply by 9.80665; the driver does"
+        why, fix = "this is in g, but m/s^2 is required", "multiply by 9.80665; the driver does"
     elif 17.0 < norm < 23.0:
         level = Level.WARN if consumer.any_acceleration_unit else Level.ERROR
-        why = "twice gravity, a fault of L2s that were switched on while tilted"
-        fix = "switch the L2 off and on while it stands upright and still"
+        why = "twice gravity, a fault of an L2 that was tilted at power-on"
+        fix = "power-cycle the L2 while it is upright and still"
     elif norm < 0.5:
         level, why = Level.ERROR, "it lacks gravity, which is required"
         fix = "publish what the accelerometer measures, +9.81 upwards at rest"
     else:
         level, why = Level.WARN, "9.81 m/s^2 is required at rest"
-        fix = "was it moving hard? else switch the L2 off and on while it stands upright and still"
+        fix = "unless it was moving hard, power-cycle the L2 while it is upright and still"
     return Finding(level, _SUBJECT, "acceleration", f"{text}: {why}", fix)
 
 
@@ -81,7 +81,7 @@ def _check_rate(rates: F64) -> Finding:
             Level.WARN,
             _SUBJECT,
             "gyro",
-            "all rates are exactly 0, as no gyro measures",
+            "all rates are exactly 0, which no gyro measures",
             "compare with the driver's own IMU topic",
         )
     return ok(_SUBJECT, "gyro", f"rates are up to {greatest:.3g} rad/s")
@@ -104,14 +104,14 @@ def _check_covariances(imu: NDArray[np.void]) -> Iterator[Finding]:
             _SUBJECT,
             "covariance-invalid",
             f"the covariance of {', '.join(wrong)} is negative or not finite",
-            "variances are 0 or more; only -1 as the first number has a meaning (not measured)",
+            "variances must be 0 or more; only -1 as the first number is allowed (not measured)",
         )
     if zero:
         yield Finding(
             Level.WARN,
             _SUBJECT,
             "covariance-zero",
-            "covariances are 0 throughout, which means not known",
+            "all covariances are 0, which means unknown",
             f"set {'; '.join(zero)}",
         )
     if not zero and not wrong:
@@ -157,7 +157,7 @@ def check_orientation(seen: Observation, consumer: Consumer) -> Iterator[Finding
     norms = np.linalg.norm(imu["orientation_wxyz"], axis=1)
     if (norms < _USABLE_NORM).any():
         if consumer.orientation is Use.IGNORED:
-            yield ok(_SUBJECT, "orientation", f"none, and {consumer.title} reads none")
+            yield ok(_SUBJECT, "orientation", f"none, and {consumer.title} needs none")
             return
         yield Finding(
             consumer.orientation.level,
@@ -175,7 +175,7 @@ def check_orientation(seen: Observation, consumer: Consumer) -> Iterator[Finding
             _SUBJECT,
             "orientation-norm",
             f"norms of orientations are {norms.min():.3f} to {norms.max():.3f}, not 1",
-            "normalise them; the driver does",
+            "normalize them; the driver does",
         )
     yield _check_gravity(imu[:: max(len(imu) // _MOST, 1)], consumer)
     yield from _check_rates(imu)
@@ -187,14 +187,14 @@ def _check_gravity(imu: NDArray[np.void], consumer: Consumer) -> Finding:
     calm = np.abs(norms - np.median(norms)) <= 0.1 * np.median(norms)
     q, acceleration = q[calm & (norms > 0)], acceleration[calm & (norms > 0)]
     if not len(q):
-        return not_judged(_SUBJECT, "orientation", "there is no acceleration to compare with")
+        return not_judged(_SUBJECT, "orientation", "no acceleration to compare with")
     angle = _from_vertical(q, acceleration)
     text = f"gravity by accelerometer and by orientation are {angle:.3g} deg apart"
     if angle < _MAX_ANGLE_DEG:
         return ok(_SUBJECT, "orientation", text)
     variants = {
-        "its numbers are w, x, y, z where x, y, z, w belong": np.roll(q, -1, axis=1),
-        "its numbers are turned about the wrong way (z, w, x, y)": np.roll(q, 1, axis=1),
+        "its numbers are in the order w, x, y, z instead of x, y, z, w": np.roll(q, -1, axis=1),
+        "its numbers are in the order z, w, x, y instead of x, y, z, w": np.roll(q, 1, axis=1),
         "it is inverted (world to IMU)": q * [1.0, -1.0, -1.0, -1.0],
     }
     guess = min(variants, key=lambda name: _from_vertical(variants[name], acceleration))
@@ -207,7 +207,7 @@ def _check_gravity(imu: NDArray[np.void], consumer: Consumer) -> Finding:
         f"{text}; " + (f"it fits if {guess}" if fits else "IMU to a z-up world is required"),
         "use the driver's IMU topic"
         if fits
-        else "switch the L2 off and on while it stands upright and still",
+        else "power-cycle the L2 while it is upright and still",
     )
 
 
@@ -233,10 +233,12 @@ def _check_rates(imu: NDArray[np.void]) -> Iterator[Finding]:
     by_orientation = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
     turned = (by_orientation > _TURNED_RAD) & (by_orientation < 2.0)
     if turned.sum() < 5:
-        yield not_judged(_SUBJECT, "gyro-unit", "too little rotation to compare with orientations")
+        yield not_judged(
+            _SUBJECT, "gyro-unit", "too little rotation to compare with the orientations"
+        )
         return
     ratio = float(np.median(by_rate[turned] / by_orientation[turned]))
-    text = f"rates turn {ratio:.3g} times as far as orientations"
+    text = f"integrated rates are {ratio:.3g} times the rotation of the orientations"
     if 0.7 < ratio < 1.4:
         yield ok(_SUBJECT, "gyro-unit", f"{text}: rad/s")
     elif 30.0 < ratio < 100.0:
@@ -244,7 +246,7 @@ def _check_rates(imu: NDArray[np.void]) -> Iterator[Finding]:
             Level.ERROR,
             _SUBJECT,
             "gyro-unit",
-            f"{text}: they are deg/s, but rad/s is required",
+            f"{text}: they are in deg/s, but rad/s is required",
             "multiply by pi / 180; the driver publishes rad/s",
         )
     else:
@@ -253,6 +255,11 @@ def _check_rates(imu: NDArray[np.void]) -> Iterator[Finding]:
             Level.WARN,
             _SUBJECT,
             "gyro-unit",
-            text + (": stamps run at half speed" if half else ": unit, axes or stamps are wrong"),
+            text
+            + (
+                ": the stamps run at half speed"
+                if half
+                else ": the unit, the axes or the stamps are wrong"
+            ),
             "set enable_l2_time_correction: true" if half else "use the driver's IMU topic",
         )

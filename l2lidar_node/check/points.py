@@ -76,7 +76,7 @@ def check_layout(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
             _SUBJECT,
             "format-changes",
             f"{others} of {len(seen.clouds)} clouds have other fields than most",
-            "is there a second publisher on the topic?",
+            "check for a second publisher on the topic",
         )
     wanted = reading(form, consumer).input
     yield from _check_fields(form, wanted, consumer)
@@ -120,10 +120,10 @@ def _check_fields(form: Format, wanted: Input, consumer: Consumer) -> Iterator[F
             yield Finding(Level.ERROR, _SUBJECT, "field-type", text, fix)
     words = " ".join(f"{item.name}:{item.code}" for item in form.fields)
     if consumer.exact and not faults and not _is_layout(form, wanted.layout):
-        text = f"{words} in {form.point_step} B: {consumer.title} takes its own bytes only"
+        text = f"{words} in {form.point_step} B: {consumer.title} accepts only its own layout"
         yield Finding(Level.ERROR, _SUBJECT, "layout", text, fix)
     elif consumer.contiguous and not faults and not _is_contiguous(fields):
-        text = f"y and z do not follow x; {consumer.title} takes them from there"
+        text = f"y and z do not follow x; {consumer.title} expects them there"
         yield Finding(Level.ERROR, _SUBJECT, "layout", text, fix)
     elif not faults:
         yield ok(_SUBJECT, "fields", f"{words}: read{when}")
@@ -151,14 +151,14 @@ def _check_memory(seen: Observation, form: Format, consumer: Consumer) -> Iterat
             _SUBJECT,
             "malformed",
             text + unreadable[0].fault,
-            "the publisher has to be mended",
+            "fix the publisher",
         )
     if form.is_bigendian:
         yield Finding(
             Level.ERROR,
             _SUBJECT,
             "byte-order",
-            f"the clouds are big-endian; {consumer.title} takes the bytes as little-endian",
+            f"the clouds are big-endian; {consumer.title} reads the bytes as little-endian",
             "publish little-endian",
         )
     wrong = sum(_has_wrong_row_step(cloud) for cloud in seen.clouds)
@@ -177,7 +177,7 @@ def _check_memory(seen: Observation, form: Format, consumer: Consumer) -> Iterat
             consumer.several_times,
             "times",
             "time-several",
-            f"several time fields ({', '.join(times)}): which one {consumer.title} takes depends "
+            f"several time fields ({', '.join(times)}): which one {consumer.title} reads depends "
             "on its version",
             f"set point_layout: {consumer.inputs[0].layout}, which has one",
         )
@@ -220,7 +220,7 @@ def _check_first(inside: list[Contents], consumer: Consumer) -> Finding:
             "first",
             f"the first cloud has {first} points, the next ones {min(others)} and more: part of a "
             f"turn; {consumer.title} {does}",
-            "set sweep_cut: turn, of which the driver publishes whole ones only",
+            "set sweep_cut: turn; the driver then publishes only whole turns",
         )
     return ok(_SUBJECT, "first", f"the first cloud is whole: {first} points")
 
@@ -237,7 +237,7 @@ def _check_counts(inside: list[Contents], consumer: Consumer) -> Iterator[Findin
             "points-few",
             f"{few} of {len(counts)} clouds have fewer than {_FEW} points, one has {least}"
             + ("; KISS-ICP aborts the process on those" if aborts else ""),
-            "look whether something covers the sensor, and at range_min, range_max and filters",
+            "check for something that covers the sensor, and range_min, range_max and filters",
         )
     else:
         yield ok(_SUBJECT, "points", f"{np.median(counts):.0f} points per cloud")
@@ -247,8 +247,8 @@ def _check_counts(inside: list[Contents], consumer: Consumer) -> Iterator[Findin
             Level.WARN,
             _SUBJECT,
             "points-origin",
-            f"{at_origin:.0%} of the points are at 0, 0, 0: returns that are none",
-            "leave them out: range_min: 0.05",
+            f"{at_origin:.0%} of the points are at 0, 0, 0: these are not returns",
+            "drop them with range_min: 0.05",
         )
 
 
@@ -260,13 +260,13 @@ def _check_finite(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
         if cloud.contents is not None
     )
     sparse = sum(not cloud.is_dense for cloud in seen.clouds)
-    fix = "set organised: false (deskew_node), or leave NaN points out"
+    fix = "set organised: false (deskew_node), or drop NaN points"
     if lying:
         yield Finding(
             Level.ERROR,
             _SUBJECT,
             "dense-lie",
-            f"{lying} clouds say is_dense and have NaN or infinite points",
+            f"{lying} clouds claim is_dense but have NaN or infinite points",
             fix,
         )
     elif sparse and consumer.is_dense is Use.NEEDED:
@@ -283,7 +283,7 @@ def _check_finite(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
             _SUBJECT,
             "nonfinite",
             f"{nonfinite} points are NaN or infinite; not every version of {consumer.title} "
-            "leaves them out",
+            "drops them",
             fix,
         )
     else:
@@ -360,13 +360,13 @@ def check_leveling(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
         return
     verdict, why = _verdict(seen)
     if verdict is None:
-        yield not_judged(_SUBJECT_LEVELED, "levelled", f"whether imu_adjust is on, {why}")
+        yield not_judged(_SUBJECT_LEVELED, "levelled", f"unknown whether imu_adjust is on: {why}")
     elif verdict:
         yield Finding(
             Level.ERROR if consumer.imu is Use.NEEDED else Level.WARN,
             _SUBJECT_LEVELED,
             "levelled",
-            f"the clouds are turned into a leveled frame ({why}); {consumer.title} deskews by "
+            f"the clouds are rotated into a level frame ({why}); {consumer.title} deskews them "
             "itself and needs them as measured",
             "set imu_adjust: false",
         )
@@ -399,10 +399,10 @@ def _verdict(seen: Observation) -> tuple[bool | None, str]:
         return None, f"the sensor was not tilted by {_TILT_DEG:g} deg or more"
     below, below_back = float(np.median(raw)), float(np.median(back))
     if below > _MANY and below_back < _FEW_LEVELED:
-        return True, f"{below:.0%} of the points are below the sensor's horizon, none turned back"
+        return True, f"{below:.0%} of the points are below the sensor's horizon, none rotated back"
     if below < _FEW_LEVELED:
         return False, "no point is below the sensor's horizon"
-    return None, "points are below the sensor's horizon either way"
+    return None, "points are below the sensor's horizon in both cases"
 
 
 def _below(points: F64) -> float:

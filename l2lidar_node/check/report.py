@@ -34,7 +34,7 @@ def _judge(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
         yield from stamps.check(clouds, consumer)
     else:
         text = "no clouds came"
-        fix = "is the driver running, the topic's name right, and does its QoS let them through?"
+        fix = "check that the driver runs, that the topic's name is right, and its QoS"
         yield Finding(Level.ERROR, "cloud", "cloud-missing", text, fix)
     if not len(seen.imu):
         yield from imu.missing(consumer)

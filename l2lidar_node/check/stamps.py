@@ -82,8 +82,8 @@ def check(track: Track, consumer: Consumer) -> Iterator[Finding]:
             Level.WARN,
             track.subject,
             "few",
-            f"{len(track.stamps)} messages are too few to judge their rate",
-            "look at more with --seconds",
+            f"{len(track.stamps)} messages are too few to judge the rate",
+            "observe longer with --seconds",
         )
         return
     intervals = np.diff(track.stamps) / 1e9
@@ -101,21 +101,21 @@ def _check_order(track: Track, intervals: F64, consumer: Consumer) -> Iterator[F
     backward, equal = int((intervals < 0).sum()), int((intervals == 0).sum())
     level = Level.WARN if consumer.time is Use.IGNORED else Level.ERROR
     if backward:
-        text = f"{backward} stamps are before the one that came before, by up to "
+        text = f"{backward} stamps are earlier than the one before, by up to "
         yield Finding(
             level,
             track.subject,
             "stamps-backward",
-            f"{text}{-intervals.min():.4g} s; buffers are ordered by stamp or cleared",
-            "is there a second publisher, or did a recording start anew?",
+            f"{text}{-intervals.min():.4g} s; consumers reorder or clear their buffers",
+            "check for a second publisher or a recording that restarted",
         )
     if equal:
         yield Finding(
             level,
             track.subject,
             "stamps-equal",
-            f"{equal} stamps are the same as the one before; integration divides by their steps",
-            "is there a second publisher?",
+            f"{equal} stamps equal the one before; integration divides by the difference",
+            "check for a second publisher",
         )
     if not backward and not equal:
         yield ok(track.subject, "stamps", "stamps ascend")
@@ -134,15 +134,16 @@ def _check_rate(
             consumer.imu.level,
             "imu",
             "rate",
-            f"{text}; {consumer.title} asks for {consumer.imu_rate_hz:g} Hz or more",
-            "the L2 sends 250 Hz: are samples lost? set qos_reliability: reliable",
+            f"{text}; {consumer.title} needs {consumer.imu_rate_hz:g} Hz or more",
+            "the L2 sends 250 Hz; if samples are lost, set qos_reliability: reliable",
         )
     elif deviation > track.jitter * period:
         yield Finding(
             Level.WARN,
             track.subject,
             "jitter",
-            f"{text}: that is {deviation / period:.0%} of the period, as when stamps are arrivals",
+            f"{text}: that is {deviation / period:.0%} of the period, typical of arrival times "
+            f"used as stamps",
             "set UseSystemTimeTS: false",
         )
     else:
@@ -163,7 +164,7 @@ def _check_gaps(track: Track, period: float, forward: F64) -> Iterator[Finding]:
         "gaps",
         f"{int(wide.sum())} gaps of up to {forward.max():.4g} s, {lost} messages missing "
         f"({share:.1%})",
-        "set qos_reliability: reliable, or look at the driver's diagnostics for lost packets",
+        "set qos_reliability: reliable, or check the driver's diagnostics for lost packets",
     )
 
 
@@ -182,8 +183,8 @@ def _check_pace(track: Track) -> Iterator[Finding]:
     """Check how fast stamps advance and how old they are when they come."""
     passed = (track.arrivals[-1] - track.arrivals[0]) / 1e9
     if not track.has_arrivals or passed < _RATIO_MIN_S:
-        why = "no times of arrival" if not track.has_arrivals else f"only {passed:.2g} s"
-        yield not_judged(track.subject, "clock", f"pace of the stamps, {why}")
+        why = "no arrival times" if not track.has_arrivals else f"only {passed:.2g} s"
+        yield not_judged(track.subject, "clock", f"rate of the stamps: {why}")
         return
     ratio = _pace(track)
     latency = track.latency_s
@@ -193,7 +194,7 @@ def _check_pace(track: Track) -> Iterator[Finding]:
             Level.ERROR,
             track.subject,
             "clock-half",
-            f"{text}: that is the L2's own clock, which is half as fast",
+            f"{text}: this is the L2's own clock, which runs at half speed",
             "set enable_l2_time_correction: true and timeScaleNum: 2",
         )
     elif abs(ratio - 1.0) > _RATIO_TOLERANCE:
@@ -201,16 +202,16 @@ def _check_pace(track: Track) -> Iterator[Finding]:
             Level.WARN,
             track.subject,
             "clock-pace",
-            f"{text}: replayed at another speed, or a clock that steps",
-            "record at speed 1; look at the driver's diagnostics of the clock",
+            f"{text}: replayed at another speed, or the clock steps",
+            "record at speed 1; check the clock in the driver's diagnostics",
         )
     elif latency < -1e-3:
         yield Finding(
             Level.WARN,
             track.subject,
             "clock-ahead",
-            f"messages come {-latency:.4g} s before what they say was measured: their stamp is "
-            "of the end, or of a clock that is ahead",
+            f"messages come {-latency:.4g} s before their stamp: it marks the end of the "
+            "measurement, or the clock is ahead",
             "stamp clouds at their first point, as the driver does",
         )
     elif latency > _OLD_S:
@@ -218,7 +219,7 @@ def _check_pace(track: Track) -> Iterator[Finding]:
             Level.WARN,
             track.subject,
             "clock-behind",
-            f"messages come {latency:.4g} s after what they say was measured",
+            f"messages come {latency:.4g} s after their stamp",
             "set use_sim_time: true in the consumer for a replay; else enable_l2_host_sync: true",
         )
     else:
@@ -241,9 +242,9 @@ def check_overlap(clouds: Track, imu: Track) -> Iterator[Finding]:
             Level.ERROR,
             _SUBJECT,
             "clocks-apart",
-            f"clouds and IMU samples have no instant in common, clouds are {offset:+.6g} s from "
-            "the samples: two clocks",
-            "stamp both by the driver, or the same UseSystemTimeTS for both",
+            f"clouds and IMU samples do not overlap in time, clouds are {offset:+.6g} s away "
+            "from the samples: two clocks",
+            "let the driver stamp both, with the same UseSystemTimeTS",
         )
         return
     covered = (starts >= samples[0]) & (ends <= samples[-1])
@@ -256,7 +257,7 @@ def check_overlap(clouds: Track, imu: Track) -> Iterator[Finding]:
             "uncovered",
             f"{bare} of {len(starts)} clouds are not covered by IMU samples from their first to "
             "their last point",
-            "look for gaps of the IMU topic; set qos_reliability: reliable",
+            "check for gaps in the IMU topic; set qos_reliability: reliable",
         )
     else:
         yield ok(
@@ -271,8 +272,9 @@ def check_overlap(clouds: Track, imu: Track) -> Iterator[Finding]:
             _SUBJECT,
             "offset",
             f"a cloud comes {clouds.latency_s * 1e3:.4g} ms after its last point, a sample "
-            f"{imu.latency_s * 1e3:.4g} ms after its stamp: an offset of about {apart:+.3g} s",
-            "stamp both by the driver",
+            f"{imu.latency_s * 1e3:.4g} ms after its stamp: their stamps differ by about "
+            f"{apart:+.3g} s",
+            "let the driver stamp both",
         )
     else:
         yield ok(_SUBJECT, "offset", f"clouds and samples come within {abs(apart) * 1e3:.3g} ms")

@@ -177,8 +177,8 @@ def check(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
             consumer.time.level,
             _SUBJECT,
             "time-missing",
-            f"no time of each point ({names}): {consumer.title} cannot deskew, which is right "
-            "only where that is done already",
+            f"no time per point ({names}): {consumer.title} cannot deskew, which is "
+            "right only for deskewed clouds",
             f"set point_layout: {layout}, or keep_time: true (deskew_node)",
         )
         return
@@ -201,13 +201,13 @@ def check(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
             Level.ERROR,
             _SUBJECT,
             "time-constant",
-            f"all points of a cloud have one time in {constant} of {len(clouds)} clouds; "
+            f"all points of a cloud have the same time in {constant} of {len(clouds)} clouds; "
             f"{consumer.title} {consumer.constant_times}",
-            f"set point_layout: {layout}; of clouds deskewed already keep_time: false",
+            f"set point_layout: {layout}, or keep_time: false for deskewed clouds",
         )
         return
     if _only_spread(consumer):
-        text = f"times differ; {consumer.title} takes any unit"
+        text = f"times differ; {consumer.title} accepts any unit"
         short = _check_length(float(np.median(times.spread)))
         yield short or ok(_SUBJECT, "time-spread", text)
         return
@@ -223,8 +223,8 @@ def _check_origin(times: Timing, consumer: Consumer) -> Iterator[Finding]:
             Level.ERROR,
             _SUBJECT,
             "time-origin",
-            f"{times.refused} of {total} clouds have times that are near neither 0 nor the stamp "
-            f"(first {times.least[0] * 1e3:.3f} ms); {consumer.title} refuses them",
+            f"{times.refused} of {total} clouds have times that are neither near 0 nor near the "
+            f"stamp (first {times.least[0] * 1e3:.3f} ms); {consumer.title} refuses them",
             "stamp the cloud at its first point, as the filters of deskew_node do",
         )
         return
@@ -250,14 +250,14 @@ def _check_order(times: Timing, consumer: Consumer) -> Iterator[Finding]:
     descents = sum(item.descents > 0 for item in times.raw)
     not_last = int((times.last < times.greatest - _RESOLUTION_S).sum())
     total = len(times.raw)
-    fix = "publish points in order of time, as the driver does"
+    fix = "publish the points in time order, as the driver does"
     if not_last:
         yield Finding(
             Level.ERROR,
             _SUBJECT,
             "time-order",
             f"the last point is not the latest in {not_last} of {total} clouds; "
-            f"{consumer.title} takes its time for the sweep's end",
+            f"{consumer.title} uses its time as the sweep's end",
             fix,
         )
     elif descents:
@@ -281,8 +281,8 @@ def _check_spread(clouds: Sequence[Cloud], times: Timing, consumer: Consumer) ->
             Level.ERROR,
             _SUBJECT,
             "sweep-long",
-            f"the points of a cloud span {longest:.4g} s as {consumer.title} takes them; it "
-            f"relies on less than {consumer.max_sweep_s:g} s",
+            f"the points of a cloud span {longest:.4g} s as {consumer.title} reads them; "
+            f"it needs less than {consumer.max_sweep_s:g} s",
             "set sweep_cut: turn, and point_layout as required if the unit is wrong",
         )
         return
@@ -300,7 +300,8 @@ def _check_spread(clouds: Sequence[Cloud], times: Timing, consumer: Consumer) ->
             Level.ERROR,
             _SUBJECT,
             "time-half",
-            f"{text}: half, as if times ran on the L2's own clock, which is half as fast",
+            f"{text}: half, as if the times were those of the L2's own clock, which runs at half "
+            f"speed",
             "set enable_l2_time_correction: true and timeScaleNum: 2",
         )
     elif not _FITS[0] <= ratio <= _FITS[1]:
@@ -308,8 +309,9 @@ def _check_spread(clouds: Sequence[Cloud], times: Timing, consumer: Consumer) ->
             Level.ERROR if ratio > 1.0 else Level.WARN,
             _SUBJECT,
             "time-spread",
-            f"{text}: they do not fit together",
-            f"set point_layout: {consumer.inputs[0].layout}; is a filter cutting out azimuths?",
+            f"{text}: these do not match",
+            f"set point_layout: {consumer.inputs[0].layout}; check for a filter that removes "
+            f"azimuths",
         )
     else:
         yield _check_length(spread) or ok(_SUBJECT, "time-spread", text)
@@ -324,7 +326,7 @@ def _check_length(spread: float) -> Finding | None:
         _SUBJECT,
         "sweep-short",
         f"the points of a cloud span {spread:.4f} s, less than a turn of the L2's head "
-        "(0.18 to 0.23 s), too thin for most odometry",
+        "(0.18 to 0.23 s), too few points for most odometry",
         "set sweep_cut: turn",
     )
 

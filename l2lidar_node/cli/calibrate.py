@@ -45,19 +45,20 @@ _POSES: Final = (
 )
 _BEFORE: Final = """\
 [bold]Before you begin[/]
-  - let the unit run for 10 minutes, so that it is warm; its IMU has to be on
-  - a furnished room of 4 to 10 m with a flat ceiling and free walls; not a corridor, not outdoors
+  - let the unit run for 10 minutes to warm up; its IMU must be on
+  - use a furnished room of 4 to 10 m with a flat ceiling and bare stretches of wall, not a
+    corridor, not outdoors
   - screw or clamp the sensor to something heavy: not foam, not a tripod, not your hand
-  - clean the cover; nobody walks about"""
+  - clean the cover; nobody may walk about"""
 _WITHIN: Final = (
-    "within what tape and surfaces leave: nothing to correct; a better tape (--tape-mm) or a "
-    "longer way tells more"
+    "within the accuracy of tape and surfaces: nothing to correct; use a better tape (--tape-mm) "
+    "or a longer distance to measure more accurately"
 )
 _RIGHT: Final = "the block that the unit reports is right: nothing to correct"
 _HELD_UP_S: Final = 10.0  # that a place may take longer than it was to be recorded
 
 app = typer.Typer(
-    help="Estimate what the unit is off by, and write its calibration file.",
+    help="Estimate the unit's calibration errors, and write its calibration file.",
     no_args_is_help=True,
 )
 app.command()(imu)
@@ -70,8 +71,8 @@ def still(
     captures: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Captures of still places (l2lidar record), one each; live from the unit if "
-            "left out.",
+            help="Captures of placements (l2lidar record), one each; live from the unit if "
+            "omitted.",
             exists=True,
             dir_okay=False,
         ),
@@ -86,7 +87,7 @@ def still(
     ] = None,
     emulator: EmulatorOption = None,
     places: Annotated[
-        int, typer.Option(min=1, max=12, help="Places to measure live, before and after.")
+        int, typer.Option(min=1, max=12, help="Placements to measure live, before and after.")
     ] = 4,
     seconds: SecondsOption = 10.0,
     keep: KeepOption = None,
@@ -94,7 +95,7 @@ def still(
         bool,
         typer.Option(
             "--keep-alpha",
-            help="Store alpha after one power-up: right until the unit is switched off.",
+            help="Store alpha after one power-up; it is right until the unit is switched off.",
         ),
     ] = False,
     output: OutputOption = None,
@@ -116,7 +117,7 @@ def still(
     l2lidar calibrate still --emulator typical -o virtual.yaml
     """
     if emulator is not None and captures:
-        raise UsageError("--emulator measures by itself; leave the captures out")
+        raise UsageError("--emulator measures by itself; omit the captures")
     known = files.existing(output)
     firmware = ""
     if emulator is not None:
@@ -143,7 +144,7 @@ def still(
         if figure is not None:
             say(f"picture in {figure}")
     if result.refusals:
-        raise CommandError("nothing is written: " + result.refusals[0].reason)
+        raise CommandError("nothing written: " + result.refusals[0].reason)
     files.write(
         made,
         output,
@@ -158,18 +159,19 @@ def still(
 def scale(
     network: NetworkConfig,
     length: Annotated[
-        float, typer.Option(min=0.1, max=50.0, help="Way between the two places by tape [m].")
+        float,
+        typer.Option(min=0.1, max=50.0, help="Distance between the two positions by tape [m]."),
     ],
     captures: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Two captures, of the start and the end of the way; live if left out.",
+            help="Two captures, at the start and the end; live if omitted.",
             exists=True,
             dir_okay=False,
         ),
     ] = None,
     tape_mm: Annotated[
-        float, typer.Option(min=0.1, max=100.0, help="What the tape is uncertain by [mm].")
+        float, typer.Option(min=0.1, max=100.0, help="Uncertainty of the tape [mm].")
     ] = 2.0,
     emulator: EmulatorOption = None,
     seconds: SecondsOption = 10.0,
@@ -233,7 +235,7 @@ def scale(
     else:
         say(
             f"the sensor measured {found.measured:.4f} m of {length:.4f} m, with "
-            f"{found.surfaces} flat patches: ranges have to be stretched by "
+            f"{found.surfaces} flat patches: ranges must be scaled by "
             f"{100 * found.scale:+.3f} +- {100 * found.sd:.3f} %"
         )
     made = CalibrationFile(
@@ -296,7 +298,7 @@ def _live(
         if not guide.is_unattended:
             say(
                 "\nSwitch the unit off and on and wait until its head turns; alpha is stored only "
-                "if it is the same then."
+                "if it is then the same."
             )
             if files.confirmed("Measure once more?"):
                 place, _ = _measured(network, folder / "again", seconds, 1, "", guide)
@@ -348,8 +350,8 @@ def _measured(
                 return place, firmware
         for trouble in troubles:
             say(f"[yellow]{trouble}[/]")
-        if not files.confirmed("Measure this place again?"):
-            raise CommandError(f"nothing is written: {troubles[0]}")
+        if not files.confirmed("Repeat this placement?"):
+            raise CommandError(f"nothing written: {troubles[0]}")
     raise AssertionError("count never ends")
 
 
@@ -403,7 +405,7 @@ def _show(result: StillResult) -> None:
         )
     out.print(table)
     say(
-        f"\nxi - 0.7 beta, which the data fix best: {result.side / DEG:+.3f} +- "
+        f"\nxi - 0.7 beta, the best determined combination: {result.side / DEG:+.3f} +- "
         f"{result.side_sd / DEG:.3f} degrees"
     )
     say(f"known worst: {result.weakest}")

@@ -40,18 +40,18 @@ EmulatorOption = Annotated[
     str | None,
     typer.Option(
         metavar="UNIT",
-        help="Calibrate a virtual unit instead: perfect, typical, poor or a number.",
+        help="Calibrate a virtual unit: perfect, typical, poor or a number.",
     ),
 ]
 SecondsOption = Annotated[
-    float, typer.Option(min=1.0, max=120.0, help="Seconds to record at each place.")
+    float, typer.Option(min=1.0, max=120.0, help="Seconds to record per placement.")
 ]
 KeepOption = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="Keep what is recorded in this folder.")
+    Path | None, typer.Option(metavar="FOLDER", help="Keep the recordings in this folder.")
 ]
 PictureOption = Annotated[
     Path | None,
-    typer.Option("--picture", metavar="FILE.png", help="Picture of before and after to write."),
+    typer.Option("--picture", metavar="FILE.png", help="Picture to write, before and after."),
 ]
 
 
@@ -68,7 +68,7 @@ def existing(output: Path | None) -> CalibrationFile | None:
     try:
         return load(output)
     except CalibrationFileError as error:
-        raise CommandError(f"{error}; give --output another name") from None
+        raise CommandError(f"{error}; choose another --output") from None
 
 
 def check_identity(place: Place, known: CalibrationFile | None, output: Path | None) -> None:
@@ -84,7 +84,7 @@ def check_identity(place: Place, known: CalibrationFile | None, output: Path | N
             f"packets of {place.blocks} different calibration blocks: record one unit in one mode"
         )
     if known is not None and not known.matches(place.block.octets):
-        raise CommandError(f"{output} is of another unit; give --output another name")
+        raise CommandError(f"{output} belongs to another unit; choose another --output")
 
 
 def unused(path: Path) -> Path:
@@ -96,7 +96,7 @@ def unused(path: Path) -> Path:
         If there is a file already: recordings are never replaced.
     """
     if path.exists():
-        raise UsageError(f"{path} is there already; give --keep another folder")
+        raise UsageError(f"{path} exists already; choose another folder for --keep")
     return path
 
 
@@ -124,11 +124,11 @@ def write(
     if unneeded:
         words = unneeded
     elif output is None:
-        words = "nothing is written without --output FILE.yaml"
+        words = "nothing written; add --output FILE.yaml"
     else:
         old = existing(output)
         if old is not None and not old.matches(made.block):
-            raise CommandError(f"{output} is of another unit; give --output another name")
+            raise CommandError(f"{output} belongs to another unit; choose another --output")
         output.parent.mkdir(parents=True, exist_ok=True)
         report.joined(made, old).save(output)
         words = f"{output}: {advice}"
@@ -151,7 +151,7 @@ def confirmed(question: str) -> bool:
             return True
         if answer in ("n", "no"):
             return False
-        say(f"'{answer}' is neither yes nor no: type y or n")
+        say(f"'{answer}' is not an answer: type y or n")
 
 
 def _answer(prompt: str) -> str:
@@ -173,7 +173,7 @@ def _answer(prompt: str) -> str:
     except EOFError:
         say("")
         raise CommandError(
-            "nobody answers; run it in a terminal, or with --yes and the sensor in its place"
+            "no answer from a terminal; run it in one, or with --yes and the sensor in position"
         ) from None
 
 
@@ -207,7 +207,7 @@ def wait_for_points(device: Device, *, quiet: bool) -> None:
     if device.wait_for(_sends_points, _MOMENT_S):
         return
     if not quiet:
-        say("waiting for points: a head that starts takes 12 to 45 s ...")
+        say("waiting for points: the head takes 12 to 45 s to start ...")
     if device.wait_for(_sends_points, _SPIN_UP_S) is None:
         raise CommandError(f"no points from the L2; {device.advice()}")
 

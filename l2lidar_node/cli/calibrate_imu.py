@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 
 _BEFORE: Final = """\
 [bold]Before you begin[/]
-  - calibrate the beams first (l2lidar calibrate still) and give the same --output here
-  - a furnished room of 4 to 10 m; take the sensor into your hands, cable and all
-  - first it stands still for 5 s; then roll, nod and turn it, one axis after the other and all
-    together, as fast as a quick look around (1 to 2 rad/s, not above 3), and shake it meanwhile,
-    until the three bars are full: 30 s or so"""
-_AXES: Final = ("roll about x", "nod about y", "turn about z")
+  - calibrate the beams first (l2lidar calibrate still) and use the same --output here
+  - use a furnished room of 4 to 10 m; hold the sensor in your hands, cable and all
+  - hold it still for 5 s; then roll, pitch and yaw it, one axis after the other and all together,
+    as fast as a quick look around (1 to 2 rad/s, not above 3), and shake it as well, until the
+    three bars are full: about 30 s"""
+_AXES: Final = ("roll about x", "pitch about y", "yaw about z")
 _FIRST_SAMPLE_S: Final = 10.0  # the clock needs a second or two of packets before it gives any
 _STILL_S: Final = 5.0
 _SHORTEST_S: Final = 20.0  # of motion, however vivid
@@ -59,7 +59,7 @@ def imu(
     capture: Annotated[
         Path | None,
         typer.Argument(
-            help="Capture of such a motion (l2lidar record); live from the unit if left out.",
+            help="Capture of such a motion (l2lidar record); live from the unit if omitted.",
             exists=True,
             dir_okay=False,
         ),
@@ -68,14 +68,14 @@ def imu(
     motion: Annotated[
         str,
         typer.Option(
-            help="Motion of the virtual unit: shake is what you are asked to do; spin, walk, "
-            "trot, drone show what they cannot tell."
+            help="Motion of the virtual unit: shake is what the guide asks for; spin, walk, trot "
+            "and drone show what they cannot determine."
         ),
     ] = "shake",
     seconds: Annotated[
         float,
         typer.Option(
-            min=_SHORTEST_S, max=300.0, help="Longest motion to record; full bars end it before."
+            min=_SHORTEST_S, max=300.0, help="Longest motion to record; full bars end it earlier."
         ),
     ] = 60.0,
     keep: KeepOption = None,
@@ -99,7 +99,7 @@ def imu(
     l2lidar calibrate imu --emulator typical -o virtual.yaml
     """
     if emulator is not None and capture is not None:
-        raise UsageError("--emulator measures by itself; leave the capture out")
+        raise UsageError("--emulator measures by itself; omit the capture")
     known = files.existing(output)
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -125,12 +125,12 @@ def imu(
         if figure is not None:
             say(f"picture in {figure}")
     if result.refusals:
-        raise CommandError("nothing is written: " + result.refusals[0].reason)
+        raise CommandError("nothing written: " + result.refusals[0].reason)
     made = CalibrationFile(place.block.octets, {}, {}, result.calibration(), {"imu": about})
     files.write(
         made,
         output,
-        "" if result.is_corrected else "the IMU is as drawn: nothing to correct",
+        "" if result.is_corrected else "the IMU matches the drawing: nothing to correct",
         "give it to deskew_node and odometry_node as calibration_file",
         quiet=json_,
     )
@@ -317,8 +317,8 @@ def _show(result: ImuResult, known: CalibrationFile | None) -> None:
 
     if not _has_beams(known):
         say(
-            "[yellow]note[/] the beams are used as reported; calibrated ones (l2lidar calibrate "
-            "still, the same --output) make this more accurate"
+            "[yellow]note[/] the beams are used as reported; calibrate them first (l2lidar "
+            "calibrate still, same --output) for better accuracy"
         )
     table = Table(box=None, pad_edge=False)
     for heading in ("", "value", "", "verdict"):
@@ -343,11 +343,11 @@ def _show(result: ImuResult, known: CalibrationFile | None) -> None:
             f"{axis} {min(100.0 * value / ENOUGH, 999.0):.0f} %"
             for axis, value in zip("xyz", result.alignment.excitation, strict=True)
         )
-        + " of what is enough"
+        + " of the required motion"
     )
     say(
         f"gyro against clouds, from sweep to sweep: {math.degrees(result.before.rms):.3f} degrees "
-        f"as drawn, {math.degrees(result.alignment.turns.rms):.3f} calibrated ({result.aligned} "
+        f"before, {math.degrees(result.alignment.turns.rms):.3f} calibrated ({result.aligned} "
         f"of {result.sweeps} sweeps aligned)"
     )
     for note in result.notes:

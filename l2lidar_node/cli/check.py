@@ -44,15 +44,15 @@ def check(
             "--for",
             callback=_known,
             metavar="CONSUMER",
-            help=f"Who is to work with the topics: {', '.join(CONSUMERS)}.",
+            help=f"Consumer of the topics: {', '.join(CONSUMERS)}.",
         ),
     ],
     source: Annotated[
         str,
         typer.Argument(
             metavar="[TOPIC|FILE]",
-            help="A topic of clouds, live; a rosbag2 folder or MCAP file; or a capture (pcap), as "
-            "lio_input.launch.py would publish it. The only live topic of clouds if left out.",
+            help="A live topic of clouds; a rosbag2 folder or MCAP file; or a capture (pcap), as "
+            "lio_input.launch.py would publish it. If omitted, the only live topic of clouds.",
         ),
     ] = "",
     cloud: Annotated[
@@ -65,7 +65,8 @@ def check(
         float | None,
         typer.Option(
             min=0.1,
-            help=f"How long to look; {_LISTEN_S:g} for topics, a recording whole if left out.",
+            help=f"Seconds to observe; by default {_LISTEN_S:g} for topics, and all of a "
+            "recording.",
         ),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
@@ -104,7 +105,7 @@ def _observe(
     try:
         from l2lidar_node.ros import topic_source
     except ImportError as error:
-        what = f"{source} is no file; topics" if source else "topics"
+        what = f"{source} is not a file; topics" if source else "topics"
         raise SourceError(f"{what} need a sourced ROS 2 ({error})") from None
     if source and asked.cloud:
         raise SourceError(f"topic '{source}' and --cloud {asked.cloud} contradict each other")

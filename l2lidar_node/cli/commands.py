@@ -71,7 +71,7 @@ def _named(text: str, now: int) -> int:
     parts = [part.strip().lower() for part in text.split(",")]
     changes = [part for part in parts if part[:1] in ("+", "-")]
     if changes and len(changes) < len(parts):
-        raise ValueError(f"work mode {text}: either all names have a sign or none has")
+        raise ValueError(f"work mode {text}: either all names need a sign or none")
     mode = now if changes else 0
     for part in parts:
         name = part.lstrip("+-")
@@ -163,7 +163,7 @@ _SILENT_S: Final = 0.5
 _LOCK_S: Final = 2.5
 _RESTART_S: Final = 60.0
 
-get_app = typer.Typer(help="Say what is set in the unit.", no_args_is_help=True)
+get_app = typer.Typer(help="Show what is set in the unit.", no_args_is_help=True)
 
 
 @get_app.command("work-mode")
@@ -205,7 +205,7 @@ def get_network(network: NetworkConfig, json_: JsonOption = False) -> None:
         print_json(values)
     else:
         out.print(facts("In use", values))
-        say("[dim]what is stored cannot be read")
+        say("[dim]stored values cannot be read")
 
 
 @get_app.command("mac")
@@ -242,18 +242,18 @@ def addresses_in_use(network: NetworkConfig) -> dict[str, str | int]:
 
 def _hear(network: NetworkConfig) -> None:
     if network.serial_port:
-        raise DeviceError("a serial line carries no network addresses; connect by UDP")
+        raise DeviceError("a serial line carries no network addresses; connect over UDP")
     with Device(network) as device:
         if device.wait_for(lambda driver: driver.counters.datagrams > 0, _LISTEN_S) is None:
-            raise DeviceError(f"nothing heard from the L2; {device.advice()}")
+            raise DeviceError(f"no data from the L2; {device.advice()}")
 
 
 T = TypeVar("T")
 
-_RESTART: Final = "it acts after a restart: `l2lidar reset`, or a power cycle"
+_RESTART: Final = "takes effect after a restart: `l2lidar reset`, or a power cycle"
 
 set_app = typer.Typer(
-    help="Change what the unit stores in its flash memory: shown before, asked for, verified.",
+    help="Change what the unit stores in its flash memory: shown first, confirmed, verified.",
     no_args_is_help=True,
 )
 
@@ -268,7 +268,7 @@ def set_work_mode(
         str,
         typer.Argument(
             help="A number; names: standard, wide_fov, mode_2d, imu_off, serial, wait_for_start; "
-            "or changes to what is set: +imu_off,-wide_fov",
+            "or changes to the present mode: +imu_off,-wide_fov",
         ),
     ],
     yes: YesOption = False,
@@ -288,8 +288,8 @@ def set_work_mode(
             return
         if after & ~before & WorkMode.SERIAL and not network.serial_port:
             say(
-                "[bold red]After the next restart this unit will be reached by its serial port "
-                "only: Ethernet is gone until the mode is set back over the serial line."
+                "[bold red]After the next restart this unit can only be reached over its serial "
+                "port: Ethernet is off until the mode is changed back over the serial line."
             )
         _ask(yes)
         with _undone_by(device, lambda: commands.set_work_mode(WorkMode(before))):
@@ -306,7 +306,7 @@ def set_parameters(
     network: NetworkConfig,
     values: Annotated[
         list[str],
-        typer.Argument(metavar="NAME=VALUE...", help="Names as `l2lidar get parameters` says."),
+        typer.Argument(metavar="NAME=VALUE...", help="Names as in `l2lidar get parameters`."),
     ],
     yes: YesOption = False,
 ) -> None:
@@ -331,7 +331,7 @@ def set_parameters(
             device.send(commands.set_parameters(after))
             found = device.read_parameters().payload
         if found != after:
-            raise DeviceError("acknowledged, but the device reports other values than were sent")
+            raise DeviceError("acknowledged, but the device reports other values than those sent")
     say("stored and read back")
 
 
@@ -345,14 +345,14 @@ def set_network(
     user_port: Annotated[int | None, typer.Option(help="New port to send to.")] = None,
     gateway: Annotated[
         str | None,
-        typer.Option(help="New gateway; the unit's address, ending in .1, if left out."),
+        typer.Option(help="New gateway; if omitted, the unit's address ending in .1."),
     ] = None,
     subnet_mask: Annotated[str, typer.Option(help="New subnet mask.")] = "255.255.255.0",
     blind: Annotated[
         bool,
         typer.Option(
             "--blind",
-            help="The unit sends elsewhere: do not wait to hear from it. Needs all four.",
+            help="The unit sends elsewhere: do not wait for its data. Needs all four.",
         ),
     ] = False,
     yes: YesOption = False,
@@ -387,7 +387,7 @@ def set_network(
         if blind:
             for _ in range(TRIES):
                 device.tell(lambda driver, now: driver.send(command, now))
-            say(f"sent, whether it has arrived is not known; {_RESTART}")
+            say(f"sent, but whether it arrived is unknown; {_RESTART}")
             return
         _send_for_good(device, command)
     say(f"stored; {_RESTART}")
@@ -431,7 +431,7 @@ def _undone_by(device: Device, make: Callable[[], Command]) -> Iterator[None]:
     except KeyboardInterrupt:
         try:
             device.send(make())
-            say("interrupted: the unit has stored what it had before")
+            say("interrupted: the unit has its old value again")
         except DeviceError as error:
             say(f"[red]interrupted, and the old value could not be stored again: {error}")
         raise
@@ -441,7 +441,7 @@ def _send_for_good(device: Device, command: Command) -> None:
     try:
         device.send(command)
     except KeyboardInterrupt:
-        say("[red]interrupted after the command had gone out: it may have been stored")
+        say("[red]interrupted after the command was sent: it may have been stored")
         raise
 
 
@@ -458,7 +458,9 @@ def _check_subnet(values: dict[str, str | int]) -> None:
         if address not in subnet:
             raise ValueError(f"{name}: {address} is not in the unit's subnet {subnet}")
         if address in (subnet.network_address, subnet.broadcast_address):
-            raise ValueError(f"{name}: {address} stands for the whole subnet {subnet}")
+            raise ValueError(
+                f"{name}: {address} is the network or broadcast address of subnet {subnet}"
+            )
     same = values["lidar_ip"] == values["user_ip"]
     if same and (not ends["lidar_ip"].is_loopback or values["lidar_port"] == values["user_port"]):
         raise ValueError(f"lidar_ip and user_ip are both {values['lidar_ip']}")
@@ -476,13 +478,13 @@ def _mac_bytes(text: str) -> bytes:
 
 
 WaitOption = Annotated[
-    float, typer.Option(min=0.0, metavar="S", help="Wait so long for it to have taken effect.")
+    float, typer.Option(min=0.0, metavar="S", help="Seconds to wait until it has taken effect.")
 ]
 
 
 @with_network
 def start(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
-    """Leave standby: the head turns, points come after 12 to 45 s.
+    """Leave standby: the head turns, points arrive after 12 to 45 s.
 
     Interrupted while it waits, it puts a unit that was in standby back.
     """
@@ -502,7 +504,7 @@ def start(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
 
 @with_network
 def stop(network: NetworkConfig) -> None:
-    """Go into standby: the motors stop, points and IMU with them.
+    """Enter standby: the motors stop, and points and IMU with them.
 
     Interrupted before it is done, it starts a unit that was running again.
     """
@@ -516,12 +518,12 @@ def stop(network: NetworkConfig) -> None:
             if was_running:
                 _restore(device, to_running=True)
             raise
-        say("stopped" if was_running else "nothing was coming before; it is in standby")
+        say("stopped" if was_running else "no data arrived before; it is in standby")
 
 
 @with_network
 def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
-    """Reboot the unit: stored settings come into force, points are back in about 25 s.
+    """Reboot the unit: stored settings take effect, points are back in about 25 s.
 
     The unit does not acknowledge it; with --wait its clock tells that it began anew.
     """
@@ -537,7 +539,7 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
                 # A clock that is known shows a restart, however young the unit was before it.
                 device.wait_for(lambda driver: driver.clock_status().locked, _LOCK_S)
         elif device.ask(lambda driver: not _heard(driver)):
-            say("[yellow]nothing is heard from it: the command is sent all the same")
+            say("[yellow]no data from it: the command is sent anyway")
         before = device.ask(_stamp_s)
         restarted.clear()
         device.tell(lambda driver, now: driver.reset_device(now))
@@ -552,7 +554,7 @@ def reset(network: NetworkConfig, wait: WaitOption = 0.0) -> None:
 
         if device.wait_for(is_back, wait) is None:
             raise DeviceError(f"the device did not restart within {wait:g} s")
-        say("it has restarted, points are back")
+        say("it has restarted and sends points again")
 
 
 def _restore(device: Device, *, to_running: bool) -> None:
@@ -563,7 +565,7 @@ def _restore(device: Device, *, to_running: bool) -> None:
             device.command(lambda driver, now: driver.stop_rotation(now)[0])
         say("interrupted: it is running again" if to_running else "interrupted: in standby")
         return
-    say("[red]interrupted, and it did not take the command to undo it")
+    say("[red]interrupted, and it did not acknowledge the command to undo it")
 
 
 def _points(device: Device) -> int:

@@ -214,13 +214,13 @@ class Device:
         """Return what may be wrong when nothing is heard."""
         if self.network.serial_port:
             return (
-                f"is it at {self.network.serial_port}, has it power, and is its work mode set to "
-                "serial?"
+                f"check that it is at {self.network.serial_port}, that it has power, and that its "
+                "work mode is set to serial"
             )
         addresses = ", ".join(local_addresses()) or "none"
         return (
-            f"is it at {self.network.l2_ip}, does it send to one of this machine's addresses "
-            f"({addresses}), port {self.network.host_port}, and has it power?"
+            f"check that it is at {self.network.l2_ip}, sends to one of this machine's addresses "
+            f"({addresses}), port {self.network.host_port}, and has power"
         )
 
     def _handle(self, event: Event) -> None:

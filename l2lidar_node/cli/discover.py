@@ -73,18 +73,20 @@ def discover(
         int, typer.Option(min=1, max=65535, help="Port that units send to.")
     ] = wire.HOST_PORT,
     l2_port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port that units are asked at.")
+        int, typer.Option(min=1, max=65535, help="Port on which units are queried.")
     ] = wire.LIDAR_PORT,
     probe: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ADDRESS", callback=_addresses, help=f"Also ask here, besides {wire.LIDAR_IP}."
+            metavar="ADDRESS",
+            callback=_addresses,
+            help=f"Address to query besides {wire.LIDAR_IP}.",
         ),
     ] = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=600.0, help="Seconds to listen.")] = 3.0,
     json_: JsonOption = False,
 ) -> None:
-    """Find units: listen on all interfaces, and ask for versions at the usual address.
+    """Find units: listen on all interfaces, and query the usual address.
 
     A unit sends to one address only, 192.168.1.2 as it leaves the factory: it is heard if this
     machine has that address. Units in standby do not send, but they answer. The exit code is 1 if
@@ -103,7 +105,7 @@ def discover(
         raise DeviceError(
             f"no L2 heard on port {host_port}. This machine's addresses: {addresses}. A new unit "
             f"sends to {wire.HOST_IP} only and takes 25 s from power-on to its first points; give "
-            f"the interface it is plugged into that address, for example "
+            "its network interface that address, for example "
             f"`sudo ip address add {wire.HOST_IP}/24 dev eth0`"
         )
 
@@ -124,8 +126,8 @@ def listen(host_port: int, ask: list[tuple[str, int]], seconds: float) -> dict[A
         except OSError as error:
             raise TransportError(
                 error.errno,
-                f"cannot listen on port {host_port}: {error.strerror}; end the driver or whatever "
-                "else uses it",
+                f"cannot listen on port {host_port}: {error.strerror}; stop the driver or "
+                "whatever else uses it",
             ) from None
         item.settimeout(_LOOK_S)
         next_probe = 0.0
@@ -178,4 +180,4 @@ def _show(rows: list[dict[str, Any]], others: list[str]) -> None:
             table.add_row(*("?" if value is None else str(value) for value in row.values()))
         out.print(table)
     if others:
-        say(f"not an L2, but sending here: {', '.join(others)}")
+        say(f"not an L2, but sends here: {', '.join(others)}")

@@ -27,56 +27,57 @@ VERBS: Final = (
         "discover",
         f"{_CLI}.discover:discover",
         UNIT,
-        "Find units: listen on all interfaces, and ask for versions at the usual address.",
+        "Find units: listen on all interfaces, and query the usual address.",
     ),
     Verb(
         "info",
         f"{_CLI}.status:info",
         UNIT,
-        "Say what the unit is, or what a recording holds: versions, calibration, rates, losses.",
+        "Show what the unit is, or what a recording contains: versions, calibration, rates, "
+        "losses.",
     ),
     Verb(
         "monitor",
         f"{_CLI}.status:monitor",
         UNIT,
-        "Watch the unit live: one line per aspect, as on /diagnostics.",
+        "Monitor the unit live: the checks of /diagnostics, one per line.",
     ),
     Verb(
         "start",
         f"{_CLI}.commands:start",
         UNIT,
-        "Leave standby: the head turns, points come after 12 to 45 s.",
+        "Leave standby: the head turns, points arrive after 12 to 45 s.",
     ),
     Verb(
         "stop",
         f"{_CLI}.commands:stop",
         UNIT,
-        "Go into standby: the motors stop, points and IMU with them.",
+        "Enter standby: the motors stop, and points and IMU with them.",
     ),
     Verb(
         "reset",
         f"{_CLI}.commands:reset",
         UNIT,
-        "Reboot the unit: stored settings come into force, points are back in about 25 s.",
+        "Reboot the unit: stored settings take effect, points are back in about 25 s.",
     ),
-    Verb("get", f"{_CLI}.commands:get_app", UNIT, "Say what is set in the unit."),
+    Verb("get", f"{_CLI}.commands:get_app", UNIT, "Show what is set in the unit."),
     Verb(
         "set",
         f"{_CLI}.commands:set_app",
         UNIT,
-        "Change what the unit stores in its flash memory: shown before, asked for, verified.",
+        "Change what the unit stores in its flash memory: shown first, confirmed, verified.",
     ),
     Verb(
         "sync-check",
         f"{_CLI}.status:sync_check",
         UNIT,
-        "Compare the unit's clock with this host's; leaves the clock alone.",
+        "Compare the unit's clock with this host's; does not change the clock.",
     ),
     Verb(
         "calibrate",
         f"{_CLI}.calibrate:app",
         UNIT,
-        "Estimate what the unit's calibration is off by, and write a calibration file.",
+        "Estimate the unit's calibration errors, and write a calibration file.",
     ),
     Verb(
         "record",
@@ -94,19 +95,19 @@ VERBS: Final = (
         "convert",
         f"{_CLI}.record:convert",
         DATA,
-        "Turn a capture into a ROS 2 bag, with the stamps the driver gives.",
+        "Convert a capture to a ROS 2 bag, with the driver's stamps.",
     ),
     Verb(
         "check",
         f"{_CLI}.check:check",
         DATA,
-        "Judge whether an odometry or mapping package can work with topics or a recording.",
+        "Check whether an odometry or mapping package can work with topics or a recording.",
     ),
     Verb(
         "view",
         f"{_CLI}.view:view",
         DATA,
-        "Look at clouds raw and deskewed, path, map, IMU and health, in rerun.",
+        "Show raw and deskewed clouds, path, map, IMU and health in rerun.",
     ),
     Verb("demo", "l2lidar_node.demo.__main__:demo", DATA, "Show everything with a virtual L2."),
 )
@@ -158,8 +159,8 @@ def app() -> typer.Typer:
     """Return the command line."""
     made = typer.Typer(
         cls=_Verbs,
-        help="Work with a Unitree L2 without ROS: find it, look at it, set it, record it.",
-        epilog="Exit codes: 0 done; 1 the unit, the network or a file stands in the way; 2 usage; "
+        help="Work with a Unitree L2 without ROS: find, inspect, configure and record it.",
+        epilog="Exit codes: 0 success; 1 a problem with the unit, the network or a file; 2 usage; "
         "130 interrupted.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,

@@ -59,7 +59,7 @@ def record(
         typer.Argument(help="FILE.pcap for raw packets; FILE.mcap or a folder for a ROS 2 bag."),
     ],
     duration: Annotated[
-        float, typer.Option(min=0.0, help="Seconds to record; until Ctrl-C if left out.")
+        float, typer.Option(min=0.0, help="Seconds to record; until Ctrl-C if omitted.")
     ] = math.inf,
     sweep_cut: CutOption = "turn",
     point_layout: LayoutOption = "native",
@@ -72,7 +72,7 @@ def record(
     """
     is_capture = _is_capture(file)
     if file.exists():
-        raise UsageError(f"{file} exists already; choose another name, or remove it")
+        raise UsageError(f"{file} exists already; choose another name or remove it")
     settings = {
         "enable_l2_host_sync": True,
         "enable_latency_measure": True,
@@ -104,7 +104,7 @@ def _record_capture(
             file.unlink()
         elif isinstance(error, CommandError):
             left = file.rename(free_name(file.with_name(f"{file.stem}.unfinished{file.suffix}")))
-            raise CommandError(f"{error}; the data received until then is in {left}") from None
+            raise CommandError(f"{error}; the data received until then are in {left}") from None
         raise
     say(f"{file}: {_size(recorder)}")
 
@@ -131,7 +131,7 @@ def _record_bag(
             _raise_first(failures)
     except (CommandError, OSError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        left = f"; what came until then is in {bag.unfinished}" if bag.unfinished else ""
+        left = f"; the data received until then are in {bag.unfinished}" if bag.unfinished else ""
         raise CommandError(f"{reason or error}{left}") from None
     say(f"{file}: {bag.clouds} clouds, {bag.samples} IMU samples")
 
@@ -152,11 +152,13 @@ def convert(
     sweep_cut: CutOption = "turn",
     point_layout: LayoutOption = "native",
     l2_ip: Annotated[
-        str, typer.Option(help="Whose packets, if there are those of several units.")
+        str, typer.Option(help="Unit whose packets to use, if there are several.")
     ] = "",
     packets: Annotated[
         bool,
-        typer.Option("--packets", help="Bag: raw packets, as publish_packets, not clouds."),
+        typer.Option(
+            "--packets", help="For a bag: write raw packets, as publish_packets does, not clouds."
+        ),
     ] = False,
 ) -> None:
     """Turn raw packets into a ROS 2 bag of clouds, with the stamps the driver gives.
@@ -236,7 +238,7 @@ def _is_capture(file: Path) -> bool:
         return False
     raise UsageError(
         f"'{file}' ends in '{file.suffix}'; expected FILE.pcap for raw packets, FILE.mcap for a "
-        "bag in one file, or a name without an ending for a rosbag2 folder"
+        "bag in one file, or a name without a suffix for a rosbag2 folder"
     )
 
 
@@ -245,7 +247,7 @@ def _watch(device: Device, failures: list[str], duration: float, size: Callable[
     begun = time.monotonic()
     try:
         if device.wait_for(_is_heard, min(_HEAR_S, duration)) is None:
-            say(f"[yellow]nothing heard from the L2 yet; {device.advice()}")
+            say(f"[yellow]no data from the L2 yet; {device.advice()}")
         with Live(console=out, auto_refresh=False, transient=True) as live:
             while (passed := time.monotonic() - begun) < duration and not failures:
                 time.sleep(min(_LOOK_S, duration - passed))
@@ -255,7 +257,7 @@ def _watch(device: Device, failures: list[str], duration: float, size: Callable[
     except KeyboardInterrupt:
         pass
     if not device.ask(_is_heard):
-        failures.append(f"nothing was heard from the L2; {device.advice()}")
+        failures.append(f"no data came from the L2; {device.advice()}")
 
 
 def _is_heard(driver: Driver) -> bool:
@@ -276,26 +278,26 @@ def replay(
         Path, typer.Argument(help="pcap or pcapng file, or a bag with raw packets.", exists=True)
     ],
     to: Annotated[
-        str, typer.Option(metavar="ADDRESS:PORT", help="Where the driver listens.")
+        str, typer.Option(metavar="ADDRESS:PORT", help="Address on which the driver listens.")
     ] = f"127.0.0.1:{wire.HOST_PORT}",
     source: Annotated[
         str | None,
         typer.Option(
             "--from",
             metavar="ADDRESS:PORT",
-            help="Where to send from; as recorded if this machine has that address.",
+            help="Address to send from; by default the recorded one if this machine has it.",
         ),
     ] = None,
     l2_ip: Annotated[
-        str, typer.Option(help="Whose packets, if the capture holds those of several units.")
+        str, typer.Option(help="Unit whose packets to use, if there are several.")
     ] = "",
     rate: Annotated[
         float, typer.Option(min=0.0, max=1000.0, help="Speed; 0 for as fast as possible.")
     ] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Start over at the end.")] = False,
     start: Annotated[float, typer.Option(min=0.0, help="Seconds to skip.")] = 0.0,
     duration: Annotated[
-        float | None, typer.Option(min=0.0, help="Seconds to play; to the end if left out.")
+        float | None, typer.Option(min=0.0, help="Seconds to play; to the end if omitted.")
     ] = None,
 ) -> None:
     """Send the datagrams of a capture or bag to a driver, at the pace they were captured.
@@ -328,7 +330,7 @@ def replay(
                         shown = time.monotonic()
                         progress.update(task, completed=recording.position, seconds=seconds)
                 if not sent:
-                    raise DeviceError(f"nothing in {file} from {start:g} s on")
+                    raise DeviceError(f"{file} has no data from {start:g} s on")
                 progress.update(task, completed=recording.position)
         except CaptureError as error:
             raise DeviceError(f"{file}: {error}") from None
@@ -382,8 +384,8 @@ def _bound(recording: Recording, source: str | None) -> socket.socket:
             raise DeviceError(f"cannot send from {source}: {error.strerror}") from None
         sender.bind(("0.0.0.0", 0))
         say(
-            f"[yellow]this machine cannot send from {recording.device} ({error.strerror}): tell "
-            "the driver the address that is sent from (l2_ip)"
+            f"[yellow]this machine cannot send from {recording.device} ({error.strerror}): set "
+            "the driver's l2_ip to the address that is used"
         )
     return sender
 

@@ -64,7 +64,7 @@ def info(
         return
     with Device(network) as device:
         if device.wait_for(lambda driver: driver.counters.frames.total() > 0, _WAIT_S) is None:
-            raise DeviceError(f"nothing heard from the L2; {device.advice()}")
+            raise DeviceError(f"no data from the L2; {device.advice()}")
         device.wait_for(_is_known, _WAIT_S)
         before = device.period()
         time.sleep(_PERIOD_S)
@@ -132,11 +132,11 @@ def _flat(values: object, above: str = "") -> Iterator[tuple[str, Any]]:
 def monitor(
     network: NetworkConfig,
     duration: Annotated[
-        float, typer.Option(min=0.0, help="Seconds to watch; for ever if left out.")
+        float, typer.Option(min=0.0, help="Seconds to monitor; until Ctrl-C if omitted.")
     ] = math.inf,
     json_: JsonOption = False,
 ) -> None:
-    """Watch the unit live: one line per aspect, as on /diagnostics. Ctrl-C ends it.
+    """Monitor the unit live: the checks of /diagnostics, one per line. Ctrl-C ends it.
 
     The exit code is 1 if any aspect was in error at the end. With --json one line per second.
     """
@@ -233,7 +233,7 @@ def sync_check(
 
     with Device(network, count, collector, enable_latency_measure=True) as device:
         if device.wait_for(_is_measuring, _HEAR_S) is None:
-            raise DeviceError(f"no measurements come from the L2; {device.advice()}")
+            raise DeviceError(f"no measurements from the L2; {device.advice()}")
         steps = range(round(duration * 10))
         for _ in steps if json_ else track(steps, "measuring", console=out, transient=True):
             device.wait_for(lambda driver: None, 0.1)
@@ -263,7 +263,9 @@ def sync_check(
     else:
         _show(result)
     if not status.locked:
-        raise DeviceError("no line fits the arrivals: network or device clock are too irregular")
+        raise DeviceError(
+            "no line fits the arrivals: the network or the device clock is too irregular"
+        )
 
 
 def _is_measuring(driver: Driver) -> bool:

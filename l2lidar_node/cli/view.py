@@ -41,13 +41,15 @@ def view(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.1, help="End so long after the first message; else Ctrl-C ends it."),
+        typer.Option(
+            min=0.1, help="Seconds to show after the first message; until Ctrl-C if omitted."
+        ),
     ] = None,
     namespace: Annotated[
         str, typer.Option(help="Namespace of the topics, for example /front.")
     ] = "",
 ) -> None:
-    """Look at clouds raw and deskewed, path, map, IMU and health, in rerun.
+    """Show raw and deskewed clouds, path, map, IMU and health in rerun.
 
     With the odometry's topics also at its standard deviations, the directions that it cannot see,
     and the map as it grows. Live topics need ROS 2; a recording does not.
@@ -78,9 +80,11 @@ def _show(
         shown = _recorded(sdk, file, namespace, seconds)
     say(f"{shown} messages shown" + (f", written to {save}" if save else ""))
     if not shown and file is None:
-        raise CommandError("no message came: is the driver running, in the same ROS_DOMAIN_ID?")
+        raise CommandError(
+            "no message arrived; check that the driver runs in the same ROS_DOMAIN_ID"
+        )
     if not shown:
-        raise CommandError(f"{file} has no topic to show: no clouds, IMU, odometry, diagnostics")
+        raise CommandError(f"{file} has no topic to show: no clouds, IMU, odometry or diagnostics")
     if web:
         _serve(seconds)
 

@@ -408,15 +408,17 @@ class DeviceClock:
             if step is not Step.FOREIGN_SYNC:
                 self._schedule.reset()
             if step is Step.REBOOT:
-                self._report(ClockEventKind.REBOOT, "device restarted, clock begins anew")
+                self._report(ClockEventKind.REBOOT, "device restarted, locking the clock again")
             elif step is Step.FOREIGN_SYNC:
                 self._host.reanchor()
                 self._report(
                     ClockEventKind.FOREIGN_SYNC,
-                    f"somebody else stepped the device's clock by {change * 1e-9:+.3f} s",
+                    f"another host stepped the device's clock by {change * 1e-9:+.3f} s",
                 )
             else:
-                self._report(ClockEventKind.LOST, "lost track of the device's clock, begins anew")
+                self._report(
+                    ClockEventKind.LOST, "lost track of the device's clock, locking again"
+                )
         if device.restarts != self._restarts:
             self._restarts = device.restarts
             self._host.reset()
@@ -438,7 +440,7 @@ class DeviceClock:
             text = f"host clock stepped by {step * 1e-9:+.3f} s{_hold(step)}"
             self._report(ClockEventKind.HOST_STEP, text)
         elif step < 0:
-            text = f"packets come {-step * 1e-9:.3f} s earlier than before{_hold(step)}"
+            text = f"packets arrive {-step * 1e-9:.3f} s earlier than before{_hold(step)}"
             self._report(ClockEventKind.EARLIER, text)
         else:
             text = f"stamps were {step * 1e-6:.1f} ms too early because of delayed packets"

@@ -57,28 +57,31 @@ def demo(
     unit: Annotated[
         str,
         typer.Option(
-            help="Which virtual unit: typical and poor are not quite what they report, perfect "
-            "is; a number is one of many."
+            help="Virtual unit: perfect matches its reported calibration, typical and poor do "
+            "not; a number selects one of many."
         ),
     ] = "typical",
     forward: Annotated[
         bool,
         typer.Option(
             "--forward",
-            help="Put the sensor on the front of the example robot; show the cloud in base_link.",
+            help="Mount the sensor on the front of the example robot; show the cloud in "
+            "base_link.",
         ),
     ] = False,
     driver_only: Annotated[
-        bool, typer.Option("--driver-only", help="Leave deskew and odometry out.")
+        bool, typer.Option("--driver-only", help="Run without deskew and odometry.")
     ] = False,
     slam: Annotated[
         bool,
         typer.Option(
             "--slam",
-            help="Build a map with loops closed, save it, and be found in it again. 3 minutes.",
+            help="Build a map with loop closure, save it, and localize in it. 3 minutes.",
         ),
     ] = False,
-    folder: Annotated[Path, typer.Option(help="Where pictures and truth go.")] = Path("out/demo"),
+    folder: Annotated[Path, typer.Option(help="Folder for pictures and truth.")] = Path(
+        "out/demo"
+    ),
     record: Annotated[
         Path | None, typer.Option(help="Bag to write: FILE.mcap, or a folder for rosbag2.")
     ] = None,
@@ -89,7 +92,7 @@ def demo(
     not keep up, so that nobody can tell.
     """
     if slam and driver_only:
-        raise UsageError("--slam needs the odometry: leave --driver-only out")
+        raise UsageError("--slam needs the odometry: omit --driver-only")
     options = _Options(
         duration or (mapping.MAPPING_S if slam else _WATCHING_S),
         world or (mapping.WORLD if slam else _WORLD),

@@ -103,11 +103,11 @@ def verdict(troubles: list[str], behind: str) -> tuple[int, list[str]]:
     load = f"load average {os.getloadavg()[0]:.1f} on {cores} processors"
     if not troubles:
         return 0, [
-            f"This machine was busy ({load}): {behind}. Every figure is right all the same."
+            f"This machine was busy ({load}): {behind}. All figures are right nevertheless."
         ]
     return INCONCLUSIVE, [
         f"THIS MACHINE DID NOT KEEP UP ({load}): {behind}.",
-        "Therefore what follows says nothing about the driver or the odometry:",
+        "So the following says nothing about the driver or the odometry:",
         *(f"  {trouble}" for trouble in troubles),
         "Close other programs, or wait until the machine is idle, and run it again. On a small "
         'computer: make demo DEMO_ARGS="--driver-only", which needs a third of the processor.',

@@ -126,7 +126,7 @@ class MappingRun:
         self._stamps.clear()
         self._places.clear()
         self._slam = self._started("localization")
-        self._console.print("the odometry has begun anew; searching for the place in the map ...")
+        self._console.print("the odometry has restarted; searching for the pose in the map ...")
         clouds = self._observer.clouds
         began = clouds.stamps[-1]
         self._watch_until(
@@ -159,8 +159,8 @@ class MappingRun:
         loops = int((built.edges["kind"] == LOOP).sum())
         picture = self._folder / "map.png"
         title = (
-            f"{loops} loops over {mapped.length_m:.0f} m: {1e3 * mapped.ate_m:.1f} mm RMS off "
-            f"the truth, the odometry alone {1e3 * alone.ate_m:.1f} mm"
+            f"{loops} loops over {mapped.length_m:.0f} m: {1e3 * mapped.ate_m:.1f} mm RMS "
+            f"error, the odometry alone {1e3 * alone.ate_m:.1f} mm"
         )
         export.draw(built, picture, title)
         self._console.print(
@@ -224,7 +224,7 @@ class MappingRun:
     def _judge_place(self, truth: Results, T_world_map: tuple[Rotation, F64]) -> list[str]:
         """Say how well the place in the map was found; return what is wrong."""
         if self._found_after_s is None:
-            return [f"the place in the saved map was not found within {_SEARCH_S:.0f} s"]
+            return [f"no pose in the saved map was found within {_SEARCH_S:.0f} s"]
         turn, shift = T_world_map
         poses = truth.trajectory()
         origin = int(poses["stamp"][0])
@@ -240,7 +240,7 @@ class MappingRun:
             f"off the truth (at most {1e3 * off.max():.0f} mm, {len(off)} poses)"
         )
         if float(np.median(off)) > _PLACED_M:
-            return [f"the place in the map is off by {np.median(off):.3f} m"]
+            return [f"the pose in the map is off by {np.median(off):.3f} m"]
         return []
 
 

@@ -353,8 +353,8 @@ def _odometry(console: Console, observer: Observer, truth: Results, folder: Path
     counts = observer.checks.get("odometry", {})
     if skipped := int(counts.get("skipped [sweeps]", 0)):
         console.print(
-            f"odometry: {skipped} of {counts['sweeps']} sweeps were not aligned, to catch up: "
-            "clouds came faster than this machine aligns them"
+            f"odometry: {skipped} of {counts['sweeps']} sweeps were skipped: clouds "
+            "arrived faster than this machine aligns them"
         )
     save_track(track.estimated, track.true, folder / "track.png", text)
     moved = [(raw, deskewed) for raw, deskewed in observer.pairs.values() if raw is not None

@@ -140,12 +140,12 @@ _MAX_IMU_CELSIUS: Final = 85.0
 _GRAVITY_TOLERANCE: Final = 0.9  # [m/s^2]; units at rest have shown 9.6 to 10.1
 _CLOCK_TROUBLES: Final = {
     ClockEventKind.REBOOT: "the device restarted",
-    ClockEventKind.FOREIGN_SYNC: "somebody else sets the device's clock",
+    ClockEventKind.FOREIGN_SYNC: "another host sets the device's clock",
     ClockEventKind.HOST_STEP: "this host's clock was stepped",
-    ClockEventKind.EARLIER: "packets come earlier than before",
+    ClockEventKind.EARLIER: "packets arrive earlier than before",
     ClockEventKind.CORRECTED: "stamps had been too early and were corrected",
     ClockEventKind.SILENCE: "the device was silent",
-    ClockEventKind.LOST: "the device's clock had been lost track of",
+    ClockEventKind.LOST: "the device's clock was lost and locked again",
 }
 _LATE_NS: Final = 500_000_000  # whoever steers by these data should know
 _WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
@@ -220,7 +220,7 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
     }
     address = driver.config.network.l2_ip
     if state is DeviceState.WAITING:
-        message = f"nothing heard from {address} yet"
+        message = f"no data from {address} yet"
         if after.foreign > before.foreign and after.stranger:
             message += f", but from {after.stranger}: if that is the L2, set l2_ip to it"
         return Check("device", Level.ERROR, message, values)
@@ -235,7 +235,7 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
         return Check("device", Level.WARN, message, values)
     if new.ignored_points > old.ignored_points and new.slots == old.slots:
         asked, measured = ("3D", "2D") if driver.config.sweep.frame3d else ("2D", "3D")
-        message = f"it measures {measured} where frame3d asks for {asked}"
+        message = f"it measures {measured} but frame3d asks for {asked}"
         return Check("device", Level.ERROR, message, values)
     nominal = POINTS_3D_HZ if driver.config.sweep.frame3d else POINTS_2D_HZ
     slow = rates[Stream.POINTS] < nominal * (1 - _RATE_TOLERANCE)
@@ -292,7 +292,7 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
             (
                 is_forged,
                 f"{datagrams:.0f} datagrams/s claim to come from {address}: an L2 sends "
-                "470, so somebody else uses its address",
+                "470, so another host uses its address",
             ),
         )
         if number > 0
@@ -348,7 +348,9 @@ def _clock(
         uncertain_ms = status.uncertainty_ns / 1e6
         troubles.append(f"every packet is delayed, stamps may be {uncertain_ms:.1f} ms off")
     if status.late_ns > _LATE_NS:
-        troubles.append(f"packets come {status.late_ns / 1e9:.1f} s late, stamps allow for it")
+        troubles.append(
+            f"packets arrive {status.late_ns / 1e9:.1f} s late; the stamps are corrected for that"
+        )
     if troubles:
         return Check("clock", Level.WARN, f"locked; {', '.join(troubles)}", values)
     return Check("clock", Level.OK, "locked", values)
@@ -362,7 +364,7 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
         "points [1/s]": f"{(new.points - old.points) / seconds:.0f}",
         "valid share [%]": f"{100 * share:.1f}",
         "empty sweeps": str(new.empty_sweeps),
-        "fragments of turns left out": str(new.fragments),
+        "fragments of turns dropped": str(new.fragments),
         "packets in fragments": str(new.fragment_packets),
         "points without orientation": str(new.unleveled),
     }
@@ -370,12 +372,14 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
         message = "imu_adjust drops points for lack of IMU data"
         return Check("points", Level.WARN, message, values)
     if not slots and new.fragments > old.fragments:
-        message = "no turn was whole, and parts of turns are left out"
+        message = "no turn was complete, and parts of turns are dropped"
         return Check("points", Level.WARN, message, values)
     if not slots:
-        return Check("points", Level.OK, "no cloud was completed lately", values)
+        return Check("points", Level.OK, "no cloud was completed recently", values)
     if share < _MIN_VALID_SHARE:
-        return Check("points", Level.WARN, "hardly any returns: is the sensor covered?", values)
+        return Check(
+            "points", Level.WARN, "hardly any returns; check whether the sensor is covered", values
+        )
     return Check("points", Level.OK, f"{100 * share:.0f} % of the slots return", values)
 
 
@@ -425,11 +429,11 @@ def _hardware(payload: bytes) -> Check:
             (state["imu_temperature"] > _MAX_IMU_CELSIUS, "the IMU is hot"),
             (
                 state["packet_lost_up"] + state["packet_lost_down"] > 0.01,
-                "inner links lose packets",
+                "packets are lost inside the sensor",
             ),
             (
                 not all(np.isfinite(state[name]) for name in state.dtype.names or ()),
-                "it reports values that are no numbers",
+                "it reports values that are not numbers",
             ),
         )
         if wrong

@@ -204,7 +204,7 @@ def end(device: VirtualL2, server: Server) -> Iterator[str]:
         happened = ", ".join(f"{count} {fault.name}" for fault, count in counts.items())
         yield f"faults that happened: {happened}"
     if server.unsent:
-        yield f"{server.unsent} datagrams found no way out"
+        yield f"{server.unsent} datagrams could not be sent"
 
 
 _LEAD_NS: Final = 100_000_000  # from ready to power-on, so that the first packets are in time
@@ -243,8 +243,8 @@ def emulate(
     flash: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps what the unit stores. Once it exists its addresses and its work "
-            "mode count, not those of the command line.",
+            help="File for what the unit stores. If it exists, its addresses and work "
+            "mode override the command line.",
             rich_help_panel="Unit",
         ),
     ] = None,
@@ -252,7 +252,7 @@ def emulate(
         str,
         typer.Option(
             metavar="FACTOR|max",
-            help="Seconds of the unit's life per second, or as fast as a receiver on this machine "
+            help="Speed of the unit's time, or max: as fast as a receiver on this machine "
             "reads. Default: 1",
             rich_help_panel=_RUN,
             show_default=False,
@@ -263,7 +263,7 @@ def emulate(
         typer.Option(
             min=0.0,
             metavar="S",
-            help="End so long after power-on. Default: never",
+            help="Seconds after power-on at which to end. Default: never",
             rich_help_panel=_RUN,
             show_default=False,
         ),
@@ -279,7 +279,7 @@ def emulate(
         bool,
         typer.Option(
             "--truth-points",
-            help="With --truth also the exact points of every packet (1.6 MB a second).",
+            help="With --truth: also write the exact points of every packet (1.6 MB a second).",
             rich_help_panel=_RUN,
         ),
     ] = False,
@@ -299,7 +299,7 @@ def emulate(
     """
     if ready and "boot_scale" in settings:
         raise typer.BadParameter(
-            "contradicts '--boot-scale', give one of them", param_hint="'--ready'"
+            "contradicts '--boot-scale'; give only one of them", param_hint="'--ready'"
         )
     if truth_points and truth is None:
         raise typer.BadParameter("needs '--truth' too", param_hint="'--truth-points'")

@@ -41,7 +41,7 @@ class PowerConfig:
     """How long the unit takes to come up, from power-on and from standby."""
 
     boot_scale: float = setting(
-        1.0, "factor on all times of this group, 0 = everything is there at once", lo=0.0, hi=10.0
+        1.0, "factor on all times of this group, 0 = no delays", lo=0.0, hi=10.0
     )
     link_s: float = setting(2.0, "power-on to the first command heard", unit="s", lo=0.0, hi=60.0)
     imu_s: float = setting(4.0, "power-on to the first IMU packet", unit="s", lo=0.0, hi=60.0)
@@ -88,7 +88,7 @@ class CrystalConfig:
     )
     clock_wave_ppm: float = setting(
         0.0,
-        "amplitude of a slow oscillation of the clock's rate, as temperature makes it",
+        "amplitude of a slow oscillation of the clock's rate, as caused by temperature",
         unit="ppm",
         lo=0.0,
         hi=1e3,
@@ -147,7 +147,7 @@ class FaultConfig:
         hi=1.0,
     )
     garbage: float = setting(
-        0.0, "probability that a datagram of random bytes goes before a packet", lo=0.0, hi=1.0
+        0.0, "probability that a datagram of random bytes precedes a packet", lo=0.0, hi=1.0
     )
 
     coalesce: float = setting(
@@ -185,12 +185,12 @@ class FaultConfig:
     )
     burst_ms: float = setting(
         0.0,
-        "for so long datagrams are withheld and then arrive at once, 0 = never",
+        "duration for which datagrams are withheld and then arrive at once, 0 = never",
         unit="ms",
         lo=0.0,
         hi=1e4,
     )
-    burst_every_s: float = setting(1.0, "one such burst every so long", unit="s", lo=0.001, hi=1e5)
+    burst_every_s: float = setting(1.0, "interval between such bursts", unit="s", lo=0.001, hi=1e5)
     reorder: float = setting(
         0.0,
         "probability that a datagram arrives reorder_ms late, after later ones",
@@ -228,4 +228,4 @@ class DeviceConfig:
     crystal: CrystalConfig = field(default_factory=CrystalConfig)
     delays: DelayConfig = field(default_factory=DelayConfig)
     faults: FaultConfig = field(default_factory=FaultConfig)
-    seed: int = setting(0, "everything random follows from this number", lo=0, hi=2**63 - 1)
+    seed: int = setting(0, "seed of everything random", lo=0, hi=2**63 - 1)

@@ -61,20 +61,20 @@ class PhysicsConfig:
     rest_s: float = setting(
         2.0, "rest at the beginning of the motion", unit="s", lo=0.0, hi=3600.0
     )
-    mount: str = setting("upright", "how the sensor sits on its carrier", choices=tuple(MOUNTS))
+    mount: str = setting("upright", "mount of the sensor on its carrier", choices=tuple(MOUNTS))
     mount_rpy_deg: tuple[float, ...] = setting(
-        (), "roll, pitch, yaw of the sensor on its carrier, in place of `mount`", unit="deg"
+        (), "roll, pitch, yaw of the sensor on its carrier, instead of `mount`", unit="deg"
     )
     unit: str = setting(
         "perfect",
-        "which unit: perfect reports what is true, typical and poor do not, a number is one of "
-        "many; fast turns its head at 5.55 Hz, all others at 4.35 Hz",
+        "unit: perfect matches its reported calibration, typical and poor do not, a number "
+        "selects one of many; fast turns its head at 5.55 Hz, all others at 4.35 Hz",
     )
     power_up: int = setting(
-        0, "how often the unit was switched on before; the phase of its mirror differs each time",
+        0, "number of power-ups before this one; each has another phase of the mirror",
         lo=0, hi=10**9,
     )  # fmt: skip
-    seed: int = setting(0, "everything random follows from this number", lo=0, hi=2**63 - 1)
+    seed: int = setting(0, "seed of everything random", lo=0, hi=2**63 - 1)
     ranges: RangeNoise = field(default_factory=RangeNoise)
     imu: ImuNoise = field(default_factory=ImuNoise)
 
@@ -183,8 +183,8 @@ class RayCastWorker:
         except BrokenProcessPool:  # open3d's readers crash on some damaged files
             self._end()
             raise RayCastError(
-                f"world '{config.world}': the process that reads it crashed; a mesh file that is "
-                "damaged or cut off does that"
+                f"world '{config.world}': the process that reads it crashed; the mesh file "
+                "may be damaged or truncated"
             ) from None
         except BaseException:
             self._end()

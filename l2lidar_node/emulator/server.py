@@ -59,7 +59,7 @@ def stored_settings(path: Path | None, config: DeviceConfig, serial: bool) -> Fl
         except ValueError as error:
             raise FlashError(f"{path}: {error}") from None
     if path is not None and not os.access(path.parent, os.W_OK):
-        raise FlashError(f"{path}: there is no folder '{path.parent}' that can be written to")
+        raise FlashError(f"{path}: '{path.parent}' is not a writable folder")
     flash = Flash.factory(config.addresses, config.identity)
     mode = flash.work_mode | (WorkMode.SERIAL if serial else 0)
     return dataclasses.replace(flash, work_mode=int(mode))

@@ -50,9 +50,9 @@ def open_bag(path: Path) -> AnyReader:
 def unreadable(path: Path, error: Exception) -> RecordingError:
     """Return what to say of a recording that its reader failed on."""
     if not path.exists():
-        return RecordingError(f"{path}: there is no such file or folder")
+        return RecordingError(f"{path}: no such file or folder")
     if path.is_dir() and not (path / "metadata.yaml").exists():
-        return RecordingError(f"{path} is no rosbag2 folder: it has no metadata.yaml")
+        return RecordingError(f"{path} is not a rosbag2 folder: it has no metadata.yaml")
     words = " ".join(str(error).split()) or type(error).__name__
     return RecordingError(f"{path} cannot be read as a recording: {words}")
 

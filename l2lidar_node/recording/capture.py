@@ -239,7 +239,9 @@ class PacketWriter:
         """
         seconds, fraction = divmod(time, _NS)
         if not 0 <= seconds < 1 << 32:
-            raise OSError(errno.EOVERFLOW, "a capture holds times from 1970 to 2106")
+            raise OSError(
+                errno.EOVERFLOW, "the time does not fit a capture, which holds 1970 to 2106"
+            )
         self._stream.write(self._RECORD.pack(seconds, fraction, len(data), len(data)) + data)
 
 

@@ -141,7 +141,7 @@ class PacketBag(io.RawIOBase):
             For any other place.
         """
         if offset or whence != io.SEEK_SET:
-            raise io.UnsupportedOperation("a bag is read from its beginning")
+            raise io.UnsupportedOperation("a bag can only be read from its beginning")
         self._chunks, self._rest, self._at = self._captures(), b"", 0
         return 0
 

@@ -285,12 +285,12 @@ def _chosen(
         others = ", ".join(f"{count} {reason}" for reason, count in reader.ignored.most_common(3))
         found = f"{sum(seen.values())} UDP datagrams" + (f" ({ports})" if ports else "")
         raise CaptureError(
-            f"no L2 packets in it, only {found}" + (f"; packets {others}" if others else "")
+            f"it has no L2 packets, only {found}" + (f"; packets {others}" if others else "")
         )
     devices = sorted({source.ip for source, _ in talks})
     if l2_ip not in devices and len(devices) > 1:
         raise CaptureError(
-            f"packets of several L2s in it, {', '.join(devices)}: select one with l2_ip"
+            f"it has packets of several L2s ({', '.join(devices)}); select one with l2_ip"
         )
     wanted = l2_ip if l2_ip in devices else devices[0]
     return max((talk for talk in talks if talk[0].ip == wanted), key=lambda talk: talks[talk])
@@ -415,8 +415,8 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
     if not is_ros_time(entry.time):
         raise CaptureError(
             f"its times reach {entry.time // 1_000_000_000} s after 1970; stamps of ROS 2 end at "
-            f"{(LAST_STAMP + 1) // 1_000_000_000} s, in January 2038. Was the clock of that "
-            "machine set?"
+            f"{(LAST_STAMP + 1) // 1_000_000_000} s, in January 2038; check whether the clock of "
+            "that machine was set"
         )
     if isinstance(entry, Received):
         return driver.receive(entry.data, entry.time)

@@ -119,7 +119,7 @@ class HealthPublisher:
         silent_s = time.monotonic() - self._asked_at
         if silent_s < _SILENT_S:
             return
-        text = f"the receiving thread has not answered for {silent_s:.0f} s"
+        text = f"the receive thread has not responded for {silent_s:.0f} s"
         check = Check("device", Level.ERROR, text, {})
         self._send([check], HostNs(self._node.get_clock().now().nanoseconds))
 
@@ -156,7 +156,7 @@ class HealthPublisher:
     def _ended(self) -> None:
         """End the program if the session failed: nothing would ever come again."""
         if self._session.failure is not None and self._node.context.ok():
-            raise StartError(f"the receiving thread failed: {self._session.failure!r}")
+            raise StartError(f"the receive thread failed: {self._session.failure!r}")
 
     def _look(self, driver: Driver, now: HostNs) -> _Figures:
         after = health.observe(driver, self._session.transport, now)

@@ -167,11 +167,12 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
     def on_lap(shift_ns: int | None) -> None:
         cut = ", which is cut off" if recording.is_cut_off else ""
         if playback.damage:
-            logger.error(f"{path} cannot be read any further: {playback.damage}")
+            logger.error(f"{path} cannot be read beyond this point: {playback.damage}")
         if shift_ns is not None:
             seconds = shift_ns / 1e9
             logger.info(
-                f"again from the beginning of {path}{cut}; stamps are {seconds:.3f} s later"
+                f"starting again from the beginning of {path}{cut}; stamps are shifted by "
+                f"{seconds:.3f} s"
             )
         else:
             logger.info(f"end of {path}{cut}")
@@ -182,9 +183,9 @@ def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None
 
 
 _ANSWER_TIMEOUT_S = (REPEAT_NS * TRIES) / 1e9 + 1.0
-_NOT_IN_TIME = "the driver did not get to it in time"
-_NO_DEVICE = "a recording is replayed, there is no device to command"
-_NOT_CONFIGURED = "the node is not configured; ros2 lifecycle set {name} configure does that"
+_NOT_IN_TIME = "the driver did not respond in time"
+_NO_DEVICE = "a recording is being replayed, so there is no device to command"
+_NOT_CONFIGURED = "the node is not configured; run: ros2 lifecycle set {name} configure"
 # 4 s, of half turns, for reliable subscribers that are held up.
 _CLOUD_DEPTH = 40
 _IMU_DEPTH = 1000
@@ -300,7 +301,7 @@ class DriverNode(ManagedNode):
             raise StartError(
                 f"parameter 'compressed_clouds': needs '{error.name}', which is not installed; "
                 "sudo apt install ros-jazzy-point-cloud-interfaces python3-zstandard, or set it "
-                "to off"
+                "to none"
             ) from None
         topics = config.topics
         is_lossy = topics.compressed_clouds == "millimeter"
@@ -362,7 +363,7 @@ class DriverNode(ManagedNode):
             f"(watchdog_timeout_ms {config.watchdog.timeout_ms})"
         )
         if config.watchdog.action == "wait" or not self.is_active:
-            self.get_logger().error(f"{text}; waiting for it to come back")
+            self.get_logger().error(f"{text}; waiting for it")
             return
         self.get_logger().fatal(f"{text}; shutting down")
         self.exit_code = 1
@@ -438,8 +439,8 @@ class DriverNode(ManagedNode):
             if not is_there:
                 address = driver.config.network.serial_port or driver.config.network.l2_ip
                 return False, (
-                    f"nothing has been heard of a device at {address} lately; the reset was sent "
-                    "all the same, but is never acknowledged"
+                    f"no data from a device at {address} recently; the reset was sent anyway, "
+                    "but a device never acknowledges it"
                 )
             return True, "reset sent; the device does not acknowledge it and is back in about 25 s"
 

@@ -35,7 +35,7 @@ def file_given(context: LaunchContext, argument: str) -> str:
     given = context.launch_configurations[argument]
     path = Path(given).expanduser()
     if not path.is_file():
-        raise FileNotFoundError(f"{argument}:={given}: there is no such file")
+        raise FileNotFoundError(f"{argument}:={given}: no such file")
     return str(path)
 
 

@@ -64,12 +64,12 @@ def untied(frames: StaticFrames | None, target: str, source: str) -> str:
     if target == source:
         return ""
     if frames is None:
-        return f"use_tf is false, so nothing tells how '{source}' is mounted"
+        return f"use_tf is false, so the mount of '{source}' is unknown"
     if frames.find(target, source) is not None:
         return ""
     return (
-        f"'{source}' is not tied to '{target}' on /tf_static; what comes on /tf alone does not "
-        "count, since it may move: give a mount as a fixed joint or by static_transform_publisher"
+        f"'{source}' is not tied to '{target}' on /tf_static (transforms on /tf are ignored, "
+        "since they may move); publish the mount with a fixed joint or static_transform_publisher"
     )
 
 

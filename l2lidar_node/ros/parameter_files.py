@@ -98,7 +98,7 @@ def _content(path: Path) -> object:
     except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:
         # The last three are PyYAML's on dates that are none, `!!int` alone, endless brackets.
         reason = " ".join(str(error).split())
-        raise ValueError(f"parameter file '{path}': is not YAML: {reason}") from None
+        raise ValueError(f"parameter file '{path}': not YAML: {reason}") from None
 
 
 def _sections(content: object, above: str, path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:

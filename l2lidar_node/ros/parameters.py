@@ -27,7 +27,7 @@ _LEGACY = {
     "robot_z": "a URDF or a static_transform_publisher",
     "frame_id": "cloud_frame",
     "imu_frame_id": "cloud_frame, from which the IMU frame is derived",
-    "disable_base_link_pub": "nothing: the driver never publishes base_link",
+    "disable_base_link_pub": "nothing; the driver never publishes base_link",
 }
 """Parameters of upstream before 0.5 and what took their place."""
 
@@ -135,8 +135,8 @@ def _refuse_unknown(node: Node, known: set[str]) -> None:
             continue
         if name.startswith("qos_overrides."):
             raise SettingError(
-                f"parameter '{name}': QoS overrides are not taken; set qos_reliability, and leave "
-                "the depths, which suit the rates of this sensor"
+                f"parameter '{name}': QoS overrides are not supported; set qos_reliability "
+                "(the depths fit the rates of this sensor)"
             )
         if name in _LEGACY:
             hint = f"it was replaced by {_LEGACY[name]}"

@@ -52,7 +52,7 @@ def make_room() -> None:
 USAGE: Final = """usage: {name} [--params-file FILE] [--ros-args ...]
 
 A ROS 2 node. After --ros-args: -p NAME:=VALUE for a parameter, -r OLD:=NEW for a name.
-Its parameters are in the README and, while it runs, in `ros2 param describe /{name} NAME`."""
+Its parameters: docs/parameters.md; while it runs, `ros2 param describe /{name} NAME`."""
 
 
 class UsageError(ValueError):
@@ -86,7 +86,7 @@ def start_rclpy(argv: list[str]) -> None:
     except RCLError as error:  # its own words are all there is to say
         raise UsageError(str(error).partition(", at ")[0]) from None
     if unknown:
-        raise UsageError(f"argument '{unknown[0]}' is not known; parameters follow --ros-args")
+        raise UsageError(f"argument '{unknown[0]}' is not known; put parameters after --ros-args")
 
 
 def ros_arguments(argv: list[str]) -> list[str]:
@@ -118,7 +118,7 @@ def _check_parameter_file(path: Path) -> None:
     except (yaml.YAMLError, ValueError, IndexError, RecursionError) as error:
         # The last three are PyYAML's on dates that are none, `!!int` alone, endless brackets.
         reason = " ".join(str(error).split())
-        raise UsageError(f"parameter file '{path}': is not YAML: {reason}") from None
+        raise UsageError(f"parameter file '{path}': not YAML: {reason}") from None
     if not isinstance(content, dict) or not all(_is_node(entry) for entry in content.values()):
         raise UsageError(
             f"parameter file '{path}': expected 'l2lidar_node:' (or '/**:'), below it "

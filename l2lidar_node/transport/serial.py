@@ -171,11 +171,11 @@ def _opened(path: str) -> int:
 def _advice(path: str, number: int, reason: str) -> str:
     start = f"cannot open the serial device {path}: "
     if number == errno.ENOENT:
-        return f"{start}it does not exist; is the cable in, and is it called otherwise (ls /dev)?"
+        return f"{start}it does not exist; check the cable and the name (ls /dev)"
     if number in (errno.EACCES, errno.EPERM):
         return f"{start}no permission; add this user to the group that owns it (dialout)"
     if number == errno.ENOTTY:
-        return f"{start}it is no serial device"
+        return f"{start}it is not a serial device"
     if number == errno.EBUSY:
         return f"{start}another program uses it"
     return start + reason

@@ -355,7 +355,7 @@ def of_period(
         values["gyro bias uncertainty [rad/s]"] = f"{motion.gyro_bias_sigma:.4f}"
         values["gravity [m/s^2]"] = f"{motion.gravity:.2f}"
     if is_leveled:
-        text = "the clouds come leveled (imu_adjust), so deskewing makes them wrong"
+        text = "the clouds are leveled (imu_adjust), so deskewing makes them wrong"
         return Check("deskew", Level.ERROR, text, values)
     if not sweeps:
         return Check("deskew", Level.WARN, "no clouds", values)

@@ -311,7 +311,7 @@ def align(
     turns = turns_between(stamps, orientations, samples, model)
     if len(turns.residual) < _FEWEST:
         raise GyroError(
-            f"{len(turns.residual)} turns between poses with IMU samples, {_FEWEST} are needed"
+            f"{len(turns.residual)} turns between poses with IMU samples, expected {_FEWEST}"
         )
     weights = np.ones(len(turns.residual))
     prior = np.diag(PRIOR_SD**-2.0)

@@ -62,8 +62,8 @@ class ImuConvention:
             found.append("the accelerometer measures in g: multiplied by 9.80665")
         if self.reversed:
             found.append(
-                "the accelerometer points the other way (gravity instead of specific force): "
-                "its sign is changed"
+                "the accelerometer has the opposite sign (gravity instead of specific force): "
+                "it is inverted"
             )
         return found
 
@@ -210,8 +210,8 @@ class ImuExtrinsics:
             raise SettingError(f"parameter 'calibration_file': {error}") from None
         if imu is None:
             problem = (
-                f"{config.calibration_file} has no part 'imu', so the IMU is used as drawn; add "
-                "it with l2lidar calibrate imu"
+                f"{config.calibration_file} has no section 'imu', so the IMU is used as in the "
+                "drawing; add it with l2lidar calibrate imu"
             )
             return cls(time_offset_ms=config.imu_time_offset_ms, problem=problem)
         by_hand = any(config.imu_rpy)

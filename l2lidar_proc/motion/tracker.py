@@ -23,15 +23,15 @@ class Flag(Enum):
     """What was short of ideal about a sweep."""
 
     NO_IMU = "no IMU samples near the sweep, so it is passed on as it came"
-    IMU_ENDS_EARLY = "the IMU samples do not reach the end of the sweep"
-    IMU_STARTS_LATE = "the IMU samples begin after the start of the sweep"
+    IMU_ENDS_EARLY = "IMU samples do not reach the end of the sweep"
+    IMU_STARTS_LATE = "IMU samples begin after the start of the sweep"
     IMU_GAP = "a stretch of the sweep has no IMU samples"
-    NO_VELOCITY = "no velocity is known, so rotation only"
-    ACCELEROMETER_FAULT = "the size of gravity is wrong, as after a start on the side"
+    NO_VELOCITY = "no velocity is known, so only rotation is corrected"
+    ACCELEROMETER_FAULT = "gravity has the wrong magnitude, as after a power-on on the side"
     CLOCK_JUMP = "the clock jumped while the sweep waited"
     UNTRUSTED_VELOCITY = "the odometry does not trust its velocity, so points may be smeared"
     PREDICTED_VELOCITY = "the odometry did not align the sweep, so its velocity is a prediction"
-    FILTER_LEFT_OUT = "a filter could not work on these points, so its chain was left out"
+    FILTER_LEFT_OUT = "a filter failed on these points, so its chain was skipped"
 
 
 @dataclass(frozen=True, slots=True)

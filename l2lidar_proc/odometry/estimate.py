@@ -22,20 +22,20 @@ from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
 class Status(Enum):
     """What is remarkable about an estimate; the value is for people."""
 
-    STARTING = "the map has just begun with this sweep"
+    STARTING = "the map began with this sweep"
     PREDICTED = "not aligned with the map: the pose is predicted"
     SPARSE = "too few points"
-    UNMATCHED = "too few points meet the map"
-    SKIPPED = "not aligned, to catch up: clouds come faster than they can be aligned"
-    DEGENERATE = "the scene does not fix the pose in every direction"
+    UNMATCHED = "too few points match the map"
+    SKIPPED = "skipped to catch up: clouds arrive faster than they can be aligned"
+    DEGENERATE = "the scene does not constrain the pose in every direction"
     SUSPECT = "contradicts max_speed, the IMU or the sweeps before: the covariance is widened"
     IMU_GAP = "IMU samples are missing within the span of this estimate"
-    NO_IMU = "no IMU sample at all: steady motion is assumed"
+    NO_IMU = "no IMU samples: constant motion is assumed"
     GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"
-    RESTARTED = "time jumped: the motion is unknown, pose and map were kept"
+    RESTARTED = "time jumped: the motion is unknown, pose and map are kept"
     LOST = "too long without a match: a new map begins at the predicted pose"
-    RETURNED = "an earlier map was met again: the pose jumped back into it"
-    REFUSED = "not later than the previous sweep: nothing was done with it"
+    RETURNED = "an earlier map was matched again: the pose jumped back into it"
+    REFUSED = "not later than the previous sweep: ignored"
 
 
 CUTS: Final = frozenset({Status.LOST, Status.RESTARTED, Status.RETURNED})

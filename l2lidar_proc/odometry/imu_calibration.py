@@ -329,7 +329,7 @@ def _is_bias() -> F64:
 def _estimate(number: int, value: float, sd: float, found: GyroAlignment) -> Estimate:
     """Return one parameter with its verdict."""
     if gyro.BIAS.start <= number < gyro.BIAS.stop:
-        reason = "deskew and odometry estimate it anew" if number == gyro.BIAS.start else ""
+        reason = "deskew and odometry estimate it themselves" if number == gyro.BIAS.start else ""
         return Estimate(value, sd, Verdict.SHOWN, reason)
     if sd > _LARGEST_SD[number]:
         return Estimate(value, sd, Verdict.UNKNOWN, f"turn more about {_needed(number, found)}")
@@ -359,8 +359,8 @@ def _weakest(sd: F64, found: GyroAlignment) -> str:
     name = "xyz"[int(np.argmax(np.abs(axis)))]
     worst = max(float(np.sqrt(values[-1])), float(sd[gyro.ROTATION].max()))
     return (
-        f"the rotation about {name} ({np.rad2deg(worst):.3f} degrees): turning about the other "
-        "two axes tells it"
+        f"the rotation about {name} ({np.rad2deg(worst):.3f} degrees): turn about the other two "
+        "axes to determine it"
     )
 
 
@@ -368,7 +368,7 @@ def _refusals(
     found: GyroAlignment, model_sd: F64, seconds: float, aligned: int, sweeps: int
 ) -> list[Refusal]:
     """Return why nothing can be believed."""
-    again = "stand in a furnished room, turn and shake vividly about all three axes for 30 s"
+    again = "in a furnished room, rotate and shake it vigorously about all three axes for 30 s"
     refusals = []
     if seconds < _SHORTEST_S:
         refusals.append(
@@ -377,7 +377,7 @@ def _refusals(
     if aligned < _FEWEST_ALIGNED * sweeps:
         refusals.append(
             Refusal(
-                f"the odometry lost its way: {aligned} of {sweeps} sweeps could be aligned",
+                f"the odometry failed: only {aligned} of {sweeps} sweeps could be aligned",
                 "turn more slowly, below 3 rad/s, in a furnished room of 4 to 10 m",
             )
         )
@@ -395,14 +395,15 @@ def _refusals(
     if rotation > _LARGEST_ROTATION:
         refusals.append(
             Refusal(
-                f"an IMU turned by {np.rad2deg(rotation):.0f} degrees: not a calibration error",
-                "give its mount in /tf_static or imu_rpy",
+                f"an IMU rotated by {np.rad2deg(rotation):.0f} degrees is not a calibration error",
+                "set its mount in /tf_static or imu_rpy",
             )
         )
     if abs(found.model.offset_s) > _LARGEST_OFFSET_S:
         refusals.append(
             Refusal(
-                f"a time offset of {1e3 * found.model.offset_s:.0f} ms: not that of the L2's IMU",
+                f"a time offset of {1e3 * found.model.offset_s:.0f} ms cannot be that of the "
+                f"L2's IMU",
                 "record the unit itself: l2lidar record",
             )
         )
@@ -434,12 +435,12 @@ def _notes(items: dict[str, Estimate], found: GyroAlignment) -> list[str]:
     unknown = [name for name, item in items.items() if item.verdict is Verdict.UNKNOWN]
     if unknown:
         notes.append(
-            f"not known from this motion, and left as in the drawing: {', '.join(unknown)}"
+            f"not determined by this motion, so left as in the drawing: {', '.join(unknown)}"
         )
     if found.outliers > 0.1 * len(found.turns.ends):
         notes.append(
-            f"{found.outliers} of {len(found.turns.ends)} turns between sweeps are far off: did "
-            "something hit the sensor, or hide the scene?"
+            f"{found.outliers} of {len(found.turns.ends)} turns between sweeps are far off; check "
+            "whether something hit the sensor or blocked its view"
         )
     return notes
 

@@ -270,7 +270,7 @@ def judge(
     values |= {f"{status.name.lower()} [sweeps]": str(count) for status, count in counts.items()}
     values |= {f"clouds refused: {reason}": str(count) for reason, count in refused.items()}
     if last is None:
-        text = "waiting for the first sweeps to fit" if since else "no clouds"
+        text = "waiting until the first sweeps match" if since else "no clouds"
         return Check("odometry", Level.WARN, text, values)
     quality = last.quality
     sigma = np.sqrt(np.diag(last.covariance))

@@ -125,7 +125,9 @@ class ScanPublisher:
             return frame, np.eye(4) if found is None else found
         up = tracker.up(stamp)
         if up is None:
-            self._warn("the vertical is not known without IMU samples; or set scan_frame")
+            self._warn(
+                "the vertical is unknown without IMU samples; publish them, or set scan_frame"
+            )
             return None
         T_level_cloud = np.eye(4)
         T_level_cloud[:3, :3] = level_rotation(up)
@@ -363,8 +365,8 @@ class DeskewNode(ManagedNode):
 
     def _warn_of_leveling(self, publishers: list[str]) -> None:
         self.get_logger().error(
-            f"{', '.join(publishers)} has imu_adjust on: it levels each packet, and deskewing "
-            "such clouds makes them wrong; set imu_adjust to false there",
+            f"{', '.join(publishers)} levels each packet (imu_adjust), and deskewing such "
+            "clouds makes them wrong; set imu_adjust to false there",
             throttle_duration_sec=30.0,
         )
 

@@ -127,7 +127,7 @@ class InputMonitor:
 
     def failed(self, error: Exception) -> None:
         """Report an error that nobody foresaw."""
-        self._failure = f"internal error, begun again: {type(error).__name__}: {error}"
+        self._failure = f"internal error, restarted: {type(error).__name__}: {error}"
         self._node.get_logger().error(f"{self._failure}\n{traceback.format_exc()}")
 
     def judge(self, check: Check, *others: str) -> Check:
@@ -158,7 +158,7 @@ class InputMonitor:
         for kind, frame in (("clouds", self.clouds), ("IMU samples", self.imu)):
             if frame.refused:
                 problems.append(
-                    f"{kind} in '{frame.refused}' refused while those in '{frame.name}' come"
+                    f"{kind} in '{frame.refused}' refused while those in '{frame.name}' arrive"
                 )
                 frame.refused = ""
         return problems
@@ -172,13 +172,13 @@ class InputMonitor:
             )
         is_simulated = self._node.get_parameter("use_sim_time").value
         if is_simulated and not self._node.count_publishers("/clock"):
-            problems.append("use_sim_time is on, but nobody publishes /clock")
+            problems.append("use_sim_time is on, but there is no publisher of /clock")
         elif self._newest is not None:
             now = self._node.get_clock().now().nanoseconds
             apart = (now - self._newest.end) / 1e9
             if abs(apart) > _CLOCK_APART_S:
                 side = "behind" if apart > 0 else "ahead of"
-                hint = "" if is_simulated else ": with a recording set use_sim_time"
+                hint = "" if is_simulated else "; with a recording set use_sim_time"
                 problems.append(f"stamps are {abs(apart):.3g} s {side} the node's clock{hint}")
         return problems
 

@@ -198,7 +198,7 @@ class OdometryNode(ManagedNode):
         if topics.velocity_type == "twist":
             raise SettingError(
                 f"parameter 'velocity_topic': {own} carries the odometry of "
-                "this process, not twists; set velocity_type to odometry, or another topic"
+                "this process, not twists; set velocity_type to odometry, or choose another topic"
             )
         return topics.velocity_type == "odometry"
 
@@ -241,8 +241,7 @@ class OdometryNode(ManagedNode):
             return
         if sweep.start == sweep.end:
             self._say(
-                f"{frame}: clouds without a time per point: each is taken as measured at the "
-                "instant of its stamp"
+                f"{frame}: clouds without a time per point: each is taken as measured at its stamp"
             )
         self._mount()
         self._inputs.sweep(sweep)
@@ -392,7 +391,7 @@ class OdometryNode(ManagedNode):
         del request
         last = self.pipeline.last
         if last is None:
-            response.success, response.message = False, "there is no map yet"
+            response.success, response.message = False, "no map yet"
             return response
         try:
             (path,) = self._folder.new_files(self._settings.value.files.map_file)
@@ -413,7 +412,9 @@ class OdometryNode(ManagedNode):
             write_whole(path, outputs.tum(poses))
             write_whole(beside, outputs.kitti(poses))
             response.success = True
-            response.message = f"{len(poses)} poses in {path.absolute()} and beside it"
+            response.message = (
+                f"{len(poses)} poses in {path.absolute()} and a KITTI file beside it"
+            )
         except (OSError, FileNameError) as error:
             response.success, response.message = False, str(error)
         return response

@@ -363,8 +363,8 @@ class SlamNode(ManagedNode):
         if parent:
             level = Level.ERROR
             text = (
-                f"'{parent}' is the parent of the odometry frame already: set "
-                "invert_tf of the odometry to false, or publish_tf of slam_node"
+                f"'{parent}' is already the parent of the odometry frame; set "
+                "invert_tf of the odometry or publish_tf of slam_node to false"
             )
         if self.worker.failures > self._failures:
             self._failures = self.worker.failures
@@ -412,7 +412,7 @@ def _sweep(
     if cloud.header.frame_id != odometry.child_frame_id:
         raise ValueError(
             f"the cloud is in '{cloud.header.frame_id}', the pose is that of "
-            f"'{odometry.child_frame_id}'; they have to be the same"
+            f"'{odometry.child_frame_id}'; they must be the same"
         )
     points = from_cloud(cloud)
     if not {"x", "y", "z"} <= set(points.dtype.names or ()):

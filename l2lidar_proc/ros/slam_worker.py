@@ -119,7 +119,7 @@ class SlamWorker:
             Before the sweeps that wait. A pose that is given has to wait for them, for instance.
         """
         if self.waiting >= _DEPTH + _MOST_REQUESTS:
-            done((False, "too much is waiting; try again"))
+            done((False, "too many requests are waiting; try again"))
             return
         rank = _NOW if at_once else _IN_TURN
         self._submit(rank, lambda: done(self._answered(job)))
@@ -144,10 +144,10 @@ class SlamWorker:
     def save(self) -> Answer:
         """Save a growing map."""
         if not isinstance(self._engine, Slam):
-            return False, "in localization mode the map stays as it was saved"
+            return False, "in localization mode the saved map stays as it is"
         built = self._engine.map()
         if not built.nodes:
-            return False, "there is no map yet"
+            return False, "no map yet"
         try:
             folder = self.folder
             if self._writer is None or self._writer.folder != folder:
@@ -212,14 +212,14 @@ class SlamWorker:
             return False, "only in localization mode"
         self._engine.relocalize()
         self._publish()
-        return True, "searching: move some meters"
+        return True, "searching; move the sensor a few meters"
 
     def set_pose(self, x: float, y: float, yaw: float) -> Answer:
         """Take the place in the map from a person [m, m, rad]."""
         if not isinstance(self._engine, Localizer):
-            return False, "an initial pose is of use in localization mode only"
+            return False, "an initial pose is used in localization mode only"
         if not self._engine.set_pose(x, y, yaw):
-            return False, "an initial pose came before the first sweep; give it again"
+            return False, "the initial pose came before the first sweep; send it again"
         self._publish()
         return True, f"taken: {x:.2f} m, {y:.2f} m, {np.degrees(yaw):.0f} degrees"
 
@@ -255,7 +255,7 @@ class SlamWorker:
     def _keep_foreign(self, folder: Path) -> None:
         """Give another name to a map that this node neither loaded nor saved."""
         if folder not in self._ours and (aside := atlas.set_aside(folder)):
-            self._warn(f"the map that was in {folder} is now {aside}")
+            self._warn(f"the previous map in {folder} is now {aside}")
         self._ours.add(folder)
 
     def _load(self) -> Map:

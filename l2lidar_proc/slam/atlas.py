@@ -73,7 +73,8 @@ class AtlasWriter:
                 not _OURS.fullmatch(path.name) for path in self.folder.iterdir()
             ):
                 raise AtlasError(
-                    f"{self.folder} holds files that are not a map; name a new or empty folder"
+                    f"{self.folder} contains files that are not a map; choose a new or empty "
+                    "folder"
                 )
             return self._save(built)
         except OSError as error:
@@ -161,7 +162,7 @@ def load(folder: Path) -> tuple[Map, list[str]]:
             try:
                 submap = _submap_of(folder, name)
             except AtlasError as error:
-                warnings.append(f"submap {number} is left out: {error}")
+                warnings.append(f"submap {number} is skipped: {error}")
         built.append(
             Node(
                 HostNs(int(row["stamp"])),
@@ -173,7 +174,7 @@ def load(folder: Path) -> tuple[Map, list[str]]:
             )
         )
     if not any(node.submap is not None for node in built):
-        raise AtlasError(f"{folder}: no submap of the map is left")
+        raise AtlasError(f"{folder}: no readable submap")
     return Map(built, nodes["T_map_node"].copy(), edges), warnings
 
 
@@ -187,7 +188,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
         raise AtlasError(f"{path} cannot be read: {error}") from None
     body = read.get("map") if isinstance(read, dict) else None
     if not isinstance(body, dict) or body.get("format") != "l2lidar atlas":
-        raise AtlasError(f"{path} is not the list of a saved map")
+        raise AtlasError(f"{path} is not the manifest of a saved map")
     if body.get("version") != VERSION:
         raise AtlasError(
             f"{path}: version {body.get('version')!r} is not known, expected {VERSION}"
@@ -197,7 +198,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     names = [body.get("graph"), *(body.get("submaps") or ["missing"])]
     for name in names[:1] + [name for name in names[1:] if name is not None]:
         if not isinstance(name, str) or not _OURS.fullmatch(name):
-            raise AtlasError(f"{path}: {name!r} is not the name of a part of a map")
+            raise AtlasError(f"{path}: {name!r} is not a file name of a map")
     return body
 
 
@@ -245,17 +246,17 @@ def _check(
     """Refuse a graph that nothing could be done with."""
     kinds = (nodes.dtype, edges.dtype, sweeps.dtype) == (_NODE, EDGE, STAMPED_POSE)
     if not kinds or nodes.ndim != 1 or not len(nodes) or len(names) != len(nodes):
-        raise AtlasError(f"{folder}: the graph is not that of a map")
+        raise AtlasError(f"{folder}: the graph is not valid")
     ends = (edges["first"], edges["second"])
     counted = (nodes["sweeps"] >= 0).all() and int(nodes["sweeps"].sum()) == len(sweeps)
     inside = all(((end >= 0) & (end < len(nodes))).all() for end in ends)
     if not counted or not inside:
-        raise AtlasError(f"{folder}: the graph names nodes that it does not have")
+        raise AtlasError(f"{folder}: the graph refers to missing nodes")
     for poses in (nodes["T_map_node"], nodes["T_odom_node"], edges["pose"]):
         turn = poses[:, :3, :3]
         off = np.swapaxes(turn, 1, 2) @ turn - np.eye(3)
         if not np.isfinite(poses).all() or (np.abs(off) > _RIGID).any():
-            raise AtlasError(f"{folder}: the graph holds a pose that is not one")
+            raise AtlasError(f"{folder}: the graph contains an invalid pose")
 
 
 def _canonical(body: dict[str, Any]) -> bytes:

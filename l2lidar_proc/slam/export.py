@@ -110,7 +110,7 @@ def occupancy(built: Map, cell: float = 0.05) -> tuple[NDArray[np.uint8], tuple[
     size = np.ceil((walls.max(axis=0) - low) / cell).astype(int) + 1
     if int(size[0]) * int(size[1]) > _LARGEST_IMAGE:
         raise ValueError(
-            f"the map needs {size[0]} x {size[1]} cells of {cell} m; take larger ones"
+            f"the map needs {size[0]} x {size[1]} cells of {cell} m; use a larger cell"
         )
     image = np.full((int(size[1]), int(size[0])), _UNKNOWN, np.uint8)
 

@@ -36,20 +36,20 @@ class Health(Enum):
     """What the odometry says of a sweep."""
 
     GOOD = "aligned"
-    DEGENERATE = "aligned, but the scene does not fix the pose in every direction"
-    SKIPPED = "not aligned for want of time: the IMU carries the pose between two that are"
+    DEGENERATE = "aligned, but the scene does not constrain the pose in every direction"
+    SKIPPED = "skipped to catch up: the IMU carries the pose"
     PREDICTED = "not aligned: the pose is predicted"
-    CUT = "the motion since the sweep before is unknown"
+    CUT = "the motion since the previous sweep is unknown"
 
 
 class SlamState(Enum):
-    """Whether the place in the map is known; the value is for people."""
+    """Whether the pose in the map is known; the value is for people."""
 
-    SEARCHING = "the place in the map is not known: it is searched for"
-    TENTATIVE = "a place fits: waiting for further looks to agree"
-    LOCALIZED = "the place in the map is known"
-    DEAD_RECKONING = "nothing has confirmed the place lately: the odometry carries it on"
-    LOST = "the place in the map is lost: the last one known is held"
+    SEARCHING = "the pose in the map is unknown and is searched for"
+    TENTATIVE = "a pose fits: waiting until further matches agree"
+    LOCALIZED = "the pose in the map is known"
+    DEAD_RECKONING = "no recent match: the odometry carries the pose"
+    LOST = "the pose in the map is lost: the last known one is held"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,7 +43,7 @@ class SurfaceGrid:
         self._edge = levels[0][0]
         ratios = [round(edge / self._edge) for edge, *_ in levels]
         if any(ratios[-1] % ratio for ratio in ratios):
-            raise ValueError(f"edges of cells {[edge for edge, *_ in levels]} m are no multiples")
+            raise ValueError(f"edges of cells {[edge for edge, *_ in levels]} m are not multiples")
         self._per_block = wide = ratios[-1]
         owners = [
             cells // (wide // ratio) for ratio, (_, cells, *_) in zip(ratios, levels, strict=True)

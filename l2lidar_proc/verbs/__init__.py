@@ -8,7 +8,7 @@ DESKEW: Final = Verb(
     "deskew",
     "l2lidar_proc.verbs.deskew:deskew",
     DATA,
-    "Deskew and filter the clouds of a recording into another one, as deskew_node does live.",
+    "Deskew and filter the clouds of a recording, as deskew_node does live.",
 )
 ODOMETRY: Final = Verb(
     "odometry",
@@ -20,7 +20,7 @@ SLAM: Final = Verb(
     "slam",
     "l2lidar_proc.verbs.slam:slam",
     DATA,
-    "Build a map of a recording with loops closed, as slam_node does live.",
+    "Build a map with loop closure from a recording, as slam_node does live.",
 )
 EXPORT: Final = Verb(
     "export",

@@ -194,7 +194,7 @@ def _topics(config: DeskewNodeConfig, kinds: dict[str, str]) -> Topics:
 
 def deskew(
     source: Annotated[Path, typer.Argument(help="rosbag2 folder or MCAP file.")],
-    target: Annotated[Path, typer.Argument(help="What to write: FILE.mcap, or a folder.")],
+    target: Annotated[Path, typer.Argument(help="FILE.mcap or a folder to write.")],
     params_file: Annotated[
         Path | None, typer.Option(help="Parameter file, as for deskew_node.")
     ] = None,
@@ -206,8 +206,8 @@ def deskew(
     """
     if target.suffix not in ("", ".mcap"):
         raise UsageError(
-            f"'{target}' ends in '{target.suffix}'; expected FILE.mcap, or a name without an "
-            "ending for a rosbag2 folder"
+            f"'{target}' ends in '{target.suffix}'; expected FILE.mcap, or a name without a "
+            "suffix for a rosbag2 folder"
         )
     try:
         config = settings_for(params_file, "deskew_node", DeskewNodeConfig)
@@ -222,7 +222,7 @@ def deskew(
         raise UsageError(str(error)) from None
     typer.echo(
         f"{target}: {counts.sweeps} clouds: {counts.deskewed} deskewed, {counts.still} at rest, "
-        f"{counts.passed_on} passed on for want of IMU samples"
+        f"{counts.passed_on} passed on because IMU samples are missing"
     )
     for reason, count in refused.items():
         typer.echo(f"{count} not deskewed: {reason}")

@@ -417,12 +417,12 @@ class _Listener:
             elif self._imu_frame and self._cloud_frame and not self._is_mounted:
                 notes.append(
                     f"no transform from '{self._imu_frame}' to '{self._cloud_frame}' in "
-                    "/tf_static: the place of the IMU is that of imu_xyz"
+                    "/tf_static: the position of the IMU is imu_xyz"
                 )
         if self._snapshots:
             notes.append(
-                f"{self._snapshots} clouds without a time per point: each is taken as measured at "
-                "the instant of its stamp"
+                f"{self._snapshots} clouds without a time per point: each is taken as "
+                "measured at its stamp"
             )
         return self.runner.finish()
 
@@ -505,10 +505,11 @@ def odometry(
         Path | None, typer.Option(help="Parameter file, as for odometry_node.", exists=True)
     ] = None,
     l2_ip: Annotated[
-        str, typer.Option(help="Whose packets, if a capture holds those of several units.")
+        str, typer.Option(help="Unit whose packets to use, if there are several.")
     ] = "",
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")
+        bool,
+        typer.Option("--overwrite", help="Replace the results of an earlier run in the folder."),
     ] = False,
 ) -> None:
     """Estimate the trajectory of the sensor through a recording, as odometry_node does live.
@@ -519,8 +520,7 @@ def odometry(
     taken = [folder / name for name in _FILES if (folder / name).exists()]
     if taken and not overwrite:
         raise UsageError(
-            f"{taken[0]} is there already, of an earlier run; name another folder or add "
-            "--overwrite"
+            f"{taken[0]} exists from an earlier run; choose another folder or add --overwrite"
         )
     try:
         config = settings_for(params_file, "odometry_node", OdometryNodeConfig)
@@ -549,4 +549,4 @@ def odometry(
     for line in [*run.report, *(f"wrote {path}" for path in files)]:
         typer.echo(line)
     if not len(run.poses):
-        raise CommandError("no pose was found: are there clouds with times, and IMU samples?")
+        raise CommandError("no pose was found; check for clouds with times, and IMU samples")

@@ -41,10 +41,11 @@ def slam(
         typer.Option(help="Parameter file, as for odometry_node and slam_node.", exists=True),
     ] = None,
     l2_ip: Annotated[
-        str, typer.Option(help="Whose packets, if a capture holds those of several units.")
+        str, typer.Option(help="Unit whose packets to use, if there are several.")
     ] = "",
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")
+        bool,
+        typer.Option("--overwrite", help="Replace the results of an earlier run in the folder."),
     ] = False,
 ) -> None:
     """Build a map of a recording with loops closed, as odometry_node and slam_node do live.
@@ -55,7 +56,7 @@ def slam(
     """
     if (folder / _MAP / atlas.MANIFEST).exists() and not overwrite:
         raise UsageError(
-            f"{folder / _MAP} holds a map of an earlier run; name another folder or add "
+            f"{folder / _MAP} has a map of an earlier run; choose another folder or add "
             "--overwrite"
         )
     try:
@@ -89,7 +90,7 @@ def slam(
         raise CommandError(f"{source}: {error}") from None
     if not len(run.poses):
         raise CommandError(
-            f"{source}: no trajectory was found; are there clouds with times, and IMU samples?"
+            f"{source}: no trajectory was found; check for clouds with times, and IMU samples"
         )
     mapping.finish()
     built = mapping.map()
@@ -106,7 +107,7 @@ def slam(
         print(line)
     print(f"{len(built.nodes)} submaps, {len(mapping.loops)} loops between them")
     for reason, count in mapping.counts.most_common():
-        print(f"{count} candidates refused: {reason}")
+        print(f"{count} candidates rejected: {reason}")
     print(*(f"wrote {path}" for path in [folder / _MAP, *files]), sep="\n")
 
 

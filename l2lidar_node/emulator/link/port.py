@@ -266,7 +266,7 @@ class SerialPort:
         except OSError:
             data = b""
         if not data:
-            raise PortError(f"{self.name}: the other end is gone")
+            raise PortError(f"{self.name}: the other end was closed")
         return [data]
 
     def send(self, data: bytes) -> bool:

@@ -115,7 +115,7 @@ class Flash:
             parameters_payload(flash)
             np.array([flash.work_mode, flash.auto_standby], dtype=np.uint32)
         except (TypeError, KeyError, AttributeError, OverflowError, ValueError) as error:
-            raise ValueError(f"no stored settings of a virtual L2: {error}") from None
+            raise ValueError(f"not the stored settings of a virtual L2: {error}") from None
         return flash
 
     def with_network(self, payload: bytes) -> Flash:

@@ -46,7 +46,9 @@ class RangeNoise:
 
     range_noise: float = setting(1.0, "factor on the measured range noise", lo=0.0, hi=100.0)
     dropout: float = setting(1.0, "factor on the measured rate of drop-outs", lo=0.0, hi=20.0)
-    weak_signal: bool = setting(True, "whether dark, slanted and distant surfaces may not return")
+    weak_signal: bool = setting(
+        True, "whether dark, slanted and distant surfaces may give no return"
+    )
     divergence_mrad: float = setting(
         4.0, "full width of the beam; 0 = no mixed pixels at edges", unit="mrad", lo=0.0, hi=50.0
     )

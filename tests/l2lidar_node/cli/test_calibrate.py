@@ -79,7 +79,7 @@ def test_too_short_a_capture_is_refused_with_what_to_do(run: Run, tmp_path: Path
     output = tmp_path / "unit.yaml"
     done = run("calibrate", "still", str(short), "-o", str(output))
     assert done.code == 1
-    assert "record 10 s at each place" in done.out
+    assert "record 10 s at each placement" in done.out
     assert "nothing is written" in done.err
     assert not output.exists()
 
@@ -159,9 +159,9 @@ def test_the_guide_is_led_through_at_a_terminal(unit: Unit, tmp_path: Path) -> N
         terminal.wait_for("Press Enter")
         terminal.type("\n")
         terminal.wait_for("turns of the head, at least 8 are needed: record 10 s")
-        terminal.wait_for("Measure this place again?")
+        terminal.wait_for("Repeat this placement?")
         terminal.type("perhaps\n")
-        terminal.wait_for("'perhaps' is neither yes nor no")
+        terminal.wait_for("'perhaps' is not an answer")
         terminal.wait_for("[Y/n]")
         terminal.type("\n")
         terminal.wait_for("Press Enter")
@@ -178,7 +178,7 @@ def test_turning_is_shown_in_bars_and_can_be_given_up(unit: Unit, tmp_path: Path
         terminal.wait_for("calibrate the beams first")
         terminal.wait_for("Press Enter")
         terminal.type("\n")
-        for text in ("still", "roll about x", "nod about y", "turn about z", "time"):
+        for text in ("still", "roll about x", "pitch about y", "yaw about z", "time"):
             terminal.wait_for(text)
         terminal.interrupt()
         assert terminal.exit_code() == 130
@@ -208,7 +208,7 @@ def test_nobody_at_the_terminal_is_said(run: Run, unit: Unit, tmp_path: Path) ->
     (tmp_path / "place_1.pcap").write_bytes(b"precious")
     done = run("calibrate", "still", "--keep", str(tmp_path), *unit.options)
     assert done.code == 2
-    assert "place_1.pcap is there already" in done.err
+    assert "place_1.pcap exists already" in done.err
 
 
 def test_the_imu_verb_refuses_what_it_cannot_use(
@@ -216,7 +216,7 @@ def test_the_imu_verb_refuses_what_it_cannot_use(
 ) -> None:
     done = run("calibrate", "imu", str(captures[0]), "--emulator", "typical")
     assert done.code == 2
-    assert "leave the capture out" in done.err
+    assert "omit the capture" in done.err
     done = run("calibrate", "imu", "--emulator", "good")
     assert done.code == 2
     assert "expected perfect, typical, poor" in done.err

@@ -91,7 +91,7 @@ def test_nobody_there_is_exit_code_1(run: Run, short_waits: None, verb: list[str
 
 def test_silence_is_explained(run: Run, short_waits: None) -> None:
     outcome = run("info", *SILENT, str(free_port()))
-    assert "is it at 127.0.0.1" in outcome.err
+    assert "check that it is at 127.0.0.1" in outcome.err
     assert "this machine's addresses" in outcome.err
 
 
@@ -270,7 +270,7 @@ def test_work_modes_as_people_write_them(text: str, now: int, expected: int) -> 
     ("text", "words"),
     [
         ("loud", "'loud' is not known.*wide_fov"),
-        ("+imu_off,wide_fov", "all names have a sign"),
+        ("+imu_off,wide_fov", "all names need a sign"),
         ("-1", "expected 0 to 0x3fffff"),
         ("0x400000", "expected 0 to 0x3fffff"),
         ("", "not known"),
@@ -325,7 +325,7 @@ def test_without_a_yes_nothing_is_stored(run: Run, unit: Unit, answer: str) -> N
 
 def test_losing_ethernet_is_warned_of(run: Run, unit: Unit) -> None:
     outcome = run("set", "work-mode", "serial", *unit.options, answer="n")
-    assert "Ethernet is gone" in outcome.out
+    assert "Ethernet is off" in outcome.out
     assert unit.flash.work_mode == 0
 
 
@@ -346,7 +346,7 @@ def test_an_interrupted_change_is_undone(
     monkeypatch.setattr(Device, "read_parameters", interrupted)
     outcome = run("set", *verb, *unit.options, "--yes")
     assert outcome.code != 0
-    assert "stored what it had before" in outcome.out
+    assert "has its old value again" in outcome.out
     assert calls[1] != before  # the change had been made
     assert unit.flash.work_mode == before.work_mode
     assert parameters_payload(unit.flash) == parameters_payload(before)

@@ -182,7 +182,7 @@ def test_a_sync_by_another_host_is_bridged_and_reported() -> None:
 
     replay.check_promises()
     assert replay.kinds == [ClockEventKind.LOCKED, ClockEventKind.FOREIGN_SYNC]
-    assert replay.events[1].text == "somebody else stepped the device's clock by +7.448 s"
+    assert replay.events[1].text == "another host stepped the device's clock by +7.448 s"
     assert replay.spread_ms.max() < 0.05
 
 

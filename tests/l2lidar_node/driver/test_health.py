@@ -86,7 +86,7 @@ def test_a_healthy_device_is_all_right(healthy: Watched) -> None:
 def test_a_device_that_is_not_there() -> None:
     watched = Watched(l2_ip="192.168.1.99")
     watched.run.wait(1)
-    assert watched.verdict("device") == (Level.ERROR, "nothing heard from 192.168.1.99 yet")
+    assert watched.verdict("device") == (Level.ERROR, "no data from 192.168.1.99 yet")
     assert watched.verdict("clock") == (Level.OK, "no data yet")
     assert set(watched.checks()) == {"device", "link", "clock", "points"}
 
@@ -133,7 +133,7 @@ def test_the_other_dimension_than_asked_for(frame3d: bool, measured: str, asked:
         kind = PacketType.POINTS_2D if frame3d else PacketType.POINTS_3D
         watched.run.hear(kind, payload)
         watched.run.hear(PacketType.IMU, build.imu(number))
-    message = f"it measures {measured} where frame3d asks for {asked}"
+    message = f"it measures {measured} but frame3d asks for {asked}"
     assert watched.verdict("device") == (Level.ERROR, message)
 
 
@@ -218,12 +218,12 @@ def test_a_covered_sensor() -> None:
     watched.run.hear(PacketType.POINTS_3D, build.points_3d(ranges=[0] * 280 + [3000] * 20))
     level, message = watched.verdict("points")
     assert level is Level.WARN
-    assert message == "hardly any returns: is the sensor covered?"
+    assert message == "hardly any returns; check whether the sensor is covered"
 
 
 def test_where_no_cloud_is_made_nothing_is_said_of_its_slots() -> None:
     waiting = streaming(1.2, sweep_cut="packets", aggregateNframes=4000)
-    assert waiting.verdict("points") == (Level.OK, "no cloud was completed lately")
+    assert waiting.verdict("points") == (Level.OK, "no cloud was completed recently")
 
     def has_gaps(item: Any) -> bool:
         """Tell whether it comes in the 0.15 s between outages of 0.25 s: a turn takes longer."""
@@ -233,7 +233,7 @@ def test_where_no_cloud_is_made_nothing_is_said_of_its_slots() -> None:
     level, message = torn.verdict("points")
     assert (level, message) == (
         Level.WARN,
-        "no turn was whole, and parts of turns are left out",
+        "no turn was complete, and parts of turns are dropped",
     )
 
 
@@ -250,8 +250,8 @@ def test_gravity_alignment_without_imu() -> None:
         ("dirty_index", 6.0, "the cover is dirty"),
         ("apd_temperature", 81.0, "the detector is hot"),
         ("imu_temperature", 86.0, "the IMU is hot"),
-        ("packet_lost_down", 0.02, "inner links lose packets"),
-        ("apd_voltage", math.nan, "it reports values that are no numbers"),
+        ("packet_lost_down", 0.02, "packets are lost inside the sensor"),
+        ("apd_voltage", math.nan, "it reports values that are not numbers"),
     ],
 )
 def test_unhealthy_hardware(name: str, value: Any, message: str) -> None:

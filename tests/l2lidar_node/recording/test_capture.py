@@ -345,7 +345,7 @@ def two_devices() -> io.BytesIO:
 
 
 def test_of_several_devices_one_must_be_named() -> None:
-    with pytest.raises(CaptureError, match=r"several L2s in it, 10\.0\.0\.1, 10\.0\.0\.2"):
+    with pytest.raises(CaptureError, match=r"several L2s \(10\.0\.0\.1, 10\.0\.0\.2"):
         Recording(two_devices(), "192.168.1.62")
     assert Recording(two_devices(), "10.0.0.2").device.ip == "10.0.0.2"
 
@@ -359,7 +359,7 @@ def test_a_capture_without_an_l2_says_what_is_in_it() -> None:
     packets = [udp_packet(b"x" * 50, destination=Endpoint("1.2.3.4", 53))] * 3
     stream = tcpdump([(1.0, bytes(packet)) for packet in packets] + [(1.0, b"?")], 101)
     with pytest.raises(
-        CaptureError, match=r"no L2 packets in it, only 3 UDP .*3 to port 53.*1 dam"
+        CaptureError, match=r"it has no L2 packets, only 3 UDP .*3 to port 53.*1 dam"
     ):
         Recording(stream)
 
@@ -372,5 +372,5 @@ def test_a_capture_of_another_sensor_is_told_from_ours() -> None:
         ports = [datagram.destination.port for datagram in reader]
         assert (ports.count(7502), ports.count(7503)) == (192, 30)
         assert not reader.ignored
-        with pytest.raises(CaptureError, match="no L2 packets in it, only 222 UDP datagrams"):
+        with pytest.raises(CaptureError, match="it has no L2 packets, only 222 UDP datagrams"):
             Recording(stream)

@@ -113,7 +113,7 @@ def test_while_a_device_does_not_acknowledge_everything_else_goes_on(rig: Rig) -
     resetting = rig.reset.call_async(Trigger.Request())
     rig.until(resetting.done)
     assert not resetting.result().success
-    assert "nothing has been heard of a device at 127.0.0.1" in resetting.result().message
+    assert "no data from a device at 127.0.0.1" in resetting.result().message
     rig.until(lambda: rig.units)
     assert rig.units == {"L2 at 127.0.0.1"}
 
@@ -137,13 +137,13 @@ def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(
         for future in pending:
             rig.until(future.done)
             assert not future.result().success
-            assert future.result().message == "the driver did not get to it in time"
-        rig.until(lambda: any("receiving thread has not answered for" in t for t in rig.said))
+            assert future.result().message == "the driver did not respond in time"
+        rig.until(lambda: any("receive thread has not responded for" in t for t in rig.said))
     finally:
         free.set()
     rig.said.clear()
-    rig.until(lambda: any("nothing heard from 127.0.0.1" in text for text in rig.said))
-    assert not any("has not answered" in text for text in rig.said[-5:])
+    rig.until(lambda: any("no data from 127.0.0.1" in text for text in rig.said))
+    assert not any("has not responded" in text for text in rig.said[-5:])
 
 
 @pytest.mark.parametrize("how", ["enable", "reset", "end"])

@@ -263,4 +263,4 @@ def test_a_driver_whose_receiving_thread_fails_ends_and_says_why(rig: Rig) -> No
         capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
     )  # fmt: skip
     assert result.returncode == 1
-    assert "receiving thread failed: RuntimeError('no idea')" in result.stderr
+    assert "receive thread failed: RuntimeError('no idea')" in result.stderr

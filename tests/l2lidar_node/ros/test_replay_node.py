@@ -179,7 +179,7 @@ def test_a_loop_goes_on_in_time_and_obeys_nobody(rig: Rig, tmp_path: Path) -> No
         ({"replay_file": "no/such.pcap"}, "cannot replay no/such.pcap: No such file"),
         ({"replay_file": "README.md"}, "a capture file"),
         ({"record_file": "/proc/no/a.pcap"}, "cannot record to /proc/no/a.pcap"),
-        ({"serial_port": "/dev/null"}, "no serial device"),
+        ({"serial_port": "/dev/null"}, "not a serial device"),
     ],
     ids=str,
 )
@@ -211,4 +211,4 @@ def test_a_capture_after_2038_is_refused_by_name(
     code, said = refused(capfd, *assigned({"replay_file": str(path)}))
     assert code == 1
     assert f"cannot replay {path}: the time " in said
-    assert "stamps of ROS 2 hold 1901-12-13 to 2038-01-19" in said
+    assert "ROS 2 stamps cover 1901-12-13 to 2038-01-19" in said

@@ -82,7 +82,7 @@ def test_only_the_gravity_alignment_is_wrong_for_lio_sam(
     data = results["lio_sam"]
     assert errors(data) == {"levelled"}
     judged = {item["check"]: item["text"] for item in data["findings"]}
-    assert judged["tf-imu"] == "the IMU's place is known"
+    assert judged["tf-imu"] == "the mount of the IMU is known"
     assert judged["fields"].endswith("read with sensor: velodyne")
 
 

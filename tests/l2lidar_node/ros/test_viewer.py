@@ -66,4 +66,4 @@ def test_what_is_published_is_written_for_the_viewer_and_silence_is_said(
 
     _, error = silent.communicate(timeout=TIMEOUT_S)
     assert silent.returncode == 1
-    assert "is the driver running" in error
+    assert "check that the driver runs" in error

@@ -159,7 +159,7 @@ def test_a_device_that_goes_away_is_taken_up_again(tmp_path: Path) -> None:
     ("path", "words"),
     [
         ("/dev/ttyNoSuch0", "does not exist.*ls /dev"),
-        ("/dev/null", "no serial device"),
+        ("/dev/null", "not a serial device"),
         ("/", "cannot open the serial device /: "),
     ],
 )

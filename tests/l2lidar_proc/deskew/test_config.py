@@ -13,11 +13,20 @@ from l2lidar_proc.deskew.config import DeskewNodeConfig
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"range_min": 5.0, "range_max": 1.0}, "'range_min': 5.0 is above range_max"),
-        ({"vertical_min": 9.0, "vertical_max": -9.0}, "'vertical_min': 9.0 is above"),
-        ({"intensity_min": 9.0, "intensity_max": 8.0}, "'intensity_min': 9.0 is above"),
-        ({"keep_boxes": (0.0,) * 7}, "'keep_boxes': a box is six numbers"),
-        ({"remove_boxes": (0.0,) * 5}, "'remove_boxes': a box is six numbers"),
+        (
+            {"range_min": 5.0, "range_max": 1.0},
+            "'range_min': 5.0 is out of range, expected at most range_max \(1.0\)",
+        ),
+        ({"vertical_min": 9.0, "vertical_max": -9.0}, "'vertical_min': 9.0 is out of range"),
+        ({"intensity_min": 9.0, "intensity_max": 8.0}, "'intensity_min': 9.0 is out of range"),
+        (
+            {"keep_boxes": (0.0,) * 7},
+            "'keep_boxes': 7 numbers are not valid, expected six per box",
+        ),
+        (
+            {"remove_boxes": (0.0,) * 5},
+            "'remove_boxes': 5 numbers are not valid, expected six per box",
+        ),
         ({"scan_height_min": 0.1}, "'scan_height_min': 0.1 is out of range, .*less"),
         ({"scan_range_min": 30.0}, "'scan_range_min': 30.0 is out of range, .*less"),
         ({"imu_xyz": (1.0, 2.0)}, "'imu_xyz': .*expected three numbers"),

@@ -56,7 +56,7 @@ def test_the_opposite_sign_is_found_within_seconds_of_motion(factor: float) -> N
     convention, changed = watched("walk", factor)
     assert 20 <= changed < 50
     assert convention.reversed
-    assert "points the other way" in convention.notes[-1]
+    assert "has the opposite sign" in convention.notes[-1]
     assert convention.in_g == (abs(factor) < 0.5)
 
 

@@ -81,7 +81,7 @@ def test_a_file_of_the_beams_alone_leaves_the_imu_as_drawn(tmp_path: Path) -> No
     settings = {"calibration_file": str(beams), "imu_time_offset_ms": 3.0}
     known = ImuExtrinsics.of(build(ImuConfig, settings))
     assert known.source == "drawing"
-    assert re.search(r"beams.yaml has no part 'imu'.*l2lidar calibrate imu", known.problem)
+    assert re.search(r"beams.yaml has no section 'imu'.*l2lidar calibrate imu", known.problem)
     assert known.rotation is None
     np.testing.assert_array_equal(known.unmixing, np.eye(3))
     assert known.time_offset_ms == 3.0

@@ -226,7 +226,7 @@ def test_simulated_time_that_nobody_publishes_is_named_and_nothing_waits_for_it(
 ) -> None:
     bench.node.set_parameters([Parameter("use_sim_time", value=True)])
     try:
-        wait_for_text(bench, "use_sim_time is on, but nobody publishes /clock")
+        wait_for_text(bench, "use_sim_time is on, but there is no publisher of /clock")
         if isinstance(bench, DeskewBench):
             bench.clouds.clear()
             bench.send_cloud(seen(WALK, 0.0, 0.2, 0.0)[0], at(0.0))  # no IMU: the wait must end
@@ -237,7 +237,7 @@ def test_simulated_time_that_nobody_publishes_is_named_and_nothing_waits_for_it(
 
 def test_stamps_far_from_the_nodes_clock_are_named(bench: Any) -> None:
     bench.send_cloud(seen(WALK, 0.0, 0.2, 0.0)[0], at(0.0))
-    wait_for_text(bench, "s behind the node's clock: with a recording set use_sim_time")
+    wait_for_text(bench, "s behind the node's clock; with a recording set use_sim_time")
 
 
 def test_reasons_have_an_end(bench: Any) -> None:

@@ -53,7 +53,7 @@ def test_an_error_that_nobody_foresaw_is_reported_and_survived(
     monkeypatch.setattr(pipeline, "sweep", lambda sweep, now, backlog: 1 / 0)
     sweep = next(iter(sweeps(recording("room", "walk"), "turn")))
     odometry.send_cloud(sweep.points, sweep.start)
-    told = "internal error, begun again: ZeroDivisionError"
+    told = "internal error, restarted: ZeroDivisionError"
     odometry.until(lambda: any(told in status.message for status in odometry.diagnostics))
     monkeypatch.setattr(pipeline, "sweep", real)
     works(odometry)

@@ -194,7 +194,7 @@ def test_the_map_stays_while_it_localizes_and_grows_again_afterwards(
     worker = bench.node._worker
     try:
         some = sweeps_of(office)
-        assert not bench.call("set_localization", True).success  # there is no map yet
+        assert not bench.call("set_localization", True).success  # no map yet
         for sweep in some[:50]:
             bench.send(sweep)
         bench.drain()

@@ -109,7 +109,7 @@ def test_a_damaged_submap_is_left_out_with_a_warning(mapped: Slam, tmp_path: Pat
     [
         (lambda folder: (folder / atlas.MANIFEST).unlink(), "not a saved map"),
         (lambda folder: (folder / atlas.MANIFEST).write_text("{"), "cannot be read"),
-        (lambda folder: (folder / atlas.MANIFEST).write_text("[1]"), "not the list"),
+        (lambda folder: (folder / atlas.MANIFEST).write_text("[1]"), "not the manifest"),
         (lambda folder: edit(folder, "version", 9), "version 9 is not known"),
         (lambda folder: edit(folder, "submaps", ["../../etc/passwd"]), "checksum is wrong"),
         (lambda folder: next(folder.glob("graph-*")).write_bytes(b"PK"), "damaged"),
@@ -135,7 +135,7 @@ def edit(folder: Path, key: str, value: object) -> None:
 def test_a_folder_with_other_files_is_not_written_to(mapped: Slam, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
 
-    with pytest.raises(AtlasError, match="holds files that are not a map"):
+    with pytest.raises(AtlasError, match="contains files that are not a map"):
         AtlasWriter(tmp_path).save(mapped.map())
 
     assert (tmp_path / "thesis.tex").read_text() == "years of work"

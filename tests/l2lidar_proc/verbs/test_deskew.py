@@ -147,7 +147,7 @@ def test_the_command_line_refuses_what_is_in_the_way(
     (tmp_path / "file").touch()
     for source, target, code, words in (
         (recording, tmp_path / "out", 2, "exists"),
-        (tmp_path / "nothing", tmp_path / "x", 1, "nothing: there is no such file"),
+        (tmp_path / "nothing", tmp_path / "x", 1, "nothing: no such file"),
         (recording, tmp_path / "file/x.mcap", 1, "Not a directory"),
         (recording, tmp_path / "x.bag", 2, "ends in '.bag'"),
     ):

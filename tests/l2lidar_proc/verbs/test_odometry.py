@@ -90,9 +90,9 @@ def test_events_give_what_the_bag_gives(tmp_path: Path) -> None:
 
 
 def test_what_is_not_a_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="nothing: there is no such file"):
+    with pytest.raises(RecordingError, match="nothing: no such file"):
         run_bag(tmp_path / "nothing", OdometryNodeConfig())
-    with pytest.raises(RecordingError, match=r"no rosbag2 folder: it has no metadata\.yaml"):
+    with pytest.raises(RecordingError, match=r"not a rosbag2 folder: it has no metadata\.yaml"):
         run_bag(tmp_path, OdometryNodeConfig())
     (tmp_path / "words.mcap").write_text("words")
     with pytest.raises(RecordingError, match=r"words\.mcap cannot be read as a recording: "):

@@ -48,4 +48,4 @@ def test_what_is_not_a_map_is_not_exported(run: Any, tmp_path: Path) -> None:
     done = run("export", str(tmp_path), "--to", "tum")
 
     assert done.code == 1
-    assert "is not the list of a saved map" in done.err
+    assert "is not the manifest of a saved map" in done.err
