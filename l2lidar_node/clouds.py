@@ -25,7 +25,7 @@ DATATYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field of a cloud, as PointField says it."""
+    """A field of a cloud, as in PointField."""
 
     name: str
     offset: int

@@ -1,4 +1,4 @@
-"""Vocabulary of the command lines: verbs, their failures, and what typer needs to know of them.
+"""Common parts of the command lines: verbs, errors, typer settings.
 
 It imports typer only when a verb is run, so that anybody may import it.
 """
@@ -25,7 +25,7 @@ DATA: Final = "Its data"
 
 
 class CommandError(RuntimeError):
-    """What a command was asked cannot be done; the message says what stands in the way."""
+    """A command cannot be carried out; the message says why."""
 
     exit_code = 1
 

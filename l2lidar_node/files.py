@@ -1,4 +1,4 @@
-"""Files that are complete or as they were before, and the one folder for those of services."""
+"""Atomic file writes, and the folder for the files of services."""
 
 from __future__ import annotations
 
@@ -100,4 +100,4 @@ class DataFolder:
 
 
 class FileNameError(ValueError):
-    """A name that must not be written to; the message says why and what would be right."""
+    """A file name that is not allowed; the message says why and what would be right."""

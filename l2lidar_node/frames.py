@@ -1,4 +1,4 @@
-"""Static frame tree: rigid transforms of mounts, and the one between any two frames."""
+"""Static frame tree: transforms between rigidly mounted frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MAX_DEPTH: Final = 1000  # of a chain; a loop has no end
 
 
 class FrameTree:
-    """Frames that do not move against each other, each with one parent, as in tf2."""
+    """Frames fixed to each other, each with one parent, as in tf2."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, F64]] = {}

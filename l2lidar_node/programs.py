@@ -1,4 +1,4 @@
-"""Starts the programs: at no moment does SIGINT or SIGTERM end one with a trace.
+"""Entry points. SIGINT and SIGTERM never print a traceback.
 
 Importing what a program needs takes a second, and Python's own handler answers Ctrl-C with a trace
 wherever it finds it. So this module imports nothing that takes time, and stands before all else:
@@ -21,7 +21,7 @@ _SAME_WISH_S = 1.0  # Ctrl-C under `ros2 launch` comes twice, from the terminal 
 
 
 class _Interruption:
-    """Handler that raises KeyboardInterrupt, once for signals that follow each other soon.
+    """Handler that raises KeyboardInterrupt, once for signals in quick succession.
 
     So what a program does when it is interrupted is not interrupted in its turn.
     """

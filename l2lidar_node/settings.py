@@ -1,4 +1,4 @@
-"""Declares a setting once: default, unit, range, meaning; all else is derived from that.
+"""Settings, each declared once: default, unit, range, meaning.
 
 A group of settings is a frozen dataclass whose fields are made by :func:`setting`. The ROS
 declaration, the check of a YAML file, the README table and the error messages all follow from the
@@ -23,11 +23,11 @@ G = TypeVar("G")
 
 
 class SettingError(ValueError):
-    """A value that a setting cannot take; the message says which, and what would be right."""
+    """An invalid value of a setting; the message says which, and what would be right."""
 
 
 class Form(NamedTuple):
-    """What a text has to look like: a pattern for all of it, and both ends of the message."""
+    """Required form of a text: a pattern, and the words of the error message."""
 
     pattern: re.Pattern[str]
     name: str
@@ -59,7 +59,7 @@ FOLDER: Final = Form(re.compile(r".*\S.*", re.DOTALL), "a folder", "its path")
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Everything there is to know about one setting.
+    """One setting.
 
     Attributes
     ----------

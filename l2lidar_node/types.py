@@ -1,4 +1,4 @@
-"""Names every value that travels between modules; depends on nothing of ours."""
+"""Values that flow between modules; imports nothing of this package."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LAST_STAMP: Final = HostNs((1 << 31) * 1_000_000_000 - 1)
 
 
 class StampError(ValueError):
-    """An instant that no ROS stamp can hold; the message says which."""
+    """A time outside the range of ROS stamps; the message says which."""
 
 
 new_tuple = tuple.__new__
@@ -96,7 +96,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The judgement of one aspect.
+    """Result of one check.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ NOT_AWAITED: Final = HostNs(0)
 
 
 class TransportCounts(Protocol):
-    """What a transport counts."""
+    """Counts of a transport."""
 
     @property
     def foreign(self) -> int:
@@ -181,16 +181,20 @@ class TransportCounts(Protocol):
 
     @property
     def kernel_drops(self) -> int:
-        """What was lost because nobody took it in time."""
+        """Datagrams that were dropped because nobody read them in time."""
+
+    @property
+    def send_errors(self) -> int:
+        """Frames to the device that could not be sent."""
 
 
 class Transport(TransportCounts, Protocol):
-    """Where bytes come from and go to."""
+    """Source and sink of bytes."""
 
     def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
-        """Return what has arrived, waiting at most ``timeout_s`` for the first of it.
+        """Return what has arrived, waiting at most ``timeout_s`` for the first datagram.
 
-        ``awaited`` says when somebody will want what has arrived by then.
+        ``awaited`` is when the next datagram that matters is expected.
         """
 
     def send(self, frame: bytes) -> None:

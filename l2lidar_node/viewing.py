@@ -1,4 +1,4 @@
-"""Draws clouds, IMU, odometry and health in rerun, live or from a recording; needs no ROS.
+"""Viewer: clouds, IMU, odometry and health in rerun, live or from a recording; no ROS.
 
 It takes messages as rclpy and as rosbags make them: both name the fields alike.
 """
@@ -40,11 +40,11 @@ ROLES: Final = {
 
 
 class ViewerError(RuntimeError):
-    """The viewer cannot be had; the message says what to do."""
+    """The viewer is not available; the message says what to do."""
 
 
 class Viewer:
-    """Hands every message to rerun.
+    """Passes every message to rerun.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class Viewer:
 
 
 class _GrownMap:
-    """One point of every cube that any cloud has touched."""
+    """One point per voxel of all clouds so far."""
 
     def __init__(self) -> None:
         self.clouds = 0

@@ -1,4 +1,4 @@
-"""What is done with the driver's sweeps: deskew, filters, odometry; no ROS outside ``ros``."""
+"""Companion of the driver: deskew, filters, odometry and SLAM; no ROS outside ``ros``."""
 
 from l2lidar_node import programs
 

@@ -1,4 +1,4 @@
-"""Turns any structured cloud with one time per point into a Sweep, or says why it cannot."""
+"""Converts any structured cloud with one time per point to a Sweep, or says why it cannot."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_POINTS: Final = 2_000_000
 
 
 class CloudError(ValueError):
-    """A cloud whose points' times cannot be told; the message says why."""
+    """A cloud whose point times cannot be determined; the message says why."""
 
 
 def to_sweep(

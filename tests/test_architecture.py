@@ -20,7 +20,6 @@ OPENERS = {"open", "read_text", "read_bytes", "write_text", "write_bytes"}
 # Modules of the pure core whose subject is a file format.
 FILE_FORMATS = {
     "l2lidar_node/emulator/truth.py",
-    "l2lidar_node/emulator/motion/tum.py",
     "l2lidar_proc/recording/bag.py",
     "l2lidar_proc/slam/atlas.py",
 }

@@ -1,1 +1,1 @@
-"""Self-calibration of a unit: beam angles, range, IMU, and the file that keeps them."""
+"""Self-calibration of a unit: beam angles, range, IMU, calibration file."""

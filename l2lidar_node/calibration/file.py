@@ -1,4 +1,4 @@
-"""Calibration file of one unit: what was estimated, for whom, and how well it is known."""
+"""Calibration file of one unit: corrections, their deviations, and the block they apply to."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class CalibrationFileError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ImuCalibration:
-    """What is known about the IMU of a unit.
+    """Calibration of a unit's IMU.
 
     Attributes
     ----------

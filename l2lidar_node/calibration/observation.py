@@ -1,4 +1,4 @@
-"""Still places: returns, gyro and block from raw packets, and how the mount rocks with the head.
+"""Placements of a still sensor: returns, gyro and block from raw packets, rocking of the mount.
 
 A housing that rocks with the head has a constant tilt (t_A, t_B) in the head frame, and moves the
 points exactly as alpha = t_A and beta = t_B do. The cloud cannot tell them apart; the gyro can:
@@ -37,7 +37,7 @@ _TURN: Final = 2.0 * np.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """What a unit measured at one still place.
+    """Measurements of a unit at one placement.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Place:
 
 
 class _Timed(NamedTuple):
-    """A payload, its place in the order of arrival and its device stamp [s]."""
+    """A payload with its arrival index and its device stamp [s]."""
 
     order: int
     stamp_s: float
@@ -97,7 +97,7 @@ class _Timed(NamedTuple):
 
 @dataclass(slots=True)
 class Gathering:
-    """Collects the packets of a place.
+    """Collects the packets of a placement.
 
     Attributes
     ----------

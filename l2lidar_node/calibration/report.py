@@ -1,4 +1,4 @@
-"""What a result looks like: the words of the command line, the calibration file, pictures."""
+"""Report of a calibration: text, calibration file, pictures."""
 
 from __future__ import annotations
 

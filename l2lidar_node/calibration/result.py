@@ -1,4 +1,4 @@
-"""What a calibration from still places found, and what becomes of it."""
+"""Result of a calibration from still placements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from l2lidar_node.types import F64
 
 
 class Verdict(Enum):
-    """What becomes of a parameter."""
+    """Whether a parameter is corrected, and why not."""
 
     CORRECTED = "corrected"
     UNCHANGED = "as reported"
@@ -42,7 +42,7 @@ class Estimate:
 
 
 class Refusal(NamedTuple):
-    """Why nothing is written, and what to do."""
+    """Reason why nothing is written, and what to do."""
 
     reason: str
     advice: str
@@ -70,7 +70,7 @@ class Quality:
 
 @dataclass(frozen=True, slots=True)
 class PlaceReport:
-    """What one place alone says.
+    """Result from one placement alone.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class PlaceReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StillResult:
-    """What still places tell about a unit.
+    """Result of a calibration from still placements.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Range scale by tape measure: two still places on a line towards a wall."""
+"""Range scale by tape measure, from two positions on a line towards a wall."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ScaleResult:
 
 
 class _Way(NamedTuple):
-    """How the second place lies to the first.
+    """Motion from the first position to the second.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Bundle of planes: robust Gauss-Newton over beam parameters, every plane eliminated."""
+"""Plane bundle adjustment: robust Gauss-Newton over beam parameters, planes eliminated."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ Finder = Callable[[F64, NDArray[np.bool_], I64], Planes]
 
 
 class FewPlanesError(ValueError):
-    """There are too few planes to estimate anything from."""
+    """Too few planes for an estimate."""
 
 
 class Unknown(NamedTuple):
-    """One unknown: a parameter of all groups, or of one alone."""
+    """One unknown: a parameter of all groups or of a single one."""
 
     parameter: int
     group: int | None = None
 
 
 class Scene(NamedTuple):
-    """Returns of several still places under one block.
+    """Returns of several placements with one calibration block.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """What the planes say about the unknowns.
+    """Estimate of the unknowns.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ def repeated(scene: Scene, solution: Solution, keep: NDArray[np.bool_]) -> F64:
 
 
 class System(NamedTuple):
-    """Normal equations of unknowns, planes eliminated.
+    """Normal equations of the unknowns, planes eliminated.
 
     Attributes
     ----------
@@ -293,7 +293,7 @@ def _linearized(
 
 
 class Meeting(NamedTuple):
-    """Where rays meet the planes that their points lie on.
+    """Intersections of rays with the planes that their points lie on.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Beam angles and range bias from still places, with what they are worth."""
+"""Beam angles and range bias from still placements, with their deviations."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ _APART: Final = np.cos(np.deg2rad(30.0))
 
 
 class CalibrationError(ValueError):
-    """Nothing can be estimated; the message says why and what to do."""
+    """No estimate is possible; the message says why and what to do."""
 
 
 def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:

@@ -1,4 +1,4 @@
-"""Checks frames, transforms and QoS: what surrounds the data."""
+"""Checks of frames, transforms and QoS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was received of a pair of topics: gathered from messages, measured, bounded."""
+"""Observation of a cloud topic and an IMU topic, with bounded memory."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ class Qos(NamedTuple):
 
 
 class Format(NamedTuple):
-    """What clouds of one publisher have in common."""
+    """Properties common to the clouds of one publisher."""
 
     fields: tuple[Field, ...]
     point_step: int
@@ -235,7 +235,7 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What was received.
+    """Everything received.
 
     Attributes
     ----------
@@ -263,7 +263,7 @@ class Observation:
 
 
 class Gathering:
-    """Gathers an observation message by message; keeps no points but a few of each cloud."""
+    """Gathers an observation message by message; keeps only a few points of each cloud."""
 
     def __init__(self) -> None:
         self._clouds: list[Cloud] = []
@@ -356,7 +356,7 @@ TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 
 
 class SourceError(ValueError):
-    """What was asked for is not to be had from the source; the message says why."""
+    """The source does not have what was asked for; the message says why."""
 
 
 class Topics(NamedTuple):

@@ -1,4 +1,4 @@
-"""Runs all checks of one consumer and words the result."""
+"""Runs all checks for one consumer and formats the result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each consumer requires of its topics, as its source has it, and what a check finds."""
+"""Requirements of each consumer, from its source code, and findings of a check."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Use(Enum):
 
 
 class TimeUnit(Enum):
-    """How a consumer takes the numbers of a time field."""
+    """How a consumer interprets the numbers of a time field."""
 
     S = "s after the stamp"
     NS = "ns after the stamp"
@@ -146,7 +146,7 @@ class Input:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consumer:
-    """What one consumer requires.
+    """Requirements of one consumer.
 
     Attributes
     ----------

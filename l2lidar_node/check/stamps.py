@@ -1,4 +1,4 @@
-"""Checks of the stamps of both topics: order, rate, gaps, pace, overlap."""
+"""Checks of the stamps of both topics: order, rate, gaps, clock speed, overlap."""
 
 from __future__ import annotations
 

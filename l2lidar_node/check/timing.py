@@ -28,7 +28,7 @@ _END_NEAR_S: Final = 1e-2
 
 
 class Timing(NamedTuple):
-    """Times of clouds as a consumer takes them, [s] after the stamp; shape (N,) each.
+    """Times of clouds as a consumer reads them, [s] after the stamp; shape (N,) each.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""The `l2lidar` command: everything that is done with an L2 by hand, without ROS."""
+"""The `l2lidar` command: works with an L2 from the command line, without ROS."""

@@ -1,4 +1,4 @@
-"""`l2lidar calibrate`: estimates what a unit is off by, and writes its calibration file."""
+"""`l2lidar calibrate`: estimates a unit's errors and writes its calibration file."""
 
 from __future__ import annotations
 
@@ -307,7 +307,7 @@ def _live(
 
 
 class _Guide(NamedTuple):
-    """How much is said and asked: nobody is there to answer, nothing but JSON is printed."""
+    """Whether to print and prompt, print only, or print JSON."""
 
     is_unattended: bool
     is_quiet: bool

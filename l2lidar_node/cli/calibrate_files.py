@@ -1,4 +1,4 @@
-"""What the `l2lidar calibrate` verbs share: their options, files, prompts and recordings."""
+"""Options, files, prompts and recordings of the `l2lidar calibrate` verbs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`l2lidar calibrate imu`: guides through turning the sensor, and calibrates its IMU."""
+"""`l2lidar calibrate imu`: guides the user in turning the sensor, and calibrates its IMU."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _virtual(path: Path, name: str, motion: str, *, quiet: bool) -> None:
 
 
 class _Watch:
-    """Collects what the gyro says while the sensor is turned; told in the receiving thread."""
+    """Collects gyro samples while the sensor is turned; called in the receive thread."""
 
     def __init__(self) -> None:
         self._samples: list[ImuSample] = []

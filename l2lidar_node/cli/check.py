@@ -1,4 +1,4 @@
-"""`l2lidar check`: judges whether an odometry or mapping package can work with the topics."""
+"""`l2lidar check`: checks whether an odometry or mapping package can work with topics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prints to people and to programs; options that several verbs share."""
+"""Output for people and programs, and options that several verbs share."""
 
 from __future__ import annotations
 

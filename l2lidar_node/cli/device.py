@@ -63,11 +63,11 @@ _LOOK_S: Final = 0.02
 
 
 class DeviceError(CommandError):
-    """The device is not there or does not do what it was asked; the message says so."""
+    """The device does not answer or did not do what it was asked; the message says which."""
 
 
 class Device:
-    """An L2 for as long as a ``with`` statement lasts.
+    """A connection to an L2, open during a ``with`` statement.
 
     Nothing about it is changed by connecting: its clock is left alone, only its version and
     parameters are asked for.

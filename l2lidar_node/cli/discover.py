@@ -1,4 +1,4 @@
-"""`l2lidar discover`: finds the units that this machine hears, and those that answer."""
+"""`l2lidar discover`: finds units that send to this machine or answer it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _EVERYBODY: Final = "255.255.255.255"
 
 @dataclass
 class Speaker:
-    """Who sends to this machine, and what.
+    """A sender, and what it sends.
 
     Attributes
     ----------

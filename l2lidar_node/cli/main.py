@@ -114,7 +114,7 @@ VERBS: Final = (
 
 
 class _Verbs(TyperGroup):
-    """The list of verbs; the one that is run is imported, the others are not."""
+    """The list of verbs; only the one that runs is imported."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

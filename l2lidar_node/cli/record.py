@@ -1,4 +1,4 @@
-"""`l2lidar record`, `convert` and `replay`: what a unit sends as a capture or bag, and back."""
+"""`l2lidar record`, `convert` and `replay`: captures and bags of a unit's data."""
 
 from __future__ import annotations
 

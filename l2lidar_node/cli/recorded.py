@@ -1,4 +1,4 @@
-"""Reads recordings for the verbs: what a bag holds, and what a driver makes of a capture."""
+"""Reads recordings for the verbs: bags, and captures through a driver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`l2lidar info`, `monitor` and `sync-check`: what the unit is, how it and its clock are doing."""
+"""`l2lidar info`, `monitor` and `sync-check`: identity, health and clock of a unit."""
 
 from __future__ import annotations
 

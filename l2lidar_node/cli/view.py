@@ -1,4 +1,4 @@
-"""`l2lidar view`: live topics or a recording in a window, the browser, or a file for later."""
+"""`l2lidar view`: shows live topics or a recording in a window, the browser, or a file."""
 
 from __future__ import annotations
 

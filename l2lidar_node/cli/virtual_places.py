@@ -1,4 +1,4 @@
-"""What `l2lidar calibrate --emulator` works on: places and motions measured by a virtual L2."""
+"""Placements and motions of a virtual L2, for `l2lidar calibrate --emulator`."""
 
 from __future__ import annotations
 

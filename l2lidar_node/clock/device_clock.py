@@ -1,4 +1,4 @@
-"""Maps device stamps to host stamps; says when it is locked and what happened to either clock.
+"""Device clock: maps device stamps to host stamps, and reports lock and clock events.
 
 Two models, one after the other. :class:`DeviceClockModel` takes the steps out of the stamps, so
 that both streams share one even device time whatever syncs and reboots do. :class:`HostClockModel`
@@ -84,7 +84,7 @@ _EVENTS: Final = 64
 
 
 class ClockEventKind(Enum):
-    """What can happen to a clock."""
+    """Kinds of clock events."""
 
     LOCKED = "locked"
     REBOOT = "reboot"
@@ -99,7 +99,7 @@ class ClockEventKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ClockEvent:
-    """Something that happened to one of the clocks, with a sentence for the log."""
+    """An event of one of the clocks, with a text for the log."""
 
     kind: ClockEventKind
     text: str
@@ -107,7 +107,7 @@ class ClockEvent:
 
 @dataclass(frozen=True, slots=True)
 class ClockStatus:
-    """What is known about the device's clock.
+    """Status of the device's clock.
 
     Attributes
     ----------

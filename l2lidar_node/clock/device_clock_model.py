@@ -1,4 +1,4 @@
-"""Maps device stamps to the device line: one continuous time base for both streams.
+"""Device clock model: maps device stamps to one continuous time base for both streams.
 
 The device's clock runs evenly until a time-sync command, of this host or of another, steps it. The
 time between two steps is an *epoch*. Each epoch has an offset, its ``base``; stamp minus base is

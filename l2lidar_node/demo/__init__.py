@@ -1,1 +1,1 @@
-"""Shows the whole chain without hardware: a virtual L2, the driver, and somebody who listens."""
+"""Demo of the whole chain without hardware: a virtual L2, the driver, and an observer."""

@@ -110,7 +110,7 @@ def demo(
 
 
 class _Options(NamedTuple):
-    """What the demo is to do."""
+    """Options of the demo."""
 
     duration: float
     world: str

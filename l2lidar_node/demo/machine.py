@@ -1,4 +1,4 @@
-"""Tells whether the machine kept up with the demo; where it did not, its figures say nothing."""
+"""Checks whether the machine kept up with the demo; if not, the figures are inconclusive."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_WAITING: Final = 0.5
 
 
 class ProcessorTime(NamedTuple):
-    """What the system gave the main thread of a program.
+    """Processor time of a program's main thread.
 
     Attributes
     ----------

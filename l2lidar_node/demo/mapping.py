@@ -1,4 +1,4 @@
-"""The demo with SLAM: a map with loops closed, saved, judged, and being found in it again."""
+"""Demo with SLAM: builds, saves and evaluates a map with loop closure, and localizes in it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _PLACED_M: Final = 0.05
 
 
 class MappingRun:
-    """A map being built, beside everything else that the demo shows.
+    """Builds a map during the demo.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Listens to the topics of the demo and records them into a bag."""
+"""Observes the topics of the demo and records them to a bag."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PAIRS: Final = 60
 
 @dataclass(slots=True)
 class TopicRecord:
-    """What was seen on one topic.
+    """Messages observed on one topic.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ _DEPTH: Final = 1000
 
 
 class TopicRecorder:
-    """Records while a ``with`` statement lasts and its node is spun.
+    """Records during a ``with`` statement, while its node is spun.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Starts programs of this package and ends them again, whatever happens."""
+"""Starts programs of this package and always ends them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _DDS_DOMAIN_STEP: Final = 250
 
 
 class ProgramError(RuntimeError):
-    """A program ended by itself; the message holds what it said."""
+    """A program ended by itself; the message has its output."""
 
 
 class Program:

@@ -1,4 +1,4 @@
-"""Reports what the demo saw, how accurate it was, and where the pictures are."""
+"""Report of the demo: topics, accuracy, pictures."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""From ordered packets to sweeps, and how the device is doing."""
+"""The driver core: packets to sweeps, commands, device health."""

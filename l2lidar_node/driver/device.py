@@ -1,4 +1,4 @@
-"""The conversation with the device: watchdog, queries, commands until they are answered."""
+"""Watchdog, queries and commands of a device."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ _FIRST_ID: Final = 100
 
 
 class QuerySchedule:
-    """What is asked of a device without anybody's wish.
+    """Queries that the driver sends by itself.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ MAX_PENDING: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """How a command ended.
+    """Outcome of a command.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class _Pending:
 
 
 class CommandClient:
-    """The commands that wait for their ACK; at most :data:`MAX_PENDING`, the oldest give way."""
+    """Commands that wait for their ACK; at most :data:`MAX_PENDING`, the oldest are dropped."""
 
     def __init__(self) -> None:
         self._pending: list[_Pending] = []

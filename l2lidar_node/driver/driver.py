@@ -1,4 +1,4 @@
-"""Composes the driver's parts: bytes with their arrival in, sweeps and samples out; no socket.
+"""Driver core: bytes with arrival times in, sweeps and IMU samples out; no socket.
 
 Every method takes the time as an argument and returns what happened. What comes out depends on
 the calls of :meth:`Driver.receive`, :meth:`Driver.sent`, :meth:`Driver.settle`,
@@ -45,7 +45,7 @@ from l2lidar_node.types import F64, HostNs, ImuSample, Stream, Sweep, new_tuple
 
 @dataclass(slots=True)
 class Counters:
-    """Everything that was counted since the start.
+    """Counts since the start.
 
     Attributes
     ----------

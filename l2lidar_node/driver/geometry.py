@@ -1,4 +1,4 @@
-"""Turns a batch of point packets into POINT records: closed form, in double, one vectorized call.
+"""Geometry: point packets to POINT records, vectorized over a batch, in double precision.
 
 The model is the one of Unitree's BSD-3 header for a 3D packet's slot j::
 
@@ -53,7 +53,7 @@ class RangeLimits(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointBatch:
-    """What a batch of packets measured.
+    """Points of a batch of packets.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class PointBatch:
 
 
 class _Table(NamedTuple):
-    """What all packets of one calibration share; arrays over slots, shape (n,)."""
+    """Values common to all packets of one calibration; arrays over slots, shape (n,)."""
 
     alpha: F64  # [rad]
     j: F64  # from the middle slot

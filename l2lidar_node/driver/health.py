@@ -1,4 +1,4 @@
-"""Says who a device is, and judges it from what was counted in a period.
+"""Device health: metadata, and checks from the counts of a period.
 
 OK needs nobody's attention, WARN should be looked at, ERROR means that data are missing or wrong.
 """
@@ -22,7 +22,7 @@ from l2lidar_node.types import STANDARD_GRAVITY, Check, HostNs, Level, Stream, T
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """Facts about one device; None or empty where it has not said so yet.
+    """Facts about one device; None or empty until it has reported them.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ _CLOCK_TROUBLES: Final = {
     ClockEventKind.SILENCE: "the device was silent",
     ClockEventKind.LOST: "the device's clock was lost and locked again",
 }
-_LATE_NS: Final = 500_000_000  # whoever steers by these data should know
+_LATE_NS: Final = 500_000_000  # matters to a controller that uses these data
 _WRONG_GRAVITY: Final = 15.0  # [m/s^2]; the accelerometer fault shows 18 to 21
 _MAX_TILT_DEG: Final = 10.0
 
@@ -166,13 +166,14 @@ _CALIBRATION_UNITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Period:
-    """What the transport and the driver counted, at one instant."""
+    """Counts of the transport and the driver at one instant."""
 
     now: HostNs
     counters: Counters
     foreign: int
     stranger: str
     kernel_drops: int
+    send_errors: int
     clock_events: dict[ClockEventKind, int]
 
 
@@ -184,6 +185,7 @@ def observe(driver: Driver, transport: TransportCounts, now: HostNs) -> Period:
         transport.foreign,
         transport.stranger,
         transport.kernel_drops,
+        transport.send_errors,
         driver.clock_status().events,
     )
 
@@ -274,10 +276,12 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
     values["stray acknowledgements"] = str(new.stray_acks)
     values["foreign datagrams"] = str(after.foreign)
     values["kernel drops"] = str(after.kernel_drops)
+    values["send errors"] = str(after.send_errors)
     damaged = sum((new.faults - old.faults).values()) + sum((new.rejected - old.rejected).values())
     received = sum(_measured(before, after).values())
     drops = after.kernel_drops - before.kernel_drops
     foreign = after.foreign - before.foreign
+    unsent = after.send_errors - before.send_errors
     datagrams = (new.datagrams - old.datagrams) / seconds
     is_forged = datagrams > _MAX_DATAGRAM_HZ
     is_grave = lost > _LOSS_ERROR * (received + lost)
@@ -288,6 +292,7 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
             (damaged, f"{damaged} damaged or impossible packets"),
             (stale, f"{stale} packets from long ago dropped: a replay, or a second path?"),
             (drops, f"{drops} datagrams dropped by the kernel; raise receive_buffer_bytes"),
+            (unsent, f"{unsent} commands could not be sent; check the cable and the network"),
             (foreign, _of_strangers(foreign, seconds, after.stranger)),
             (
                 is_forged,

@@ -19,7 +19,7 @@ _LATE_REACH: Final = 64  # numbers this far behind are late ones, not a wrap
 
 @dataclass(slots=True)
 class SequenceCounts:
-    """What the sequence numbers of one stream said so far.
+    """Counts from the sequence numbers of one stream.
 
     Attributes
     ----------
@@ -271,7 +271,7 @@ Released = list[tuple[int, Timed]]
 
 @dataclass(slots=True)
 class _Lane:
-    """What is known of one stream.
+    """State of one stream.
 
     ``suspects`` are packets in a row that either begin a new sequence or come from long ago. The
     next packets say which.
@@ -287,7 +287,7 @@ class _Lane:
 
 
 class ReorderBuffer:
-    """The packets of both streams on their way from arrival to use.
+    """Reorder buffer of both streams.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Groups point packets into sweeps: by count, head angle or duration, never without bound.
+"""Sweep assembly: groups point packets by count, head angle or duration, with a size limit.
 
 Each packet is placed by the calibration block to use: the unit's own, a file's, or parameters'.
 """
@@ -54,7 +54,7 @@ def calibration_file(config: FileConfig) -> CalibrationFile | None:
 
 
 class BlockChoice:
-    """Replaces the blocks that a unit reports by those to use.
+    """Chooses between the calibration block that a unit reports and its correction.
 
     Parameters win over the file, the file over the unit. Recordings keep what the unit reports.
 
@@ -127,7 +127,7 @@ Level = Callable[[list[HostNs]], NDArray[np.float64]]
 
 
 class _Placed(NamedTuple):
-    """A packet and where it stands in its sweep."""
+    """A packet and its position in the sweep."""
 
     packet: PointPacket
     given: HostNs  # its start as it was pushed

@@ -18,7 +18,7 @@ _DATE: Final = Form(re.compile(r"[0-9]{6}"), "a date", "six digits such as 25071
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddressConfig:
-    """Network settings the unit leaves the factory with; commands 108 and 109 replace them."""
+    """Factory network settings of the unit; commands 108 and 109 replace them."""
 
     lidar_ip: str = setting("127.0.0.1", "address the virtual L2 sends from and listens on")
     lidar_port: int = setting(
@@ -38,7 +38,7 @@ class AddressConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerConfig:
-    """How long the unit takes to come up, from power-on and from standby."""
+    """Start-up times, from power-on and from standby."""
 
     boot_scale: float = setting(
         1.0, "factor on all times of this group, 0 = no delays", lo=0.0, hi=10.0
@@ -61,7 +61,7 @@ class PowerConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentityConfig:
-    """What the unit says about itself."""
+    """Identity that the unit reports."""
 
     hardware: str = setting("2.2.1.1", "hardware version, four numbers")
     firmware: str = setting("2.8.11.1", "firmware version, four numbers")
@@ -78,7 +78,7 @@ class IdentityConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrystalConfig:
-    """How fast the unit's clock runs: (1 + ppm(t) / 1e6) / clock_ratio, t from power-on."""
+    """Rate of the unit's clock: (1 + ppm(t) / 1e6) / clock_ratio, t from power-on."""
 
     clock_ratio: float = setting(
         1.99866, "true seconds per second of the unit's clock", lo=0.5, hi=3.0
@@ -98,7 +98,7 @@ class CrystalConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DelayConfig:
-    """How long the unit keeps a measurement before it leaves.
+    """Delays from measurement to transmission.
 
     A point packet is stamped at its first slot and leaves ``points_delay_us`` after its last slot
     was measured; an IMU packet is stamped at the sample and leaves ``imu_delay_us`` later.
@@ -115,7 +115,7 @@ class DelayConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultConfig:
-    """What goes wrong, and how often.
+    """Faults and how often they occur.
 
     Everything is off by default. Probabilities are per datagram, those of damage per packet.
     """
@@ -220,7 +220,7 @@ class FaultConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceConfig:
-    """Everything about the virtual unit but the world it sees."""
+    """All settings of the virtual unit except its world."""
 
     addresses: AddressConfig = field(default_factory=AddressConfig)
     power: PowerConfig = field(default_factory=PowerConfig)

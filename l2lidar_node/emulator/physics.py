@@ -1,4 +1,4 @@
-"""What there is to measure: world, motion, scanner and IMU, and a process that measures ahead.
+"""World, motion, scanner and IMU of the virtual L2, and its ray-cast process.
 
 Casting rays in a process of its own disturbs no deadline.
 """
@@ -39,7 +39,7 @@ from l2lidar_node.settings import setting
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhysicsConfig:
-    """Where the virtual L2 is, how it moves and what is imperfect about it."""
+    """World, motion and imperfections of the virtual L2."""
 
     world: str = setting(
         "room",
@@ -81,7 +81,7 @@ class PhysicsConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Physics:
-    """What the virtual L2 measures with."""
+    """World, motion, scanner and IMU of the virtual L2."""
 
     world: World
     motion: Motion
@@ -151,11 +151,11 @@ _Key = tuple[str | WorkMode, int, int]
 
 
 class RayCastError(RuntimeError):
-    """The measuring process was killed."""
+    """The ray-cast process was killed."""
 
 
 class RayCastWorker:
-    """A process that measures; its sources are those of a :class:`VirtualL2`.
+    """A process that casts rays ahead; its sources feed a :class:`VirtualL2`.
 
     Parameters
     ----------

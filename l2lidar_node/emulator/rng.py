@@ -1,4 +1,4 @@
-"""Hands out random numbers that belong to a packet, whichever packets are asked for together."""
+"""Random numbers by packet, independent of which packets are requested together."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """What the numbers are for; every use has its own, so switching one off changes no other."""
+    """Purpose of the numbers; each has its own stream, so switching one off changes no other."""
 
     HEAD = 1
     STATE = 2

@@ -1,4 +1,4 @@
-"""Puts a virtual L2 together from its settings and runs it on a port, in real time or faster."""
+"""Runs a virtual L2 on a port, in real time or faster."""
 
 from __future__ import annotations
 

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.unit.scanner import Scan
 from l2lidar_node.files import write_whole
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
+from l2lidar_node.recording import tum
 
 JUNK = -1
 """``row`` of bytes that belong to no packet."""
@@ -121,7 +121,7 @@ PACKET: Final = np.dtype(
 
 
 class Fault(IntFlag):
-    """What can go wrong; names are those of the settings."""
+    """Kinds of faults, named as the settings."""
 
     BAD_CRC = auto()
     TRUNCATE = auto()
@@ -153,7 +153,7 @@ class FaultEvent(NamedTuple):
 
 
 class PacketLog:
-    """Books every packet when it leaves the unit and again when it reaches the host.
+    """Logs every packet when it leaves the unit and when it reaches the host.
 
     A packet has arrived when its bytes reached the host undamaged, one after the other and with
     nothing in between: a reader of a byte stream needs that and no more. One that also uses the

@@ -1,4 +1,4 @@
-"""Turns a command into bytes and tells whether an ACK answers it."""
+"""Commands: encodes them and matches their ACKs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FROM_HOST: Final = frozenset(
 
 
 class Command(NamedTuple):
-    """Something to tell the device.
+    """A command to the device.
 
     Attributes
     ----------

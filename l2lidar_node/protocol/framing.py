@@ -1,4 +1,4 @@
-"""Turns a byte stream cut anywhere into frames and frame errors; bounded and resynchronizing.
+"""Framer: byte stream to frames and frame errors; bounded and resynchronizing.
 
 The stream is what one sender puts into datagrams (or onto a serial line). Frames may be coalesced,
 split at any byte, damaged, or have garbage between them. The rules:
@@ -39,7 +39,7 @@ _WHOLE: Final = {
 
 
 class Fault(Enum):
-    """What was wrong with bytes that did not become a frame."""
+    """Why bytes did not become a frame."""
 
     JUNK = "junk"  # bytes that belong to no frame
     SIZE = "size"  # a size field that cannot be true
@@ -56,7 +56,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FrameError:
-    """Bytes that were given up.
+    """Bytes that were discarded.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Turns a frame into a typed packet or a decode error."""
+"""Packet decoder: frame to typed packet or decode error."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ImuPacket(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """What a unit says it is; versions as printed, most significant number first."""
+    """Identity of a unit; versions as printed, most significant number first."""
 
     hardware: str
     firmware: str
@@ -108,7 +108,7 @@ class Parameters:
 
 @dataclass(frozen=True, slots=True)
 class UnknownPacket:
-    """A good frame of a type that nothing is known about, or that only a host sends."""
+    """A good frame of an unknown type, or of one that only a host sends."""
 
     packet_type: int
     payload: bytes
@@ -116,7 +116,7 @@ class UnknownPacket:
 
 @dataclass(frozen=True, slots=True)
 class DecodeError:
-    """A good frame whose content cannot be true.
+    """A good frame with impossible content.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ def decode(frame: Frame) -> Packet:
 
 
 class _PointLayout(NamedTuple):
-    """Where the numbers are in a packet of ranges."""
+    """Layout of a point packet."""
 
     packet_type: int
     size: int

@@ -1,4 +1,4 @@
-"""States the wire format of the Unitree L2 once: numbers, layouts, sizes, and the frame.
+"""Wire format of the Unitree L2: numbers, layouts, sizes, and the frame.
 
 Facts come from Unitree's BSD-3 headers (unilidar_sdk2) and from the behavior of its client. All
 numbers are little-endian and packed. Sizes called ``size`` include the 12-byte header and the
@@ -31,7 +31,6 @@ LIDAR_IP: Final = "192.168.1.62"
 LIDAR_PORT: Final = 6101
 HOST_IP: Final = "192.168.1.2"
 HOST_PORT: Final = 6201
-SERIAL_BAUD: Final = 4_000_000
 
 IMU_RATE_HZ: Final = 250.0
 MIRROR_PERIOD_S: Final = 0.004639  # one fast-mirror turn, so one 3D packet
@@ -40,7 +39,7 @@ QUATERNION_NORM: Final = 0.9983  # what units really send
 
 
 class PacketType(IntEnum):
-    """Number in a frame's header that says what its payload is."""
+    """Type of a frame's payload, in its header."""
 
     USER_COMMAND = 100
     ACK = 101

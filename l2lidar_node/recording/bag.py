@@ -1,4 +1,4 @@
-"""Bags without ROS: reads any, and writes what a driver hands out as its node publishes it."""
+"""Bags without ROS: reads any bag, and writes a driver's output as its node publishes it."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
 
 
 class BagFile:
-    """A bag that serialized messages are written into; use it in a ``with``.
+    """Writer of serialized messages to a bag; use it in a ``with``.
 
     It gets its name when it is finished. Until then it grows in a folder beside it that ends in
     ``.unfinished``; what a killed run left there neither blocks the next one nor is lost.

@@ -36,7 +36,7 @@ _TIME_OFFSET: Final = 14
 
 
 class CaptureError(ValueError):
-    """A file that is no capture, or one that cannot be used; the message says why."""
+    """A file that is not a usable capture; the message says why."""
 
 
 def is_capture(start: bytes) -> bool:
@@ -80,7 +80,7 @@ class _CutOffError(Exception):
 
 
 class PacketReader:
-    """Iterates over the packets of a file from where it stands.
+    """Iterates over the packets of a file from its present position.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ class PacketReader:
 
 
 class _Interface(NamedTuple):
-    """Where packets of a pcapng file came from, and what its times count."""
+    """An interface of a pcapng file: link type and time resolution."""
 
     link: int
     ticks_per_s: int
@@ -338,7 +338,7 @@ class CaptureReader:
 
 
 class CaptureWriter:
-    """Writes datagrams into a pcap file that every tool opens.
+    """Writes datagrams to a standard pcap file.
 
     Ethernet, IPv4 and UDP headers are made up around them, with right lengths and checksums.
 

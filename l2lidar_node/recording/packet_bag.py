@@ -1,4 +1,4 @@
-"""Raw packets in bags: messages whose data are small captures, read again as one capture.
+"""Raw packets in bags: messages that contain small captures, read as one capture.
 
 The driver's packet topic carries ``std_msgs/UInt8MultiArray``. The data of each message are a
 whole pcap file of a twentieth of a second, written by the same code as a capture on disk: so what
@@ -27,7 +27,7 @@ _LARGEST: Final = 60_000  # [B]; one datagram of UDP
 
 
 class PacketBatch:
-    """Collects what a session's tap hears into small captures.
+    """Collects what a session's tap receives into small captures.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Recordings of one L2: what it sent, what was sent to it, and when; and their replay.
+"""Recordings of one L2 and their replay: data and commands with their times.
 
 A recording runs through a driver at once (:func:`events`) or at its own pace in a thread
 (:class:`Playback`).
@@ -83,7 +83,7 @@ class Received(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """A command that went to the device, and when."""
+    """A command that was sent to the device, and when."""
 
     command: Command
     time: HostNs
@@ -96,7 +96,7 @@ class Waited(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """By how much the host's clock was set [ns], and the instant at which the driver was told."""
+    """Step of the host's clock [ns], and the time at which the driver was told."""
 
     by_ns: int
     time: HostNs
@@ -113,7 +113,7 @@ Entry = Received | Sent | Waited | Stepped | Slewed
 
 
 class Recording:
-    """What a capture holds of one L2.
+    """The part of a capture that belongs to one L2.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ _FLUSH_NS: Final = 1_000_000_000  # so much at most is lost when the process is 
 
 
 class Recorder:
-    """A session's tap that writes a pcap file as it goes.
+    """A session's tap that writes a pcap file continuously.
 
     Parameters
     ----------
@@ -480,11 +480,12 @@ def shifted(event: Event, by_ns: int) -> Event:
 
 
 class NoTransport:
-    """Stands for the transport that a recording has not."""
+    """Transport of a recording, which has none."""
 
     foreign = 0
     stranger = ""
     kernel_drops = 0
+    send_errors = 0
 
     def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
         """Return nothing."""

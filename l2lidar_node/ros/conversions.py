@@ -1,4 +1,4 @@
-"""Turns plain values into ROS messages and back; changes units and order, nothing else.
+"""Conversions between plain values and ROS messages.
 
 Clouds and IMU samples are published hundreds of times a second, so both are made as serialized
 (CDR) messages: a template lets rclpy serialize one message and then only replaces what changes.
@@ -31,7 +31,8 @@ NS: Final = 1_000_000_000
 _FIRST_S: Final = FIRST_STAMP // NS
 _LAST_S: Final = LAST_STAMP // NS
 _STAMP_AT: Final = 4  # in a serialized message, after its encapsulation
-_STAMP: Final = struct.Struct("<iI")
+STAMP: Final = struct.Struct("<iI")
+"""A stamp in a serialized message: seconds, nanoseconds."""
 _QUATERNION: Final = struct.Struct("<4d")
 _VECTOR: Final = struct.Struct("<3d")
 
@@ -118,7 +119,7 @@ class CloudTemplate:
         data = serialize_message(message)
         before, rest = _split(data, struct.pack("<I", message.width))
         self._between, _ = _split(rest, struct.pack("<I", message.row_step))
-        self._encapsulation, self._before = before[:_STAMP_AT], before[_STAMP_AT + _STAMP.size :]
+        self._encapsulation, self._before = before[:_STAMP_AT], before[_STAMP_AT + STAMP.size :]
 
     def serialize(self, points: NDArray[np.void], stamp: HostNs) -> bytes:
         """Return the CDR message of finite points, shape (N,), of this template's layout."""
@@ -137,7 +138,7 @@ class CloudTemplate:
         return b"".join(
             (
                 self._encapsulation,
-                _STAMP.pack(*split_stamp(stamp)),
+                STAMP.pack(*split_stamp(stamp)),
                 self._before,
                 struct.pack("<I", count),
                 self._between,
@@ -176,7 +177,7 @@ class ImuTemplate:
         data = serialize_message(message)
         slots = [data.index(struct.pack("<d", value)) for value in self._SLOTS]
         sizes = (_QUATERNION.size, _VECTOR.size, _VECTOR.size)
-        begins = [_STAMP_AT + _STAMP.size, *(at + n for at, n in zip(slots, sizes, strict=True))]
+        begins = [_STAMP_AT + STAMP.size, *(at + n for at, n in zip(slots, sizes, strict=True))]
         # What never changes: the encapsulation, and what stands before, between and behind.
         self._constant = (
             data[:_STAMP_AT],

@@ -1,4 +1,4 @@
-"""Publishes the health of the device once a second, and what it is once it is known.
+"""Publishes diagnostics of the device once a second, and its metadata on change.
 
 With ``imu_adjust`` the points are turned upright but stay in the cloud frame. TF then applies the
 mount a second time: right only where the mount does not tilt the sensor.
@@ -34,7 +34,7 @@ MAX_TILT_DEG: Final = 2.0
 
 
 class MountMonitor:
-    """Follows the static transforms above a cloud frame.
+    """Monitors the static transforms above a cloud frame.
 
     Parameters
     ----------

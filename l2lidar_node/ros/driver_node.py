@@ -1,4 +1,4 @@
-"""The driver as a ROS 2 node: reads parameters, runs the session, publishes what it hands out."""
+"""Driver node: reads parameters, runs the session, publishes its events."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _DEPTH = 100  # 5 s: a recorder that finds the driver within that has all from i
 
 
 class PacketPublisher:
-    """A session's tap that publishes what it hears, a twentieth of a second per message.
+    """A session's tap that publishes raw packets, 50 ms per message.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the launch files share: parameters from arguments, files that exist, required nodes."""
+"""Helpers of the launch files: parameters from arguments, file checks, required nodes."""
 
 from __future__ import annotations
 

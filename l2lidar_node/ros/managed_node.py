@@ -1,4 +1,4 @@
-"""A managed node: a life cycle of states (https://design.ros2.org/articles/node_lifecycle.html).
+"""Managed node (https://design.ros2.org/articles/node_lifecycle.html).
 
 A manager, or ``ros2 lifecycle``, configures, activates, deactivates and cleans it up. With
 ``autostart``, the default, it is active as soon as it is made: a plain node to whoever does not
@@ -43,7 +43,7 @@ _DESTROYING: Final = frozenset(  # the services that set_up created
 
 
 class NextTurn:
-    """Awaitable that lets the executor do what else there is to do, once."""
+    """Awaitable that yields to the executor once."""
 
     def __await__(self) -> Generator[None, None, None]:
         """Yield to the executor."""
@@ -51,7 +51,7 @@ class NextTurn:
 
 
 class ManagedNode(LifecycleNode):
-    """Base of the nodes: a subclass says what each transition does.
+    """Base class of the nodes; a subclass implements each transition.
 
     Whatever ROS entities :meth:`set_up` and :meth:`begin` create are destroyed by the transition
     that undoes them; a subclass only gives up what else it holds.

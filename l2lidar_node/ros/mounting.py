@@ -1,4 +1,4 @@
-"""How a cloud's frame is mounted: static frames, and whether the driver levels its clouds."""
+"""Mount of a cloud's frame: static transforms, and the driver's imu_adjust."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ _PARAMETER: Final = "imu_adjust"  # of this driver, and of upstream's
 
 
 class ImuAdjustClient:
-    """Asks every publisher of a topic, again and again, as publishers come and go.
+    """Queries imu_adjust of every publisher of a topic, repeatedly.
 
     Parameters
     ----------

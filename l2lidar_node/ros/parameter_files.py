@@ -1,4 +1,4 @@
-"""Reads what a ROS parameter file says to one node, under whatever name that node runs."""
+"""Reads the parameters of one node from a ROS parameter file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ G = TypeVar("G")
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML as ROS reads it: 2e-07 is a number, which for PyYAML it is only with a point in it."""
+    """YAML as ROS reads it: 2e-07 is a number (for PyYAML only 2.0e-07 is)."""
 
 
 _Loader.add_implicit_resolver(

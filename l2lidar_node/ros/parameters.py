@@ -1,4 +1,4 @@
-"""Declares a group of settings as ROS parameters and follows their changes; names none itself."""
+"""Declares a group of settings as ROS parameters and follows their changes."""
 
 from __future__ import annotations
 

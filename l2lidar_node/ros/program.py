@@ -1,4 +1,4 @@
-"""Runs a node as a program: middleware, command line, spinning, signals, exit code.
+"""Runs a node as a program: middleware, command line, executor, signals, exit code.
 
 Fast DDS hands messages to subscribers on the same host through 512 kB of shared memory. A cloud
 takes 365 kB of it until every subscriber has read it: if one is held up for an instant, the next
@@ -133,7 +133,7 @@ def _is_node(entry: object) -> bool:
 
 
 class StartError(RuntimeError):
-    """What a node needs is not to be had, or no longer; the message says what."""
+    """A resource that a node needs is missing; the message says which."""
 
 
 def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> int:

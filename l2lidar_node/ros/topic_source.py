@@ -1,4 +1,4 @@
-"""Live topics for the command line: gathered to be checked, or shown in the viewer."""
+"""Live topics for the command line, for the check or the viewer."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _found(node: Node, asked: Topics, needs_imu: bool) -> Topics:
 
 
 class _Ear:
-    """Hears topics and notes when each message came, however late this program gets to it."""
+    """Subscribes to topics and notes the arrival time of each message."""
 
     def __init__(self, node: Node, topics: Topics, gathering: Gathering) -> None:
         # Best effort takes from every publisher, and deep queues lose nothing of what comes.
@@ -150,7 +150,7 @@ def _offers(node: Node, topic: str) -> tuple[Qos, ...]:
 
 
 class ViewerNode(Node):
-    """Hands every message to the viewer.
+    """Passes every message to the viewer.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Names the topics of a launch as they are without a namespace; in one, they follow it."""
+"""Topic names of the launch files, without a namespace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The clock of this host, and when somebody set it."""
+"""Clock of this host, and detection of its steps and slewing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SLEW_SURE_NS: Final = 10_000  # to which slewing is read, at worst
 
 
 class HostClock:
-    """The clock that arrivals are told in, CLOCK_REALTIME.
+    """The clock of arrival times, CLOCK_REALTIME.
 
     People and time servers set it, nobody sets CLOCK_BOOTTIME. Both run at the same rate, even
     while time servers adjust it and while the host is suspended, so their difference changes only

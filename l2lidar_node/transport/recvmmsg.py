@@ -1,4 +1,4 @@
-"""Takes many datagrams in one system call, recvmmsg(2), with the kernel's arrival times.
+"""Reads many datagrams in one system call, recvmmsg(2), with the kernel's arrival times.
 
 Python's socket module takes one datagram in a call and raises when there is no more. A driver
 that looks at its socket hundreds of times a second spends more on that than on the datagrams.
@@ -39,7 +39,7 @@ _recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int
 
 
 class DatagramReader:
-    """Takes one sender's datagrams from a UDP socket.
+    """Reads one sender's datagrams from a UDP socket.
 
     Parameters
     ----------

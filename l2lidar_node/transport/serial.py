@@ -1,4 +1,4 @@
-"""The serial line: 4 Mbaud, 8N1, raw; read by a thread of its own, so that nothing overflows."""
+"""Serial line: 4 Mbaud, 8N1, raw; read by its own thread, so that nothing overflows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A thread that runs a driver on a transport; the only one that touches either."""
+"""Session: the thread that runs a driver on a transport."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ _TICK_NS: Final = round(TICK_S * 1e9)
 
 
 class Tap(Protocol):
-    """Somebody who notes everything that a driver's output depends on, in order."""
+    """Receives everything that a driver's output depends on, in order."""
 
     def received(self, data: bytes, arrival: HostNs) -> None:
         """Take note of bytes that are handed to the driver."""
@@ -181,7 +181,7 @@ class Tap(Protocol):
 
 
 class Taps:
-    """Several taps that are told the same.
+    """Several taps that receive the same.
 
     Parameters
     ----------

@@ -41,11 +41,11 @@ _WHOLE: Final = 0xFFFF_FFFF
 
 
 class TransportError(OSError):
-    """The network cannot be used as asked; the message says what to do."""
+    """The network cannot be used as configured; the message says what to do."""
 
 
 class UdpTransport:
-    """A UDP socket that hears one device.
+    """A UDP socket that receives from one device.
 
     The source address counts, not the port: that of a unit may differ from ``l2_port``. Datagrams
     of other senders are read and counted. While there are more than :data:`FLOOD_HZ` of them the

@@ -1,4 +1,4 @@
-"""Moves every point of a sweep to where a sensor standing still would have seen it."""
+"""Deskew: moves every point of a sweep to the pose at one instant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filters: which points to keep; and points laid out as an image.
+"""Point filters, and organized clouds.
 
 The L2 measures along a line: 300 slots of one packet follow each other 8 us and 0.6 degrees apart,
 then comes the dark half of the mirror's turn. The next line is 7 degrees away, so in space even
@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 
 class FilterError(ValueError):
-    """A filter that cannot work on these points; the message says which and why."""
+    """A filter cannot work on these points; the message says which and why."""
 
 
 _LONGEST_SLOT_S: Final = 1e-4

@@ -1,4 +1,4 @@
-"""Takes sweeps, IMU samples and velocities as they come and gives deskewed, filtered clouds.
+"""Deskew pipeline: sweeps, IMU samples and velocities in, deskewed and filtered clouds out.
 
 Composes sequencer, tracker, filters and deskew; node, offline tool and tests all use this. A
 :class:`~l2lidar_node.types.Check` says in words and figures how it is doing.
@@ -32,7 +32,7 @@ _MS: Final = 1_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deskewed:
-    """A sweep as seen from one instant.
+    """A deskewed and filtered sweep.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Deskewed:
 
 @dataclass(frozen=True, slots=True)
 class PipelineCounts:
-    """What went through since the start.
+    """Counts since the start.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class PipelineCounts:
 
 
 class Pipeline:
-    """Everything between messages and messages.
+    """Sequencer, tracker, deskew and filters.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Rotation, time offset, scale and bias of a gyro, from how the poses of an odometry turn.
+"""Gyro alignment: rotation, time offset, scale and bias from the poses of an odometry.
 
 A gyro with the rotation R in the cloud frame measures ``m = (I + E) R^T w + b`` of the cloud
 frame's angular velocity w, E symmetric: scale on its diagonal, misalignment beside it. What is
@@ -101,7 +101,7 @@ class GyroModel:
 
 
 class Turns(NamedTuple):
-    """How poses turn against the gyro between them, one row for each interval.
+    """Rotation of poses against the gyro, one row for each interval.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class Turns(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroAlignment:
-    """What the motion tells about a gyro.
+    """Result of a gyro alignment.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""IMU buffer: the recent samples in order of time, whatever order and state they arrive in.
+"""IMU buffer: recent samples in time order, and the sequencer of sweeps.
 
 :class:`Sequencer` holds sweeps until samples cover their end, or their time is up.
 """
@@ -35,7 +35,7 @@ def earlier(samples: Samples, by_ms: float) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class ImuCounts:
-    """Counts of what has come into a buffer since it was made.
+    """Counts of samples since the buffer was created.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class ImuBuffer:
 
 
 class Reason(Enum):
-    """Why a sweep goes on."""
+    """Why a sweep was released."""
 
     COVERED = "IMU samples cover it"
     WAITED = "it waited long enough"
@@ -228,7 +228,7 @@ class Reason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """A sweep that waits no longer.
+    """A released sweep.
 
     Attributes
     ----------
@@ -244,7 +244,7 @@ class Release:
 
 
 class Sequencer:
-    """First in, first out; nothing is lost.
+    """Holds sweeps until IMU samples cover them; first in, first out.
 
     Parameters
     ----------

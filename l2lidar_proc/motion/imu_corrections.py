@@ -1,4 +1,4 @@
-"""What is corrected in IMU samples: unit and sign, rotation, delay of stamps, gyro scale.
+"""Corrections of IMU samples: unit and sign, rotation, delay of stamps, gyro scale.
 
 :class:`ImuConvention` recognizes accelerometers that measure in g, or with the opposite sign.
 :class:`ImuExtrinsics` is what a calibration file and the settings say of an IMU beside its place.
@@ -35,7 +35,7 @@ _SHORTEST_NS: Final = 190_000_000
 
 
 class ImuConvention:
-    """Brings samples to m/s^2 and to specific force: +9.8 upwards at rest, as REP 145 has it.
+    """Converts samples to m/s^2 and specific force (+9.8 upwards at rest, REP 145).
 
     The unit is told from the norm of the first samples. The sign can only be told from motion:
     how the poses of the odometry bend says which way the sensor was accelerated.
@@ -169,7 +169,7 @@ class ImuConvention:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuExtrinsics:
-    """How samples and mount of an IMU are put right before anything is computed with them.
+    """Corrections of an IMU's samples and mount.
 
     Attributes
     ----------

@@ -245,7 +245,7 @@ def _matches(values: F64, mean: F64, spread: F64, floor: float) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialState:
-    """State before anything but the IMU has been seen.
+    """State from IMU samples alone.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Motion of a sweep: poses at knots of time, the filter's state and the samples around it.
+"""Motion of a sweep: poses at knots of time, filter state and IMU samples.
 
 A trajectory is continuous between its knots: poses of the cloud frame within the sweep.
 """

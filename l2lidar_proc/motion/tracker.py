@@ -20,7 +20,7 @@ from l2lidar_proc.motion.twist_filter import TwistFilter
 
 
 class Flag(Enum):
-    """What was short of ideal about a sweep."""
+    """Problems with the motion of a sweep."""
 
     NO_IMU = "no IMU samples near the sweep, so it is passed on as it came"
     IMU_ENDS_EARLY = "IMU samples do not reach the end of the sweep"
@@ -79,7 +79,7 @@ _LONGEST_MOTION_NS: Final = 2_000_000_000  # between two sweeps that follow each
 
 
 class KnownMotion(NamedTuple):
-    """Motion of a sweep that an odometry in the same process has estimated.
+    """Motion of a sweep, estimated by an odometry in the same process.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class KnownMotion(NamedTuple):
 
 
 class MotionTracker:
-    """IMU buffer, static detector and error-state filter, asked together.
+    """IMU buffer, static detector and error-state filter.
 
     Deskew without odometry is this filter with updates from twists, or with none.
 

@@ -50,7 +50,7 @@ from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """What an alignment found.
+    """Result of an alignment.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ _STEPS: Final = (tuning.WEAK_STEP, -tuning.WEAK_STEP)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeakDirections:
-    """Directions of the pose about which a sweep says less than its points claim.
+    """Directions of the pose that a sweep constrains less than its points suggest.
 
     Attributes
     ----------

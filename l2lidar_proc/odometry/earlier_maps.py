@@ -1,4 +1,4 @@
-"""Earlier maps: kept when the odometry is lost, and searched until one is seen again.
+"""Earlier maps: kept when the odometry is lost, and searched until one is matched again.
 
 A map begun after a loss lies in the odometry frame where the prediction had come to, and stays as
 uncertain as that for good. When a sweep meets an earlier map, the odometry goes on in that one
@@ -63,7 +63,7 @@ class Return:
 
 
 class EarlierMaps:
-    """The maps of the latest losses, oldest first; no more than a few."""
+    """The maps of the last losses, oldest first."""
 
     def __init__(self) -> None:
         self._maps: list[EarlierMap] = []

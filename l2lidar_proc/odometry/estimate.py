@@ -1,4 +1,4 @@
-"""The estimate of one sweep: its pose, its quality, and the same for the robot's base frame."""
+"""Estimate of one sweep: pose, quality, and the motion of the base frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
 
 
 class Status(Enum):
-    """What is remarkable about an estimate; the value is for people."""
+    """Status of an estimate; the value is its description."""
 
     STARTING = "the map began with this sweep"
     PREDICTED = "not aligned with the map: the pose is predicted"
@@ -47,7 +47,7 @@ DOUBTFUL: Final = frozenset({Status.SUSPECT, Status.LOST, Status.RESTARTED})
 
 @dataclass(frozen=True, slots=True)
 class AlignmentQuality:
-    """How well a sweep could be aligned.
+    """Quality of an alignment.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class AlignmentQuality:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryEstimate:
-    """Where the sensor was at one instant, and how it moved.
+    """Pose and motion of the sensor at one instant.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ class BaseMotion:
 
 
 class BaseFrame:
-    """The base frame on the sensor; the odometry frame begins below its first place, yaw 0.
+    """The base frame; the odometry frame begins at its first position, yaw 0.
 
     Parameters
     ----------

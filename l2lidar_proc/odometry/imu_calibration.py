@@ -1,4 +1,4 @@
-"""Calibration of the IMU against the odometry: the gyro should turn as the clouds do.
+"""Calibration of the IMU against the odometry, by comparing rotations.
 
 :func:`calibrate` runs the odometry over a recording, each time with what is known of the IMU so
 far: a rotation or a delay of the samples that deskew a sweep moves its pose a little.
@@ -114,7 +114,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuResult:
-    """What a motion tells about an IMU.
+    """Result of an IMU calibration.
 
     Attributes
     ----------
@@ -446,7 +446,7 @@ def _notes(items: dict[str, Estimate], found: GyroAlignment) -> list[str]:
 
 
 class ExtrinsicCheck:
-    """Compares poses with the gyro, part by part of the way.
+    """Compares poses with the gyro, segment by segment.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""KISS-ICP's parts for the odometry, and KISS-ICP as it is; the only importer of kiss_icp.
+"""KISS-ICP's parts for the odometry, and unmodified KISS-ICP; the only importer of kiss_icp.
 
 It is imported where it is first used: its configuration takes longer than a node may to start.
 kiss_icp ends the whole process, without an exception, on constant times and on clouds of one
@@ -48,7 +48,7 @@ def kiss_config(config: OdometryConfig) -> KISSConfig:
 
 
 class _Parts(NamedTuple):
-    """What KISS-ICP consists of; kiss_icp has no types."""
+    """The parts of KISS-ICP; kiss_icp has no types."""
 
     map: Any
     registration: Any
@@ -130,7 +130,7 @@ class KissMatcher:
 
 
 class PlainKiss:
-    """KISS-ICP as it is: its own deskew and prediction, no IMU.
+    """Unmodified KISS-ICP: its own deskew and prediction, no IMU.
 
     Parameters
     ----------

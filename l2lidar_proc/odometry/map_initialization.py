@@ -27,7 +27,7 @@ from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
 
 class Trial(NamedTuple):
-    """Outcome of one way to begin the map.
+    """Result of one attempt to begin the map.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ from l2lidar_proc.odometry.uncertainty import MapDrift
 
 
 class Match(NamedTuple):
-    """What came of matching a sweep with the map.
+    """Result of matching a sweep with the map.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Takes sweeps and IMU samples as they come and gives estimates; node and offline tool use it."""
+"""Odometry pipeline: sweeps and IMU samples in, estimates out, for node and command line."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SERIOUS: Final = {
 
 
 class OdometryPipeline:
-    """Sequencer and odometry, and what they have said so far.
+    """Sequencer and odometry, with trajectory and counts.
 
     Parameters
     ----------

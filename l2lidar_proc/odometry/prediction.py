@@ -36,7 +36,7 @@ _MAX_GAP_NS: Final = 50_000_000  # the default of imu_gap_ms: beyond it the rate
 
 
 class Predictor:
-    """Holds the latest IMU samples and carries states along them.
+    """Holds the latest IMU samples and propagates states along them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Keeps the map of small surfaces: points binned into cells, a plane fitted to each cell.
+"""Surfel map: points binned into cells, a plane fitted to each cell.
 
 A surface averages the range noise of every point that ever fell into its cell, which
 nearest-neighbor methods cannot do. Cells come in several sizes; the finest flat one speaks for a

@@ -1,4 +1,4 @@
-"""Uncertainty beyond the filter's own: of the map, of its place, and of the noise assumed.
+"""Uncertainty beyond the filter's: of the map, of its frame, and of the assumed noise.
 
 :class:`MapDrift`: what a sweep adds to the map carries the error of the pose that added it. A
 sweep that is aligned with what the last few sweeps have put into the map learns where it is
@@ -37,7 +37,7 @@ _VELOCITY: Final = slice(VELOCITY.start - POSE.start, VELOCITY.stop - POSE.start
 
 
 class MapDrift:
-    """How wrong the map may be where it is in use, as a small move of the whole map.
+    """Uncertainty of the map in use, as a small motion of the whole map.
 
     Covariances (6, 6) are of a shift and a turn of the map about its origin [m, rad], in its axes.
     """
@@ -206,7 +206,7 @@ def _carried(place: F64) -> F64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameJump:
-    """How wrong the map's place in the odometry frame may be; nothing at the beginning.
+    """Uncertainty of the map's pose in the odometry frame; zero at the beginning.
 
     Alignment with the map cannot tell, so this stays for good.
 
@@ -260,7 +260,7 @@ class _Correction(NamedTuple):
 
 
 class InnovationTest:
-    """Compares the corrections of the last seconds with their covariances."""
+    """Compares the innovations of the last seconds with their covariances."""
 
     def __init__(self) -> None:
         self._recent: deque[_Correction] = deque()

@@ -1,4 +1,4 @@
-"""Turns the messages of a recording into plain values; needs rosbags, not ROS."""
+"""Converts the messages of a recording to plain values; needs rosbags, not ROS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectories and maps as files that others read."""
+"""Trajectories and maps as files for other programs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.files import whole
+from l2lidar_node.recording.tum import pose_array, render
 from l2lidar_node.types import F64, HostNs
 
 STAMPED_POSE: Final = np.dtype([("stamp", "<i8"), ("pose", "<f8", (4, 4))])
@@ -20,7 +21,7 @@ StampedPoses = NDArray[np.void]
 
 
 class Trajectory:
-    """Poses of days, as they come."""
+    """A growing array of stamped poses."""
 
     def __init__(self) -> None:
         self._rows = np.empty(256, STAMPED_POSE)
@@ -28,7 +29,7 @@ class Trajectory:
 
     @property
     def poses(self) -> StampedPoses:
-        """All of them, shape (N,); a view."""
+        """All poses, shape (N,); a view."""
         return self._rows[: self._count]
 
     def append(self, stamp: HostNs, pose: F64) -> None:
@@ -41,14 +42,9 @@ class Trajectory:
 
 def tum(poses: StampedPoses) -> str:
     """Return the lines of a TUM file: seconds, x, y, z, then the quaternion as x, y, z, w."""
-    lines = []
-    for stamp, pose in zip(poses["stamp"].tolist(), poses["pose"], strict=True):
-        seconds, rest = divmod(stamp, 1_000_000_000)
-        w, x, y, z = rotations.from_matrix(pose[:3, :3]).tolist()
-        numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3].tolist(), x, y, z, w))
-        # not through a float: seconds since 1970 would lose the last hundreds of nanoseconds
-        lines.append(f"{seconds}.{rest:09d} {numbers}\n")
-    return "".join(lines)
+    pose = poses["pose"]
+    quaternions = [rotations.from_matrix(one) for one in pose[:, :3, :3]]
+    return render(pose_array(poses["stamp"], pose[:, :3, 3], np.reshape(quaternions, (-1, 4))))
 
 
 def kitti(poses: StampedPoses) -> str:

@@ -1,4 +1,4 @@
-"""Deskew and odometry in one process: each cloud and sample is received, parsed and deskewed once.
+"""Companion node: deskew and odometry in one process, with shared subscriptions.
 
 Both nodes keep their names, parameters, topics and services.
 """

@@ -1,4 +1,4 @@
-"""Deskew and filters as a ROS 2 node: converts messages, calls the pipeline, publishes."""
+"""Deskew node: converts messages, calls the pipeline, publishes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 class ScanPublisher:
-    """The scan's topic, and where its frame is gravity's, the transform to that.
+    """Publishes the laser scan, and the transform to its level frame.
 
     Parameters
     ----------

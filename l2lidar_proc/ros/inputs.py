@@ -1,4 +1,4 @@
-"""Input monitor: names what is wrong with the messages on a node's input topics."""
+"""Input monitor: reports problems with the messages on a node's input topics."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 class FollowedFrame:
-    """The frame in which a node takes the messages of a topic.
+    """The frame in which a node accepts the messages of a topic.
 
     Messages of two sensors on one topic cannot be told apart but by their frames. The node stays
     with the first frame until that one has been silent for half a second.
@@ -56,7 +56,7 @@ class FollowedFrame:
 
 
 class InputMonitor:
-    """Judges what comes in, between two looks of the diagnostics.
+    """Checks the input between two diagnostics.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Publishes the transform from the odometry frame to the map, again and again."""
+"""Publishes the transform from the odometry frame to the map periodically."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def reach(stamp: HostNs, waited_ns: int, transforms_until: int) -> int:
 
 
 class Blend:
-    """Lets a transform follow its corrections over some time instead of at once."""
+    """Blends corrections of a transform over some time."""
 
     def __init__(self) -> None:
         self._from: F64 | None = None

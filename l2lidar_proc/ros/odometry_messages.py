@@ -1,4 +1,4 @@
-"""Turns what the odometry says into messages."""
+"""Conversions of odometry estimates to ROS messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
 from l2lidar_node import rotations
-from l2lidar_node.ros.conversions import diagnostic_status, to_time
+from l2lidar_node.ros.conversions import STAMP, diagnostic_status, to_time
 from l2lidar_node.types import F64, Check, HostNs, Level, split_stamp
 from l2lidar_proc.odometry.estimate import BaseMotion, OdometryEstimate, Status
 
@@ -26,10 +26,8 @@ UNKNOWN_VARIANCE: Final = 9999.0
 """What rtabmap takes for a pose or velocity that is not known."""
 
 _STAMP_AT: Final = 8  # behind the encapsulation and the number of transforms
-_STAMP: Final = struct.Struct("<iI")
-_TRANSFORM: Final = struct.Struct(
-    "<7d"
-)  # translation, then rotation x, y, z, w: the message's end
+# translation, then rotation x, y, z, w; the end of the message
+_TRANSFORM: Final = struct.Struct("<7d")
 
 XYZ: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
@@ -135,7 +133,7 @@ def transform(matrix: F64, stamp: HostNs, parent: str, child: str) -> bytes:
     before, between = _transform_layout(parent, child)
     w, x, y, z = rotations.from_matrix(matrix[:3, :3]).tolist()
     numbers = _TRANSFORM.pack(*matrix[:3, 3].tolist(), x, y, z, w)
-    return b"".join((before, _STAMP.pack(*split_stamp(stamp)), between, numbers))
+    return b"".join((before, STAMP.pack(*split_stamp(stamp)), between, numbers))
 
 
 @lru_cache(maxsize=16)
@@ -144,7 +142,7 @@ def _transform_layout(parent: str, child: str) -> tuple[bytes, bytes]:
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     data = serialize_message(TFMessage(transforms=[message]))
-    return data[:_STAMP_AT], data[_STAMP_AT + _STAMP.size : -_TRANSFORM.size]
+    return data[:_STAMP_AT], data[_STAMP_AT + STAMP.size : -_TRANSFORM.size]
 
 
 def pose(matrix: F64) -> Pose:

@@ -1,4 +1,4 @@
-"""Odometry as a ROS 2 node: converts messages, calls the pipeline, publishes."""
+"""Odometry node: converts messages, calls the pipeline, publishes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _PATH_STEP = (0.05, np.radians(5.0))  # [m, rad] between poses of the path
 
 
 class OdometryNode(ManagedNode):
-    """Publishes where the sensor, or what carries it, is.
+    """Publishes the pose of the sensor or of its carrier.
 
     Raises
     ------

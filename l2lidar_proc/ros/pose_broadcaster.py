@@ -1,4 +1,4 @@
-"""Publishes poses: one for each sweep, and between them those that the IMU carries on.
+"""Publishes poses of sweeps, and poses propagated by the IMU between them.
 
 Registering a sweep takes 50 ms, on a small computer 150. A controller wants a pose every 20 ms
 all the while, so these come from the thread that takes the IMU's messages.
@@ -28,7 +28,7 @@ _MOST_SAMPLES: Final = 250  # of a batch, whatever their stamps are
 
 
 class PoseBroadcaster:
-    """Sends transforms and the fast odometry; every method may be called from any thread.
+    """Publishes transforms and the fast odometry; thread-safe.
 
     Parameters
     ----------

@@ -20,15 +20,12 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, PointCloud2
 
 from l2lidar_node.clouds import Field, points_of
-from l2lidar_node.ros.conversions import from_time
+from l2lidar_node.ros.conversions import NS, STAMP, from_time
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.motion.imu_buffer import Samples
 
-NS: Final = 1_000_000_000
-
 _LITTLE_ENDIAN: Final = b"\x00\x01"  # encapsulation of plain CDR; two bytes of options follow
 _BODY: Final = 4  # alignment counts from the end of the encapsulation
-_STAMP: Final = struct.Struct("<iI")
 _LENGTH: Final = struct.Struct("<I")
 _FRAME: Final = 12  # offset of the frame's length in the message
 _NUMBERS: Final = 37  # doubles of an Imu: quaternion, rate, force, and a covariance after each
@@ -36,7 +33,7 @@ _MAX_FIELDS: Final = 256
 
 
 class ImuBatch(NamedTuple):
-    """Samples of one frame, in the order of their arrival."""
+    """Samples of one frame in arrival order."""
 
     samples: Samples
     frame: str
@@ -126,7 +123,7 @@ def _imu_by_rclpy(message: bytes) -> ImuBatch | None:
 
 @dataclass(frozen=True, slots=True)
 class _CloudMessage:
-    """The parts of a PointCloud2 that its points are read from."""
+    """The parts of a PointCloud2 needed to read its points."""
 
     height: int
     width: int
@@ -155,7 +152,7 @@ def cloud(message: bytes) -> Cloud:
 def _parse_cloud(message: bytes) -> tuple[_CloudMessage, HostNs, str]:
     if message[:2] != _LITTLE_ENDIAN:
         raise struct.error("another encapsulation")
-    seconds, nanoseconds = _STAMP.unpack_from(message, 4)
+    seconds, nanoseconds = STAMP.unpack_from(message, 4)
     reader = _Reader(message, _FRAME)
     frame = reader.string()
     height, width, count = reader.number(), reader.number(), reader.number()
@@ -175,7 +172,7 @@ def _parse_cloud(message: bytes) -> tuple[_CloudMessage, HostNs, str]:
 
 
 class _Reader:
-    """Reads strings, numbers and bytes of a CDR body one after the other."""
+    """Reads strings, numbers and bytes of a CDR body in sequence."""
 
     def __init__(self, message: bytes, place: int) -> None:
         self._message = message

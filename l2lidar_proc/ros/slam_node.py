@@ -1,4 +1,4 @@
-"""SLAM as a ROS 2 node: pairs odometry with clouds, hands them to a worker, publishes TF."""
+"""SLAM node: pairs odometry with clouds, passes them to a worker, publishes TF."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class _Parts:
 
 
 class SlamNode(ManagedNode):
-    """Publishes where the odometry frame is in the map.
+    """Publishes the pose of the odometry frame in the map.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The thread in which slam_node does everything but listening and TF."""
+"""Worker thread of slam_node: everything except subscriptions and TF."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class Listener(Protocol):
 
 
 class NeverExecuted(CallbackGroup):
-    """Keeps what belongs to it out of the executor's wait set; its owner takes the messages."""
+    """Keeps its entities out of the executor's wait set; their owner takes the messages."""
 
     def can_execute(self, entity: Any) -> bool:
         """Return False."""

@@ -1,4 +1,4 @@
-"""Saved maps: a folder that is whole at every instant, with a checksum for each part.
+"""Saved maps: a folder that is consistent at every instant, with checksums.
 
 ``atlas.json`` names everything else and is replaced in one step, last. Other files carry their
 checksum in their name and never change, so that saving again writes only what is new, and a
@@ -47,7 +47,7 @@ class AtlasError(ValueError):
 
 
 class AtlasWriter:
-    """Saves a map into a folder, again and again.
+    """Saves a growing map to a folder.
 
     Parameters
     ----------

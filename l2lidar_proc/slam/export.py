@@ -1,4 +1,4 @@
-"""Maps as the files of other programs: g2o, TUM, KITTI, interactive_slam, QN, nav2, PLY, PCD."""
+"""Exports maps for other programs: g2o, TUM, KITTI, interactive_slam, QN, nav2, PLY, PCD."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Follows the places where the sensor may be, look after look, until only one is left.
+"""Pose hypotheses: tracks where the sensor may be until one hypothesis remains.
 
 Rooms look alike, but not in everything, and a wrong place has to go on being alike while the
 sensor moves. So places are not judged by one look: each is carried on by the odometry, and all of
@@ -48,7 +48,7 @@ _WINDOW: Final = Window(1.0, 0.4, np.radians(4.0))  # around a place, searched b
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """What was seen over a few meters, and from where in odom (4, 4)."""
+    """An observation over a few meters, and its pose in odom (4, 4)."""
 
     number: int
     origin: F64
@@ -57,7 +57,7 @@ class _Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Verdict:
-    """What a look says of a place: contradiction, things in the way if looked for, verified."""
+    """Score of a hypothesis by one observation: contradiction, obstruction, verification."""
 
     contradiction: float = _UNKNOWN
     obstructed: float | None = None
@@ -66,7 +66,7 @@ class _Verdict:
 
 @dataclass(slots=True, eq=False)
 class _Place:
-    """A place: ``T_map_odom``, and what the looks say of it, by number."""
+    """A hypothesis: ``T_map_odom``, and its scores by observation."""
 
     T_map_odom: F64
     verdicts: dict[int, _Verdict] = field(default_factory=dict)
@@ -82,7 +82,7 @@ class _Place:
 
 
 class PlaceHypotheses:
-    """The places that are followed, and the looks that they are held against.
+    """The hypotheses, and the observations they are compared with.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Localization in a saved map: searches for the place, then keeps it; the map stays as it is.
+"""Localization: searches for the pose in a saved map, then tracks it; the map is constant.
 
 What is estimated is ``T_map_odom`` with its covariance, all six components: the vertical of an
 odometry that began in motion is off by degrees. The covariance grows with the odometry's way and
@@ -50,7 +50,7 @@ _FEWEST_SWEEPS: Final = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """A place in the map that fitted.
+    """A pose in the map that fits.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Look:
 
 
 class Localizer:
-    """Finds and keeps the place in a saved map.
+    """Finds and tracks the pose in a saved map.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Loops: which places the pose graph says may be near, and which verified pairs are believed.
+"""Loops: candidates from the pose graph, and admission of verified pairs.
 
 What is between two nodes is the shortest way through the graph: the uncertainty of its edges, and
 the odometry's way along them, over which systematic drift adds up.
@@ -38,7 +38,7 @@ _TURN_PER_M: Final = np.radians(0.05) / 10.0  # systematic drift in yaw
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
-    """What the graph says of two nodes.
+    """Relation of two nodes in the graph.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Relation:
 
 
 class Graph:
-    """Shortest ways from one node to all others.
+    """Shortest paths from one node to all others.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ class Loop:
 
 
 class Admission:
-    """Loops that wait, loops in force, pairs that are barred.
+    """Pending loops, accepted loops, barred pairs.
 
     Parameters
     ----------

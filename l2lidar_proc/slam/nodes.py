@@ -1,4 +1,4 @@
-"""What the back end is given and keeps: sweeps, nodes, the map, its states."""
+"""Data of the back end: sweeps, nodes, the map, states."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _TURN_ARM_M = 0.5  # a turn counts like the way it makes at this distance
 
 
 class Health(Enum):
-    """What the odometry says of a sweep."""
+    """Status of a sweep by the odometry."""
 
     GOOD = "aligned"
     DEGENERATE = "aligned, but the scene does not constrain the pose in every direction"
@@ -43,7 +43,7 @@ class Health(Enum):
 
 
 class SlamState(Enum):
-    """Whether the pose in the map is known; the value is for people."""
+    """Whether the pose in the map is known; the value is its description."""
 
     SEARCHING = "the pose in the map is unknown and is searched for"
     TENTATIVE = "a pose fits: waiting until further matches agree"
@@ -54,7 +54,7 @@ class SlamState(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometrySweep:
-    """A deskewed sweep with its place in the odometry.
+    """A deskewed sweep with its odometry pose.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A submap that was closed, as other back ends want it.
+    """A finished submap, for other back ends.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ class Map:
 
 
 class OpenNode:
-    """A submap that still grows.
+    """A submap that is still growing.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Search for a place in the whole map when nothing is known of where the sensor is."""
+"""Global search for a place in the map, without an initial pose."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CELL_M: Final = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A place in the map that a query fits.
+    """A place in the map that matches a query.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Place search in plan: correlates bird's-eye images of upright structure by FFT.
+"""Place correlation: matches bird's-eye images of vertical structure by FFT.
 
 Gravity fixes roll and pitch, so a place has four unknowns. x, y and yaw come from here, the height
 and the verdict from registration.
@@ -28,7 +28,7 @@ _GLOBAL_YAWS: Final = 72
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where one structure lies on another.
+    """Pose of one structure on another.
 
     Attributes
     ----------

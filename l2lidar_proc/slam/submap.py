@@ -1,4 +1,4 @@
-"""Submaps: the points of a few meters of way, and what registration needs to know of them.
+"""Submaps: points over a few meters of travel, and the data that registration needs.
 
 A submap's frame stands at its first sweep with z up. It keeps one point per voxel as int16 steps
 of 2 mm and the number of the viewpoint that saw it: 7 bytes a point, +-65 m.
@@ -30,7 +30,7 @@ _HALF: Final = 1 << (BITS - 1)
 
 
 class SurfaceGrid:
-    """The flat surfaces of a map as it is now.
+    """The flat surfaces of a map.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ _COMPACT: Final = 200_000  # points after which an open submap is thinned
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Submap:
-    """Points of some meters of way.
+    """Points over a few meters of travel.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class Submap:
 
 
 class SubmapBuilder:
-    """Gathers the sweeps of a submap.
+    """Collects the sweeps of a submap.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ class SubmapBuilder:
 
 
 class SubmapView:
-    """What registration needs of a submap: surfaces, neighbors, free space, vertical structure.
+    """Registration data of a submap: surfaces, neighbors, free space, vertical structure.
 
     Parameters
     ----------

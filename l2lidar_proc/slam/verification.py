@@ -1,4 +1,4 @@
-"""Registers a submap against another one and decides whether they show the same place.
+"""Verification: registers two submaps and decides whether they show the same place.
 
 Point to plane against the target's surfaces, from many starts. A result counts only if the two
 submaps agree where they overlap, do not contradict each other's free space, fit both ways round,
@@ -63,7 +63,7 @@ REASONS: Final = ("overlap", "agreement", "free space", "one way", "ambiguous", 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """How far from a guess the truth may be.
+    """Search window around a guess.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How well a submap fits another one at some pose.
+    """Fit of two submaps at a pose.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ def verify(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """How two submaps fit where registration from one guess leads.
+    """Fit of two submaps after registration from one guess.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ def _things(marks: _Marks, target: SubmapView) -> float:
 
 
 class _Marks(NamedTuple):
-    """What the first points (N,) of a submap are at a pose in another one.
+    """Classification of a submap's points (N,) at a pose in another one.
 
     Attributes
     ----------

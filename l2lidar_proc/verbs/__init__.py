@@ -1,4 +1,4 @@
-"""Verbs that this package adds to the ``l2lidar`` command, by the entry points of setup.py."""
+"""Verbs that this package adds to the ``l2lidar`` command through entry points."""
 
 from typing import Final
 

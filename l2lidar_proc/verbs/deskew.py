@@ -1,4 +1,4 @@
-"""`l2lidar deskew`: the clouds of a recording, deskewed with the same code as the node."""
+"""`l2lidar deskew`: deskews the clouds of a recording with the node's code."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _END_NS: Final = 2**62
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """What to read.
+    """Topics to read.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Topics:
 
 
 class _Deskewer:
-    """Feeds the pipeline with the messages of a recording and writes what comes out."""
+    """Feeds the pipeline with the messages of a recording and writes its output."""
 
     def __init__(self, config: DeskewNodeConfig, topics: Topics, writer: bag.BagFile) -> None:
         self.pipeline = Pipeline(config.proc)

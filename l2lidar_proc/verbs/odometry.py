@@ -1,4 +1,4 @@
-"""`l2lidar odometry`: the trajectory of a recording, by the same code as the node."""
+"""`l2lidar odometry`: estimates the trajectory of a recording with the node's code."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryRun:
-    """What was found in a recording.
+    """Result of the odometry of a recording.
 
     Attributes
     ----------
@@ -324,7 +324,7 @@ def _imu_topic(kinds: dict[str, str], wanted: str, cloud: str) -> str:
 
 
 class _Listener:
-    """Turns messages into events, and takes the mounts from /tf_static.
+    """Converts messages to events, and reads the mounts from /tf_static.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""`l2lidar slam` and `l2lidar export`: a map of a recording, and maps as the files of others."""
+"""`l2lidar slam` and `l2lidar export`: builds a map of a recording, and exports maps."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The way to the host: ports, faults and damage."""
+"""The link to the host: ports and faults."""

@@ -1,4 +1,4 @@
-"""The way to the host and its faults: damaged, lost, late and reordered datagrams."""
+"""Faults of the link: damaged, lost, late and reordered datagrams."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ _HEAVY_LIMIT: Final = 5.0  # largest delay in units of that percentile
 
 
 class Stage(Protocol):
-    """Something that happens to datagrams."""
+    """A processing stage for datagrams."""
 
     def __call__(self, datagrams: Sequence[Datagram], now_ns: int) -> list[Datagram]:
         """Return what becomes of datagrams that come until ``now_ns``; none gets earlier."""
@@ -420,7 +420,7 @@ def is_silent(config: FaultConfig, since_power_on_ns: int) -> bool:
 
 
 class Path:
-    """Carries datagrams through stages and keeps those whose time has not come.
+    """Passes datagrams through the stages and holds those that are not due.
 
     Parameters
     ----------

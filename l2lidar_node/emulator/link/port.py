@@ -1,4 +1,4 @@
-"""Where the virtual unit is plugged in: a UDP socket, a serial device or a pseudo-terminal."""
+"""Ports of the virtual unit: UDP socket, serial device or pseudo-terminal."""
 
 from __future__ import annotations
 

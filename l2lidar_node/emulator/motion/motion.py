@@ -1,4 +1,4 @@
-"""Moves the sensor: pose, rates and accelerations at any instant, on a smooth curve.
+"""Motion of the sensor: pose, rates and accelerations on a smooth curve.
 
 Position and quaternion form one vector of seven numbers, interpolated by a spline over time, the
 quaternion then divided by its norm. With Q the spline's unnormalised
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.emulator.motion import tum
+from l2lidar_node.recording import tum
 from l2lidar_node.types import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ MOUNTS: Final[dict[str, tuple[float, float, float]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kinematics:
-    """How the cloud frame moves at N instants.
+    """Kinematics of the cloud frame at N instants.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ class Kinematics:
 
 
 class Motion:
-    """The sensor's way through the world.
+    """The sensor's trajectory through the world.
 
     The time line begins with a rest, then speeds up smoothly (three continuous derivatives) within
     ``ramp_s`` to the pace of the underlying curve. A periodic curve goes on for ever; any other

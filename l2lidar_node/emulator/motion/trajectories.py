@@ -1,4 +1,4 @@
-"""Built-in motions, and tours of a scene as robots and people make them."""
+"""Built-in motions, and tours of a scene in the style of robots and people."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ _HIT_RATE: Final = 500.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Style:
-    """How a tour is carried out.
+    """Style of a tour.
 
     Attributes
     ----------

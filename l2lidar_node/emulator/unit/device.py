@@ -1,4 +1,4 @@
-"""A virtual L2 without sockets or clocks: bytes and instants in, datagrams and instants out."""
+"""Virtual L2 without sockets or clocks: bytes and times in, datagrams and times out."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Link(Enum):
 
 
 class _Event(NamedTuple):
-    """Something that happens by itself."""
+    """A scheduled event."""
 
     time_ns: int
     fault: Fault

@@ -198,7 +198,7 @@ class Epoch(NamedTuple):
 
 
 class UnitClock:
-    """Tells what the unit's clock shows at a true instant.
+    """The unit's clock as a function of true time.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ class UnitClock:
 
 
 class PowerState(Enum):
-    """How far the unit has come since it booted."""
+    """Progress of the unit's start-up."""
 
     DEAF = "deaf"  # no link yet
     BOOTING = "booting"  # hears commands, has produced nothing yet
@@ -287,7 +287,7 @@ class PowerState(Enum):
 
 
 class Power:
-    """Knows since when the unit is on and from when on each stream flows.
+    """Power state: when the unit was switched on and when each stream starts.
 
     Attributes
     ----------
@@ -369,7 +369,7 @@ class Received(NamedTuple):
 
 
 class Inbox:
-    """Collects bytes until they make up packets; tail words but the end mark are ignored."""
+    """Assembles packets from bytes; ignores tail words except the end mark."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -435,7 +435,7 @@ Reply = tuple[PacketType, bytes]
 
 
 class Firmware:
-    """Everything about the unit but its measurements.
+    """The unit's firmware without its measurements.
 
     Parameters
     ----------

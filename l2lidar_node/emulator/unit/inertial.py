@@ -1,4 +1,4 @@
-"""Measures the motion as the L2's IMU does: rates, specific force and the onboard orientation."""
+"""IMU of the virtual L2: rates, specific force and the onboard orientation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BLOCK: Final = 50  # samples that share one generator
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuNoise:
-    """What is imperfect about the IMU; each effect is switched off alone by 0.
+    """Imperfections of the IMU; 0 switches an effect off.
 
     Published figures for the gyro at rest with the motors on range from 0.03 to 0.35 rad/s in all,
     with lines at the head's frequency and its double. The defaults are the lower end: about 0.04

@@ -1,4 +1,4 @@
-"""Decides what comes back from a ray: range noise, drop-outs, mixed pixels, intensity, limits.
+"""Returns of rays: range noise, drop-outs, mixed pixels, intensity, limits.
 
 Sizes are as measured on real recordings of the L2, see the constants.
 """
@@ -42,7 +42,7 @@ _PARTICLE_FARTHEST_M: Final = 12.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeNoise:
-    """What is imperfect about ranges; each effect is switched off alone by 0."""
+    """Imperfections of ranges; 0 switches an effect off."""
 
     range_noise: float = setting(1.0, "factor on the measured range noise", lo=0.0, hi=100.0)
     dropout: float = setting(1.0, "factor on the measured rate of drop-outs", lo=0.0, hi=20.0)

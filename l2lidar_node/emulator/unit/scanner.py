@@ -1,4 +1,4 @@
-"""The scanner: turns the head, casts the rays of each slot, fills the packets.
+"""Scanner: rotates the head, casts the rays of each slot, fills the packets.
 
 A :class:`View` is what a carrier leaves of them: sectors, cones, and the carrier's own body.
 """
@@ -26,7 +26,7 @@ from l2lidar_node.types import F64
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A window: nothing comes back from directions outside it.
+    """A field of view: there are no returns from outside it.
 
     Attributes
     ----------
@@ -222,7 +222,7 @@ WIDE_MARGIN_RAD: Final = np.deg2rad(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Consecutive packets and the truth about them.
+    """Consecutive packets and their truth.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Streams of measurements: where they come from, when they are due, how they leave.
+"""Measurement streams: sources, schedule and transmission.
 
 Without a world, for tests of load and clock, they come from a shell seen standing still.
 """
@@ -131,7 +131,7 @@ class InertialSource(Protocol):
 
 
 class Feed(NamedTuple):
-    """Where a stream's measurements come from.
+    """Source and schedule of a stream.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ class Due(NamedTuple):
 
 
 class MeasurementStream:
-    """Hands out the packets of one feed by the time at which they leave the unit.
+    """Yields the packets of one feed at the times at which they leave the unit.
 
     Parameters
     ----------
@@ -332,7 +332,7 @@ class Reply(NamedTuple):
 
 
 class Outbox:
-    """Makes datagrams of what is due, one packet each.
+    """Makes datagrams from due packets, one each.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Individual L2 units: calibration, speeds and limits, and what is wrong with each."""
+"""Individual L2 units: calibration, speeds, limits and errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _GREY: Final = 0.5  # reflectivity at which the range is right
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnitErrors:
-    """How a unit differs from what it reports; the default is a perfect unit.
+    """Differences of a unit from its reported calibration; none by default.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Builds houses to get lost in: a flat, a bare corridor, a hall, a stairwell, an atrium's lift.
+"""Buildings that are hard for odometry: flat, bare corridor, hall, stairwell, atrium.
 
 Each is drawn anew from a seed; the same seed gives the same building.
 """

@@ -1,4 +1,4 @@
-"""Builds the scenes for mapping: loops of tens to hundreds of meters, and places that look alike.
+"""Scenes for mapping: loops of tens to hundreds of meters, and look-alike places.
 
 Each comes with a way through it in three dimensions, since a ground z(x, y) cannot hold two
 storeys.
@@ -34,7 +34,7 @@ _ROUND_M: Final = 2.4  # of way over which a corner is rounded
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappingScene:
-    """A scene and a way through it.
+    """A scene and a path through it.
 
     Attributes
     ----------

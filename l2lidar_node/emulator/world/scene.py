@@ -1,4 +1,4 @@
-"""Scenes: triangles with reflectivity, the shapes they are built of, and room to move.
+"""Scenes: triangles with reflectivity, building blocks, and free paths.
 
 Every function returns an array of shape (T, 3, 3): T triangles, three corners each, x y z [m].
 """
@@ -112,7 +112,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Triangles, and a way through them that touches none.
+    """Triangles, and a collision-free path through them.
 
     Attributes
     ----------

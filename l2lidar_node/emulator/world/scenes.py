@@ -1,4 +1,4 @@
-"""The scenes that come with the emulator and their names: rooms, a corridor, a yard, woods.
+"""Built-in scenes and their names: rooms, a corridor, a yard, woods.
 
 The houses are in :mod:`~l2lidar_node.emulator.world.buildings`, what is mapped in
 :mod:`~l2lidar_node.emulator.world.mapping_scenes`.

@@ -1,4 +1,4 @@
-"""What a ray meets: triangles at rest, things that move, glass, mirrors, and people."""
+"""Ray casting: static triangles, moving bodies, glass, mirrors and people."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ _CULL_KNOTS: Final = 17
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mover:
-    """A rigid body on its way through the world.
+    """A rigid body that moves through the world.
 
     Attributes
     ----------

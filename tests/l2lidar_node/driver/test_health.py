@@ -21,6 +21,7 @@ class Link:
     foreign = 0
     stranger = ""
     kernel_drops = 0
+    send_errors = 0
 
 
 class Watched:
@@ -162,12 +163,13 @@ def test_damage_drops_and_foreigners_are_named() -> None:
     watched.run.hear(PacketType.POINTS_3D, build.points_3d(count=999))
     bad = build.frame(PacketType.ACK, build.ack(1))
     watched.run.driver.receive(bad[:20] + b"\xee\xee" + bad[22:], HostNs(watched.run.now))
-    watched.link.foreign, watched.link.kernel_drops = 3, 2
+    watched.link.foreign, watched.link.kernel_drops, watched.link.send_errors = 3, 2, 4
     check = watched.checks()["link"]
     assert check.level is Level.WARN
     assert check.message == (
         "2 damaged or impossible packets; 2 datagrams dropped by the kernel; raise "
-        "receive_buffer_bytes; 3 datagrams of other senders refused"
+        "receive_buffer_bytes; 4 commands could not be sent; check the cable and the network; "
+        "3 datagrams of other senders refused"
     )
     assert check.values["damaged: crc"] == check.values["rejected: 102.point_num"] == "1"
     watched.begin()

@@ -80,6 +80,7 @@ class VirtualHost:
     foreign = 0
     stranger = ""
     kernel_drops = 0
+    send_errors = 0
 
     def __init__(
         self,

@@ -23,12 +23,12 @@ import pytest
 
 from l2lidar_node.emulator.cli import main
 from l2lidar_node.emulator.config import DeviceConfig
-from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.physics import PhysicsConfig, RayCastWorker, assemble
 from l2lidar_node.emulator.truth import Fault, Results
 from l2lidar_node.emulator.unit.firmware import Flash
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import WorkMode
+from l2lidar_node.recording import tum
 from l2lidar_node.settings import build, settings_of
 from tests.l2lidar_node.emulator.rig import command, read
 from tests.support.processes import ended_with_the_test

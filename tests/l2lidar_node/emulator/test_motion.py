@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_node import rotations
 from l2lidar_node.emulator import truth
-from l2lidar_node.emulator.motion import trajectories, tum
+from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import (
     MOUNTS,
     Motion,
@@ -22,6 +22,7 @@ from l2lidar_node.emulator.motion.motion import (
 )
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
+from l2lidar_node.recording import tum
 from l2lidar_node.types import STANDARD_GRAVITY
 
 ROOM = scenes.make("room")

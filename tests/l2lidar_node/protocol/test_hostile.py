@@ -29,7 +29,7 @@ JUMPS_NS = [300_000_000, 10_000_000_000, -5_000_000_000, 60 * YEAR_NS, -60 * YEA
 class Link:
     """The counts of a transport."""
 
-    foreign = kernel_drops = 0
+    foreign = kernel_drops = send_errors = 0
     stranger = ""
 
 

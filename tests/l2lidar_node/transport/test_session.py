@@ -255,7 +255,7 @@ def test_a_receiver_that_fails_ends_the_session_and_says_why(device: socket.sock
 class Scripted:
     """A transport that hands out what it was given, then nothing."""
 
-    foreign = kernel_drops = 0
+    foreign = kernel_drops = send_errors = 0
     stranger = ""
 
     def __init__(self, *batches: list[Datagram]) -> None:

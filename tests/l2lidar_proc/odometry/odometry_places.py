@@ -10,9 +10,9 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from l2lidar_node.emulator.motion import tum
 from l2lidar_node.emulator.motion.motion import rpy_quaternions
 from l2lidar_node.emulator.world import scene, scenes
+from l2lidar_node.recording import tum
 from tests.support.odometry_runs import Run, record
 
 SEED = 6
