@@ -108,7 +108,7 @@ def test_a_file_of_another_unit_is_not_overwritten(
     other.save(tmp_path / "other.yaml")
     done = run("calibrate", "still", str(captures[1]), "-o", str(tmp_path / "other.yaml"))
     assert done.code == 1
-    assert "is of another unit" in done.err
+    assert "belongs to another unit" in done.err
     assert "estimating" not in done.out  # nobody waits for what is not written
 
 
@@ -204,7 +204,7 @@ def test_a_unit_whose_imu_is_off_is_told_before_anybody_turns_it(
 def test_nobody_at_the_terminal_is_said(run: Run, unit: Unit, tmp_path: Path) -> None:
     done = run("calibrate", "scale", "--length", "3", *unit.options)
     assert done.code == 1
-    assert "nobody answers" in done.err
+    assert "no answer from a terminal" in done.err
     (tmp_path / "place_1.pcap").write_bytes(b"precious")
     done = run("calibrate", "still", "--keep", str(tmp_path), *unit.options)
     assert done.code == 2
@@ -224,7 +224,7 @@ def test_the_imu_verb_refuses_what_it_cannot_use(
     CalibrationFile(bytes(32), {"xi_angle": 0.001}).save(output)
     done = run("calibrate", "imu", str(captures[0]), "-o", str(output))
     assert done.code == 1
-    assert "is of another unit" in done.err
+    assert "belongs to another unit" in done.err
     done = run("calibrate", "imu", str(captures[0]))
     assert done.code == 1
     assert "record for 30 s" in done.err

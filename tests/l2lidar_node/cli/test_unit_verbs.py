@@ -410,7 +410,7 @@ def test_network_is_stored_and_what_is_left_out_stays(run: Run, unit: Unit) -> N
         (["--lidar-ip", "l2"], "l2"),
         (["--lidar-ip", "224.0.0.1"], "is not a host address"),
         (["--user-ip", "10.0.0.1"], "not in the unit's subnet"),
-        (["--lidar-ip", "127.0.0.255"], "whole subnet"),
+        (["--lidar-ip", "127.0.0.255"], "broadcast address of subnet"),
         (["--lidar-port", "0"], "1 to 65535"),
         (["--gateway", "here"], "gateway"),
         (["--subnet-mask", "255.0.255.0"], "mask"),

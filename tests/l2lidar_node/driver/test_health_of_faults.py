@@ -107,7 +107,7 @@ def test_a_covered_sensor() -> None:
     [
         (WorkMode.IMU_OFF, WARN, "no IMU"),
         (WorkMode.MODE_2D, ERROR, "2D"),
-        (WorkMode.WAIT_FOR_START, ERROR, "nothing heard"),
+        (WorkMode.WAIT_FOR_START, ERROR, "no data from"),
     ],
 )
 def test_work_modes_that_do_not_fit(mode: Any, level: Any, message: str) -> None:

@@ -352,7 +352,7 @@ def test_a_new_map_takes_the_name_of_an_old_one_but_not_its_place(
         worker.close()
 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map", "map-1"]
-    assert said == [f"the map that was in {tmp_path}/map is now {tmp_path}/map-1"]
+    assert said == [f"the previous map in {tmp_path}/map is now {tmp_path}/map-1"]
     assert len(atlas.load(tmp_path / "map")[0].nodes) < len(mapped.nodes)
     assert len(atlas.load(tmp_path / "map-1")[0].nodes) >= len(mapped.nodes)
 
