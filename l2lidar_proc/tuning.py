@@ -175,7 +175,7 @@ NIS_CHANCE: Final = 3.8  # mean of 3 components that chance exceeds in one of 10
 NIS_SPEED_FLOOR: Final = 0.03  # [m/s] of corrections in a window that never count
 NIS_MOST: Final = 25.0  # by which variances are raised at most
 # Zero-rate and zero-g levels of MEMS sensors; source: data sheets of the ICM-20948 (0.09 rad/s,
-# 0.5 m/s^2) and of the BMI160 (0.05 rad/s, 0.4 m/s^2). Twice that is no bias any more.
+# 0.5 m/s^2) and of the BMI160 (0.05 rad/s, 0.4 m/s^2). Twice these values are implausible as a bias.
 MOST_GYRO_BIAS: Final = 0.2  # [rad/s]
 MOST_ACCEL_BIAS: Final = 1.0  # [m/s^2]
 

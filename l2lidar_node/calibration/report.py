@@ -111,7 +111,7 @@ def calibration_of(
 def beams_of(file: CalibrationFile | None) -> F64:
     """Return what a file corrects of the beams, shape (8,), in the order of model.NAMES.
 
-    The range scale is no part of it; nothing is corrected without a file.
+    The range scale is not part of it; nothing is corrected without a file.
     """
     known = {} if file is None else file.correction
     return np.array([known.get(ENTRIES.get(name, ""), 0.0) for name in NAMES])

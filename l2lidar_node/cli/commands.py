@@ -116,7 +116,7 @@ def with_parameters(payload: bytes, changes: list[str]) -> bytes:
     Raises
     ------
     ValueError
-        If a name is not known or a value is no finite number.
+        If a name is not known or a value is not a finite number.
     """
     block = np.frombuffer(payload, wire.PARAMETERS_PAYLOAD, 1).copy()
     for text in changes:
@@ -277,7 +277,7 @@ def set_work_mode(
 
     Interrupted after the command has gone out, it stores the old mode again.
     """
-    _checked(lambda: parse_work_mode(mode, 0))  # what is no work mode needs no unit
+    _checked(lambda: parse_work_mode(mode, 0))  # a wrong work mode is refused without a unit
     with Device(network) as device:
         before = device.read_parameters().work_mode
         after = _checked(lambda: parse_work_mode(mode, before))

@@ -122,7 +122,7 @@ class Watchdog:
         """Begin to count anew: the host's clock was set, or the host slept.
 
         A board without a battery starts in the past and jumps when it finds a time server: that
-        is no silence of the device.
+        does not count as silence.
         """
         self._last = dict.fromkeys(self._last, now)
         if self._watching_since is not None:

@@ -126,7 +126,7 @@ def _value(item: Setting, given: bool | str) -> Value:
         text = str(error).removeprefix(f"parameter '{item.name}': ")
     except ValueError:
         kind = "list of numbers such as 1.5,4" if item.item else _NUMBERS[item.type]
-        text = f"{given!r} is no {kind}"
+        text = f"{given!r} is not a {kind}"
         if item.range_text:
             text += f", expected {item.range_text}"
     raise typer.BadParameter(text, param_hint=f"'{flag(item)}'")

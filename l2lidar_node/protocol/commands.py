@@ -95,7 +95,7 @@ class Command(NamedTuple):
 
     @property
     def time(self) -> HostNs | None:
-        """What it sets the device's clock to; None if it is no time sync."""
+        """Time to which it sets the device's clock; None if it is not a time sync."""
         if self.packet_type != wire.PacketType.TIME_SYNC:
             return None
         seconds, nanoseconds = struct.unpack("<2I", self.payload)

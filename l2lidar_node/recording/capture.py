@@ -96,7 +96,7 @@ class PacketReader:
     Raises
     ------
     CaptureError
-        While iterating, if this is no capture or its structure is damaged.
+        While iterating, if this is not a capture or its structure is damaged.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -303,7 +303,7 @@ class CaptureReader:
     Raises
     ------
     CaptureError
-        While iterating, if this is no capture.
+        While iterating, if this is not a capture.
     """
 
     def __init__(self, stream: BinaryIO) -> None:

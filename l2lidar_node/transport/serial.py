@@ -51,7 +51,7 @@ class SerialTransport:
     Raises
     ------
     TransportError
-        If the device cannot be opened or is no serial one.
+        If the device cannot be opened or is not a serial device.
     """
 
     def __init__(self, path: str) -> None:

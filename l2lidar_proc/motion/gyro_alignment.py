@@ -30,7 +30,7 @@ PRIOR_SD: Final = np.array([*[np.deg2rad(10.0)] * 3, *[0.02] * 3, *[0.01] * 3, *
 """What is known beforehand, wide: it only keeps what the motion does not tell near nothing.
 
 Rotations up to 10 degrees, scales of 2 %, misalignments of 1 %, biases of 0.2 rad/s and offsets of
-20 ms are beyond what such sensors have; twice of each is no sensor.
+20 ms are beyond what such sensors have; twice these values are implausible.
 """
 
 _PARTS: Final = 8  # of the recording, whose scatter tells the uncertainty

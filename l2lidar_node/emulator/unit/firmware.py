@@ -532,7 +532,7 @@ class Firmware:
         return AckStatus.OK
 
     def _store(self, packet_type: int, payload: bytes, now_ns: int) -> AckStatus:
-        """Carry out a packet that is no command but a value."""
+        """Apply a packet that carries a value rather than a command."""
         if packet_type == PacketType.TIME_SYNC:
             sec, nsec = (int(word) for word in np.frombuffer(payload, "<u4"))
             self.clock.set(now_ns, sec * 1_000_000_000 + nsec)

@@ -73,7 +73,7 @@ def test_rocking_of_the_mount_is_taken_out(recovered: Any) -> None:
         assert report.precession.rock_sin == pytest.approx(
             ERRORS.precession_back[1], abs=0.02 * DEG
         )
-    assert sum("taken out" in note for note in recovered.notes) == len(POSES)
+    assert sum("subtracted" in note for note in recovered.notes) == len(POSES)
 
 
 def test_a_perfect_unit_is_left_alone() -> None:

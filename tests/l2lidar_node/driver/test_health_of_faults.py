@@ -48,7 +48,7 @@ def test_without_a_fault_everything_is_ok() -> None:
     [
         (
             {"loss": 0.01, "foreign_sync_at": (2.8,)},
-            {"link": (WARN, "packets lost"), "clock": (WARN, "somebody else")},
+            {"link": (WARN, "packets lost"), "clock": (WARN, "another host")},
         ),
         (
             {"loss": 0.5},

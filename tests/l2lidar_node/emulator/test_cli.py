@@ -222,8 +222,8 @@ def test_a_killed_measuring_process_is_one_message(host: socket.socket) -> None:
     ("options", "words"),
     [
         (["--loss", "2"], ["'--loss'", "2.0 is out of range", "0 to 1"]),
-        (["--loss", "often"], ["'--loss'", "'often' is no number", "0 to 1"]),
-        (["--lidar-port", "x"], ["'--lidar-port'", "'x' is no whole number"]),
+        (["--loss", "often"], ["'--loss'", "'often' is not a number", "0 to 1"]),
+        (["--lidar-port", "x"], ["'--lidar-port'", "'x' is not a whole number"]),
         (["--jitter", "some"], ["'--jitter'", "'heavy'"]),
         (["--reboot-at", "1,x"], ["'--reboot-at'", "1,x", "such as"]),
         (["--reboot-at", "-1"], ["'--reboot-at'", "out of range"]),
