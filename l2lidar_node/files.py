@@ -46,9 +46,8 @@ def write_whole(path: Path, content: bytes | str) -> None:
 class DataFolder:
     """The folder that services of a node write to and read from.
 
-    Whoever is in the ROS domain can call a service and set a parameter, so the names that come
-    that way are names inside this folder, and nothing is overwritten unless the one who starts
-    the node allows it.
+    Every participant of the ROS domain can call services and set parameters. So their file names
+    stay inside this folder, and nothing is overwritten unless the node was started with overwrite.
 
     Parameters
     ----------

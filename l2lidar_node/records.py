@@ -41,7 +41,7 @@ def assign(records: Records, index: NDArray[np.integer[Any]], values: Records) -
 
 
 def joined(parts: Sequence[Records]) -> Records:
-    """Return arrays of records one after the other.
+    """Return arrays of records, concatenated.
 
     Raises
     ------

@@ -165,7 +165,7 @@ class Datagram(NamedTuple):
 
 
 NOT_AWAITED: Final = HostNs(0)
-"""In place of the instant at which something is awaited: nobody knows when."""
+"""Instead of the time at which a datagram is expected: unknown."""
 
 
 class TransportCounts(Protocol):
@@ -181,7 +181,7 @@ class TransportCounts(Protocol):
 
     @property
     def kernel_drops(self) -> int:
-        """Datagrams that were dropped because nobody read them in time."""
+        """Datagrams that were dropped because they were not read in time."""
 
     @property
     def send_errors(self) -> int:

@@ -38,7 +38,7 @@ PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
 PRIOR_SPEED: Final = 1.0  # [m/s]
 SPEED_BOUND_SHARE: Final = 0.02  # of max_speed: its noise as a measurement. Derived: a hard bound
 MAP_ORIGIN_SIGMA: Final = 1e-3  # [m, rad] of the pose with which a new map begins
-# After a time jump. Derived: somebody moved the sensor by hand meanwhile.
+# After a time jump. Derived: the sensor may have been moved by hand meanwhile.
 TIME_JUMP_ROTATION: Final = 0.1  # [rad]
 TIME_JUMP_POSITION: Final = 0.5  # [m]
 TIME_JUMP_VELOCITY: Final = 1.0  # [m/s]
@@ -175,7 +175,7 @@ NIS_CHANCE: Final = 3.8  # mean of 3 components that chance exceeds in one of 10
 NIS_SPEED_FLOOR: Final = 0.03  # [m/s] of corrections in a window that never count
 NIS_MOST: Final = 25.0  # by which variances are raised at most
 # Zero-rate and zero-g levels of MEMS sensors; source: data sheets of the ICM-20948 (0.09 rad/s,
-# 0.5 m/s^2) and of the BMI160 (0.05 rad/s, 0.4 m/s^2). Twice these values are implausible as a bias.
+# 0.5 m/s^2) and of the BMI160 (0.05 rad/s, 0.4 m/s^2). Twice these values cannot be a bias.
 MOST_GYRO_BIAS: Final = 0.2  # [rad/s]
 MOST_ACCEL_BIAS: Final = 1.0  # [m/s^2]
 
@@ -184,7 +184,7 @@ MOST_ACCEL_BIAS: Final = 1.0  # [m/s^2]
 LOOSE_POSITION: Final = 0.06  # [m] a prediction less certain may be a surface off
 LOOSE_ROTATION: Final = 0.03  # [rad] or turned too far
 INLIER_RATIO: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
-# After a loose prediction it may have so many times the outliers that are usual of late. Tuned on:
+# After a loose prediction it may have so many times the usual number of recent outliers. Tuned on:
 # wood in rain (inliers 0.85 to 0.90 at the right place, up to 0.72 at wrong ones), bare trunks
 USUAL_OUTLIERS: Final = 2.5
 USUAL_BLEND: Final = 0.1  # share of each newer sweep in what is usual

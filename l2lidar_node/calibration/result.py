@@ -32,7 +32,7 @@ class Estimate:
         [rad], [m]; NaN where it is not known.
     verdict : Verdict
     reason : str
-        Empty where nothing is to be said.
+        Empty if there is nothing to report.
     """
 
     value: float

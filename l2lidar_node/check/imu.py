@@ -119,7 +119,7 @@ def _check_covariances(imu: NDArray[np.void]) -> Iterator[Finding]:
 
 
 def missing(consumer: Consumer) -> Iterator[Finding]:
-    """Yield what there is to say where no sample came."""
+    """Yield the findings for a topic without samples."""
     if consumer.imu is not Use.IGNORED:
         yield Finding(
             consumer.imu.level,

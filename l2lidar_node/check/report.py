@@ -18,7 +18,7 @@ _LONGEST_S: Final = 20.0
 
 
 def judge(seen: Observation, consumer: Consumer) -> list[Finding]:
-    """Return what there is to say about an observation for a consumer, in a fixed order."""
+    """Return the findings about an observation for a consumer, in a fixed order."""
     with np.errstate(all="ignore"):  # any number may stand in a message
         return list(_judge(seen, consumer))
 

@@ -24,7 +24,7 @@ class Finding(NamedTuple):
     text : str
         What was found and what is required; one line.
     fix : str
-        What to do; empty where nothing is to be done.
+        What to do; empty if nothing is needed.
     """
 
     level: Level

@@ -318,7 +318,7 @@ def _check_spread(clouds: Sequence[Cloud], times: Timing, consumer: Consumer) ->
 
 
 def _check_length(spread: float) -> Finding | None:
-    """Return what there is to say about sweeps of so many seconds."""
+    """Return the finding about sweeps of this duration [s]."""
     if spread >= _TURN_S:
         return None
     return Finding(

@@ -137,7 +137,7 @@ def write(
 
 
 def ask(text: str, *, unattended: bool) -> None:
-    """Say what to do and wait for Enter; go on at once where nobody is there."""
+    """Print what to do and wait for Enter; continue at once without a terminal."""
     if not unattended:
         say(text)
         _answer("Press Enter when it stands still (Ctrl-C ends it): ")

@@ -361,7 +361,7 @@ def set_network(
 
     The unit never tells what it has stored, so its acknowledgement is all there is. Gateway and
     mask cannot be known beforehand and are always written. Over a serial line, or for a unit that
-    sends to an address nobody knows any more, give both addresses and both ports.
+    sends to an unknown address, give both addresses and both ports.
     """
     given = {
         "lidar_ip": lidar_ip,
@@ -405,7 +405,7 @@ def set_mac(
     seen = hardware_address(network.l2_ip) or "not known"
     out.print(change({"MAC": seen}, {"MAC": command.payload[:6].hex(":")}))
     with Device(network) as device:
-        device.read_parameters()  # so that nobody is asked in vain
+        device.read_parameters()  # before asking for confirmation
         _ask(yes)
         _send_for_good(device, command)
     say(f"stored; {_RESTART}")

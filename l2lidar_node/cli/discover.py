@@ -136,7 +136,7 @@ def listen(host_port: int, ask: list[tuple[str, int]], seconds: float) -> dict[A
             if now >= next_probe:
                 next_probe = now + _PROBE_S
                 _probe(item, ask)
-            with suppress(OSError):  # nothing in time, or nobody at an address that was asked
+            with suppress(OSError):  # no answer in time, or no host at a queried address
                 data, sender = item.recvfrom(_MAX_DATAGRAM)
                 speakers.setdefault(sender, Speaker()).hear(data)
     return speakers

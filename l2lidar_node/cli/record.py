@@ -66,7 +66,7 @@ def record(
 ) -> None:
     """Record a unit. A capture (.pcap) keeps every packet with its time of arrival.
 
-    It opens in Wireshark, is written as it comes so that a crash costs a second at most, and can
+    It opens in Wireshark, is written continuously, so a crash costs a second at most, and can
     be replayed bit for bit by the driver's parameter replay_file. A bag keeps clouds, IMU samples
     and the static transform. The unit's clock is set once, as the driver does.
     """
@@ -368,7 +368,7 @@ def _sent(sender: socket.socket, data: bytes, destination: tuple[str, int]) -> b
         pass
     try:
         sender.sendto(data, destination)
-    except OSError:  # nobody listens (yet)
+    except OSError:  # no listener (yet)
         return False
     return True
 

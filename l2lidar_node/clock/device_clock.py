@@ -1,6 +1,6 @@
 """Device clock: maps device stamps to host stamps, and reports lock and clock events.
 
-Two models, one after the other. :class:`DeviceClockModel` takes the steps out of the stamps, so
+Two models in series. :class:`DeviceClockModel` takes the steps out of the stamps, so
 that both streams share one even device time whatever syncs and reboots do. :class:`HostClockModel`
 maps that to the host's clock (:mod:`l2lidar_node.clock.lower_envelope` has the estimator, and why
 it is not a Kalman filter).
@@ -55,12 +55,12 @@ class SyncSchedule:
         return self._sent is None or not 0 <= now - self._sent < self._interval
 
     def sent(self, value: HostNs, sent: HostNs) -> None:
-        """Take note of a sync that left the host."""
+        """Record a sync that was sent."""
         self._value = value
         self._sent = sent
 
     def host_stepped(self, by_ns: int) -> None:
-        """Take note that the host's clock was set."""
+        """Record a step of the host's clock."""
         if self._sent is not None:
             self._sent = HostNs(self._sent + by_ns)
 
@@ -164,7 +164,7 @@ class _Mode(Enum):
     SYSTEM = "system"
 
 
-# These begin a time line; whoever follows needs all of them.
+# These begin a time line; a follower needs all of them.
 _RARE: Final = frozenset({ClockEventKind.LOCKED, ClockEventKind.REBOOT, ClockEventKind.LOST})
 
 _ESTIMATED, _SYSTEM = _Mode.ESTIMATED, _Mode.SYSTEM  # to look up a member of an Enum takes long
@@ -188,7 +188,7 @@ class DeviceClock:
     Notes
     -----
     Stamps of a stream never go backwards and are never after the packet's arrival. Where both
-    cannot be had, after the host's clock was set back, packets get no stamp until it has passed
+    are impossible, after the host's clock was set back, packets get no stamp until it has passed
     the latest one.
     """
 
@@ -308,12 +308,12 @@ class DeviceClock:
         return DeviceNs(self._host.due + base)
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
-        """Take note that a time-sync command with this value left the host at ``sent``."""
+        """Record that a time-sync command with this value was sent at ``sent``."""
         self._schedule.sent(value, sent)
         self._device.synced(value, sent)
 
     def host_stepped(self, by_ns: int, at: HostNs) -> None:
-        """Take note that the host's clock was set.
+        """Record a step of the host's clock.
 
         Parameters
         ----------
@@ -329,7 +329,7 @@ class DeviceClock:
         self._host.stepped(by_ns, at)
 
     def host_slewed(self, by_ns: int, at: HostNs) -> None:
-        """Take note of how far slewing has moved the host's clock, at ``at``, in all [ns].
+        """Record the total slewing of the host's clock at ``at`` [ns].
 
         To be called whenever the last two calls do not predict it. From the first call on, slewing
         is not inferred from arrivals.

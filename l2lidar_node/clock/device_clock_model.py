@@ -145,7 +145,7 @@ class DeviceClockModel:
         return points.base
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
-        """Take note of a sync that left this host; whether it arrives is not known."""
+        """Record a sync that this host sent; whether it arrives is unknown."""
         self._syncs.append(_Sync(value, sent))
 
     def host_stepped(self, by_ns: int, at: int) -> None:
@@ -199,7 +199,7 @@ class DeviceClockModel:
 
         The possible reasons, in the order in which they are tested: the packet is old; a standby;
         a sync of this host; an epoch that another packet has begun; a gap. What is left is a step
-        that somebody else made.
+        that another host made.
         """
         cadence = state.cadence
         if self._is_old(state, seq, stamp):

@@ -61,23 +61,23 @@ class HostSlewing:
         self._knots: deque[tuple[int, int]] = deque([(0, 0)], maxlen=_KNOTS)
 
     def told(self, by_ns: int, at: int) -> None:
-        """Take note of how far it has been moved [ns] when it shows ``at``."""
+        """Record the total slewing [ns] when the clock shows ``at``."""
         if not self.is_told:
             self.is_told = True
             self._base = by_ns
             self._knots.clear()
         knots = self._knots
-        while knots and knots[-1][0] >= at:  # the clock was set back, and nobody told
+        while knots and knots[-1][0] >= at:  # the clock was set back without a report
             knots.pop()
         knots.append((at, by_ns - self._base))
 
     def stepped(self, by_ns: int) -> None:
-        """Take note that the host's clock was set."""
+        """Record a step of the host's clock."""
         self._knots = deque(((at + by_ns, by) for at, by in self._knots), maxlen=_KNOTS)
 
     @property
     def rate(self) -> float:
-        """Slewing of late [ns per ns of host time]."""
+        """Recent slewing [ns per ns of host time]."""
         knots = self._knots
         if len(knots) < 2:
             return 0.0
@@ -113,13 +113,13 @@ class HostClockModel:
         Place on the device line at which :meth:`update` wants to be called.
     steps : deque of int
         Steps of what is published that arrivals made necessary [ns]: the host's clock was set, or
-        if that ``is_told``, load had hidden the true delay; whoever reads it takes it out.
+        if that ``is_told``, load had hidden the true delay; reading it clears it.
     uncertainty_ns : float
         By how much stamps may be off [ns], the constant part of the path delay aside.
     late_ns : int
         How late the least delayed packet of the last 100 ms was, against the fit.
     is_told : bool
-        Whether somebody tells when the host's clock is set; else that is inferred.
+        Whether steps of the host's clock are reported; if not, they are inferred.
     advance_ns : int
         How much earlier than the envelope stamps shall be: the constant part of the path delay.
     line : Line
@@ -212,7 +212,7 @@ class HostClockModel:
             self._low_at = (u, arrival)
 
     def stepped(self, by_ns: int, at: int) -> None:
-        """Take note that the host's clock was set, and shows ``at``; 0: that this will be told.
+        """Record a step of the host's clock, which shows ``at``; 0 announces reports of steps.
 
         A packet is stamped in the time that was shown when it was measured, whenever it comes.
         """
@@ -231,7 +231,7 @@ class HostClockModel:
         self._go(u, self.at(u) + by_ns, self._slope)
 
     def slewed(self, by_ns: int, at: int) -> None:
-        """Take note of how far slewing has moved the host's clock in all [ns], at ``at``."""
+        """Record the total slewing of the host's clock [ns] at ``at``."""
         before = self._slewing.rate
         self._slewing.told(by_ns, at)
         if self._envelope is None:

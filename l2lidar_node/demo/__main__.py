@@ -89,7 +89,7 @@ def demo(
     """Show everything with a virtual L2: it streams over UDP into driver, deskew and odometry.
 
     The exit code is 1 if a figure is not as it should be, 75 if one is not but this machine did
-    not keep up, so that nobody can tell.
+    not keep up, so that the result is inconclusive.
     """
     if slam and driver_only:
         raise UsageError("--slam needs the odometry: omit --driver-only")

@@ -63,7 +63,7 @@ class Program:
             errors="replace",
             cwd=folder,
         )
-        # A pipe that nobody reads fills up, and the program stops at its next word.
+        # A pipe without a reader fills up, and the program blocks at its next write.
         self.lines: deque[str] = deque(maxlen=_LINES)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -184,9 +184,9 @@ def free_ros_domain() -> int:
 
 
 def free_udp_ports(count: int) -> list[int]:
-    """Return UDP ports of the loopback interface that nobody uses right now.
+    """Return UDP ports of the loopback interface that are not in use.
 
-    They lie beyond those that the system hands out to whoever asks for any port, as DDS does many
+    They lie outside the system's range of ephemeral ports, which DDS uses many
     times at every start, and no other process is given them by this function until this one ends:
     nobody takes them before they are used. No port is returned twice until all have been.
 

@@ -56,7 +56,7 @@ class Watchdog:
             self._points_seen = True
             since = self._standby_since
             if since is not None and now - since > RUN_OUT_NS:
-                self._standby_since = None  # it did not obey, or somebody else started it
+                self._standby_since = None  # it did not obey, or another host started it
         elif last is None or now - last > SILENCE_NS:
             self._imu_since = now
         self._last[stream] = now
@@ -154,7 +154,7 @@ class QuerySchedule:
         self._latency_id = _FIRST_ID
 
     def due(self, now: HostNs, *, version: bool, parameters: bool) -> list[Command]:
-        """Return what is to be asked now; ``version``, ``parameters``: whether they are known."""
+        """Return the queries that are due; ``version``, ``parameters``: whether they are known."""
         if 0 <= self._next - now <= QUERY_NS:
             return []
         self._next = HostNs(now + QUERY_NS)

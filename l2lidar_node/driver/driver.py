@@ -287,16 +287,16 @@ class Driver:
         return events
 
     def host_stepped(self, by_ns: int, at: HostNs) -> list[Event]:
-        """Take note that the clock of arrivals was set and shows ``at``; return what that makes.
+        """Record a step of the clock of arrivals, which shows ``at``; return the events.
 
-        A step of 0 says that steps will be told. Where nobody tells they are inferred.
+        A step of 0 announces that steps will be reported. Without reports they are inferred.
         """
         events = self.catch_up()
         self._clock.host_stepped(by_ns, at)
         return events + self._clock.events()
 
     def host_slewed(self, by_ns: int, at: HostNs) -> None:
-        """Take note of how far slewing has moved the clock of arrivals since a fixed instant.
+        """Record the total slewing of the clock of arrivals.
 
         To be called whenever the last two calls do not predict it; see
         :meth:`DeviceClock.host_slewed`.
@@ -338,8 +338,8 @@ class Driver:
     def sent(self, command: Command, at: HostNs) -> list[Event]:
         """Do what sending a command does to the driver itself; return what it completes.
 
-        The driver calls it for everything it sends. Whoever replays a recording calls it for the
-        commands in there.
+        The driver calls it for everything it sends. A replay calls it for the
+        recorded commands.
         """
         if command.is_latency:
             self._requests.add(command, at, tries=1)

@@ -1,6 +1,6 @@
 """Device health: metadata, and checks from the counts of a period.
 
-OK needs nobody's attention, WARN should be looked at, ERROR means that data are missing or wrong.
+OK needs no attention, WARN needs a look, ERROR means that data are missing or wrong.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The onboard orientation: gravity alignment of points, and a check against gravity.
 
-This is what upstream's ``imu_adjust`` does. This is not motion compensation: it turns each packet as
-a whole, knows no translation, and its result is level with gravity instead of fixed to the sensor.
+This is upstream's ``imu_adjust``. It is not motion compensation: it rotates each packet as a
+whole, ignores translation, and its result is level with gravity instead of fixed to the sensor.
 The companion package deskews properly and needs this off.
 """
 

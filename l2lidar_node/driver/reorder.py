@@ -195,7 +195,7 @@ class SequenceOrder(Generic[T]):
             return -behind if behind <= min(self._reach, self._modulus // 2) else ahead
         if seq >= self._next - self._reach:
             return seq - self._next
-        # It wrapped, nobody knows where: after the largest number seen, as far as can be told.
+        # It wrapped at an unknown number: after the largest one seen, as far as is known.
         largest = max((n for n in self.waiting if n >= self._next), default=self._next - 1)
         return largest + 1 - self._next + seq
 
@@ -223,7 +223,7 @@ class SequenceOrder(Generic[T]):
         return released
 
     def _unlearn(self, seq: int) -> None:
-        """Take note of a number that shows the modulus to be too small."""
+        """Record a number that shows the modulus to be too small."""
         if self._modulus != _UNKNOWN and seq >= self._modulus:
             if self._next == 0:
                 self._next = self._modulus
@@ -280,7 +280,7 @@ class _Lane:
     order: SequenceOrder[Timed]
     newest: PointPacket | ImuPacket | None = None
     arrival: int = 0  # [ns] of the packet that came last
-    released: Timed | None = None  # what came out last; None: the newest one
+    released: Timed | None = None  # the last one released; None: the newest one
     fallen: int = 0  # packets in a row whose stamps fell
     suspects: list[Timed] = field(default_factory=list)
     withholds: bool = False  # the packet that came last is one of them

@@ -32,7 +32,7 @@ class AddressConfig:
         wire.HOST_PORT, "UDP port the measurements are sent to", lo=1, hi=65535
     )
     reply_to_sender: bool = setting(
-        False, "send to whoever sent the last command instead of the stored host"
+        False, "send to the sender of the last command instead of the stored host"
     )
 
 

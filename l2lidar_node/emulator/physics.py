@@ -208,14 +208,14 @@ class RayCastWorker:
         self._end(_GRACE_S)
 
     def _end(self, grace_s: float = 0.0) -> None:
-        workers = [*(self._pool._processes or {}).values()]  # nobody else tells which they are
+        workers = [*(self._pool._processes or {}).values()]  # there is no public way to get them
         manager: Any = self._pool._executor_manager_thread  # forgotten by not waiting for it
         results: Any = self._pool._result_queue
         self._pool.shutdown(wait=False, cancel_futures=True)
         if len(wait([worker.sentinel for worker in workers], grace_s)) < len(workers):
             for worker in workers:
                 worker.kill()
-            results._writer.close()  # nobody waits for the rest of a block that was cut off
+            results._writer.close()  # the rest of a truncated block is not needed
         if manager is not None:
             manager.join()  # else it closes what the interpreter writes to at its end
 
@@ -272,7 +272,7 @@ _state: dict[str, Any] = {}  # of the measuring process
 
 
 def leave_out_dash() -> None:
-    """Have open3d imported in half of the time, without what draws in notebooks."""
+    """Let open3d be imported without notebook drawing, in half the time."""
     dash = ModuleType("dash")
     dash.__dict__.update(dict.fromkeys(("Dash", "dcc", "html")))
     sys.modules["dash"] = dash

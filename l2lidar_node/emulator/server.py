@@ -25,7 +25,7 @@ from l2lidar_node.protocol.wire import WorkMode
 WORLDLESS: Final = ("pattern", "none")
 """Worlds that are not ray-cast: a shell, and nothing at all."""
 
-_REMEMBERED: Final = 10_000  # packets, when nobody asks for the truth
+_REMEMBERED: Final = 10_000  # packets, if the truth is not written
 
 
 class FlashError(ValueError):
@@ -79,7 +79,7 @@ def opened(flash: Flash, config: DeviceConfig, serial: str | None) -> Port:
 
 
 def seen_from(config: DeviceConfig, physics: PhysicsConfig) -> PhysicsConfig:
-    """Return the physics with a rest until the first points: nobody sees the motion before."""
+    """Return the physics at rest until the first points; earlier motion would not be seen."""
     spin_up_s = config.power.points_s * config.power.boot_scale
     return dataclasses.replace(physics, rest_s=physics.rest_s + spin_up_s)
 

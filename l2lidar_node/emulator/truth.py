@@ -155,7 +155,7 @@ class FaultEvent(NamedTuple):
 class PacketLog:
     """Logs every packet when it leaves the unit and when it reaches the host.
 
-    A packet has arrived when its bytes reached the host undamaged, one after the other and with
+    A packet has arrived when its bytes reached the host undamaged, in sequence and with
     nothing in between: a reader of a byte stream needs that and no more. One that also uses the
     boundaries of datagrams may recover a few others.
 
@@ -225,7 +225,7 @@ class PacketLog:
             self._events.append(FaultEvent(time_ns, fault, 0, -1))
 
     def arrived(self, datagrams: Iterable[Datagram]) -> None:
-        """Take note of datagrams that reach the host, in the order in which they do."""
+        """Record datagrams that reach the host, in their order of arrival."""
         for datagram in datagrams:
             for row, start, stop, size, intact in datagram.pieces:
                 follows = start == 0 or self._cursor == (row, start)

@@ -103,7 +103,7 @@ class Command(NamedTuple):
 
 
 def recorded(packet_type: int, payload: bytes) -> Command | None:
-    """Return the command of a frame that somebody sent; None if no command looks like that."""
+    """Return the command in a frame; None if it is not a known command."""
     layout = wire.PAYLOADS.get(packet_type)
     if packet_type not in _FROM_HOST or layout is None or len(payload) != layout.itemsize:
         return None

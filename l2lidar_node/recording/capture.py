@@ -89,7 +89,7 @@ class PacketReader:
     Attributes
     ----------
     is_cut_off : bool
-        Whether the file ended within a packet, as it does when whoever wrote it was killed.
+        Whether the file ended within a packet, as after its writer was killed.
     untimed : int
         Packets left out because the file does not say when they came.
 

@@ -255,7 +255,7 @@ def _sent(frame: Frame, time: HostNs) -> Iterator[Sent]:
     command = recorded(frame.packet_type, frame.payload)
     if command is None:
         return
-    # Whoever captured it saw it a little after it was made, and the driver counts from then.
+    # It was captured a little after it was made, and the driver counts from then.
     made = command.time
     if made is not None and 0 <= time - made < _IN_FLIGHT_NS:
         time = made

@@ -56,7 +56,7 @@ class MountMonitor:
         return frame, math.degrees(math.acos(float(np.clip(T_root_cloud[2, 2], -1.0, 1.0))))
 
     def judge(self, levels_points: bool) -> Check | None:
-        """Return what is to be said of the mount while the driver levels its points or not.
+        """Return the check of the mount, depending on whether the driver levels its points.
 
         None without a mount. A warning is logged as well, every 30 s at most.
         """

@@ -83,7 +83,7 @@ def parameters_given(
 def required(
     is_respawned: bool = False, ends_with_success: bool = True
 ) -> Callable[[ProcessExited, LaunchContext], Shutdown | None]:
-    """Return the ``on_exit`` of a process without which the launch is of no use.
+    """Return the ``on_exit`` of a process that the launch requires.
 
     Parameters
     ----------

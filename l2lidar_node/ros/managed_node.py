@@ -1,8 +1,7 @@
 """Managed node (https://design.ros2.org/articles/node_lifecycle.html).
 
 A manager, or ``ros2 lifecycle``, configures, activates, deactivates and cleans it up. With
-``autostart``, the default, it is active as soon as it is made: a plain node to whoever does not
-ask.
+``autostart``, the default, it becomes active by itself, like a plain node.
 """
 
 from __future__ import annotations
@@ -101,7 +100,7 @@ class ManagedNode(LifecycleNode):
         return []
 
     async def allows(self, transition: int) -> bool:
-        """Return whether a transition that somebody asked for may take place.
+        """Return whether a requested transition may take place.
 
         Parameters
         ----------
@@ -266,12 +265,12 @@ class ManagedNode(LifecycleNode):
     # ---- entities
 
     def _entities(self) -> set[Any]:
-        """Return what there is."""
+        """Return all entities of the node."""
         lists = (self.publishers, self.subscriptions, self.clients, self.services, self.timers)
         return {entity for some in (*lists, self.guards) for entity in some}
 
     def _destroy_since(self, before: set[Any]) -> None:
-        """Destroy what has been created since there was what there is in ``before``."""
+        """Destroy the entities that are not in ``before``."""
         kept = before | set(self.shared_entities())
         for publisher in [found for found in self.publishers if found not in kept]:
             if isinstance(publisher, LifecyclePublisher):

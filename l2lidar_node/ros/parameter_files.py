@@ -34,7 +34,7 @@ def parameters_for(path: Path, stock_name: str, full_name: str) -> dict[str, Any
     path : Path
         YAML file.
     stock_name : str
-        Name that the node has when nobody renames it.
+        Default name of the node.
     full_name : str
         Namespace and name it has now, for example ``/front/l2lidar_node``.
 

@@ -19,12 +19,12 @@ _SLEW_SURE_NS: Final = 10_000  # to which slewing is read, at worst
 class HostClock:
     """The clock of arrival times, CLOCK_REALTIME.
 
-    People and time servers set it, nobody sets CLOCK_BOOTTIME. Both run at the same rate, even
+    People and time servers set it; CLOCK_BOOTTIME is never set. Both run at the same rate, even
     while time servers adjust it and while the host is suspended, so their difference changes only
     when this clock is set, and by as much.
 
     Time servers also slew it: they adjust the rate of CLOCK_REALTIME and CLOCK_MONOTONIC, not that
-    of CLOCK_MONOTONIC_RAW, which counts the bare oscillator. Nobody sets these two, and both stop
+    of CLOCK_MONOTONIC_RAW, which counts the bare oscillator. These two are never set and both stop
     while the host is suspended, so their difference changes by the slewing alone.
     """
 

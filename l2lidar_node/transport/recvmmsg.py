@@ -51,7 +51,7 @@ class DatagramReader:
     Attributes
     ----------
     datagrams : list of Datagram
-        What came from the sender, in order; whoever reads it begins a new list.
+        Datagrams of the sender, in order; the reader replaces the list.
     strangers : list of bytes
         Packed addresses of the senders of all else, which is dropped; likewise.
     """

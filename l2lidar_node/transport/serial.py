@@ -38,11 +38,11 @@ class SerialTransport:
     Attributes
     ----------
     foreign : int
-        Always 0: there is nobody else on a serial line.
+        Always 0: a serial line has only one sender.
     stranger : str
         Always empty.
     kernel_drops : int
-        Reads that were thrown away because nobody took them for too long.
+        Reads that were dropped because they were not taken in time.
     send_errors : int
         Frames that could not be sent, for example while a cable is out.
     interruptions : int
@@ -72,7 +72,7 @@ class SerialTransport:
 
     def receive(self, timeout_s: float, awaited: HostNs = NOT_AWAITED) -> list[Datagram]:
         """Return what has arrived, in order; empty when nothing did in time."""
-        del awaited  # a thread reads all as it comes
+        del awaited  # a thread reads continuously
         with self._arrived:
             if not self._backlog:
                 self._arrived.wait(timeout_s)

@@ -162,22 +162,22 @@ class Tap(Protocol):
     """Receives everything that a driver's output depends on, in order."""
 
     def received(self, data: bytes, arrival: HostNs) -> None:
-        """Take note of bytes that are handed to the driver."""
+        """Record bytes that are passed to the driver."""
 
     def sent(self, frame: bytes, at: HostNs) -> None:
-        """Take note of a frame that the driver counts as sent at an instant."""
+        """Record a frame and the time at which the driver counts it as sent."""
 
     def waited(self, until: HostNs) -> None:
-        """Take note that the driver is told to wait no longer for what was due until then."""
+        """Record that the driver stops waiting for what was due until then."""
 
     def stepped(self, by_ns: int, at: HostNs) -> None:
-        """Take note that the driver is told that the host's clock was set."""
+        """Record a step of the host's clock that is reported to the driver."""
 
     def slewed(self, by_ns: int, at: HostNs) -> None:
-        """Take note that the driver is told how far slewing has moved the host's clock."""
+        """Record slewing of the host's clock that is reported to the driver."""
 
     def close(self) -> None:
-        """Take note that this was all."""
+        """Finish the record."""
 
 
 class Taps:

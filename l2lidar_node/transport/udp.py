@@ -73,7 +73,7 @@ class UdpTransport:
         self.send_errors = 0
         self._foreign = 0
         self._kernel_drops = 0
-        self._dropped = 0  # as the kernel counts: for want of room, and by the filter
+        self._dropped = 0  # as the kernel counts: buffer full, or refused by the filter
         self._filters = False
         self._window_since = 0  # [ns] strangers are counted over a second
         self._window_foreign = 0  # what there were when it began

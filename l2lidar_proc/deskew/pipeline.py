@@ -285,7 +285,7 @@ def _timed(
 
 
 def of_sweep(quality: Quality, waited_ns: int) -> Check:
-    """Return what there is to say about one sweep."""
+    """Return the check of one sweep."""
     serious = {Flag.NO_IMU, Flag.ACCELEROMETER_FAULT, Flag.CLOCK_JUMP}
     if serious & set(quality.flags):
         level = Level.ERROR
@@ -318,7 +318,7 @@ def of_period(
     is_leveled: bool,
     untied: str = "",
 ) -> Check:
-    """Return what there is to say about the time between two looks.
+    """Return the check of the period between two diagnostics.
 
     Parameters
     ----------

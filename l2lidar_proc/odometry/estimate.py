@@ -169,7 +169,7 @@ def cloud_pose(state: InertialState, lever: F64) -> F64:
 
 
 def gaps_in(motion: SweepMotion) -> list[Status]:
-    """Return what is to be said of the IMU samples of a motion."""
+    """Return the status of the IMU samples of a motion."""
     if motion.imu.missing.all():
         return [Status.NO_IMU]
     return [Status.IMU_GAP] if motion.imu.missing.any() else []

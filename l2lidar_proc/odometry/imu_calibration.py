@@ -388,7 +388,7 @@ def _refusals(
             Refusal(
                 f"gyro and clouds differ by {np.rad2deg(found.turns.rms):.2f} degrees from "
                 "sweep to sweep: they do not turn together",
-                "check that the IMU is the sensor's own and that nobody walks through the scene",
+                "check that the IMU is the sensor's own and that the scene is still",
             )
         )
     rotation = float(np.linalg.norm(found.model.values[gyro.ROTATION]))
@@ -550,7 +550,7 @@ class ExtrinsicCheck:
         self.finding = "; ".join(text for text in (self._rotation(), self._offset()) if text)
 
     def _rotation(self) -> str:
-        """Return what is to be said of the rotation."""
+        """Return the finding about the rotation."""
         assert self._change is not None
         vector, sd = self._change[gyro.ROTATION], self._sd[gyro.ROTATION]
         clear = (sd < _KNOWN) & (np.abs(vector) > _CERTAIN * sd)
@@ -565,7 +565,7 @@ class ExtrinsicCheck:
         return f"extrinsic rotation looks {np.degrees(size):.1f} degrees off ({axes})"
 
     def _offset(self) -> str:
-        """Return what is to be said of the time offset."""
+        """Return the finding about the time offset."""
         assert self._change is not None
         value, sd = float(self._change[gyro.OFFSET]), float(self._sd[gyro.OFFSET])
         if sd > _KNOWN_S or abs(value) < max(_WORTH_SAYING_S, _CERTAIN * sd):

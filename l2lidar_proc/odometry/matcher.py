@@ -99,7 +99,7 @@ class SweepMatcher:
         self._before: F64 | None = None  # place of the sweep before
         self._oldest = 0  # sweep from which on places are still in the map
         self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
-        self._inliers = 0.0, 0  # mean inlier ratio of late, and of how many sweeps
+        self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
 
     @property
     def is_young(self) -> bool:

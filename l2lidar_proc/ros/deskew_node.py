@@ -80,7 +80,7 @@ class ScanPublisher:
         self._builder.config = config
 
     def publish(self, item: Deskewed, cloud_frame: str, tracker: MotionTracker) -> None:
-        """Publish the scan of a sweep if somebody wants it."""
+        """Publish the scan of a sweep if it is wanted."""
         config = self._builder.config
         if self._scans is None or not (
             config.publish == "always" or self._scans.get_subscription_count()

@@ -46,7 +46,7 @@ class FollowedFrame:
         self._last_s = 0.0
 
     def takes(self, frame: str) -> bool:
-        """Return whether a message that has just come in this frame is to be used."""
+        """Return whether to use a message in this frame."""
         now = time.monotonic()
         if self.name not in (None, frame) and now - self._last_s < _FRAME_TIMEOUT_S:
             self.refused = frame
@@ -109,7 +109,7 @@ class InputMonitor:
     ) -> Callable[..., None]:
         """Return a callback that survives its own errors.
 
-        An error that nobody foresaw is logged with its traceback and reported as ERROR in the
+        An unexpected error is logged with its traceback and reported as ERROR in the
         diagnostics; ``recover`` then has the node begin again. The node stays alive.
         """
 
@@ -126,7 +126,7 @@ class InputMonitor:
         return run
 
     def failed(self, error: Exception) -> None:
-        """Report an error that nobody foresaw."""
+        """Report an unexpected error."""
         self._failure = f"internal error, restarted: {type(error).__name__}: {error}"
         self._node.get_logger().error(f"{self._failure}\n{traceback.format_exc()}")
 
@@ -225,7 +225,7 @@ def load_libraries(*names: str) -> None:
 def answer_or_error(
     monitor: InputMonitor, answer: Callable[[Any, Any], T]
 ) -> Callable[[Any, Any], T]:
-    """Return a service's callback that answers an error that nobody foresaw with its text."""
+    """Return a service's callback that answers an unexpected error with its text."""
 
     @wraps(answer)
     def run(request: Any, response: Any) -> T:

@@ -108,7 +108,7 @@ class MapTransform:
 
 
 def reach(stamp: HostNs, waited_ns: int, transforms_until: int) -> int:
-    """Return the newest instant for which somebody may want the transform [ns].
+    """Return the newest time for which the transform may be requested [ns].
 
     Parameters
     ----------

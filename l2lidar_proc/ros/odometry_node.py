@@ -245,7 +245,7 @@ class OdometryNode(ManagedNode):
             )
         self._mount()
         self._inputs.sweep(sweep)
-        # Whoever shows the deskewed cloud needs the transform up to its end, and needs it first.
+        # To show the deskewed cloud, the transform must reach its end and arrive first.
         self._poses.catch_up()
         self.pipeline.sweep(sweep, time.monotonic_ns(), item.backlog)
 

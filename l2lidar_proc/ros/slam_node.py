@@ -279,7 +279,7 @@ class SlamNode(ManagedNode):
         self._pose.publish(message)
 
     def _show(self) -> None:
-        """Publish map, path and graph if they changed and somebody listens."""
+        """Publish map, path and graph if they changed and have subscribers."""
         listeners = [self._map, self._path, self._graph]
         wanted = tuple(publisher.get_subscription_count() for publisher in listeners)
         worker = self.worker

@@ -23,7 +23,7 @@ from l2lidar_proc.slam.pose_graph import GtsamMissingError
 from l2lidar_proc.slam.slam import Slam
 
 Answer = tuple[bool, str]
-"""Whether something worked, and what there is to say."""
+"""Success of a request, and its message."""
 
 _DEPTH: Final = 400  # sweeps that may wait while a loop is verified: over a minute
 _MOST_REQUESTS: Final = 50  # that may wait besides
@@ -53,7 +53,7 @@ class SlamWorker:
     counts : Counter of str
         Candidates that were refused, by reason.
     submaps, loops, dropped, failures, saved_bytes : int
-        ``failures`` are errors that nobody foresaw.
+        ``failures`` are unexpected errors.
 
     Raises
     ------
@@ -227,7 +227,7 @@ class SlamWorker:
         while (job := self._jobs.get()[2]) is not None:
             try:
                 job()
-            except Exception as error:  # nobody foresaw it: the node stays alive and says so
+            except Exception as error:  # unexpected: the node stays alive and reports it
                 self._failed(error)
 
     def _submit(self, rank: int, job: Callable[[], None] | None) -> None:

@@ -36,7 +36,7 @@ IMU_DEPTH: Final = 2000
 _AHEAD: Final = 4  # clouds that are taken out of their queue at once, to know how many wait
 
 SLOW_LOOK_S: Final = 0.25
-"""Between looks into the IMU's queue where nobody is in a hurry."""
+"""Period of reading the IMU's queue while no sweep waits."""
 
 _WAIT_S: Final = 0.003  # between looks while a sweep waits for its last samples
 
@@ -77,7 +77,7 @@ class ReceivedCloud:
         found = self._sweeps[unit]
         if isinstance(found, CloudError):
             raise found
-        # a snapshot has no times: whoever needs them is told so
+        # a snapshot has no times: raise for a caller that needs them
         return found if snapshots or found.start < found.end else to_sweep(points, stamp, unit)
 
 

@@ -197,7 +197,7 @@ def between(poses: F64, first: int, second: int) -> F64:
 LARGEST_DEVIATION: Final = 3.0
 """[sigma] An edge farther off after optimization condemns the batch that came last."""
 
-_WAITING_WAY_M: Final = 60.0  # a pair that nobody confirms within this way is forgotten
+_WAITING_WAY_M: Final = 60.0  # a pair that is not confirmed within this distance is dropped
 _AGREE_CHI2: Final = 22.5  # 6 degrees of freedom, 99.9 %
 _LOOSE: Final = (np.radians(0.2), 0.03)  # [rad, m] by which submaps are bent themselves
 

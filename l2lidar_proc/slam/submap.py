@@ -284,7 +284,7 @@ class SubmapView:
     def is_open(self, points: F64) -> NDArray[np.bool_]:
         """Return which points (N, 3) rays passed on their last two meters, shape (N,).
 
-        Finer than :meth:`is_free`, and up to the surfaces: whoever asks has to see to it that
+        Finer than :meth:`is_free`, and up to the surfaces: the caller must make sure that
         they are not on one.
         """
         return _contained(voxel_keys(points, _OPEN_CELL_M), self._open)

@@ -403,7 +403,7 @@ class _Listener:
         self._sweep(frame, stamp, now, lambda: points)
 
     def finish(self) -> OdometryRun:
-        """Return what was found, and what is to be said of the recording."""
+        """Return the result and the remarks on the recording."""
         notes = self.runner.notes
         if self._config.odometry.mode == "inertial":
             if not self.imu:

@@ -123,7 +123,7 @@ class UdpPort:
     network : Network
         Addresses; the unit's port may be 0 for any free one.
     reply_to_sender : bool
-        Send to whoever sent last instead of the stored host, once there was somebody.
+        Send to the last sender, if there was one, instead of the stored host.
 
     Raises
     ------

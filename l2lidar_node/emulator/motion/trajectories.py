@@ -394,7 +394,7 @@ def _legs(stops: F64, style: Style, seconds: float) -> tuple[F64, F64]:
     headings.append(np.array([heading]))
     for start, end in pairwise(stops):
         flat = end[:2] - start[:2]
-        if np.linalg.norm(flat) > 1e-6:  # else straight up: whoever stands there keeps looking
+        if np.linalg.norm(flat) > 1e-6:  # else straight up: keep the heading
             change = float(np.arctan2(flat[1], flat[0])) - heading
             change = float(np.mod(change + np.pi, 2.0 * np.pi) - np.pi)
             if abs(change) > _TURNS_RAD:

@@ -186,7 +186,7 @@ class VirtualL2:
             if received.status is AckStatus.OK:
                 self.received[received.packet_type] += 1
             self._obey(received, now_ns)
-            if self.boots != boots:  # what came after a reset in the same bytes is forgotten
+            if self.boots != boots:  # bytes after a reset are dropped
                 self._restarted()
                 break
         self._retune(now_ns)

@@ -242,7 +242,7 @@ LIFT_RISE_M: Final = 7.2
 def atrium(seed: int = 0) -> Scene:
     """Return an atrium with galleries at 3.6 and 7.2 m; the tour takes its open lift up.
 
-    The platform itself is :func:`platform`; it has to move with whoever stands on it.
+    The platform itself is :func:`platform`; it must move with its passenger.
     """
     rng = np.random.default_rng((seed, 5))
     builder = Builder()

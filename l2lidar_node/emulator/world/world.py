@@ -353,7 +353,7 @@ def _passes(
 
 
 _KNOTS_PER_S: Final = 5.0
-_NEAREST_M: Final = 0.75  # nobody comes closer to the sensor
+_NEAREST_M: Final = 0.75  # people keep this distance to the sensor
 _CLOTHES: Final = (0.2, 0.6)  # reflectivity
 
 
