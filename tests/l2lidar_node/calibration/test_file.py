@@ -88,7 +88,7 @@ def test_a_file_that_is_not_there_or_endless_is_an_error(tmp_path: Path) -> None
         load(tmp_path / "none.yaml")
     long = tmp_path / "long.yaml"
     long.write_bytes(b"#" * (file._LARGEST_FILE + 1))
-    with pytest.raises(CalibrationFileError, match="larger"):
+    with pytest.raises(CalibrationFileError, match="too large"):
         load(long)
 
 

@@ -80,7 +80,7 @@ def test_too_short_a_capture_is_refused_with_what_to_do(run: Run, tmp_path: Path
     done = run("calibrate", "still", str(short), "-o", str(output))
     assert done.code == 1
     assert "record 10 s at each placement" in done.out
-    assert "nothing is written" in done.err
+    assert "nothing written" in done.err
     assert not output.exists()
 
 
@@ -139,7 +139,7 @@ def test_live_places_are_recorded_and_kept(
         "--yes", *unit.options,
     )  # fmt: skip
     assert done.code == 1
-    assert "flat surfaces" in done.err or "nothing is written" in done.err
+    assert "flat surfaces" in done.err or "nothing written" in done.err
     size = wire.FRAME_SIZES[PacketType.POINTS_3D]
     with (tmp_path / "place_1.pcap").open("rb") as stream:
         received = [entry for entry in Recording(stream) if isinstance(entry, Received)]

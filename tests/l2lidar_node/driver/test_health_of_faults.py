@@ -76,7 +76,7 @@ def test_a_fault_is_named(faults: Any, found: dict[str, tuple[Level, str]]) -> N
 def test_packets_that_stay_late_are_told() -> None:
     check = judged(6.0, 7.0, late=[(4.0, 9.0, 1.5)])["clock"]
     assert check.level is WARN
-    assert check.message == "locked; packets come 1.5 s late; the stamps are corrected for that"
+    assert check.message == "locked; packets arrive 1.5 s late; the stamps are corrected for that"
     assert judged(6.0, 7.0, late=[(4.0, 4.5, 0.2)])["clock"].message == "locked"
 
 

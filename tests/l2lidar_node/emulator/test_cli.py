@@ -243,7 +243,10 @@ def test_a_killed_measuring_process_is_one_message(host: socket.socket) -> None:
         (["--mount", "sideways"], ["'--mount'", "upside_down"]),
         (["--flash", "pyproject.toml"], ["pyproject.toml", "stored settings"]),
         (["--flash", "tests"], ["tests: Is a directory"]),
-        (["--flash", "no/folder/flash.json"], ["flash.json", "no folder 'no/folder'"]),
+        (
+            ["--flash", "no/folder/flash.json"],
+            ["flash.json", "'no/folder' is not a writable folder"],
+        ),
         pytest.param(["--world", "tests"], ["tests: not a file"], marks=needs_rays),
         (["--worlds", "room"], ["--worlds"]),
     ],
