@@ -24,7 +24,7 @@ RUN_BY = {
     r"\.venv/bin/python -m pytest .*": "CI itself",
     r"PYTHON=.* make setup": "tests/test_setup.py",
     r"(python3 -m venv|\.venv/bin/(pip|python -m colcon)) .*": "tests/test_packaging.py",
-    r"make demo\b.*": "tests/l2lidar_node/ros/test_demo.py",
+    r"make demo\b.*": "tests/l2lidar_node/demo/test_demo.py",
     r"l2lidar (discover|info|set \w+).*": "tests/l2lidar_node/cli/test_unit_verbs.py",
     r"l2lidar calibrate (still|imu|scale) .*": "tests/l2lidar_node/cli/test_calibrate.py",
     r"l2lidar (record|convert|replay|odometry) .*": "tests/l2lidar_node/cli/test_data_verbs.py",
