@@ -87,7 +87,7 @@ def registered_verbs() -> list[Verb]:
 
 @contextmanager
 def interruption_exits() -> Iterator[None]:
-    """Turn Ctrl-C into exit code 130; Ubuntu 24.04's click says "Aborted" and exits with 1."""
+    """Turn Ctrl-C into exit code 130; Ubuntu 24.04's click prints "Aborted" and exits with 1."""
     try:
         yield
     except KeyboardInterrupt:

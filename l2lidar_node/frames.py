@@ -41,7 +41,7 @@ class FrameTree:
         self._parents[child] = parent, np.array(T_parent_child, dtype=np.float64)
 
     def find(self, target: str, source: str) -> F64 | None:
-        """Return what takes source coordinates to target coordinates, (4, 4), None if unknown."""
+        """Return the transform from source to target coordinates, (4, 4), None if unknown."""
         target, source = target.lstrip("/"), source.lstrip("/")
         if target == source:
             return np.eye(4)
@@ -53,7 +53,7 @@ class FrameTree:
         return None
 
     def root(self, frame: str) -> tuple[str, F64]:
-        """Return the topmost frame above a frame, and what takes its coordinates there, (4, 4).
+        """Return the topmost frame above a frame, and the transform to it, (4, 4).
 
         The frame itself where nothing is above it.
         """

@@ -71,7 +71,7 @@ def ignore_signals() -> None:
 
 
 def interruptible(main: Callable[[], int | None]) -> int:
-    """Run what is ended by KeyboardInterrupt, with SIGINT and SIGTERM raising it.
+    """Run a function that KeyboardInterrupt ends; SIGINT and SIGTERM raise it.
 
     Returns
     -------

@@ -113,7 +113,7 @@ class Viewer:
         self._uncertainty(np.asarray(message.pose.covariance, np.float64).reshape(6, 6), position)
 
     def diagnostics(self, message: Any) -> None:
-        """Show a DiagnosticArray: each status, what changes, and its figures as curves."""
+        """Show a DiagnosticArray: each status, its changes, and its figures as curves."""
         self._at(message)
         rerun = self._rerun
         for status in message.status:

@@ -107,7 +107,7 @@ def without_time(points: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def position_problem(layout: np.dtype[Any]) -> str:
-    """Return what is wrong with the fields x, y and z of a cloud; empty if nothing is."""
+    """Return the problem with the fields x, y and z of a cloud; empty if there is none."""
     for axis in "xyz":
         if axis not in (layout.names or ()):
             return f"field '{axis}' is missing"

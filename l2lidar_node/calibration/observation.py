@@ -129,7 +129,7 @@ class Gathering:
         self._rejected += 1
 
     def place(self) -> Place:
-        """Return what was gathered.
+        """Return the gathered placement.
 
         Raises
         ------
@@ -290,7 +290,7 @@ class Precession:
 
     @property
     def correction(self) -> F64:
-        """What the precession adds to the parameters of the beams, shape (8,)."""
+        """Contribution of the precession to the beam parameters, shape (8,)."""
         found = np.zeros(len(NAMES))
         found[[ALPHA, BETA, ROCK_COS, ROCK_SIN]] = (
             self.tilt_a, self.tilt_b, self.rock_cos, self.rock_sin,

@@ -109,7 +109,7 @@ def calibration_of(
 
 
 def beams_of(file: CalibrationFile | None) -> F64:
-    """Return what a file corrects of the beams, shape (8,), in the order of model.NAMES.
+    """Return a file's corrections of the beams, shape (8,), in the order of model.NAMES.
 
     The range scale is not part of it; nothing is corrected without a file.
     """
@@ -128,7 +128,7 @@ def quality_mm(quality: Quality) -> dict[str, float]:
 
 
 def joined(new: CalibrationFile, old: CalibrationFile | None) -> CalibrationFile:
-    """Return a new result with what an older file of the same unit has beside it.
+    """Return a new result joined with the other sections of an older file of the same unit.
 
     Beams, scale and IMU are estimated on their own: each replaces its own part of the file.
     """
@@ -157,7 +157,7 @@ _HALVES: Final = ("alpha below 90 degrees", "alpha above 90 degrees")
 
 
 def save(result: StillResult, path: Path) -> None:
-    """Write the picture of a result as PNG or whatever the suffix says.
+    """Write the picture of a result in the format of the suffix.
 
     Raises
     ------

@@ -139,7 +139,7 @@ class StillResult:
 
     @property
     def stored(self) -> dict[str, float]:
-        """What a file of this result corrects, by parameter."""
+        """Corrections stored in a file, by parameter."""
         return {
             name: item.value
             for name, item in self.estimates.items()

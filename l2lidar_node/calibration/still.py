@@ -165,7 +165,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
 
 
 def problems(place: Place) -> list[Refusal]:
-    """Return what is wrong with a place before anything is estimated."""
+    """Return the problems of a placement that show before the estimation."""
     found = []
     if place.turns < _FEWEST_TURNS:
         found.append(
@@ -274,7 +274,7 @@ def _precession(
     places: Sequence[Place],
     precessions: Sequence[Precession | None],
 ) -> tuple[list[Precession | None], list[str], list[Refusal]]:
-    """Return the precession to take out of each place, what to say, and why to refuse.
+    """Return the precession to subtract for each placement, notes, and refusals.
 
     A gyro may show a line at the head's frequency that is not a motion. A real rocking is hardly
     ever a circle: its part against the turning of the head shows in the cloud too.
@@ -350,7 +350,7 @@ def _alone(
     places: Sequence[Place],
     precessions: Sequence[Precession | None],
 ) -> list[PlaceReport]:
-    """Return what each place alone says: one step from the common solution."""
+    """Return the solution of each placement alone: one step from the common solution."""
     group = scene.group[solution.planes.member]
     owner = group[solution.planes.first]
     reports = []

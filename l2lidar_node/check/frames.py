@@ -107,7 +107,7 @@ def _reachable(frame: str, transforms: Iterable[tuple[str, str]]) -> set[str]:
 
 
 def check_qos(seen: Observation, consumer: Consumer) -> Iterator[Finding]:
-    """Yield findings on what publishers offer and the consumer's subscriptions ask for."""
+    """Yield findings on the QoS of publishers and of the consumer's subscriptions."""
     if seen.clouds:
         yield _check_offer("cloud", seen.cloud_qos, consumer.cloud_qos, consumer)
     if len(seen.imu) and consumer.imu is not Use.IGNORED:

@@ -105,7 +105,7 @@ class Contents:
 
 
 def contents(points: NDArray[np.void]) -> Contents:
-    """Return what is in a cloud.
+    """Return the contents of a cloud.
 
     Parameters
     ----------

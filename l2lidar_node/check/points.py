@@ -406,7 +406,7 @@ def _verdict(seen: Observation) -> tuple[bool | None, str]:
 
 
 def _below(points: F64) -> float:
-    """Return the share of points that are below what an L2 can see."""
+    """Return the share of points below an L2's field of view."""
     level = np.hypot(points[:, 0], points[:, 1])
     elevation = np.degrees(np.arctan2(points[:, 2] - OPTICAL_CENTRE_M, level))
     return float((elevation < _BELOW_DEG).mean())

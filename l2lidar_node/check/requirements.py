@@ -45,7 +45,7 @@ def ok(subject: str, check: str, text: str) -> Finding:
 
 
 def not_judged(subject: str, check: str, text: str) -> Finding:
-    """Return a finding that nothing can be said, and why."""
+    """Return a finding that something could not be judged, and why."""
     return Finding(Level.OK, subject, check, f"not judged: {text}")
 
 

@@ -278,7 +278,7 @@ def _virtual(name: str, seconds: float, places: int, *, quiet: bool) -> list[Pla
 def _live(
     network: NetworkConfig, places: int, seconds: float, keep: Path | None, guide: _Guide
 ) -> tuple[list[Place], str]:
-    """Guide through the places and return what was measured."""
+    """Guide through the placements and return the measurements."""
     found: list[Place] = []
     firmware = ""
     with ExitStack() as stack:
@@ -316,7 +316,7 @@ class _Guide(NamedTuple):
 def _measured(
     network: NetworkConfig, path: Path, seconds: float, power_up: int, text: str, guide: _Guide
 ) -> tuple[Place, str]:
-    """Return a place; one that cannot be used is told at once, and may be measured again.
+    """Return a placement; report at once if it cannot be used, and offer to repeat it.
 
     Parameters
     ----------
@@ -384,7 +384,7 @@ def _recorded(
 
 
 def _show(result: StillResult) -> None:
-    """Print what was found."""
+    """Print the result."""
     table = Table(box=None, pad_edge=False)
     for heading in ("", "reported", "correction", "", "verdict"):
         table.add_column(heading, overflow="fold")

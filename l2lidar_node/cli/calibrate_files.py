@@ -56,7 +56,7 @@ PictureOption = Annotated[
 
 
 def existing(output: Path | None) -> CalibrationFile | None:
-    """Return what the file to add to holds; None if there is none yet.
+    """Return the content of the file to add to; None if there is none yet.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def existing(output: Path | None) -> CalibrationFile | None:
 
 
 def check_identity(place: Place, known: CalibrationFile | None, output: Path | None) -> None:
-    """Refuse what was not measured by one unit in one mode, that of the file to add to.
+    """Refuse measurements of another unit or mode than that of the file to add to.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def wait_for_points(device: Device, *, quiet: bool) -> None:
 
 
 def recorder(path: Path, network: NetworkConfig, failures: list[str]) -> Recorder:
-    """Return what writes a new capture; it adds to ``failures`` where it cannot go on.
+    """Return a writer of a new capture; it adds to ``failures`` if it cannot continue.
 
     Raises
     ------
@@ -255,7 +255,7 @@ def _sends_points(driver: Driver) -> bool:
 
 
 def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
-    """Return what a capture holds of a still place, and the unit's firmware if it says so.
+    """Return the placement in a capture, and the unit's firmware if it is known.
 
     Raises
     ------
@@ -281,7 +281,7 @@ def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
 
 
 def _gathered(gathering: Gathering, frame: Frame) -> str:
-    """Add a frame to a place; return the firmware if it says so."""
+    """Add a frame to a placement; return the firmware if the frame has it."""
     packet = decode(frame)
     if isinstance(packet, PointPacket):
         if packet.packet_type == PacketType.POINTS_3D:

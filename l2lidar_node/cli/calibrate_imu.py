@@ -229,7 +229,7 @@ def _bar(quiet: bool) -> Progress:
 
 
 def _estimated(path: Path, known: CalibrationFile | None, *, quiet: bool) -> ImuResult:
-    """Return what a capture tells about the IMU."""
+    """Return the result of a capture."""
     from l2lidar_proc.motion.gyro_alignment import GyroError
     from l2lidar_proc.odometry import imu_calibration
 
@@ -276,7 +276,7 @@ def _measured(
 
 
 def over_time(turns: Turns) -> tuple[F64, F64]:
-    """Return the instants (N,) [s] of turns, and what they are off by, (N, 3) [rad]."""
+    """Return the times (N,) [s] of rotations, and their errors (N, 3) [rad]."""
     ends = turns.ends
     return np.asarray((ends - ends[:1]) * 1e-9), turns.residual
 
@@ -312,7 +312,7 @@ def _about(result: ImuResult, firmware: str, known: CalibrationFile | None) -> d
 
 
 def _show(result: ImuResult, known: CalibrationFile | None) -> None:
-    """Print what was found."""
+    """Print the result."""
     from l2lidar_proc.odometry.imu_calibration import ENOUGH, UNITS
 
     if not _has_beams(known):

@@ -357,7 +357,7 @@ def set_network(
     ] = False,
     yes: YesOption = False,
 ) -> None:
-    """Store addresses; what is left out stays as it is in use now.
+    """Store addresses; omitted ones stay as they are.
 
     The unit never tells what it has stored, so its acknowledgement is all there is. Gateway and
     mask cannot be known beforehand and are always written. Over a serial line, or for a unit that
@@ -425,7 +425,7 @@ def _ask(yes: bool) -> None:
 
 @contextlib.contextmanager
 def _undone_by(device: Device, make: Callable[[], Command]) -> Iterator[None]:
-    """Send another command when what happens within is interrupted."""
+    """Send another command if the body is interrupted."""
     try:
         yield
     except KeyboardInterrupt:
@@ -582,7 +582,7 @@ def _heard(driver: Driver) -> bool:
 
 
 def _stamp_s(driver: Driver) -> float:
-    """Return what the device's clock showed at the latest points; infinity if there were none."""
+    """Return the device's clock at the latest points [s]; infinity if there were none."""
     if driver.last_points is None:
         return float("inf")
     info = np.frombuffer(driver.last_points, wire.DATA_INFO, 1)[0]

@@ -68,7 +68,7 @@ def as_data(checks: Iterable[Check]) -> dict[str, Any]:
 
 
 def change(before: Mapping[str, object], after: Mapping[str, object]) -> Table:
-    """Return a table of what was and what will be, the differences marked."""
+    """Return a table of old and new values, with the differences marked."""
     table = Table(box=None, pad_edge=False)
     for heading in ("", "before", "after"):
         table.add_column(heading)

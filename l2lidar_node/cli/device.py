@@ -124,7 +124,7 @@ class Device:
         self._session.stop()
 
     def ask(self, question: Callable[[Driver], T]) -> T:
-        """Return what a question to the driver gives, asked in the thread that owns it."""
+        """Return the result of a function of the driver, called in the thread that owns it."""
         return self._session.call(lambda driver, now: question(driver)).result()
 
     def wait_for(self, question: Callable[[Driver], T | None], timeout_s: float) -> T | None:
@@ -140,7 +140,7 @@ class Device:
             time.sleep(_LOOK_S)
 
     def command(self, start: Callable[[Driver, HostNs], int]) -> Answer:
-        """Send what ``start`` queues, wait for its answer and return it.
+        """Send the command that ``start`` queues, wait for its answer and return it.
 
         Raises
         ------
@@ -189,13 +189,13 @@ class Device:
         return found
 
     def period(self) -> health.Period:
-        """Return what has been counted so far."""
+        """Return the counts so far."""
         return self._session.call(
             lambda driver, now: health.observe(driver, self._session.transport, now)
         ).result()
 
     def checks(self, before: health.Period) -> tuple[list[Check], health.Period]:
-        """Return how the time since is judged, and what has been counted by now."""
+        """Return the checks of the period since then, and the present counts."""
 
         def look(driver: Driver, now: HostNs) -> tuple[list[Check], health.Period]:
             after = health.observe(driver, self._session.transport, now)
@@ -211,7 +211,7 @@ class Device:
         )
 
     def advice(self) -> str:
-        """Return what may be wrong when nothing is heard."""
+        """Return what to check if no data arrive."""
         if self.network.serial_port:
             return (
                 f"check that it is at {self.network.serial_port}, that it has power, and that its "

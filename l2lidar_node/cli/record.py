@@ -360,7 +360,7 @@ def _paced(
 
 
 def _sent(sender: socket.socket, data: bytes, destination: tuple[str, int]) -> bool:
-    """Send, and throw away what the driver says: a recording does not obey."""
+    """Send, and discard the driver's commands: a recording cannot obey."""
     try:
         for _ in range(_UNSWEPT):
             sender.recv(65_536)

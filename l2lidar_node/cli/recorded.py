@@ -44,7 +44,7 @@ _IMU_DEPTH: Final = 1000
 def observe_bag(
     path: Path, asked: Topics, needs_imu: bool, seconds: float | None = None
 ) -> tuple[Observation, Topics]:
-    """Return what a rosbag2 folder or an MCAP file holds.
+    """Return the observation of a rosbag2 folder or an MCAP file.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def observe_bag(
 def observe_capture(
     path: Path, consumer: str, seconds: float | None = None
 ) -> tuple[Observation, Topics]:
-    """Return what the driver would publish of a capture, with its parameters for a consumer.
+    """Return the observation of what the driver would publish from a capture for a consumer.
 
     These are the ones with which ``lio_input.launch.py consumer:=NAME`` starts it, where there is
     such a profile; else its defaults with ``imu_adjust`` off.
@@ -127,7 +127,7 @@ def shared_file(name: str) -> Path | None:
 
 
 def describe(path: Path, l2_ip: str = "") -> dict[str, Any]:
-    """Return what a capture, a bag or a calibration holds, as values for JSON.
+    """Return the content of a capture, a bag or a calibration, as values for JSON.
 
     Raises
     ------

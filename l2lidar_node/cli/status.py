@@ -55,7 +55,7 @@ def info(
     ] = None,
     json_: JsonOption = False,
 ) -> None:
-    """Say what the unit is: versions, work mode, calibration, scan geometry, and its state.
+    """Show what the unit is: versions, work mode, calibration, scan geometry, and its state.
 
     Of a file it says what is in it: from when, how long, how much, what was lost.
     """
@@ -189,7 +189,7 @@ class _Collector:
         self._framer = Framer()
 
     def received(self, data: bytes, arrival: HostNs) -> None:
-        """Keep the stamps of what is measured; points leave when their last slot is measured."""
+        """Keep the stamps of measurements; points leave after their last slot is measured."""
         for item in self._framer.feed(data):
             packet = decode(item) if isinstance(item, Frame) else None
             if isinstance(packet, PointPacket):
@@ -274,7 +274,7 @@ def _is_measuring(driver: Driver) -> bool:
 
 
 def judged(seen: list[tuple[int, int]], ratio: float) -> dict[str, float]:
-    """Return what stamps and arrivals of one stream say.
+    """Return the statistics of one stream's stamps and arrivals.
 
     Parameters
     ----------

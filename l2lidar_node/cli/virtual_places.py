@@ -45,7 +45,7 @@ def still_places(
     seed: int = 0,
     imu: ImuNoise | None = None,
 ) -> list[Place]:
-    """Return what a virtual unit measures at still places.
+    """Return the measurements of a virtual unit at still placements.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def still_places(
 
 
 def slide(own: str | Unit, length: float, *, seconds: float = 10.0, seed: int = 0) -> list[Place]:
-    """Return what a virtual unit measures at both ends of a way along a tape in a room.
+    """Return the measurements of a virtual unit at both ends of a tape in a room.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class SyncSchedule:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, as with a device that has just started."""
+        """Start over, as with a device that has just started."""
         self.in_force = not self._wanted
         self._sent: HostNs | None = None
         self._value = HostNs(0)
@@ -348,7 +348,7 @@ class DeviceClock:
         self._host.advance_ns = min(self._round_trips) // 2
 
     def status(self) -> ClockStatus:
-        """Return what is known now."""
+        """Return the present status."""
         line = self._host.line
         return ClockStatus(
             locked=self._locked,
@@ -368,7 +368,7 @@ class DeviceClock:
         )
 
     def events(self) -> list[ClockEvent]:
-        """Return what happened since the last call, oldest first."""
+        """Return the events since the last call, oldest first."""
         happened = list(self.happened)
         self.happened.clear()
         return happened

@@ -237,7 +237,7 @@ def _watch(console: Console, observer: Observer, programs: Programs, seconds: fl
 
 
 def _wait_for_data(observer: Observer, programs: Programs) -> None:
-    """Watch until clouds come, then forget what start-up looked like."""
+    """Watch until clouds arrive, then forget the start-up."""
     deadline = time.monotonic() + _START_TIMEOUT_S
     while not observer.clouds.stamps:
         observer.watch(time.monotonic() + 0.2)

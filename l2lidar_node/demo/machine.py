@@ -50,7 +50,7 @@ def processor_time(pid: int) -> ProcessorTime | None:
 
 
 def shortfall(run: Mapping[str, Any], times: Mapping[str, ProcessorTime]) -> str:
-    """Return in what the machine fell behind; empty if it kept up.
+    """Return where the machine fell behind; empty if it kept up.
 
     Only what has nothing to do with the driver and what follows it counts: an odometry that skips
     sweeps may just be slow.
@@ -88,7 +88,7 @@ def shortfall_since(began_ns: int, truth: Path, times: Mapping[str, ProcessorTim
 
 
 def verdict(troubles: list[str], behind: str) -> tuple[int, list[str]]:
-    """Return the exit code and what to say in the end.
+    """Return the exit code and the final message.
 
     Parameters
     ----------

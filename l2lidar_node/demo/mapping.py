@@ -112,7 +112,7 @@ class MappingRun:
         self._console.print(f"slam_node/save: {self._asked('slam_node/save')}")
 
     def start_again(self) -> None:
-        """Begin the odometry and slam_node anew somewhere in the map, and watch until it knows.
+        """Restart odometry and slam_node somewhere in the map, and watch until it localizes.
 
         Raises
         ------
@@ -144,7 +144,7 @@ class MappingRun:
             self._found_after_s = (self._stamps[0] - began) / 1e9
 
     def report(self) -> list[str]:
-        """Say what the map holds and how right it is, draw it, and return what is wrong."""
+        """Print size and accuracy of the map, draw it, and return problems."""
         from l2lidar_proc.slam import atlas, export
         from l2lidar_proc.slam.pose_graph import LOOP
 
@@ -183,7 +183,7 @@ class MappingRun:
         return self._programs.start("l2lidar_proc.ros.slam_node", assigned(values))
 
     def _asked(self, service: str) -> str:
-        """Call a service and return what it says."""
+        """Call a service and return its message."""
         client = self._observer.create_client(Trigger, service)
         deadline = time.monotonic() + _ANSWER_S
         future, asked = None, 0.0
@@ -201,7 +201,7 @@ class MappingRun:
         return str(answer.message)
 
     def _watch_until(self, is_done: Callable[[], bool], topic: str, record: TopicRecord) -> None:
-        """Handle what arrives until something is so; messages of a topic have to keep coming."""
+        """Handle messages until a condition holds; messages of a topic must keep arriving."""
         began = time.monotonic()
         while not is_done():
             self._watch(0.2)
@@ -222,7 +222,7 @@ class MappingRun:
         self._places.append((place.x, place.y, place.z))
 
     def _judge_place(self, truth: Results, T_world_map: tuple[Rotation, F64]) -> list[str]:
-        """Say how well the place in the map was found; return what is wrong."""
+        """Print the accuracy of the localization; return problems."""
         if self._found_after_s is None:
             return [f"no pose in the saved map was found within {_SEARCH_S:.0f} s"]
         turn, shift = T_world_map

@@ -111,7 +111,7 @@ class Observer(Node):
         return {name: check for entry in self.diagnostics for name, check in entry.items()}
 
     def watch(self, until: float) -> None:
-        """Handle what arrives until a monotonic time [s]."""
+        """Handle messages until a monotonic time [s]."""
         while (left := until - time.monotonic()) > 0:
             with held():
                 rclpy.spin_once(self, timeout_sec=min(left, 0.1))

@@ -138,7 +138,7 @@ class Programs:
         program.stop()
 
     def processor_times(self) -> dict[str, ProcessorTime]:
-        """Return the processor time of those that run, by module; where the system tells it."""
+        """Return the processor time of running programs by module, if the system reports it."""
         times = {item.module: processor_time(item.pid) for item in self._running}
         return {module: time for module, time in times.items() if time is not None}
 
@@ -158,7 +158,7 @@ def assigned(values: Mapping[str, object]) -> list[str]:
 
 
 def isolate_ros() -> None:
-    """Keep the topics on this machine and apart from other nodes, unless told otherwise."""
+    """Keep the topics on this machine and apart from other nodes by default."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     if "ROS_DOMAIN_ID" not in os.environ:
         os.environ["ROS_DOMAIN_ID"] = str(free_ros_domain())

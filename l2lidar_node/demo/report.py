@@ -267,7 +267,7 @@ def report(
     with_odometry: bool,
     mount: F64 | None = None,
 ) -> list[str]:
-    """Print what was seen, write pictures, and return what is wrong.
+    """Print the report, write pictures, and return problems.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def report(
 
 
 def _in_base(console: Console, cloud: NDArray[np.void], mount: F64, folder: Path) -> list[str]:
-    """Show a cloud as RViz does with the fixed frame base_link; return what is wrong."""
+    """Show a cloud as RViz does with the fixed frame base_link; return problems."""
     shown = moved(cloud, mount)
     floor, ceiling = floor_and_ceiling(shown)
     text = f"in {BASE_FRAME} the floor is at z = {floor:.2f} m, the ceiling at {ceiling:.2f} m"
@@ -340,7 +340,7 @@ def _topics(observer: Observer, with_odometry: bool) -> Table:
 
 
 def _odometry(console: Console, observer: Observer, truth: Results, folder: Path) -> list[str]:
-    """Judge the track and draw it; return what is wrong."""
+    """Evaluate the track and draw it; return problems."""
     if len(observer.positions) < _MIN_POSES:
         return [f"/odometry: {len(observer.positions)} poses, expected {_MIN_POSES} and more"]
     positions = np.array(observer.positions)

@@ -82,7 +82,7 @@ class Metadata:
 
 
 def metadata(driver: Driver) -> Metadata:
-    """Return what a driver knows about its device."""
+    """Return the metadata of a driver's device."""
     version, parameters = driver.version, driver.parameters
     mode = None if parameters is None else parameters.work_mode
     packet = None
@@ -389,7 +389,7 @@ def _points(old: Counters, new: Counters, seconds: float) -> Check:
 
 
 def _calibration(driver: Driver, payload: bytes) -> list[Check]:
-    """Return what is used instead of the reported calibration; nothing where that is used."""
+    """Return the values that replace the reported calibration, if any."""
     start = wire.DATA_INFO.itemsize + wire.INSIDE_STATE.itemsize
     reported = payload[start : start + wire.CALIBRATION.itemsize]
     blocks = driver.blocks

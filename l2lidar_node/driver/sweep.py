@@ -99,7 +99,7 @@ class BlockChoice:
         return found
 
     def values(self, reported: bytes) -> dict[str, float]:
-        """Return what is used by name, ranges of the parameters included."""
+        """Return the values in use by name, including the range parameters."""
         record = np.frombuffer(self.used(reported), wire.CALIBRATION, 1)[0]
         values = {name: float(record[name]) for name in wire.CALIBRATION.names or ()}
         if self._config.override_range_calibration:
@@ -204,7 +204,7 @@ class SweepAssembler:
 
     @property
     def ends_at_pause(self) -> bool:
-        """Whether what has been collected is a sweep if nothing more comes.
+        """Whether the collected packets form a sweep if no more arrive.
 
         Part of a turn is not. It waits: packets that the network or a busy host held back go on
         where the ones before ended, and then the turn is whole. Their stamps tell.
@@ -258,7 +258,7 @@ class SweepAssembler:
         return sweeps
 
     def flush(self) -> Sweep | None:
-        """Return what has been collected so far as a sweep.
+        """Return the packets collected so far as a sweep.
 
         None if that is nothing, or part of a turn or half turn.
         """
@@ -285,7 +285,7 @@ class SweepAssembler:
         return _BOUNDARY if is_over else _NONE
 
     def _finish(self, end: _Cut) -> list[Sweep]:
-        """Return what has been collected as one sweep; nothing where it is part of a turn.
+        """Return the collected packets as one sweep; None if they are part of a turn.
 
         LIO-SAM takes its first cloud for a key frame and crashes on one that is too small.
         """

@@ -166,7 +166,7 @@ def _text(value: Value) -> str:
 def beginning(
     config: DeviceConfig, physics: PhysicsConfig, flash: Flash, port: Port
 ) -> Iterator[str]:
-    """Yield the lines for the start: what is emulated, where it sends and what will go wrong."""
+    """Yield the start-up lines: the unit, its addresses, and the faults."""
     power, identity = config.power, config.identity
     world = physics.world
     sight = world if world in WORLDLESS else f"{world}, {physics.motion}, {physics.mount}"
@@ -189,7 +189,7 @@ def beginning(
 
 
 def end(device: VirtualL2, server: Server) -> Iterator[str]:
-    """Yield the lines for the end: what was sent and heard, how punctually, what went wrong."""
+    """Yield the final lines: what was sent and received, the latency, the faults."""
     seconds = max(device.now_ns - device.power_on_ns, 0) * 1e-9
     sent = ", ".join(f"{count} {kind.name}" for kind, count in sorted(device.sent.items()))
     heard = ", ".join(
@@ -284,7 +284,7 @@ def emulate(
         ),
     ] = False,
 ) -> None:
-    """Emulate a Unitree L2: stream what a moving sensor sees, obey commands, fail on request.
+    """Emulate a Unitree L2: stream a moving sensor's data, obey commands, fail on request.
 
     Without options a unit on 127.0.0.1:6101 sends to 127.0.0.1:6201, carried through a furnished
     room, with points from 25 s on.

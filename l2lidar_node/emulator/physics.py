@@ -204,7 +204,7 @@ class RayCastWorker:
         self.close()
 
     def close(self) -> None:
-        """End the process; what it has not begun is dropped, and what takes it long as well."""
+        """End the process; pending work is dropped."""
         self._end(_GRACE_S)
 
     def _end(self, grace_s: float = 0.0) -> None:

@@ -33,7 +33,7 @@ class FlashError(ValueError):
 
 
 def stored_settings(path: Path | None, config: DeviceConfig, serial: bool) -> Flash:
-    """Return what the unit's flash holds: a file's content, or a new unit's settings without one.
+    """Return the unit's stored settings: those in a file, or a new unit's without one.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ class Framer:
 
 
 def _parse(data: bytes) -> tuple[list[FramingEvent], bytes]:
-    """Return the events in ``data`` and what is left, the beginning of a frame."""
+    """Return the events in ``data`` and the rest, the beginning of a frame."""
     events: list[FramingEvent] = []
     at = 0
     while at < len(data):
@@ -157,7 +157,7 @@ def _take_out(data: bytes, at: int, events: list[FramingEvent]) -> bytes:
 
 
 def _frame_at(data: bytes, at: int) -> Frame | Fault | None:
-    """Return the frame that begins here, or what is wrong with it; None if it is incomplete."""
+    """Return the frame that begins here, or its error; None if it is incomplete."""
     if len(data) - at < _HEADER_SIZE:
         return None
     _, packet_type, size = wire.HEADER.unpack_from(data, at)

@@ -48,7 +48,7 @@ def open_bag(path: Path) -> AnyReader:
 
 
 def unreadable(path: Path, error: Exception) -> RecordingError:
-    """Return what to say of a recording that its reader failed on."""
+    """Return the error message for a recording whose reader failed."""
     if not path.exists():
         return RecordingError(f"{path}: no such file or folder")
     if path.is_dir() and not (path / "metadata.yaml").exists():
@@ -293,7 +293,7 @@ class BagWriter:
 
     @property
     def unfinished(self) -> Path | None:
-        """What an exception left; see :class:`BagFile`."""
+        """Path of an unfinished bag; see :class:`BagFile`."""
         return self._file.unfinished
 
     def __enter__(self) -> BagWriter:

@@ -48,7 +48,7 @@ def is_capture(start: bytes) -> bool:
 
 
 def is_capture_file(path: Path) -> bool:
-    """Tell whether a file is a capture, or is called one: then its reader says what it lacks."""
+    """Tell whether a file is a capture by content or name."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:

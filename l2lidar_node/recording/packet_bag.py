@@ -64,7 +64,7 @@ class PacketBatch:
             self._begun = HostNs(arguments[-1])
 
     def is_due(self, now: HostNs) -> bool:
-        """Tell whether what has been collected should be handed on."""
+        """Tell whether the batch should be published."""
         if self._begun is None:
             return False
         return not 0 <= now - self._begun < _LONGEST_NS or self._stream.tell() > _LARGEST

@@ -219,11 +219,11 @@ class RecordingWriter:
         self._capture.write(UdpDatagram(until, self._host, self._host, WAITED))
 
     def stepped(self, by_ns: int, at: HostNs) -> None:
-        """Append that the driver was told that the host's clock was set."""
+        """Append a step of the host's clock."""
         self._capture.write(UdpDatagram(at, self._host, self._host, STEPPED % by_ns))
 
     def slewed(self, by_ns: int, at: HostNs) -> None:
-        """Append that the driver was told how far slewing had moved the host's clock."""
+        """Append the slewing of the host's clock."""
         self._capture.write(UdpDatagram(at, self._host, self._host, SLEWED % by_ns))
 
 
@@ -241,7 +241,7 @@ def written(entry: Entry) -> tuple[str, tuple[Any, ...]]:
 
 
 def _noted(data: bytes, time: HostNs) -> Waited | Stepped | Slewed | None:
-    """Return what a datagram from the host to itself stands for."""
+    """Return the note in a datagram from the host to itself."""
     if data == WAITED:
         return Waited(time)
     step = _STEP.fullmatch(data)
@@ -354,15 +354,15 @@ class Recorder:
         self._write(lambda: self._writer.waited(until), until)
 
     def stepped(self, by_ns: int, at: HostNs) -> None:
-        """Write that the driver was told that the host's clock was set."""
+        """Write a step of the host's clock."""
         self._write(lambda: self._writer.stepped(by_ns, at), at)
 
     def slewed(self, by_ns: int, at: HostNs) -> None:
-        """Write that the driver was told how far slewing had moved the host's clock."""
+        """Write the slewing of the host's clock."""
         self._write(lambda: self._writer.slewed(by_ns, at), at)
 
     def close(self) -> None:
-        """Write what is left and close the file; may be called more than once."""
+        """Write the rest and close the file; may be called more than once."""
         if self._is_open:
             self._is_open = False
             try:
@@ -405,7 +405,7 @@ def endpoints(network: NetworkConfig) -> tuple[Endpoint, Endpoint]:
 
 
 def feed(driver: Driver, entry: Entry) -> list[Event]:
-    """Return what an entry of a recording makes a driver hand out.
+    """Return the events of a driver for an entry of a recording.
 
     Raises
     ------

@@ -201,7 +201,7 @@ class ImuTemplate:
 
 
 def _split(data: bytes, mark: bytes) -> tuple[bytes, bytes]:
-    """Return what stands before and after a mark that occurs once."""
+    """Return the bytes before and after a mark that occurs once."""
     before, found, after = data.partition(mark)
     if not found or mark in after:
         raise ValueError("the serialized message has an unexpected layout")

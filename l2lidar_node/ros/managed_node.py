@@ -187,7 +187,7 @@ class ManagedNode(LifecycleNode):
     # ---- transitions, as rclpy calls them
 
     def on_configure(self, state: LifecycleState) -> Return:
-        """Run :meth:`set_up`; what it began is undone if it fails."""
+        """Run :meth:`set_up`; undo it if it fails."""
         del state
         self._before_set_up = self._entities()
         if self._succeeds(self.set_up):
@@ -220,7 +220,7 @@ class ManagedNode(LifecycleNode):
         return Return.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> Return:
-        """Give up what the node holds in the state it is in."""
+        """Release what the node holds in its present state."""
         if state.state_id == State.PRIMARY_STATE_ACTIVE:
             self._succeeds(self.pause)
         if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:

@@ -47,7 +47,7 @@ class StaticFrames:
         return self._tree.find(target, source)
 
     def root(self, frame: str) -> tuple[str, F64]:
-        """Return the topmost frame above a frame, and what takes its coordinates there, (4, 4)."""
+        """Return the topmost frame above a frame, and the transform to it, (4, 4)."""
         return self._tree.root(frame)
 
     def _take(self, message: TFMessage) -> None:

@@ -60,7 +60,7 @@ class UsageError(ValueError):
 
 
 def wants_help(argv: list[str]) -> bool:
-    """Tell whether a command line, the program's name first, asks what it may be."""
+    """Tell whether a command line, starting with the program's name, asks for help."""
     own = argv[1 : argv.index("--ros-args")] if "--ros-args" in argv else argv[1:]
     return "--help" in own or "-h" in own
 
@@ -137,7 +137,7 @@ class StartError(RuntimeError):
 
 
 def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> int:
-    """Make a node, spin it until it is told to end, and return the exit code.
+    """Create a node, spin it until shutdown, and return the exit code.
 
     See :func:`run_nodes`.
     """
@@ -145,7 +145,7 @@ def run(name: str, make: Callable[[], Node], args: list[str] | None = None) -> i
 
 
 def run_nodes(name: str, make: Callable[[], list[Node]], args: list[str] | None = None) -> int:
-    """Make the nodes of a process, spin them until told to end, and return the exit code.
+    """Create the nodes of a process, spin them until shutdown, and return the exit code.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ _IDLE: Final = 50  # turns of the executor without a message of before
 
 
 def observe(asked: Topics, needs_imu: bool, seconds: float) -> tuple[Observation, Topics]:
-    """Return what comes within some seconds.
+    """Observe for some seconds and return the observation.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class _Ear:
         self._handled = 0
 
     def listen(self, seconds: float) -> None:
-        """Take what comes within some seconds."""
+        """Receive messages for some seconds."""
         _spin(self._executor, seconds)
         # What came by now still waits where this program is slow, more samples than clouds.
         self._end_ns = time.time_ns()

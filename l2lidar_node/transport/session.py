@@ -50,7 +50,7 @@ class Loop(ABC):
 
     @property
     def failure(self) -> BaseException | None:
-        """What ended the loop before it was stopped; None if nothing did."""
+        """Exception that ended the loop; None if there was none."""
         return self._failure
 
     def start(self) -> None:
@@ -104,7 +104,7 @@ class Loop(ABC):
         """Do everything until it is done or :attr:`_stopping` is set."""
 
     def _release(self) -> None:
-        """Give up what is held."""
+        """Release the resources."""
         self.transport.close()
 
     def _run(self) -> None:

@@ -161,14 +161,14 @@ def by_azimuth(points: Points, config: FilterConfig) -> Mask:
 
 
 def in_boxes(points: Points, config: FilterConfig) -> Mask:
-    """Keep what lies in any of the boxes keep_boxes; everything if there is none."""
+    """Keep points in any of the boxes keep_boxes; all points if there is none."""
     if not config.keep_boxes:
         return np.ones(len(points), dtype=np.bool_)
     return _inside(points, config.keep_boxes)
 
 
 def outside_boxes(points: Points, config: FilterConfig) -> Mask:
-    """Keep what lies in none of the boxes remove_boxes."""
+    """Keep points outside all boxes remove_boxes."""
     return ~_inside(points, config.remove_boxes)
 
 

@@ -172,12 +172,12 @@ class Pipeline:
         self._sequencer.jump()
 
     def finish(self, now: int) -> list[Deskewed]:
-        """Return what waits, finished by ``now`` [ns] though the IMU may not cover it."""
+        """Return the waiting sweeps at ``now`` [ns], even if the IMU does not cover them."""
         self._sequencer.jump()
         return self.poll(now)
 
     def poll(self, now: int) -> list[Deskewed]:
-        """Return what is finished by ``now`` [ns], in order."""
+        """Return the sweeps finished by ``now`` [ns], in order."""
         released = self._sequencer.release(self.tracker.buffer.newest, now)
         return [self._process(release) for release in released]
 
@@ -199,7 +199,7 @@ class Pipeline:
     def _assemble(
         self, sweep: Sweep, trajectory: SweepTrajectory | None
     ) -> tuple[HostNs, NDArray[np.void], str]:
-        """Filter, deskew, filter again; return stamp, points to publish, what went wrong.
+        """Filter, deskew, filter again; return stamp, points to publish, problem.
 
         Without a trajectory the points stay as they are and keep their times.
         """

@@ -283,7 +283,7 @@ def _derivatives(plain: F64, model: GyroModel, change: F64) -> F64:
 def align(
     stamps: NDArray[np.int64], orientations: F64, samples: Samples, start: GyroModel | None = None
 ) -> GyroAlignment:
-    """Return what poses tell about a gyro.
+    """Return the alignment of a gyro with poses.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def align(
 
 
 def information(turns: Turns) -> tuple[F64, F64]:
-    """Return what turns say about a small change of the parameters.
+    """Return the normal equations of the parameters from turns.
 
     Returns
     -------
@@ -385,7 +385,7 @@ def _normal(turns: Turns) -> tuple[F64, F64]:
 
 
 def _by_parts(white: Turns) -> tuple[F64, F64, F64]:
-    """Return what the parts say relative to the whole, its deviations, and the covariance.
+    """Return the parts' deviations from the whole, standard deviations, and the covariance.
 
     Delete-one jackknife over stretches of the recording; where it says less than the residuals
     themselves, those count.

@@ -87,7 +87,7 @@ class ImuBuffer:
 
     @property
     def counts(self) -> ImuCounts:
-        """What came in so far."""
+        """Counts of samples so far."""
         return ImuCounts(**self._tally)
 
     @property

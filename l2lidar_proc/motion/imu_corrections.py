@@ -56,7 +56,7 @@ class ImuConvention:
 
     @property
     def notes(self) -> list[str]:
-        """What was recognized, for people."""
+        """Descriptions of what was detected."""
         found = []
         if self.in_g:
             found.append("the accelerometer measures in g: multiplied by 9.80665")
@@ -68,13 +68,13 @@ class ImuConvention:
         return found
 
     def forget_motion(self) -> None:
-        """Forget poses and samples, as after a restart; what was recognized stays."""
+        """Forget poses and samples, as after a restart; keep what was detected."""
         self._recent: Samples = np.empty(0, IMU_SAMPLE)
         self._poses: list[tuple[HostNs, F64]] = []
         self._bends: list[tuple[F64, F64]] = []
 
     def applied(self, samples: Samples) -> Samples:
-        """Return samples (N,) in m/s^2, as specific force, by what has been recognized so far."""
+        """Return samples (N,) in m/s^2, as specific force, by the detections so far."""
         if not self.in_g and not self.reversed:
             return samples
         samples = samples.copy()
@@ -193,7 +193,7 @@ class ImuExtrinsics:
 
     @classmethod
     def of(cls, config: ImuConfig) -> ImuExtrinsics:
-        """Return what the settings say; those set by hand count more than the file.
+        """Return the corrections from the settings; those set by hand win over the file.
 
         A file that has nothing about an IMU, as one of the beams alone, leaves it as drawn.
 

@@ -151,7 +151,7 @@ class SweepMotion:
         )
 
     def at_rest(self, state: InertialState, covariance: F64) -> SweepMotion:
-        """Return the motion of a sensor that stands still instead, whatever the IMU measured.
+        """Return the motion of a sensor at rest, regardless of the IMU.
 
         Parameters
         ----------

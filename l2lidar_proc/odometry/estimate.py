@@ -271,7 +271,7 @@ class BaseFrame:
         self._T_odom_map = None
 
     def odom_from_map(self, T_map_lidar: F64) -> F64:
-        """Return what takes the odometry's own coordinates to the odometry frame, (4, 4).
+        """Return the transform from map to odometry frame, (4, 4).
 
         The first pose that is given decides.
         """

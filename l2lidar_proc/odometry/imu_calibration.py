@@ -152,7 +152,7 @@ class ImuResult:
         )
 
     def calibration(self) -> ImuCalibration:
-        """Return what a file stores: what is not known, or not wrong, is as in the drawing."""
+        """Return the values to store; unknown or correct ones are as in the drawing."""
         values = [
             item.value if item.verdict is Verdict.CORRECTED else 0.0
             for item in self.estimates.values()
@@ -183,7 +183,7 @@ def calibrate(
     *,
     beams_calibrated: bool = False,
 ) -> ImuResult:
-    """Estimate what an IMU is off by.
+    """Estimate the errors of an IMU.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def judged(
     samples: Samples,
     model_sd: F64 = _MODEL_SD,
 ) -> ImuResult:
-    """Return the result of an alignment: verdicts, refusals, what is known worst.
+    """Return the result of an alignment: verdicts, refusals, worst-known parameters.
 
     Parameters
     ----------
@@ -339,7 +339,7 @@ def _estimate(number: int, value: float, sd: float, found: GyroAlignment) -> Est
 
 
 def _needed(number: int, found: GyroAlignment) -> str:
-    """Return about which axes one would have to turn to know a parameter."""
+    """Return the axes to turn about to determine a parameter."""
     if number < gyro.ROTATION.stop:
         axes = [axis for axis in range(3) if axis != number]
     elif number < gyro.SCALE.stop:
@@ -412,7 +412,7 @@ def _refusals(
 
 
 def _contradictions(found: GyroAlignment, model_sd: F64) -> list[Refusal]:
-    """Return whether one part of the recording says something else than the others."""
+    """Return whether one part of the recording contradicts the others."""
     which = [*range(gyro.ROTATION.stop), gyro.OFFSET]
     away = np.abs(found.parts[:, which] - found.model.values[which])
     own = np.hypot(found.parts_sd[:, which], model_sd[which])
@@ -498,7 +498,7 @@ class ExtrinsicCheck:
         self._count += len(samples)
 
     def pose(self, estimate: OdometryEstimate) -> None:
-        """Take an estimate; one that was not aligned with the map tells nothing."""
+        """Take an estimate; ignored if it was not aligned with the map."""
         if CUTS & set(estimate.status):
             self._begin()
             return
@@ -534,7 +534,7 @@ class ExtrinsicCheck:
             self._judge()
 
     def _judge(self) -> None:
-        """Say what the parts together say, if they agree on it."""
+        """Set the finding of all parts, if they agree."""
         count = len(self._parts)
         if count < _FEWEST_PARTS:
             return

@@ -28,7 +28,7 @@ CLOUDS: Final = (CLOUD, *LIVOX)
 
 
 def chosen(kinds: dict[str, str], wanted: str, kind: str | tuple[str, ...], parameter: str) -> str:
-    """Return the topic that was asked for, or the only one of its kind.
+    """Return the requested topic, or the only one of its type.
 
     Parameters
     ----------

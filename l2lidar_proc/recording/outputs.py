@@ -56,7 +56,7 @@ def kitti(poses: StampedPoses) -> str:
 
 
 def leveled_start(pose: F64) -> F64:
-    """Return what takes a first pose (4, 4) to the origin with yaw 0; roll and pitch stay."""
+    """Return the transform that moves a first pose (4, 4) to the origin with yaw 0."""
     forward = pose[:3, 0]
     yaw = np.arctan2(forward[1], forward[0])
     if np.hypot(forward[0], forward[1]) < 1e-3:  # x points up or down: y tells the heading

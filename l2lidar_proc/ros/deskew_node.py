@@ -115,7 +115,7 @@ class ScanPublisher:
     def _place(
         self, stamp: HostNs, cloud_frame: str, tracker: MotionTracker
     ) -> tuple[str, F64] | None:
-        """Return the scan's frame, and what takes cloud coordinates to it; None if not known."""
+        """Return the scan's frame, and the transform from the cloud frame; None if unknown."""
         frame = self._builder.config.frame
         if frame:
             found = self._frames.find(frame, cloud_frame) if self._frames is not None else None
@@ -208,7 +208,7 @@ class DeskewNode(ManagedNode):
         load_libraries("filterpy.kalman")
 
     def pause(self) -> None:
-        """Listen no more; publish what still waits, and forget how the sensor moved."""
+        """Stop listening, publish waiting sweeps, and forget the motion."""
         self._sensors.remove(self)
         for item in self.pipeline.finish(time.monotonic_ns()):
             self._publish(item)
@@ -225,7 +225,7 @@ class DeskewNode(ManagedNode):
 
     @property
     def pipeline(self) -> Pipeline:
-        """What deskews; only while the node is configured."""
+        """The deskew pipeline; only while the node is configured."""
         assert self._pipeline is not None
         return self._pipeline
 
@@ -286,7 +286,7 @@ class DeskewNode(ManagedNode):
         self._refuse(error, "dropped")
 
     def _follow(self, frame: str) -> None:
-        """Begin anew where clouds come in another frame than before."""
+        """Start over if clouds arrive in another frame."""
         if self._cloud_frame not in ("", frame):
             for item in self.pipeline.finish(time.monotonic_ns()):
                 self._publish(item)
@@ -336,7 +336,7 @@ class DeskewNode(ManagedNode):
         self.pipeline.velocity(from_time(message.header.stamp), velocity, source, covariance)
 
     def advance(self) -> None:
-        """Publish what is finished."""
+        """Publish finished sweeps."""
         for item in self.pipeline.poll(time.monotonic_ns()):
             self._publish(item)
 

@@ -131,7 +131,7 @@ class InputMonitor:
         self._node.get_logger().error(f"{self._failure}\n{traceback.format_exc()}")
 
     def judge(self, check: Check, *others: str) -> Check:
-        """Return a check with what is wrong with the inputs, and with others; forgets it."""
+        """Return a check of the inputs and other problems, and clear them."""
         problems = [*self._of_topics(), *self._of_frames(), *self._of_times(), *self._of_shape()]
         problems += filter(None, others)
         level = max(check.level, Level.WARN) if problems else check.level
@@ -204,12 +204,12 @@ def in_range(samples: Samples) -> NDArray[np.bool_]:
 
 
 def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
-    """Return a timer that runs on whatever the host's clock, /clock or a replay do."""
+    """Return a timer that is independent of the host's clock, /clock and replays."""
     return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def load_libraries(*names: str) -> None:
-    """Import, in a thread, what the first sweep will need; who needs it earlier waits.
+    """Import in a thread what the first sweep will need.
 
     Meanwhile the node is there and answers, and what comes waits in its queues.
     """

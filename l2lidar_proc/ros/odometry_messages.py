@@ -55,7 +55,7 @@ def set_unknown(message: Odometry) -> None:
 def odometry_status(
     estimate: OdometryEstimate, base_frame: str, T_map_base: F64, now: int
 ) -> DiagnosticArray:
-    """Return what is remarkable about an estimate, with the estimate's stamp.
+    """Return the status of an estimate, with the estimate's stamp.
 
     The message is ``ALIGNED``, or the names of :class:`Status` that apply, comma-separated; the
     values are explained in docs/slam.md.
@@ -138,7 +138,7 @@ def transform(matrix: F64, stamp: HostNs, parent: str, child: str) -> bytes:
 
 @lru_cache(maxsize=16)
 def _transform_layout(parent: str, child: str) -> tuple[bytes, bytes]:
-    """Return what stands before and after the stamp, up to the numbers."""
+    """Return the bytes before and after the stamp, up to the numbers."""
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     data = serialize_message(TFMessage(transforms=[message]))

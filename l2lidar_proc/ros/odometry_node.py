@@ -135,7 +135,7 @@ class OdometryNode(ManagedNode):
 
     @property
     def pipeline(self) -> OdometryPipeline:
-        """What estimates; only while the node is configured."""
+        """The odometry pipeline; only while the node is configured."""
         assert self._pipeline is not None
         return self._pipeline
 
@@ -288,7 +288,7 @@ class OdometryNode(ManagedNode):
             self.get_logger().warning(note)
 
     def _share_frame(self, imu_frame: str) -> None:
-        """Put the IMU where the clouds' frame is, if it says that it is measured in that one."""
+        """Put the IMU at the clouds' origin if both have the same frame."""
         topics = self._settings.value.topics
         if (
             imu_frame
@@ -304,7 +304,7 @@ class OdometryNode(ManagedNode):
             )
 
     def advance(self) -> None:
-        """Publish what is finished."""
+        """Publish finished estimates."""
         estimates = self.pipeline.poll(time.monotonic_ns())
         for estimate in estimates:
             self._publish(estimate)
@@ -420,7 +420,7 @@ class OdometryNode(ManagedNode):
         return response
 
     def _untied(self) -> str:
-        """Return what is wrong where the poses cannot be those of the base frame."""
+        """Return why the poses are not those of the base frame; empty if they are."""
         base = self._settings.value.topics.base_frame
         reason = untied(self._frames, self._cloud_frame, base) if base else ""
         if not reason or not self._cloud_frame:

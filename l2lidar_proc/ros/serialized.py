@@ -80,7 +80,7 @@ def imu_batches(messages: Sequence[bytes]) -> Iterator[ImuBatch]:
 
 
 def _head(message: bytes) -> tuple[int, bytes, bytes]:
-    """Return what messages of one layout and frame share."""
+    """Return the parts common to messages of one layout and frame."""
     (length,) = _LENGTH.unpack_from(message, _FRAME) if len(message) >= _FRAME + 4 else (0,)
     end = min(_FRAME + 4 + length, len(message))
     return len(message), message[:2], message[_FRAME:end]

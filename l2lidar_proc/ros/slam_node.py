@@ -93,7 +93,7 @@ class SlamNode(ManagedNode):
 
     @property
     def worker(self) -> SlamWorker:
-        """What builds or searches the map; only while the node is configured."""
+        """The worker; only while the node is configured."""
         assert self._worker is not None
         return self._worker
 

@@ -130,7 +130,7 @@ class SlamWorker:
             self._submit(_IN_TURN, lambda: show(*self._shown()))
 
     def close(self) -> None:
-        """End the thread; what waits is forgotten."""
+        """End the thread; waiting work is dropped."""
         try:
             while True:
                 self._jobs.get_nowait()
@@ -169,7 +169,7 @@ class SlamWorker:
         return worked, text
 
     def load(self) -> Answer:
-        """Begin anew with the saved map."""
+        """Start over with the saved map."""
         try:
             saved = self._load()
         except AtlasError as error:
@@ -178,7 +178,7 @@ class SlamWorker:
         return True, f"{len(saved.nodes)} submaps of {self.folder.absolute()}"
 
     def reset(self) -> Answer:
-        """Begin anew: with an empty map, or in localization mode with the one that was loaded."""
+        """Start over: with an empty map, or in localization mode with the loaded one."""
         if not self._is_localizing and self._map is not None:
             self._ours.discard(self.folder)  # what was loaded is not to be lost
         self._begin(self._map if self._is_localizing else None)

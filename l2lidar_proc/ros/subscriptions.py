@@ -98,7 +98,7 @@ class Listener(Protocol):
         """Take note of a cloud that could not be read."""
 
     def advance(self) -> None:
-        """Publish what is finished."""
+        """Publish finished results."""
 
 
 class NeverExecuted(CallbackGroup):
@@ -302,7 +302,7 @@ class SensorSubscriptions:
             self._thread = None
 
     def look(self) -> None:
-        """Hand out what has come, and let the listeners publish what is finished."""
+        """Pass on new messages, and let the listeners publish finished results."""
         self.drain()
         if self._clouds:
             self._hand_out(self._clouds.popleft())

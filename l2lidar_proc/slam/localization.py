@@ -124,7 +124,7 @@ class Localizer:
         return True
 
     def relocalize(self) -> None:
-        """Forget the place and search for it, whatever the setting says."""
+        """Forget the pose and search for it, regardless of the setting."""
         self._forget()
         self._may_search = True
 
@@ -194,7 +194,7 @@ class Localizer:
             self._hypotheses.clear()
 
     def _cut(self) -> None:
-        """Begin again after the odometry lost its way: what was known is held, not believed."""
+        """Start over after the odometry was lost: hold the last pose without trusting it."""
         self._sweeps.clear()
         self._looks = []
         self._hypotheses.clear()
@@ -225,7 +225,7 @@ class Localizer:
         return origin, SubmapView(builder.finish())
 
     def _keep(self, origin: F64, query: SubmapView) -> None:
-        """Correct a place that is known with what the map shows there."""
+        """Correct a known pose by registration with the map."""
         assert self.T_map_odom is not None
         predicted = self.T_map_odom @ origin
         places = self._map.poses[:, :3, 3]
@@ -289,7 +289,7 @@ class Localizer:
         return True
 
     def _contradicted(self, origin: F64, measured: F64, noise: F64) -> bool:
-        """Take a look that the known place does not allow; believe the third that says the same.
+        """Take an observation that contradicts the known pose; accept the third that agrees.
 
         Then the place was known less well than its covariance says.
         """

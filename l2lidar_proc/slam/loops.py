@@ -78,7 +78,7 @@ class Relation:
         return float(left @ np.linalg.solve(self.covariance + floor, left))
 
     def admits(self, off: F64) -> bool:
-        """Return whether an error (6,) of the relative pose is within what drift explains."""
+        """Return whether an error (6,) of the relative pose is within the drift."""
         return self.chi2(off) < _CHI2
 
 
@@ -136,7 +136,7 @@ class Graph:
         return [int(node) for node in order[:_MOST]]
 
     def relation(self, node: int) -> Relation:
-        """Return what is between another node (first) and the one the ways begin at."""
+        """Return the relation of another node (first) to the start node."""
         drift = self._config.drift
         covariance = np.zeros((6, 6))
         end = self._poses[self._node]
@@ -256,7 +256,7 @@ class Admission:
         return (query, target) not in self._barred
 
     def judge(self, relation: Relation | None, loop: Loop) -> bool:
-        """Take a verified pair; return whether it is within what the odometry's drift explains.
+        """Take a verified pair; return whether it is within the odometry's drift.
 
         Parameters
         ----------

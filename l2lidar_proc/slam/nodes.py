@@ -90,7 +90,7 @@ class OdometrySweep:
 
 
 def health_of(names: Iterable[str]) -> Health:
-    """Return what the names of an estimate's remarks mean for the map."""
+    """Return the health of a sweep from the status names of an estimate."""
     remarks = set(names)
     if remarks & {status.name for status in CUTS}:
         return Health.CUT

@@ -71,7 +71,7 @@ def leveled(transform: F64) -> F64:
 
 
 def adjoint(transform: F64) -> F64:
-    """Return what takes errors in the axes of b to those of a for ``T_a_b``, shape (..., 6, 6)."""
+    """Return the adjoint of ``T_a_b``: errors in axes b to axes a, shape (..., 6, 6)."""
     turn, shift = transform[..., :3, :3], transform[..., :3, 3]
     out = np.zeros((*transform.shape[:-2], 6, 6))
     out[..., TURN, TURN] = out[..., SHIFT, SHIFT] = turn

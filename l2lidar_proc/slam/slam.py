@@ -211,7 +211,7 @@ class Slam:
         return batch if batch and self._enter(batch) else []
 
     def _near(self, graph: Graph, number: int) -> list[Loop]:
-        """Return verified pairs with the nodes that the odometry says may be near."""
+        """Return verified pairs with the nodes that may be near by the odometry."""
         eligible = np.array([node.is_comparable for node in self.nodes])
         query = self.view_of(number)
         found = []
@@ -305,7 +305,7 @@ class Slam:
     # ---- results
 
     def view_of(self, number: int) -> SubmapView:
-        """Return what registration needs of a node that has points."""
+        """Return the registration view of a node with points."""
         submap = self.nodes[number].submap
         assert submap is not None
         return self._views.of(number, submap)

@@ -215,7 +215,7 @@ class SubmapBuilder:
             self._pending = 0
 
     def finish(self) -> Submap:
-        """Return the submap of what was added so far; more may be added afterwards."""
+        """Return the submap so far; more may be added afterwards."""
         if not self._parts:
             return Submap(np.empty(0, SUBMAP_POINT), np.zeros((0, 3), np.float32))
         placed, _, view = self._thinned()

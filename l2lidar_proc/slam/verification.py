@@ -287,7 +287,7 @@ class _Marks(NamedTuple):
 
 
 def _marked(query: SubmapView, target: SubmapView, pose: F64, count: int) -> _Marks:
-    """Return what the first so many points of a submap are at a pose in another one."""
+    """Return the marks of a submap's first points at a pose in another one."""
     points = transformed(pose, query.source[:count])
     index, _, distances = target.surfaces.match(points)
     met = np.zeros(len(points), np.bool_)

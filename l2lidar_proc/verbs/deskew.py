@@ -90,7 +90,7 @@ class _Deskewer:
             self._odometry.mount(T_cloud_imu)
 
     def finish(self, now: int) -> None:
-        """Write what is finished by ``now`` [ns]."""
+        """Write the sweeps finished by ``now`` [ns]."""
         # The odometry first, as in the companion: a sweep is deskewed with its own motion.
         if self._odometry is not None:
             for estimate in self._odometry.poll(now):

@@ -73,7 +73,7 @@ class OdometryRun:
 
     @property
     def report(self) -> list[str]:
-        """Lines that tell a person what was found."""
+        """Lines of a report for people."""
         return [
             f"{len(self.poses)} poses from {self.sweeps} sweeps",
             *self.notes,
@@ -150,7 +150,7 @@ class OdometryRunner:
                 self._observer(estimate, self.base)
 
     def finish(self) -> OdometryRun:
-        """Return what was found."""
+        """Return the result."""
         self._poll(_END_NS)
         found = self.pipeline.trajectory.poses
         poses = self.base.poses(found)
@@ -168,7 +168,7 @@ class OdometryRunner:
         )
 
     def _finding(self) -> list[str]:
-        """Return what looks wrong with the IMU, and what to do."""
+        """Return the problem with the IMU, and what to do."""
         finding = self.pipeline.check.finding
         return [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
 
@@ -176,7 +176,7 @@ class OdometryRunner:
 def run_events(
     events: Iterator[Event], config: OdometryNodeConfig, observer: Observer | None = None
 ) -> OdometryRun:
-    """Return what the odometry makes of sweeps and samples in the order of their arrival."""
+    """Return the odometry of sweeps and samples in arrival order."""
     runner = OdometryRunner(config, observer)
     for event in events:
         runner.take(event)
@@ -190,7 +190,7 @@ def run_capture(
     l2_ip: str = "",
     observer: Observer | None = None,
 ) -> OdometryRun:
-    """Return what the odometry makes of a capture, cut into sweeps of a full turn.
+    """Return the odometry of a capture, cut into sweeps of a full turn.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def run_bag(
     progress: Progress = lambda share: None,
     observer: Observer | None = None,
 ) -> OdometryRun:
-    """Return what the odometry makes of a bag.
+    """Return the odometry of a bag.
 
     Parameters
     ----------

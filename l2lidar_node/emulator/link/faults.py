@@ -137,7 +137,7 @@ class Stage(Protocol):
     """A processing stage for datagrams."""
 
     def __call__(self, datagrams: Sequence[Datagram], now_ns: int) -> list[Datagram]:
-        """Return what becomes of datagrams that come until ``now_ns``; none gets earlier."""
+        """Return the datagrams processed until ``now_ns``; none gets earlier."""
         ...
 
 
@@ -274,7 +274,7 @@ def split(dice: Dice) -> Stage:
 
 
 def fragment(datagrams: Sequence[Datagram], now_ns: int) -> list[Datagram]:
-    """Cut what is too long for one datagram; no fault, the unit itself does so."""
+    """Split packets too long for one datagram, as the unit itself does; not a fault."""
     return [part for datagram in datagrams for part in datagram.fragments()]
 
 
@@ -453,7 +453,7 @@ class Path:
             self._count += 1
 
     def arrivals(self, now_ns: int) -> list[Datagram]:
-        """Return what arrives until a true instant and was not returned yet, in order of time."""
+        """Return the new datagrams that arrive until a true time, in time order."""
         out: list[Datagram] = []
         while self._waiting and self._waiting[0][0] <= now_ns:
             out.append(heapq.heappop(self._waiting)[2])

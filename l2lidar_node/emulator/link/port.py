@@ -83,7 +83,7 @@ class Port(Protocol):
         ...
 
     def receive(self) -> list[bytes]:
-        """Return what the host has sent and was not returned before; does not wait.
+        """Return data that the host has sent since the last call; does not wait.
 
         Raises
         ------
@@ -97,7 +97,7 @@ class Port(Protocol):
         ...
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until the host has taken most of what was sent, as far as that can be known.
+        """Wait until the host has read most of the sent data, as far as that is known.
 
         Returns
         -------
@@ -270,7 +270,7 @@ class SerialPort:
         return [data]
 
     def send(self, data: bytes) -> bool:
-        """Send bytes; what comes while the line is full is lost, there is no flow control."""
+        """Send bytes; they are lost while the line is full, since there is no flow control."""
         self._flush()
         if self._rest:
             return False

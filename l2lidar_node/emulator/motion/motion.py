@@ -176,7 +176,7 @@ class Kinematics:
         lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0),
         gravity: float = STANDARD_GRAVITY,
     ) -> NDArray[np.float64]:
-        """Return what an ideal accelerometer measures [m/s^2], cloud frame, shape (N, 3).
+        """Return the specific force of an ideal accelerometer [m/s^2], cloud frame, shape (N, 3).
 
         Parameters
         ----------

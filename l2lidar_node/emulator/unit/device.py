@@ -162,7 +162,7 @@ class VirtualL2:
         return min(instants, default=None)
 
     def advance(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Let time go by and return what reaches the host until ``now_ns``.
+        """Advance time and return what reaches the host until ``now_ns``.
 
         Returns
         -------
@@ -249,7 +249,7 @@ class VirtualL2:
         self._restarted()
 
     def _restarted(self) -> None:
-        """Drop what a restart takes from the unit's memory."""
+        """Drop what a restart clears from the unit's memory."""
         self._inbox = Inbox()
         self._replies.clear()
         self._outbox.restart()

@@ -238,11 +238,11 @@ class UnitClock:
         self.set(now_ns, max(0, self.at(now_ns) + change_ns))
 
     def at(self, now_ns: int) -> DeviceNs:
-        """Return what the clock shows at a true instant."""
+        """Return the clock's reading at a true time."""
         return DeviceNs(int(self.stamps(np.array([now_ns], dtype=np.int64))[0]))
 
     def stamps(self, instants_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return what the clock shows at true instants.
+        """Return the clock's readings at true times.
 
         Parameters
         ----------

@@ -159,7 +159,7 @@ class Inertial:
         return np.asarray(vectors @ rotations.matrices(self._to_cloud[None])[0])
 
     def _line(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the turning head shakes into the gyro, amplitude 1, shape (N, 3).
+        """Return the vibration of the spinning head in the gyro, amplitude 1, shape (N, 3).
 
         A unit whose mount rocks has its line at the head's frequency from that.
         """
@@ -170,7 +170,7 @@ class Inertial:
     def _orientation(
         self, times: NDArray[np.float64], truth: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return what the onboard filter says: yaw from 0 and drifting, a slow tilt error."""
+        """Return the onboard filter's orientation: drifting yaw from 0, a slow tilt error."""
         tilt = np.deg2rad(self.noise.tilt_error)
         error = np.zeros((len(times), 3))
         error[:, 0] = tilt * np.sin(2.0 * np.pi * times / 17.0 + 1.0)

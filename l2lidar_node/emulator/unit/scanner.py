@@ -132,7 +132,7 @@ _TURN = 2.0 * np.pi
 
 
 def mean_angle(t_s: NDArray[np.float64], unit: Unit, seed: int) -> NDArray[np.float64]:
-    """Return the head's angle without wobble [rad], not wrapped; the seed says where it starts."""
+    """Return the head's angle without wobble [rad], unwrapped; the seed sets its start."""
     start = generator(seed, Stream.HEAD, 0).uniform(0.0, _TURN)
     return np.asarray(start + _TURN / unit.head_period_s * t_s)
 

@@ -222,7 +222,7 @@ class MeasurementStream:
 
     @property
     def packet_type(self) -> PacketType:
-        """What the frames are."""
+        """Packet type of the frames."""
         return self._feed.packet_type
 
     @property

@@ -98,12 +98,12 @@ class UnitErrors:
         return any((*self.precession, *self.precession_back))
 
     def powered_up(self, seed: int, number: int) -> UnitErrors:
-        """Return the errors after a power-up: the phase of mirror and laser is drawn anew."""
+        """Return the errors after a power-up, with a new random phase of mirror and laser."""
         drawn = generator(seed, Stream.POWER_UP, number).standard_normal()
         return replace(self, alpha=self.alpha + self.alpha_phase * float(drawn), alpha_phase=0.0)
 
     def range_response(self, distance: F64, cosine: F64, reflectivity: F64) -> F64:
-        """Return what the range finder adds to a distance [m]; arrays of one shape."""
+        """Return the range finder's error at a distance [m]; arrays of one shape."""
         nearness = np.clip(1.0 - distance / _NEAR_M, 0.0, 1.0)
         return np.asarray(
             -self.near * nearness**2

@@ -104,7 +104,7 @@ class World:
         directions: NDArray[np.float64],
         times: NDArray[np.float64] | None = None,
     ) -> NDArray[np.void]:
-        """Return what rays meet first.
+        """Return the first hits of rays.
 
         open3d finds the triangle in float32; the distance is then computed from that triangle's
         plane in float64, so hits lie on their plane to 1e-12 m.
@@ -267,7 +267,7 @@ class MovingWorld(World):
         self._mirrors = mirrors
 
     def cast(self, origins: F64, directions: F64, times: F64 | None = None) -> NDArray[np.void]:
-        """Return what rays meet first, shape (N,), dtype HIT; see :meth:`World.cast`.
+        """Return the first hits of rays, shape (N,), dtype HIT; see :meth:`World.cast`.
 
         Parameters
         ----------
@@ -316,7 +316,7 @@ class MovingWorld(World):
         hits[sent] = again
 
     def _opaque(self, origins: F64, directions: F64, when: F64) -> NDArray[np.void]:
-        """Return what rays meet among static things and moving bodies."""
+        """Return the hits of rays on static triangles and moving bodies."""
         hits = self.solid.cast(origins, directions)
         if not len(when):
             return hits
