@@ -61,7 +61,7 @@ def test_empty_list_can_be_filled_live(started: Any) -> None:
 
 
 def test_qos_overrides_are_refused_rather_than_ignored(started: Any) -> None:
-    words = "qos_overrides./points.publisher.reliability': QoS overrides are not taken"
+    words = "qos_overrides./points.publisher.reliability': QoS overrides are not supported"
     with pytest.raises(SettingError, match=re.escape(words)):
         started(
             "lists: {ros__parameters: {qos_overrides: {/points: {publisher: {reliability: "

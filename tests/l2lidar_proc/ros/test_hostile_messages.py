@@ -170,7 +170,7 @@ def test_clouds_of_another_frame_are_refused_while_the_first_come(bench: Any) ->
     for number in range(5):
         bench.send_cloud(points, at(number))
         bench.clouds_out.publish(to_cloud(points, at(number), "rear"))
-    wait_for_text(bench, "clouds in 'rear' refused while those in 'l2lidar_link' come")
+    wait_for_text(bench, "clouds in 'rear' refused while those in 'l2lidar_link' arrive")
     assert bench.node._cloud_frame == FRAME
 
 
