@@ -19,7 +19,7 @@ help: ## show this list
 	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
 	@printf '  make %s\n' $(BENCHES:%=bench-%)
 
-setup: ## install what is needed into .venv; every other target does this first
+setup: ## install everything into .venv; all other targets do this first
 	@scripts/setup.sh
 
 demo: setup ## stream a virtual L2 through the driver (DEMO_ARGS="--help" for more)
@@ -29,7 +29,7 @@ demo: setup ## stream a virtual L2 through the driver (DEMO_ARGS="--help" for mo
 test: lint imports ## the whole gate: lint, format, types, imports, tests
 	@$(MAKE) --no-print-directory --jobs 2 MYPY="nice $(RUN) -m mypy" types pytest
 
-test-noble: ## the tests with the versions of Ubuntu 24.04, on Python 3.11 and 3.12 where found
+test-noble: ## the tests with the versions of Ubuntu 24.04, on Python 3.11 and 3.12 if found
 	@scripts/test_noble.sh $(PYTEST_ARGS)
 
 check: lint types imports ## the gate without the tests
@@ -47,17 +47,17 @@ imports: setup
 pytest: setup
 	$(RUN) -m pytest $(WORKERS) $(PYTEST_ARGS)
 
-format: setup ## put every Python file into the project's format
+format: setup ## format all Python files
 	$(RUN) -m ruff check --fix-only .
 	$(RUN) -m ruff format .
 
 docs: setup pages ## the documents as a site with search and API pages, in site/
 	$(RUN) -m mkdocs build --quiet
 
-docs-serve: docs ## the same at http://127.0.0.1:8000, renewed at every change
+docs-serve: docs ## the same at http://127.0.0.1:8000, rebuilt at every change
 	$(RUN) -m mkdocs serve
 
-pages: setup ## write what follows from the settings (config/, docs/parameters.md)
+pages: setup ## generate config/ and docs/parameters.md from the settings
 	$(RUN) -m scripts.make_reference
 
 animation: setup ## draw README's animation (docs/demo.gif)
@@ -66,13 +66,13 @@ animation: setup ## draw README's animation (docs/demo.gif)
 $(BENCHES:%=bench-%): bench-%: setup
 	$(RUN) -m benchmarks.bench_$(subst -,_,$*) $(BENCH_ARGS)
 
-faults: setup ## every fault the virtual L2 can make, and what the driver says to it
+faults: setup ## every fault of the virtual L2, and the driver's reaction
 	$(RUN) -m benchmarks.faults $(BENCH_ARGS)
 
-soak: setup ## a long run, watched for growth, loss and drift
+soak: setup ## a long run, monitored for memory growth, loss and drift
 	$(RUN) -m benchmarks.soak $(BENCH_ARGS)
 
-fuzz: setup ## hostile input for everything that reads input from outside
+fuzz: setup ## hostile input for everything that reads external input
 	$(RUN) -m benchmarks.fuzz $(BENCH_ARGS)
 
 mutants: setup ## small changes of the pure core: does a test notice each?

@@ -1,4 +1,4 @@
-"""Starts the driver, deskew and odometry, and RViz where asked for."""
+"""Starts the driver, deskew and odometry, and optionally RViz."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction

@@ -31,7 +31,7 @@ PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES
 
 
 def check_packages(context):
-    """Refuse to start anything where a part is not installed."""
+    """Refuse to start if a package is not installed."""
     needed = ["lio_sam", "tf2_ros"]
     if context.launch_configurations["rviz"] == "true":
         needed.append("rviz2")
@@ -46,7 +46,7 @@ def check_packages(context):
 
 
 def shared_memory(context):
-    """Return what gives Fast DDS room for LIO-SAM's messages, unless the user has chosen."""
+    """Return the Fast DDS profile for LIO-SAM's messages, unless the user has set one."""
     profile = file_given(context, "fastdds_profile")
     if any(os.environ.get(name) for name in PROFILE_VARIABLES):
         return []

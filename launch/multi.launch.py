@@ -56,7 +56,7 @@ def launch_setup(context):
 
 
 def generate_launch_description():
-    """Return drivers, and deskew and odometry where asked for."""
+    """Return drivers, and optionally deskew and odometry."""
     example = PathJoinSubstitution([FindPackageShare("l2lidar_node"), "config", "multi.yaml"])
     return LaunchDescription(
         [

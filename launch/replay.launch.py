@@ -21,7 +21,7 @@ FOR_DESKEW = {"enable_IMU_publishing": True, "imu_adjust": False, "sweep_cut": "
 
 
 def launch_setup(context):
-    """Return the driver, and deskew and odometry where they are asked for."""
+    """Return the driver, and optionally deskew and odometry."""
     given = context.launch_configurations
     is_followed = given["deskew_odometry"] == "true"
     if is_followed and given["loop"] == "true":
@@ -71,7 +71,7 @@ def launch_setup(context):
 
 
 def generate_launch_description():
-    """Return a driver that reads a file, deskew and odometry, and RViz where asked for."""
+    """Return a driver that reads a file, deskew and odometry, and optionally RViz."""
     share = FindPackageShare("l2lidar_node")
     return LaunchDescription(
         [

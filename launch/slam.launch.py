@@ -1,4 +1,4 @@
-"""Starts the driver, odometry and SLAM, and RViz where asked for."""
+"""Starts the driver, odometry and SLAM, and optionally RViz."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction

@@ -61,15 +61,15 @@ install_packages() {
     if [ "$(id -u)" != 0 ]; then
         as_root=(sudo)
         if ! command -v sudo >/dev/null || { [ ! -t 0 ] && ! sudo -n true 2>/dev/null; }; then
-            die "system packages are missing and this user may not install them. Let an administrator run:" \
+            die "system packages are missing and this user may not install them. Ask an administrator to run:" \
                 "    apt-get install $*" "then run the command again."
         fi
     fi
     say "installing system packages: $*"
-    "${as_root[@]}" apt-get update -qq || say "apt-get update failed; going on with the package lists there are"
+    "${as_root[@]}" apt-get update -qq || say "apt-get update failed; continuing with the existing package lists"
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" \
         >/dev/null || die "apt-get could not install: $*" \
-        "Its own words are above. Install these packages, then run the command again."
+        "Its output is above. Install these packages, then run the command again."
 }
 
 # --- Python ---------------------------------------------------------------------------------------------
@@ -122,9 +122,9 @@ find_python() {
 pip_install() {
     "$python" -m pip install --quiet --no-compile --disable-pip-version-check "$@" >"$venv/pip.log" 2>&1 && return
     { grep -v '^WARNING' "$venv/pip.log" || true; } | tail -n 15 >&2
-    die "pip could not install what is needed; its own words are above." \
-        "Is there a network, and free disk space? Where PyPI cannot be reached, set PIP_INDEX_URL to a mirror" \
-        "of it. Then run the command again."
+    die "pip could not install the packages; its output is above." \
+        "Check the network and the free disk space. If PyPI cannot be reached, set PIP_INDEX_URL to a mirror." \
+        "Then run the command again."
 }
 
 check_ros() {
@@ -135,9 +135,9 @@ check_ros() {
             "Install ROS 2 Jazzy, 'source /opt/ros/jazzy/setup.bash', then run the command again."
         ;;
     jazzy) ;;
-    *) say "ROS 2 '$ros' is sourced; this project is written and tested for Jazzy. Going on with '$ros'." ;;
+    *) say "ROS 2 '$ros' is sourced; this project is written and tested for Jazzy. Continuing with '$ros'." ;;
     esac
-    say "using the ROS 2 that is sourced ($ros)"
+    say "using the sourced ROS 2 ($ros)"
 }
 
 no_python() {
@@ -162,7 +162,7 @@ make_venv() {
             "Source that ROS 2 ('source /opt/ros/$ros/setup.bash') or unset ROS_DISTRO to do without it."
         options=(--system-site-packages)
     fi
-    say "making ${venv##*/} with $found"
+    say "creating ${venv##*/} with $found"
     rm -rf "$venv"
     "$found" -m venv "${options[@]}" "$venv" || die "$found could not make a virtual environment."
 }
@@ -198,7 +198,7 @@ main() {
 
     if is_done installed "$installed"; then
         is_healthy && return
-        say "${venv##*/} is damaged; making it anew"
+        say "${venv##*/} is damaged; creating it again"
         rm -rf "$venv"
     fi
     if ! is_done made "$made" || ! "$python" -m pip --version >/dev/null 2>&1; then
@@ -213,7 +213,7 @@ main() {
         [ -n "$ros" ] || install_ros
         mark ros "$ros_made"
     fi
-    say "installing the Python packages this project needs (the first time: some minutes)"
+    say "installing the Python packages (some minutes the first time)"
     pip_install --no-build-isolation --editable '.[bench,dev,docs,slam,view]'
     is_healthy || die "something is still missing from ${venv##*/}; run 'make clean', then the command again."
     mark installed "$installed"

@@ -116,7 +116,7 @@ def test_an_unreachable_package_index_is_explained_and_the_next_run_goes_on(proj
         project, "ldconfig", "printf '%s \\n' libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libgomp.so.1"
     )
     first = run(project, "make", "setup", **NOWHERE)
-    assert f"making .venv with {BASE_PYTHON}" in first.stdout
+    assert f"creating .venv with {BASE_PYTHON}" in first.stdout
     assert first.returncode != 0
     assert "PIP_INDEX_URL" in first.stderr
     assert "setuptools" in first.stderr
