@@ -43,7 +43,9 @@ NOT_RUN = {
     r"ros2 (topic|service|param|run|bag|security|lifecycle) .*": ROS,
     r"source .*": ROS,
     r"export ROS_SECURITY_.*": ROS,
+    r"ZENOH_CONFIG_OVERRIDE=.* ros2 run .*": ROS,
     r"rosdep .*": ROS,
+    r"colcon build --packages-select lio_sam .*": "builds another package, with ROS",
     r"mkdir -p ~/ros2_ws/src.*": ADMIN,
     r"cd .*": ADMIN,
     r"export .*": ROS,
@@ -61,7 +63,8 @@ def commands() -> list[tuple[str, str]]:
     """Return every command of a shell block with the page it stands on."""
     found = []
     for page in PAGES:
-        for block in re.findall(r"^```(?:bash|console)\n(.*?)^```", page.read_text(), re.M | re.S):
+        shell = re.compile(r"^ *```(?:bash|console)\n(.*?)^ *```", re.M | re.S)  # also in lists
+        for block in shell.findall(page.read_text()):
             joined = re.sub(r"\\\n\s*", " ", block)
             for line in joined.splitlines():
                 command = line.partition("  #")[0].removeprefix("$ ").strip()
