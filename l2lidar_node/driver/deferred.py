@@ -1,8 +1,8 @@
-"""Puts off packets of points that nothing depends on yet, so that many are handled in one go.
+"""Defers point packets that nothing depends on yet, to handle many of them together.
 
-After a pause of some milliseconds the caches of a processor hold nothing of a program: the first
-packet takes five times as long as the tenth. An IMU sample is wanted at once; of a packet of
-points nothing comes out before its sweep is complete.
+After a pause of some milliseconds the caches are cold: the first packet takes five times as long
+as the tenth. An IMU sample is needed at once; a point packet has no effect before its sweep is
+complete.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from l2lidar_node.protocol.packets import NS, PointPacket
 from l2lidar_node.types import Datagram, HostNs, new_tuple
 
 MOST: Final = 64
-"""Packets that are put off at most."""
+"""Largest number of deferred packets."""
 
 _NUMBERS: Final = struct.Struct("<I4xII")  # sequence number, seconds and nanoseconds of the stamp
 _HEADERS: Final = {
@@ -31,13 +31,13 @@ class DeferredPoints:
     Attributes
     ----------
     waiting : list of Datagram
-        In the order in which they came; only to be read.
+        In arrival order; read only.
     newest : HostNs
-        When the last one came.
+        Arrival of the last one.
     until : int
-        Stamp of the device from which on an IMU sample has to wait for what has been put off [ns].
+        Device stamp from which on an IMU sample must wait for the deferred packets [ns].
     due : HostNs
-        When the packet is expected that may not be put off; 0 where none may be.
+        When the packet that must not be deferred is expected; 0 if none may be deferred.
     """
 
     __slots__ = ("_header", "_left", "_next", "_stamp", "due", "newest", "until", "waiting")
@@ -97,7 +97,7 @@ class DeferredPoints:
         return True
 
     def taken(self) -> list[Datagram]:
-        """Return what has been put off; nothing more is until :meth:`begin`."""
+        """Return the deferred packets; defer no more until :meth:`begin`."""
         self._left = 0
         self.due = HostNs(0)
         waiting, self.waiting = self.waiting, []

@@ -191,7 +191,7 @@ class Driver:
 
     @property
     def gravity(self) -> GravityMonitor:
-        """What the samples say of gravity."""
+        """Gravity check of the samples."""
         self._hand_on()
         return self._gravity
 
@@ -564,7 +564,7 @@ class Driver:
 
 
 def _points_size(config: DriverConfig) -> int:
-    """Return the size of the datagrams of points that are asked for [B]."""
+    """Return the size of the expected point datagrams [B]."""
     is_3d = config.sweep.frame3d
     return wire.FRAME_SIZES[_POINTS_3D if is_3d else wire.PacketType.POINTS_2D]
 
