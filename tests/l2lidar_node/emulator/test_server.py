@@ -304,7 +304,7 @@ def test_a_serial_line_that_is_cut_ends_the_run() -> None:
     port = SerialPort(os.ttyname(line))
     os.close(line)
     os.close(other)
-    with pytest.raises(PortError, match="gone"):
+    with pytest.raises(PortError, match="closed"):
         Server(serial_unit(), port).run()
     port.close()
 
