@@ -51,6 +51,7 @@ class MapDrift:
         """Forget everything: a new map begins, without error by definition."""
         self._known = 0
         self._current = np.zeros((6, 6))
+        self._reported = np.zeros((6, 6))  # the same, but falling over some sweeps
         self._way, self._before = 0.0, np.zeros(3)
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
         self._vertical: F64 | None = None  # gravity when it was first known [m/s^2]
@@ -81,12 +82,23 @@ class MapDrift:
         self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
         self._behind = float(shares @ self._ways[rows])
         if place is None or weakly is None:
+            self._fall()
             return
         weakest, (sweeps, shares) = weakly
         holding = np.tensordot(shares, self._history[self._rows(sweeps)].astype(np.float64), 1)
         along = np.zeros((6, 6))
         along[:3, :3] = np.outer(weakest, weakest)
         self._combine(place, self._current, holding, along)
+        self._fall()
+
+    def _fall(self) -> None:
+        """Let the uncertainty that is reported grow at once and fall over some sweeps.
+
+        A single sweep may seem to be held by old surfaces, and the next one not.
+        """
+        strength, axes = np.linalg.eigh(self._reported - self._current)
+        left = tuning.DRIFT_FALL * np.maximum(strength, 0.0)
+        self._reported = self._current + (axes * left) @ axes.T
 
     def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
@@ -119,8 +131,9 @@ class MapDrift:
         ways : ndarray, shape (K,)
             By how much the place may have run away along each since the sweep before, 1 sigma [m].
         """
-        before = self._current
+        before, reported = self._current, self._reported
         self.meet(support)
+        self._reported = reported
         along = np.zeros((6, 6))
         along[:3, :3] = free @ free.T
         now = self._combine(place, self._current, before, along)
@@ -129,6 +142,7 @@ class MapDrift:
             now[:3, :3] += (2.0 * sigma + way) * way * np.outer(direction, direction)
         back = _carried(-place)
         self._current = back @ now @ back.T
+        self._fall()
 
     def record(self, sweep: int, place: F64, covariance: F64) -> None:
         """Remember how uncertain the pose was that added a sweep.
@@ -194,7 +208,7 @@ class MapDrift:
         bend = tuning.MAP_BEND**2 * max(away, self._behind)
         unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
         unit[3:, 3:] += np.outer(self._lean, self._lean)
-        return np.asarray(moved @ self._current @ moved.T + unit)
+        return np.asarray(moved @ self._reported @ moved.T + unit)
 
 
 def _carried(place: F64) -> F64:
