@@ -10,10 +10,13 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import heapq
+import itertools
 import json
+import math
 import os
 import random
 import selectors
+import signal
 import struct
 import sys
 import time
@@ -24,6 +27,7 @@ import rclpy
 from point_cloud_interfaces.msg import CompressedPointCloud2
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
@@ -129,22 +133,24 @@ def _run_link() -> int:
 _KINDS = {"cloud": PointCloud2, "zstd": CompressedPointCloud2, "packets": UInt8MultiArray}
 
 
-_FIRST_S = 60.0  # until the virtual L2 and the driver are at work, and found
+_FIRST_S: Final = 40.0  # until the virtual L2 and the driver are at work, and found
 _SMALLEST = 1044  # [B] one packet of points: before them, there is only word of waiting
 
 
 def _watch() -> int:
-    """Listen: TOPIC TYPE RELIABILITY SECONDS; return the exit code."""
+    """Listen: TOPIC TYPE RELIABILITY SECONDS, 0 for until told to end; return the exit code."""
     topic, kind, reliability, seconds = sys.argv[1:]
-    rclpy.init(args=[])
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("wifi_watch")
     ages: list[float] = []
+    arrivals: list[float] = []
     sizes: list[int] = []
 
     def hear(data: bytes) -> None:
         if len(data) < _SMALLEST:
             return
         whole, fraction = struct.unpack_from("<iI", data, 4)
+        arrivals.append(time.monotonic())
         ages.append(time.time() - whole - fraction * 1e-9)
         sizes.append(len(data))
 
@@ -162,19 +168,24 @@ def _watch() -> int:
     )
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    told: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
     deadline = time.monotonic() + _FIRST_S
-    while not sizes and time.monotonic() < deadline:  # over a bad link it may never come
+    while not (sizes or told) and time.monotonic() < deadline:  # it may never come
         executor.spin_once(timeout_sec=0.1)
-    ages.clear()
-    sizes.clear()
     begun = time.monotonic()
-    while time.monotonic() < begun + float(seconds):
+    ending = begun + float(seconds) if float(seconds) else math.inf
+    while not told and time.monotonic() < ending:
         executor.spin_once(timeout_sec=0.1)
+    ended = time.monotonic()
+    is_counted = [not float(seconds) or begun < arrival <= ended for arrival in arrivals]
     found: dict[str, Any] = {
-        "seconds": time.monotonic() - begun,
-        "messages": len(sizes),
-        "bytes": sum(sizes),
-        "ages_s": ages,
+        "begun_s": begun,
+        "seconds": ended - begun,
+        "messages": sum(is_counted),
+        "bytes": sum(itertools.compress(sizes, is_counted)),
+        "ages_s": list(itertools.compress(ages, is_counted)),
+        "arrivals_s": list(itertools.compress(arrivals, is_counted)),
     }
     print(json.dumps(found))
     node.destroy_node()
