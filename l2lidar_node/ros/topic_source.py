@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import rclpy
@@ -27,6 +29,8 @@ _DISCOVERY_S: Final = 6.0
 _SILENCE_S: Final = 10.0  # then the viewer gives up
 _LOOK_S: Final = 0.1
 _ASK_AGAIN_S: Final = 1.0
+_STDOUT: Final = 1
+_STDERR: Final = 2
 _IDLE: Final = 50  # turns of the executor without a message of before
 
 
@@ -46,13 +50,28 @@ def observe(asked: Topics, needs_imu: bool, seconds: float) -> tuple[Observation
     SourceError
         If there are no such topics, or which to use is not plain.
     """
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("l2lidar_check")
+    with _standard_output_for_results():
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        node = Node("l2lidar_check")
+        try:
+            return _observe(node, asked, needs_imu, seconds)
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+
+
+@contextmanager
+def _standard_output_for_results() -> Iterator[None]:
+    """Have Fast DDS complain on the standard error output: it would spoil the JSON."""
+    sys.stdout.flush()
+    kept = os.dup(_STDOUT)
+    os.dup2(_STDERR, _STDOUT)
     try:
-        return _observe(node, asked, needs_imu, seconds)
+        yield
     finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+        sys.stdout.flush()
+        os.dup2(kept, _STDOUT)
+        os.close(kept)
 
 
 def _observe(
@@ -64,6 +83,7 @@ def _observe(
     ear = _Ear(node, topics, gathering)
     imu_adjust = ImuAdjustClient(node, topics.cloud, _ASK_AGAIN_S)
     ear.listen(seconds)
+    ear.wait_for(lambda: imu_adjust.answer is not None)  # a busy publisher answers late
     return (
         gathering.observation(
             cloud_qos=_offers(node, topics.cloud),
@@ -125,6 +145,10 @@ class _Ear:
             with held():
                 self._executor.spin_once(timeout_sec=0.0)
             idle = 0 if self._handled > before else idle + 1
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        """Go on until a condition holds, or for some seconds; clouds and samples are left out."""
+        _spin(self._executor, _DISCOVERY_S, condition)
 
     def _timed(self, take: Callable[[Any, int], None]) -> Callable[[Any, Any], None]:
         def hear(message: Any, info: Any) -> None:
