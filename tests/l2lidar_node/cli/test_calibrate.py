@@ -147,8 +147,11 @@ def test_live_places_are_recorded_and_kept(
     assert packets * wire.MIRROR_PERIOD_S >= 1.0  # whatever held it up meanwhile
 
 
-def test_the_guide_is_led_through_at_a_terminal(unit: Unit, tmp_path: Path) -> None:
+def test_the_guide_is_led_through_at_a_terminal(
+    make_unit: Callable[..., Unit], tmp_path: Path
+) -> None:
     """A place that cannot be used is told at once, wrong answers are asked again."""
+    unit = make_unit(scanner=PatternScanner(wide=True))
     with Terminal(
         "l2lidar_node.cli.main", "calibrate", "still", "--places", "1", "--seconds", "1",
         "--keep", str(tmp_path), *unit.options,
@@ -158,7 +161,7 @@ def test_the_guide_is_led_through_at_a_terminal(unit: Unit, tmp_path: Path) -> N
         terminal.wait_for("Place 1 of 1: upright")
         terminal.wait_for("Press Enter")
         terminal.type("\n")
-        terminal.wait_for("turns of the head, at least 8 are needed: record 10 s")
+        terminal.wait_for("wide field of view, which has its own block")
         terminal.wait_for("Repeat this placement?")
         terminal.type("perhaps\n")
         terminal.wait_for("'perhaps' is not an answer")
