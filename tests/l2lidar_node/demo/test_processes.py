@@ -46,7 +46,7 @@ def test_a_program_that_says_much_does_not_stop_at_a_full_pipe() -> None:
     assert code == 0
     assert len(said) > 1 << 16  # what a pipe holds
     assert len(program.lines) <= 2_000
-    assert "RETURN_VALUE" in program.lines[-1]
+    assert "RETURN_" in program.lines[-1]  # VALUE, or CONST since Python 3.12
 
 
 def test_processes_beside_each_other_have_domains_and_ports_of_their_own() -> None:
