@@ -316,17 +316,16 @@ def stamp(message: object) -> int:
 
 
 def test_record_writes_bags(run: Run, unit: Unit, tmp_path: Path) -> None:
-    counts = {"/points": 0, "/imu/data": 0}
-    for seconds in ("2.5", "10", "40"):  # what a slow machine needs to have the clock locked
-        path = tmp_path / f"{seconds}.mcap"
-        outcome = run("record", str(path), *unit.options, "--duration", seconds)
-        assert (outcome.code, outcome.err) == (0, "")
-        with AnyReader([path]) as reader:
-            counts |= {name: topic.msgcount for name, topic in reader.topics.items()}
-        if counts["/points"] >= 3:
-            break
+    path = tmp_path / "run.mcap"
+    outcome = run("record", str(path), *unit.options, "--duration", "8")
+    assert (outcome.code, outcome.err) == (0, "")
+    with AnyReader([path]) as reader:
+        counts = {name: topic.msgcount for name, topic in reader.topics.items()}
+    # nothing before the clock is locked, which takes 2 s and more on a busy machine
     assert counts["/points"] >= 3
     assert counts["/imu/data"] > 100
+    said = f"run.mcap: {counts['/points']} clouds, {counts['/imu/data']} IMU samples"
+    assert said in outcome.out.replace("\n", "")
 
 
 def test_odometry_of_a_capture(run: Run, tmp_path: Path) -> None:
