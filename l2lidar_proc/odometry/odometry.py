@@ -82,7 +82,8 @@ class Odometry:
         self.phase = Phase.INITIALIZING
         self.motion: SweepMotion | None = None
         self._belief: tuple[InertialState, F64] | None = None  # state and covariance to go on from
-        self._at_rest: deque[tuple[InertialState, F64]] = deque()  # beliefs of late, oldest first
+        # posteriors of the present rest, oldest first
+        self._at_rest: deque[tuple[InertialState, F64]] = deque()
         self.matcher = SweepMatcher(self.config, self._lever)
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()

@@ -360,7 +360,7 @@ class SurfelMap:
     def _cells_of(self, groups: _Groups) -> tuple[I64, I64]:
         """Return the cells (C,) of all levels that groups (G,) lie in, and which is whose (L, G).
 
-        A group belongs to the coarser cells around its middle, so nothing is asked of the sizes.
+        A group belongs to the coarser cells around its middle, so the sizes need not be multiples.
         """
         coarser = self._keys(groups.middles, slice(1, None))
         found = [groups.keys]
@@ -574,9 +574,14 @@ def _products(x: F64, y: F64, z: F64) -> Iterator[F64]:
 
 
 def _shifted(moments: F64, offsets: F64) -> F64:
-    """Return moments (10, G) about points that lie offsets (G, 3) before those of today.
+    """Return the moments (10, G) of r + d from those of r, by the parallel axis theorem.
 
-    Count, sum and products of offsets r + d for those of r: parallel axis theorem.
+    Parameters
+    ----------
+    moments : ndarray, shape (10, G)
+        Count, sum [m] and products [m^2] of some vectors r.
+    offsets : ndarray, shape (G, 3)
+        The same d for all vectors of a group [m].
     """
     count, total, products = moments[0], moments[1:4], moments[4:]
     d = np.ascontiguousarray(offsets.T)

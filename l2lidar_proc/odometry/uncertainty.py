@@ -92,9 +92,9 @@ class MapDrift:
         self._fall()
 
     def _fall(self) -> None:
-        """Let the uncertainty that is reported grow at once and fall over some sweeps.
+        """Let the reported uncertainty grow at once and fall over some sweeps.
 
-        A single sweep may seem to be held by old surfaces, and the next one not.
+        A single sweep may seem to match old surfaces although the next one does not.
         """
         strength, axes = np.linalg.eigh(self._reported - self._current)
         left = tuning.DRIFT_FALL * np.maximum(strength, 0.0)
@@ -171,10 +171,10 @@ class MapDrift:
         self._known = max(self._known, row + 1)
 
     def lean(self, gravity: F64, covariance: F64) -> None:
-        """Take the vertical as the filter has it: by what it has turned the map has bent.
+        """Record how far gravity has turned in the map: so far the map has bent.
 
-        Registered against itself the map does not show that, nor is it taken back. What an
-        accelerometer's bias may have feigned at the beginning does not count.
+        Registration against the map itself cannot show that, nor undo it. The angle that an
+        accelerometer bias at the beginning can explain does not count.
 
         Parameters
         ----------
