@@ -93,6 +93,18 @@ class Cadence:
         history.clear()
         return True
 
+    def deviation(self, seq: int, advance: int) -> float | None:
+        """Return how far a packet is from where the loop predicts it [ns].
+
+        None if that is too far for the next packet of the stream.
+        """
+        gap = seq - self._seq
+        if gap <= 0:
+            gap += self._modulus
+        off = advance - gap * self._period - self._phase
+        tolerance = self._tolerance if gap == 1 else self.noise(gap)
+        return off if gap > 0 and -tolerance <= off <= tolerance else None
+
     def follows(self, seq: int, advance: int) -> bool:
         """Update the loop with the next packet, if that is where the loop predicts it.
 
@@ -107,21 +119,19 @@ class Cadence:
         bool
             False if it is elsewhere; the loop is unchanged then.
         """
+        off = self.deviation(seq, advance)
+        if off is None:
+            return False
         gap = seq - self._seq
         if gap <= 0:
             gap += self._modulus
-        period = self._period
-        off = advance - gap * period - self._phase
-        tolerance = self._tolerance if gap == 1 else self.noise(gap)
-        if gap <= 0 or not -tolerance <= off <= tolerance:
-            return False
         if seq < self._seq:
             self._is_modulus_confirmed = True
         self._phase = (self._gain - 1.0) * off
         count = self._period_packets
         if count < _AVERAGING_PACKETS:
             self._period_packets = count = count + 1
-        self._period = period + (advance / gap - period) / count
+        self._period += (advance / gap - self._period) / count
         self._seq = seq
         if gap == 1:
             deviation = self._deviation

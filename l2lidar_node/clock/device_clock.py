@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.clock.device_clock_model import DeviceClockModel, Step
 from l2lidar_node.clock.host_clock_model import HostClockModel
 from l2lidar_node.config import ClockConfig
@@ -297,15 +298,24 @@ class DeviceClock:
         self._ends[stream] = result + duration_ns
         return HostNs(result)
 
-    def interchangeable_until(self) -> DeviceNs:
-        """Return up to which stamp it does not matter which stream's packets are observed first.
+    def interchangeable(self) -> tuple[DeviceNs, Cadence] | None:
+        """Return while it does not matter which stream's packets are observed first.
 
-        As long as no stamp falls, and each stream's come in order. 0 where it does matter.
+        Returns
+        -------
+        tuple of (DeviceNs, Cadence) or None
+            Stamp up to which it does not as long as the cadence, a copy of that of the points,
+            predicts each of them, and :meth:`predicts_imu` each IMU sample. None where it does.
         """
-        base = self._device.common_base
-        if base is None or not self._host.ready:
-            return DeviceNs(0)
-        return DeviceNs(self._host.due + base)
+        forecast = self._device.forecast() if self._host.ready else None
+        if forecast is None:
+            return None
+        until = min(self._host.due + forecast.base, forecast.end)
+        return DeviceNs(until), forecast.cadence
+
+    def predicts_imu(self, seq: int, stamp: DeviceNs) -> bool:
+        """Tell whether an IMU sample is the predicted next one, see :meth:`interchangeable`."""
+        return self._device.predicts_imu(seq, stamp)
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Record that a time-sync command with this value was sent at ``sent``."""

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import Final, NamedTuple
 
 from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.types import DeviceNs, HostNs, Stream
@@ -71,6 +72,24 @@ class _Epoch:
     def __init__(self, base: int, sync: _Sync | None) -> None:
         self.base = base
         self.sync = sync  # that began it; None if it was not one of this host
+
+
+class Forecast(NamedTuple):
+    """What predicts the next packets of points.
+
+    Attributes
+    ----------
+    cadence : Cadence
+        A copy, at the last packet.
+    base : int
+        Of the epoch [ns device].
+    end : int
+        Stamp from which on a packet may belong to another epoch [ns device].
+    """
+
+    cadence: Cadence
+    base: int
+    end: int
 
 
 class _StreamState:
@@ -128,21 +147,36 @@ class DeviceClockModel:
         self._imu = _StreamState(_IMU_GAIN)
         self._points = _StreamState(_POINTS_GAIN)
 
-    @property
-    def common_base(self) -> int | None:
-        """The ``base`` of the epoch that both streams are in, or the only one that there is.
+    def forecast(self) -> Forecast | None:
+        """Return what predicts the next packets of points, while both streams are in one epoch.
 
-        None while they are in two, or a sync may be about to begin another one.
+        None while they are in two, while a step may have begun another one, or while a sync may be
+        about to.
         """
-        imu, points = self._imu.epoch, self._points.epoch
-        if points is None or (imu is not None and imu is not points):
+        imu, points = self._imu, self._points
+        epoch, newest = points.epoch, self._newest_sync
+        if epoch is None or (imu.epoch is not None and imu.epoch is not epoch):
+            return None
+        if imu.suspect is not None or points.suspect is not None:
             return None
         if self._syncs:
             last = self._syncs[-1]
-            is_in_force = last is self._newest_sync
-            if not is_in_force and self._points.arrival - last.sent < _SYNC_DELAY_NS:
+            if last is not newest and points.arrival - last.sent < _SYNC_DELAY_NS:
                 return None
-        return points.base
+        end = _NO_SYNC.value if epoch.sync is newest else newest.value
+        return Forecast(copy(points.cadence), epoch.base, end)
+
+    def predicts_imu(self, seq: int, stamp: DeviceNs) -> bool:
+        """Tell whether an IMU sample is the predicted next one.
+
+        Its place neither depends on packets of points then, if a forecast holds for them, nor
+        affects theirs.
+        """
+        state, newest = self._imu, self._newest_sync
+        epoch = state.epoch
+        if epoch is None or (stamp >= newest.value and epoch.sync is not newest):
+            return False
+        return state.cadence.deviation(seq, stamp - epoch.base - state.u) is not None
 
     def synced(self, value: HostNs, sent: HostNs) -> None:
         """Record a sync that this host sent; whether it arrives is unknown."""

@@ -10,10 +10,11 @@ from __future__ import annotations
 import struct
 from typing import Final
 
+from l2lidar_node.clock.cadence import Cadence
 from l2lidar_node.driver.reorder import REORDER_NS, Timed
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.packets import NS, PointPacket
-from l2lidar_node.types import Datagram, HostNs, new_tuple
+from l2lidar_node.types import Datagram, DeviceNs, HostNs, new_tuple
 
 MOST: Final = 64
 """Largest number of deferred packets."""
@@ -35,12 +36,22 @@ class DeferredPoints:
     newest : HostNs
         Arrival of the last one.
     until : int
-        Device stamp from which on an IMU sample must wait for the deferred packets [ns].
+        Stamp from which on an IMU sample must wait for the deferred packets [ns].
     due : HostNs
         When the packet that must not be deferred is expected; 0 if none may be deferred.
     """
 
-    __slots__ = ("_header", "_left", "_next", "_stamp", "due", "newest", "until", "waiting")
+    __slots__ = (
+        "_cadence",
+        "_header",
+        "_left",
+        "_next",
+        "_stamp",
+        "due",
+        "newest",
+        "until",
+        "waiting",
+    )
 
     def __init__(self) -> None:
         self.waiting: list[Datagram] = []
@@ -48,8 +59,11 @@ class DeferredPoints:
         self.until = 0
         self._header = b""
         self._next = self._left = self._stamp = 0
+        self._cadence = Cadence(0.0)
 
-    def begin(self, last: Timed, left: int, due: HostNs, until: int) -> None:
+    def begin(
+        self, last: Timed, left: int, due: HostNs, until: DeviceNs, cadence: Cadence
+    ) -> None:
         """Put off what follows a packet from now on.
 
         Parameters
@@ -60,14 +74,17 @@ class DeferredPoints:
             Packets after it of which the last one may not be put off.
         due : HostNs
             When that one is expected.
-        until : int
-            Stamp of the device up to which it does not matter which stream comes first [ns].
+        until : DeviceNs
+            Stamp up to which it does not matter which stream comes first.
+        cadence : Cadence
+            That of the points at the last packet: where it does not predict one, order matters.
         """
         packet, arrival = last
         assert isinstance(packet, PointPacket)
         self._header = _HEADERS[packet.packet_type]
         self._next = packet.seq + 1
         self._stamp = packet.stamp
+        self._cadence = cadence
         self._left = min(left - 1, MOST)
         self.newest, self.due, self.until = arrival, due, until
 
@@ -87,7 +104,7 @@ class DeferredPoints:
             or not data.startswith(self._header)
         ):
             return False
-        if stamp >= self.until:
+        if stamp >= self.until or not self._cadence.follows(seq, stamp - self._stamp):
             self.until = 0
         self.waiting.append(new_tuple(Datagram, (data, arrival)))
         self._next = seq + 1

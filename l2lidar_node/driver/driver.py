@@ -412,7 +412,10 @@ class Driver:
         if isinstance(packet, ImuPacket):
             self._watchdog.heard(_IMU, arrival)
             deferred = self._deferred
-            if deferred.waiting and packet.stamp >= deferred.until:
+            if deferred.waiting and (
+                packet.stamp >= deferred.until
+                or not self._clock.predicts_imu(packet.seq, packet.stamp)
+            ):
                 events = self.catch_up()
                 events += self._handle(packet, arrival)
                 self._defer_next()
@@ -449,10 +452,12 @@ class Driver:
         """
         left = self._assembler.packets_left
         last = self._reorder_buffer.last_in_order(_POINTS)
-        until = self._clock.interchangeable_until()
-        if left > 1 and last is not None and until:
+        if left <= 1 or last is None:
+            return
+        interchangeable = self._clock.interchangeable()
+        if interchangeable is not None:
             due = HostNs(last.arrival + left * _POINTS_PERIOD_NS)
-            self._deferred.begin(last, left, due, until)
+            self._deferred.begin(last, left, due, *interchangeable)
 
     def _reordered(
         self, stream: Stream, packet: PointPacket | ImuPacket, arrival: HostNs

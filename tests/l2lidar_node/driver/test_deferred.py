@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Collection
 from typing import Any
 
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Counters, Driver, Event
+from l2lidar_node.protocol import wire
 from l2lidar_node.settings import build as configure
 from l2lidar_node.types import HostNs, ImuSample, Sweep
 from tests.support import build
@@ -36,9 +38,23 @@ def _damaged(item: Datagram) -> Datagram:
     return item._replace(data=bytes(data))
 
 
-def disturbed(what: list[tuple[int, str]]) -> list[Datagram]:
-    """Return the capture with something done to it at some places, arrivals in order."""
+def _shifted(item: Datagram, by_ns: int) -> Datagram:
+    """Return a datagram with another stamp."""
+    kind, payload = wire.HEADER.unpack_from(item.data)[1], bytearray(item.data[12:-12])
+    seconds, nanoseconds = struct.unpack_from("<II", payload, 8)
+    stamp = seconds * build.NS + nanoseconds + by_ns
+    struct.pack_into("<II", payload, 8, *divmod(stamp, build.NS))
+    return item._replace(data=build.frame(kind, bytes(payload)))
+
+
+def disturbed(what: list[tuple[int, str]], steps: list[tuple[int, float]]) -> list[Datagram]:
+    """Return the capture with something done to it at some places, arrivals in order.
+
+    ``steps`` are those by which another host sets the device's clock [ms].
+    """
     some = list(_DATAGRAMS)
+    for at, by_ms in steps:
+        some[at:] = [_shifted(item, round(by_ms * 1e6)) for item in some[at:]]
     for at, kind in what:
         _DISTURBANCES[kind](some, min(at, len(some) - 100))
     arrivals = [item.arrival_ns for item in some]
@@ -77,19 +93,26 @@ def _facts(sweep: Sweep) -> tuple[Any, ...]:
 
 
 numbers = st.integers(_LOCKED, len(_DATAGRAMS) - 1)
+step_sizes = st.builds(
+    lambda sign, power: float(sign * 10**power), st.sampled_from([-1, 1]), st.floats(-2.0, 4.0)
+)
 disturbances = st.lists(st.tuples(numbers, st.sampled_from(sorted(_DISTURBANCES))), max_size=4)
 
 
 @settings(max_examples=12, deadline=None)
 @given(
     what=disturbances,
+    steps=st.lists(st.tuples(numbers, step_sizes), max_size=2),
     looks=st.sets(numbers, max_size=60),
     cut=st.sampled_from(["turn", "packets"]),
 )
+@example(what=[], steps=[(314, 7.5896)], looks=set(), cut="packets")
+@example(what=[], steps=[(622, 0.534)], looks=set(), cut="packets")
+@example(what=[], steps=[(631, -0.2675)], looks=set(), cut="turn")
 def test_when_they_are_handled_changes_nothing(
-    what: list[tuple[int, str]], looks: set[int], cut: str
+    what: list[tuple[int, str]], steps: list[tuple[int, float]], looks: set[int], cut: str
 ) -> None:
-    datagrams = disturbed(what)
+    datagrams = disturbed(what, steps)
     outcome = Outcome(datagrams, looks, sweep_cut=cut)
     one_by_one = Outcome(datagrams, range(len(datagrams)), sweep_cut=cut)
     assert outcome.same(one_by_one)
