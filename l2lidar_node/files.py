@@ -26,14 +26,17 @@ def free_name(path: Path) -> Path:
 def whole(path: Path) -> Iterator[Path]:
     """Give a name of the same suffix to write to; at the end the file replaces ``path``.
 
-    After an exception what was written is removed, and ``path`` stays what it was.
+    After an exception what was written is removed, and ``path`` stays what it was. An error of the
+    operating system names ``path``.
     """
     part = path.with_name(f".part-{path.name}")
     try:
         yield part
         os.replace(part, path)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (part, str(part)):
+            error.filename, error.filename2 = str(path), None
         raise
 
 

@@ -132,8 +132,9 @@ def by_tape(
     scale = length / measured - 1.0
     if abs(scale) > _WORST_SCALE:
         raise CalibrationError(
-            f"the sensor moved by {measured:.3f} m by its own ranges and {length:.3f} m by the "
-            f"tape: {100 * scale:+.1f} % is too much for a range scale; read the tape again"
+            f"the sensor moved by {measured:.3f} m by its own ranges and by {length:.3f} m by the "
+            f"tape; a range scale explains at most {100 * _WORST_SCALE:.0f} %: read the tape "
+            "again, and slide the sensor straight towards a flat wall"
         )
     along = found.shift / measured
     sd = float(np.sqrt(along @ own @ along + _MODEL_SD_M**2 + length_sd**2)) / length

@@ -108,6 +108,8 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
         angles = _with_axis_distance(whole, solution)
         bias, reason = range_bias(whole, angles)
     except FewPlanesError:
+        if refusals:
+            raise CalibrationError("; ".join(refusals[0])) from None
         raise CalibrationError(
             "too few flat surfaces are seen by both halves of the fan; calibrate in a furnished "
             "room of 4 to 10 m with a flat ceiling and bare stretches of wall"
@@ -126,8 +128,8 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     is_corrected |= bool((np.abs(alphas) > _SIGNIFICANT * sd[2:]).any())
     if is_corrected and not is_better and not refusals:
         notes.append(
-            f"planes became only {100 * (1 - after.thickness / before.thickness):.0f} % thinner: "
-            "the reported block is as good"
+            f"walls would not become {100 * _LEAST_GAIN:.0f} % thinner: the reported block is as "
+            "good"
         )
         is_corrected = False
     verdict = Verdict.CORRECTED if is_corrected else Verdict.UNCHANGED

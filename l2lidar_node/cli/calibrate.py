@@ -118,7 +118,7 @@ def still(
     """
     if emulator is not None and captures:
         raise UsageError("--emulator measures by itself; omit the captures")
-    known = files.existing(output)
+    known = files.prepared(output, figure)
     firmware = ""
     if emulator is not None:
         gathered = _virtual(emulator, seconds, min(places, 4), quiet=json_)
@@ -191,7 +191,7 @@ def scale(
 
     l2lidar calibrate scale --length 3.000 start.pcap end.pcap -o front.yaml
     """
-    known = files.existing(output)
+    known = files.prepared(output)
     firmware = ""
     if emulator is not None:
         from l2lidar_node.cli.virtual_places import slide
@@ -202,7 +202,9 @@ def scale(
             raise UsageError(str(error)) from None
     elif captures:
         if len(captures) != 2:
-            raise UsageError(f"{len(captures)} captures; expected two, of start and end")
+            raise UsageError(
+                f"expected two captures, of start and end; the number given is {len(captures)}"
+            )
         gathered, firmware = _captured(captures, [])
     else:
         gathered = []
@@ -263,15 +265,17 @@ def _captured(first: Sequence[Path], again: Sequence[Path]) -> tuple[list[Place]
 
 def _virtual(name: str, seconds: float, places: int, *, quiet: bool) -> list[Place]:
     from l2lidar_node.cli.virtual_places import POSES_DEG, still_places
+    from l2lidar_node.emulator.unit.units import unit
 
     poses = tuple(POSES_DEG)[:places]
-    if not quiet:
-        say(f"a virtual unit, '{name}', at {len(poses)} places, twice switched on")
     try:
-        first = still_places(name, seconds=seconds, poses=poses)
-        second = still_places(name, seconds=seconds, poses=poses[:1], power_up=1)
+        before, after = (unit(name, power_up) for power_up in (0, 1))
     except ValueError as error:
         raise UsageError(str(error)) from None
+    if not quiet:
+        say(f"a virtual unit, '{name}', at {len(poses)} places, twice switched on")
+    first = still_places(before, seconds=seconds, poses=poses)
+    second = still_places(after, seconds=seconds, poses=poses[:1], power_up=1)
     return [*first, *second]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import sys
 import time
@@ -29,6 +30,8 @@ _SPIN_UP_S: Final = 60.0
 _HEARD_S: Final = 6.0  # a unit that was just switched on needs 4 s for its first IMU packet
 _MOMENT_S: Final = 1.5
 _LOOK_S: Final = 0.1
+_CALIBRATIONS: Final = (".yaml", ".yml")
+_PICTURES: Final = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 
 OutputOption = Annotated[
     Path | None,
@@ -53,6 +56,32 @@ PictureOption = Annotated[
     Path | None,
     typer.Option("--picture", metavar="FILE.png", help="Picture to write, before and after."),
 ]
+
+
+def prepared(output: Path | None, picture: Path | None = None) -> CalibrationFile | None:
+    """Return the content of the file to add to; None if there is none yet.
+
+    What cannot be written is found here, before anybody carries a sensor about.
+
+    Raises
+    ------
+    UsageError
+        If a file has another suffix or is a folder.
+    CommandError
+        If its folder cannot be written to, or the file to add to cannot be used.
+    """
+    expected = ((output, _CALIBRATIONS, "FILE.yaml"), (picture, _PICTURES, "FILE.png"))
+    for path, suffixes, words in expected:
+        if path is None:
+            continue
+        if path.suffix.lower() not in suffixes:
+            raise UsageError(f"'{path}' ends in '{path.suffix}'; expected {words}")
+        if path.is_dir():
+            raise UsageError(f"'{path}' is a folder; expected {words}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK):
+            raise CommandError(f"cannot write to the folder of '{path}'")
+    return existing(output)
 
 
 def existing(output: Path | None) -> CalibrationFile | None:
@@ -129,7 +158,6 @@ def write(
         old = existing(output)
         if old is not None and not old.matches(made.block):
             raise CommandError(f"{output} belongs to another unit; choose another --output")
-        output.parent.mkdir(parents=True, exist_ok=True)
         report.joined(made, old).save(output)
         words = f"{output}: {advice}"
     if not quiet:

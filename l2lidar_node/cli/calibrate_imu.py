@@ -100,7 +100,7 @@ def imu(
     """
     if emulator is not None and capture is not None:
         raise UsageError("--emulator measures by itself; omit the capture")
-    known = files.existing(output)
+    known = files.prepared(output, figure)
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         if capture is not None:

@@ -217,10 +217,14 @@ class Device:
                 f"check that it is at {self.network.serial_port}, that it has power, and that its "
                 "work mode is set to serial"
             )
-        addresses = ", ".join(local_addresses()) or "none"
+        if self.network.host_ip == "0.0.0.0":
+            addresses = ", ".join(local_addresses()) or "none"
+            target = f"one of this machine's addresses ({addresses})"
+        else:
+            target = self.network.host_ip
         return (
-            f"check that it is at {self.network.l2_ip}, sends to one of this machine's addresses "
-            f"({addresses}), port {self.network.host_port}, and has power"
+            f"check that it is at {self.network.l2_ip}, sends to {target}, port "
+            f"{self.network.host_port}, and has power"
         )
 
     def _handle(self, event: Event) -> None:

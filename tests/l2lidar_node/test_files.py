@@ -54,6 +54,9 @@ def test_an_error_leaves_what_was_there(tmp_path: Path) -> None:
         fill_the_disk()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(FileNotFoundError) as caught:
+        write_whole(tmp_path / "nowhere" / "a.txt", "new")
+    assert caught.value.filename == str(tmp_path / "nowhere" / "a.txt")
 
 
 def test_the_name_to_write_to_tells_the_format(tmp_path: Path) -> None:

@@ -75,6 +75,9 @@ def test_captures_of_a_unit_become_its_calibration_file(
 
 
 def test_too_short_a_capture_is_refused_with_what_to_do(run: Run, tmp_path: Path) -> None:
+    shorter = capture(tmp_path / "shorter.pcap", (0.0, 0.0, 0.0), 0.02)
+    done = run("calibrate", "still", str(shorter))
+    assert "0.1 turns of the head, at least 8 are needed; record 10 s" in done.err
     short = capture(tmp_path / "short.pcap", (0.0, 0.0, 0.0), 0.3)
     output = tmp_path / "unit.yaml"
     done = run("calibrate", "still", str(short), "-o", str(output))
@@ -116,6 +119,24 @@ def test_a_virtual_unit_must_be_known(run: Run) -> None:
     done = run("calibrate", "still", "--emulator", "good")
     assert done.code == 2
     assert "expected perfect, typical, poor" in done.err
+    assert not done.out
+
+
+def test_what_cannot_be_written_is_said_before_anybody_measures(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "file").touch()
+    for option, name, code, words in (
+        ("-o", "unit.txt", 2, "ends in '.txt'; expected FILE.yaml"),
+        ("-o", "folder.yaml", 2, "is a folder; expected FILE.yaml"),
+        ("--picture", "unit", 2, "ends in ''; expected FILE.png"),
+        ("-o", "file/unit.yaml", 1, "file: File exists"),
+    ):
+        for verb in (["still"], ["imu"], ["scale", "--length", "3"]):
+            if option == "--picture" and verb[0] == "scale":
+                continue
+            done = run("calibrate", *verb, option, str(tmp_path / name))
+            assert (done.code, done.out) == (code, "")
+            assert words in done.err
 
 
 def test_the_scale_of_a_virtual_unit_is_written(run: Run, tmp_path: Path) -> None:
@@ -139,7 +160,7 @@ def test_live_places_are_recorded_and_kept(
         "--yes", *unit.options,
     )  # fmt: skip
     assert done.code == 1
-    assert "flat surfaces" in done.err or "nothing written" in done.err
+    assert "turns of the head, at least 8 are needed" in done.err
     size = wire.FRAME_SIZES[PacketType.POINTS_3D]
     with (tmp_path / "place_1.pcap").open("rb") as stream:
         received = [entry for entry in Recording(stream) if isinstance(entry, Received)]
