@@ -25,7 +25,10 @@ under load even the least delayed packet is late. Three rules keep that out of t
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import deque
+from itertools import pairwise
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 _BLOCK_S: Final = 0.1
@@ -68,6 +71,8 @@ _GUESS: Final = 1e-3  # deviation of units from the guess, as a share; those mea
 # Sum of distances of packets to a line with the guessed ratio over that of the best line. Where
 # the guess was right it was below this in 99 of 100 simulated loads of 16 batches and more.
 _CONTRADICTED: Final = 1.5
+
+_x: Final = itemgetter(0)
 
 BLOCK_NS: Final = int(_BLOCK_S * 1e9)
 """Length of a block [ns host]: of the packets in one, only the least delayed one is kept."""
@@ -120,12 +125,11 @@ def supporting_line(packets: list[tuple[int, int]], guess: float) -> Line | None
     """
     u0, h0 = packets[0]
     points = [(float(u - u0), (h - h0) - guess * (u - u0)) for u, h in packets]
-    hull = _lower_hull(points)
-    if len(hull) < 2:
+    edge = _edge(points, sum([x for x, _ in points]) / len(points))
+    if edge is None:
         return None
-    mean = sum([x for x, _ in points]) / len(points)
-    base, slope = _edge(hull, mean)
-    heights = sorted(y - base - slope * x for x, y in points)
+    base, slope = edge
+    heights = sorted(_heights(points, base, slope))
     return Line(u0, h0 + round(base), guess + slope, heights[len(heights) // 2])
 
 
@@ -148,29 +152,52 @@ def _above_lowest(packets: list[tuple[int, int]], ratio: float) -> list[float]:
     return [height - lowest for height in heights]
 
 
-def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the vertices of the lower convex hull of points that ascend in x."""
-    hull: list[tuple[float, float]] = []
-    for x, y in points:
-        while len(hull) > 1:
-            (ax, ay), (bx, by) = hull[-2], hull[-1]
-            if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
-                break
-            hull.pop()
-        if hull and hull[-1][0] == x:
-            if y >= hull[-1][1]:
-                continue
-            hull.pop()
-        hull.append((x, y))
-    return hull
+def _edge(points: list[tuple[float, float]], at: float) -> tuple[float, float] | None:
+    """Return height at 0 and slope of the edge over a place of the lower convex hull of points.
+
+    The walk along the hull (Jarvis, Information Processing Letters 2, 1973) begins at the lowest
+    point, which is hardly ever more than three edges away.
+
+    Parameters
+    ----------
+    points : list of (float, float)
+        Ascending in x.
+    at : float
+        Between the first x and the last one.
+
+    Returns
+    -------
+    (float, float) or None
+        None if all x are the same.
+    """
+    heights = [y for _, y in points]
+    lowest = heights.index(min(heights))
+    x, y = points[lowest]
+    left = [point for point in points[:lowest] if point[0] < x]
+    right = [point for point in points[lowest + 1 :] if point[0] > x]
+    slope = 0.0
+    if left and (at <= x or not right):
+        while left and x >= at:
+            slopes = [(y - b) / (x - a) for a, b in left]
+            slope = max(slopes)
+            farthest = slopes.index(slope)
+            x, y = left[farthest]
+            left = [point for point in left[:farthest] if point[0] < x]
+    elif right:
+        while right and x < at:
+            slopes = [(b - y) / (a - x) for a, b in right]
+            slope = min(slopes)
+            farthest = len(slopes) - 1 - slopes[::-1].index(slope)
+            x, y = right[farthest]
+            right = [point for point in right[farthest + 1 :] if point[0] > x]
+    else:
+        return None
+    return y - slope * x, slope
 
 
-def _edge(hull: list[tuple[float, float]], at: float) -> tuple[float, float]:
-    """Return height at 0 and slope of the edge of a hull that spans a place."""
-    right = next(i for i, (x, _) in enumerate(hull) if i and (x >= at or i == len(hull) - 1))
-    (ax, ay), (bx, by) = hull[right - 1], hull[right]
-    slope = (by - ay) / (bx - ax)
-    return ay - slope * ax, slope
+def _heights(points: list[tuple[float, float]], base: float, slope: float) -> list[float]:
+    """Return the heights of points above a line."""
+    return [y - base - slope * x for x, y in points]
 
 
 class LowerEnvelope:
@@ -235,7 +262,7 @@ class LowerEnvelope:
         points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in packets]
         self._lo, self._hi = _RATIOS
         self._evidence = math.inf
-        error = self._learn(points, float(line.host - h0), 0.0)
+        error = self._learn(points, _heights(points, float(line.host - h0), 0.0))
         self.spread_ns = error
         self.uncertainty_ns = error if self.is_known else self._weigh_guess(packets, error)
         self._restart(packets)
@@ -265,7 +292,7 @@ class LowerEnvelope:
             return False
         u0, h0 = recent[0]
         points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]
-        error = self._error(points, float(line.host - h0), 0.0)
+        error = self._error(points, _heights(points, float(line.host - h0), 0.0))
         width = self._width(points, error)
         is_far_better = not self.is_known and _FAR_BETTER * error < self._evidence
         if width > _TIGHT and not is_far_better:
@@ -319,7 +346,7 @@ class LowerEnvelope:
                 continue
             u0, h0 = recent[0]
             points = [(float(u - u0), (h - h0) - line.ratio * (u - u0)) for u, h in recent]
-            error = self._error(points, float(line.host - h0), 0.0)
+            error = self._error(points, _heights(points, float(line.host - h0), 0.0))
             width = self._width(points, error) * line.ratio
             grown = abs(line.ratio - self.line.ratio) * (recent[-1][0] - u0)
             if abs(line.at(u0) - self.line.at(u0)) > grown:
@@ -339,7 +366,7 @@ class LowerEnvelope:
         self.moves += 1
         self.line = line
         self._lo, self._hi = _RATIOS
-        self._learn(points, float(line.host - recent[0][1]), 0.0)
+        self._learn(points, _heights(points, float(line.host - recent[0][1]), 0.0))
 
     def move(self, lows: list[tuple[int, int]], *, widen: bool = True) -> None:
         """Forget all packets but these and lay the line, its ratio unchanged, below them.
@@ -373,10 +400,8 @@ class LowerEnvelope:
         guess = self.line.ratio
         u0, h0 = recent[0]
         points = [(float(u - u0), (h - h0) - guess * (u - u0)) for u, h in recent]
-        hull = _lower_hull(points)
-        end = points[-1][0]
-        base = min(y for _, y in hull)
-        bounds = self._bounds(points, base, end)
+        base = min([y for _, y in points])
+        bounds = self._bounds(points, base, points[-1][0])
         least = sorted(bounds)
         level = least[min(_VOTERS, len(least)) - 1]
         used = points
@@ -385,16 +410,17 @@ class LowerEnvelope:
             used = [point for point, bound in zip(points, bounds, strict=True) if bound <= cut]
         slope = 0.0
         span = (used[-1][0] - used[0][0]) * guess
-        if len(hull) > 1 and span >= _MIN_SPAN_NS:
-            _, slope = _edge(hull, sum(x for x, _ in used) / len(used))
-            slope = min(max(slope, self._lo - guess), self._hi - guess)
-            base = min(y - slope * x for x, y in hull)
-        heights = sorted(y - base - slope * x for x, y in points)
-        self.line = Line(u0, h0 + round(base), guess + slope, heights[len(heights) // 2])
+        edge = None
         if span >= _MIN_SPAN_NS:
-            error = self._learn(points, base, slope)
-        else:
-            error = self._error(points, base, slope)
+            edge = _edge(points, sum([x for x, _ in used]) / len(used))
+        if edge is not None:
+            slope = min(max(edge[1], self._lo - guess), self._hi - guess)
+            base = min([y - slope * x for x, y in points])
+        heights = _heights(points, base, slope)
+        excess = sorted(heights)[len(heights) // 2]
+        self.line = Line(u0, h0 + round(base), guess + slope, excess)
+        learn = self._learn if span >= _MIN_SPAN_NS else self._error
+        error = learn(points, heights)
         self.spread_ns = level if self.is_known else error
         self.uncertainty_ns = level if self.is_known else self._weigh_guess(recent, error)
 
@@ -425,7 +451,7 @@ class LowerEnvelope:
             heights = _above_lowest(packets, ratio)
             self.line = Line(u0, h0 + round(lowest), ratio, sorted(heights)[len(heights) // 2])
             points = [(float(u - u0), y) for (u, _), y in zip(packets, heights, strict=True)]
-            error = max(error, self._error(points, 0.0, 0.0))
+            error = max(error, self._error(points, heights))
         return (1.0 + 0.5 * _SAFETY) * error
 
     def _bounds(self, points: list[tuple[float, float]], base: float, end: float) -> list[float]:
@@ -435,33 +461,29 @@ class LowerEnvelope:
         bend = 0.5 * _DRIFT_PER_S * ratio * ratio * 1e-9
         return [y - base + (spread + bend * (end - x)) * (end - x) for x, y in points]
 
-    def _error(self, points: list[tuple[float, float]], base: float, slope: float) -> float:
-        """Return how well the minimum of points above a line repeats [ns host].
+    def _error(self, points: list[tuple[float, float]], heights: list[float]) -> float:
+        """Return how well the minimum of the heights of points repeats [ns host].
 
         The least height of each quarter of the time says so. Where heights vary much and quarters
         have few points, that may be chance.
         """
         end = points[-1][0]
-        least = [math.inf] * _PARTS
-        heights = []
-        for x, y in points:
-            part = min(int(_PARTS * x / end), _PARTS - 1) if end else 0
-            height = y - base - slope * x
-            heights.append(height)
-            least[part] = min(least[part], height)
-        worst = max(height for height in least if height < math.inf)
-        heights.sort()
-        chance = heights[len(heights) // 2] * _PARTS / len(heights)
-        return max(worst, 0.0) + chance + _RESOLUTION_NS
+        cuts = [
+            0,
+            *(bisect_left(points, part * end / _PARTS, key=_x) for part in range(1, _PARTS)),
+        ]
+        least = [min(heights[a:b]) for a, b in pairwise([*cuts, len(points)]) if a < b]
+        chance = sorted(heights)[len(heights) // 2] * _PARTS / len(heights)
+        return max(*least, 0.0) + chance + _RESOLUTION_NS
 
     def _width(self, points: list[tuple[float, float]], error: float) -> float:
         """Return to which share a ratio is known from points whose minimum repeats so well."""
         span = points[-1][0] * self.line.ratio
         return _SAFETY * error / span if span > 0.0 else 1.0
 
-    def _learn(self, points: list[tuple[float, float]], base: float, slope: float) -> float:
+    def _learn(self, points: list[tuple[float, float]], heights: list[float]) -> float:
         """Narrow the bounds of the ratio if a fit says enough; return the error of its minimum."""
-        error = self._error(points, base, slope)
+        error = self._error(points, heights)
         self._evidence = min(error, self._evidence) if self.is_known else error
         width = self._width(points, error)
         if width <= _KNOWN:
