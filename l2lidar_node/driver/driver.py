@@ -19,7 +19,13 @@ from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.deferred import DeferredPoints
 from l2lidar_node.driver.device import Answer, CommandClient, DeviceState, QuerySchedule, Watchdog
 from l2lidar_node.driver.orientation import GravityAlignment, GravityMonitor
-from l2lidar_node.driver.reorder import REORDER_NS, Released, ReorderBuffer, SequenceCounts
+from l2lidar_node.driver.reorder import (
+    REORDER_NS,
+    Released,
+    ReorderBuffer,
+    SequenceCounts,
+    Timed,
+)
 from l2lidar_node.driver.sweep import (
     MAX_GAP_NS,
     BlockChoice,
@@ -39,8 +45,10 @@ from l2lidar_node.protocol.packets import (
     PointPacket,
     Version,
     decode,
+    decode_imu,
+    decode_points,
 )
-from l2lidar_node.types import F64, HostNs, ImuSample, Stream, Sweep, new_tuple
+from l2lidar_node.types import F64, Datagram, HostNs, ImuSample, Stream, Sweep, new_tuple
 
 
 @dataclass(slots=True)
@@ -117,7 +125,8 @@ _FOREVER_NS: Final = 1 << 62
 # Looking up a member of an Enum takes long.
 _IMU, _POINTS, _POINTS_3D = Stream.IMU, Stream.POINTS, wire.PacketType.POINTS_3D
 _SAMPLES_AT_ONCE: Final = 64  # are handed on, at most
-_IMU_SIZE: Final = wire.FRAME_SIZES[wire.PacketType.IMU]
+_IMU_TYPE: Final = int(wire.PacketType.IMU)
+_IMU_SIZE: Final = wire.FRAME_SIZES[_IMU_TYPE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,8 +235,25 @@ class Driver:
         counters and states are those of now only after it.
         """
         events, self._owed = self._owed, []
-        for data, arrival in self._deferred.taken():
-            events += self._take(data, arrival)
+        waiting = self._deferred.taken()
+        if waiting:
+            events += self._take_together(waiting)
+        return events
+
+    def _take_together(self, waiting: list[Datagram]) -> list[Event]:
+        """Do what :meth:`_take` does with datagrams that were put off, one by one."""
+        packets = decode_points(waiting)
+        if packets is None or not self._reorder_buffer.all_follow(
+            Timed(packets[0], waiting[0].arrival), Timed(packets[-1], waiting[-1].arrival)
+        ):
+            return [event for datagram in waiting for event in self._take(*datagram)]
+        self.counters.frames[packets[0].packet_type] += len(packets)
+        self._watchdog.heard(_POINTS, waiting[-1].arrival)
+        events: list[Event] = []
+        for packet, (_, arrival) in zip(packets, waiting, strict=True):
+            events += self._points(packet, arrival)
+            if self._clock.happened:
+                events += self._clock.events()
         return events
 
     def _take(self, data: bytes, arrival: HostNs) -> list[Event]:
@@ -238,6 +264,14 @@ class Driver:
             events = self.catch_up()
         if not deferred.waiting and not self._reorder_buffer.is_flowing(arrival):
             events += self.settle(arrival)
+        if len(data) == _IMU_SIZE:
+            sample = decode_imu(data)
+            if sample is not None:
+                counters.frames[_IMU_TYPE] += 1
+                events += self._handle(sample, arrival)
+                if self._clock.happened:
+                    events += self._clock.events()
+                return events
         for item in self._framer.feed(data):
             if isinstance(item, FrameError):
                 counters.faults[item.fault.value] += 1

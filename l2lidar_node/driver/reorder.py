@@ -116,6 +116,15 @@ class SequenceOrder(Generic[T]):
             self._given_up.discard(seq)
         return True
 
+    def all_follow(self, first: int, last: int) -> bool:
+        """Take all numbers from the next one to another; return whether none wraps or waits."""
+        if first != self._next or self.waiting or first < self._modulus <= last:
+            return False
+        self._next = self._after(last)
+        if self._given_up:
+            self._given_up.difference_update(range(first, last + 1))
+        return True
+
     def push(self, seq: int, item: T) -> list[tuple[int, T]]:
         """Return what can be released now, each with how many are missing just before it."""
         if self.follows(seq):
@@ -324,12 +333,23 @@ class ReorderBuffer:
             or not lane.order.follows(packet.seq)
         ):
             return False
-        lane.newest = packet
-        lane.arrival = arrival
-        lane.released = None
-        lane.fallen = 0
-        if lane.suspects:
-            _refute(lane)
+        _advance(lane, packet, arrival)
+        return True
+
+    def all_follow(self, first: Timed, last: Timed) -> bool:
+        """Take packets of points of consecutive numbers, with stamps that do not fall.
+
+        Return whether each :meth:`follows`. If not, none is taken.
+        """
+        lane = self._points
+        if (
+            lane.newest is None
+            or first.packet.stamp < lane.newest.stamp
+            or not self.is_flowing(first.arrival)
+            or not lane.order.all_follow(first.packet.seq, last.packet.seq)
+        ):
+            return False
+        _advance(lane, last.packet, last.arrival)
         return True
 
     def begins_anew(
@@ -483,6 +503,16 @@ def _continues(before: Timed, packet: PointPacket | ImuPacket) -> bool:
         0 < packet.seq - before.packet.seq <= _FEW
         and 0 < packet.stamp - before.packet.stamp < RESTART_NS
     )
+
+
+def _advance(lane: _Lane, packet: PointPacket | ImuPacket, arrival: HostNs) -> None:
+    """Take a packet that follows the one before."""
+    lane.newest = packet
+    lane.arrival = arrival
+    lane.released = None
+    lane.fallen = 0
+    if lane.suspects:
+        _refute(lane)
 
 
 def _refute(lane: _Lane) -> None:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.framing import Frame
-from l2lidar_node.types import DeviceNs, Quaternion, Vector3, new_tuple
+from l2lidar_node.types import Datagram, DeviceNs, Quaternion, Vector3, new_tuple
 
 NS: Final = 1_000_000_000
 
 # Measurements are decoded hundreds of times a second: one precompiled struct each instead of a
 # dtype view.
-_IMU = struct.Struct("<4I 4f 3f 3f")
+_IMU = struct.Struct("<4I10f")
+_IMU_FRAME = struct.Struct(f"<{wire.HEADER.size}s4I10fI6x2s")
+_IMU_HEADER: Final = wire.HEADER.pack(wire.MAGIC, wire.PacketType.IMU, _IMU_FRAME.size)
+_PAYLOAD: Final = slice(wire.HEADER.size, -wire.TAIL.size)  # of a whole frame
 
 _MAX_FIELD: Final = 1e6  # in any unit: all real ones are below 1e4, and points must fit float32
 _MAX_TIME_INCREMENT_S: Final = 1e-3
@@ -147,37 +151,47 @@ class _PointLayout(NamedTuple):
     size: int
     capacity: int
     fields: struct.Struct  # time increment and number of points are the last ones
+    frame: struct.Struct  # the same fields, the CRC and the end mark
     head_angle: int | None  # place among the fields
 
 
-_POINTS_3D: Final = _PointLayout(
-    wire.PacketType.POINTS_3D,
-    wire.POINTS_3D_PAYLOAD.itemsize,
-    wire.POINTS_PER_3D_PACKET,
-    struct.Struct("<4I 36x 8f 8f I"),
-    12,
+_INTEGERS: Final = 4  # fields before the floats
+
+
+def _layout(
+    packet_type: wire.PacketType, capacity: int, fields: str, head_angle: int | None
+) -> _PointLayout:
+    size = wire.PAYLOADS[packet_type].itemsize
+    layout = struct.Struct(f"<{fields}")
+    rest = size - layout.size
+    frame = struct.Struct(f"<{wire.HEADER.size}x{fields}{rest}xI6x2s")
+    return _PointLayout(int(packet_type), size, capacity, layout, frame, head_angle)
+
+
+_POINTS_3D: Final = _layout(wire.PacketType.POINTS_3D, wire.POINTS_PER_3D_PACKET, "4I36x8f8fI", 12)
+_POINTS_2D: Final = _layout(
+    wire.PacketType.POINTS_2D, wire.POINTS_PER_2D_PACKET, "4I36x8f6fI", None
 )
-_POINTS_2D: Final = _PointLayout(
-    wire.PacketType.POINTS_2D,
-    wire.POINTS_2D_PAYLOAD.itemsize,
-    wire.POINTS_PER_2D_PACKET,
-    struct.Struct("<4I 36x 8f 6f I"),
-    None,
-)
+_LAYOUTS: Final = {layout.packet_type: layout for layout in (_POINTS_3D, _POINTS_2D)}
 
 
 def _points(layout: _PointLayout, payload: bytes) -> PointPacket | DecodeError:
-    packet_type, size, capacity, numbers, head_angle = layout
-    if len(payload) != size:
-        return DecodeError(packet_type, "length")
-    fields = numbers.unpack_from(payload)
-    seq, _, sec, nsec = fields[:4]
+    if len(payload) != layout.size:
+        return DecodeError(layout.packet_type, "length")
+    return _point_packet(layout, layout.fields.unpack_from(payload), payload)
+
+
+def _point_packet(
+    layout: _PointLayout, fields: Sequence[Any], payload: bytes
+) -> PointPacket | DecodeError:
+    packet_type, _, capacity, _, _, head_angle = layout
+    seq, _, sec, nsec = fields[:_INTEGERS]
     time_increment, count = fields[-2:]
     if count > capacity:
         return DecodeError(packet_type, "point_num")
     if nsec >= NS:
         return DecodeError(packet_type, "stamp")
-    length = math.hypot(*fields[4:-1])  # one NaN or infinity anywhere makes it one
+    length = math.hypot(*fields[_INTEGERS:-1])  # one NaN or infinity anywhere makes it one
     if not length <= _MAX_FIELD:
         is_finite = math.isfinite(length)
         return DecodeError(packet_type, "implausible" if is_finite else "not_finite")
@@ -189,10 +203,55 @@ def _points(layout: _PointLayout, payload: bytes) -> PointPacket | DecodeError:
     return new_tuple(PointPacket, (packet_type, seq, stamp, duration_ns, angle, payload))
 
 
+def decode_points(datagrams: Sequence[Datagram]) -> list[PointPacket] | None:
+    """Decode whole frames of points, in half the time that they take one by one.
+
+    Parameters
+    ----------
+    datagrams : sequence of Datagram
+        Not empty. Each has the size and the header of a frame of points of the same type.
+
+    Returns
+    -------
+    list of PointPacket or None
+        Those that :class:`~l2lidar_node.protocol.framing.Framer` and :func:`decode` make of them.
+        None if anything is wrong with one: these tell what.
+    """
+    layout = _LAYOUTS[wire.HEADER.unpack_from(datagrams[0].data)[1]]
+    unpack = layout.frame.unpack
+    packets = []
+    for data, _ in datagrams:
+        payload = data[_PAYLOAD]
+        *fields, crc, end = unpack(data)
+        if end != wire.TAIL_END or crc != zlib.crc32(payload):
+            return None
+        packet = _point_packet(layout, fields, payload)
+        if isinstance(packet, DecodeError):
+            return None
+        packets.append(packet)
+    return packets
+
+
+def decode_imu(data: bytes) -> ImuPacket | None:
+    """Decode a datagram that is one frame of the IMU, faster than a framer and :func:`decode`.
+
+    None if it is not a good one: these tell what.
+    """
+    header, *fields, crc, end = _IMU_FRAME.unpack(data)
+    if header != _IMU_HEADER or end != wire.TAIL_END or crc != zlib.crc32(data[_PAYLOAD]):
+        return None
+    packet = _imu_packet(fields)
+    return packet if isinstance(packet, ImuPacket) else None
+
+
 def _imu(payload: bytes) -> ImuPacket | DecodeError:
     if len(payload) != _IMU.size:
         return DecodeError(wire.PacketType.IMU, "length")
-    seq, _, sec, nsec, w, x, y, z, p, q, r, ax, ay, az = _IMU.unpack(payload)
+    return _imu_packet(_IMU.unpack(payload))
+
+
+def _imu_packet(fields: Sequence[Any]) -> ImuPacket | DecodeError:
+    seq, _, sec, nsec, w, x, y, z, p, q, r, ax, ay, az = fields
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not (
         nsec < NS

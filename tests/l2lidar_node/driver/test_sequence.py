@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import pytest
@@ -282,3 +283,24 @@ def test_any_numbers_are_taken(numbers: Any, window: Any) -> None:
     counts = order.counts
     assert len(out) + counts.duplicates + counts.late == len(numbers)
     assert all(missing >= 0 for missing, _ in released)
+
+
+@given(disturbed(), st.integers(0, 30), st.integers(-1, 1), st.sampled_from([1025, 2000]))
+def test_numbers_that_follow_together_are_those_that_follow_one_by_one(
+    stream: Any, count: int, off: int, modulus: int
+) -> None:
+    first, numbers = stream
+    order: SequenceOrder[int] = SequenceOrder(WINDOW)
+    for number in [*range(first), *numbers]:
+        order.push(number % modulus, number)
+    begin = (max(numbers, default=0) + 1 + off) % modulus
+    together, singly = copy.deepcopy(order), copy.deepcopy(order)
+    is_taken = together.all_follow(begin, begin + count)
+    assert is_taken == all(singly.follows(number) for number in range(begin, begin + count + 1))
+    following = [begin + count + step for step in (1, 2, 0, 4, 3)]
+    for number in range(begin, begin + count + 1) if not is_taken else ():
+        together.push(number, number)
+        order.push(number, number)
+    expected = order if not is_taken else singly
+    assert [together.push(n, n) for n in following] == [expected.push(n, n) for n in following]
+    assert together.counts == expected.counts

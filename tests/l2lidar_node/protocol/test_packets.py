@@ -11,7 +11,7 @@ import pytest
 from hypothesis import example, given, strategies as st
 
 from l2lidar_node.protocol import wire
-from l2lidar_node.protocol.framing import Frame
+from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import (
     Ack,
     DecodeError,
@@ -21,8 +21,11 @@ from l2lidar_node.protocol.packets import (
     UnknownPacket,
     Version,
     decode,
+    decode_imu,
+    decode_points,
 )
 from l2lidar_node.protocol.wire import PacketType
+from l2lidar_node.types import Datagram, HostNs
 from tests.support import build
 
 KINDS = [PacketType.POINTS_3D, PacketType.POINTS_2D]
@@ -235,3 +238,38 @@ def test_any_payload_of_the_right_size_decodes_to_finite_values(
     if isinstance(packet, ImuPacket):
         assert math.hypot(*packet.orientation_wxyz) == pytest.approx(1)
         assert all(map(math.isfinite, packet.angular_velocity + packet.linear_acceleration))
+
+
+def one_by_one(data: bytes) -> Any:
+    """Return the packet of a datagram that is one good frame; None if it is not."""
+    found = [decode(item) for item in Framer().feed(data) if isinstance(item, Frame)]
+    return found[0] if len(found) == 1 and isinstance(found[0], PointPacket | ImuPacket) else None
+
+
+@st.composite
+def whole_frames(draw: Any, kind: PacketType, first: int) -> bytes:
+    """Draw a datagram of the size of a frame, good or with a word changed from a place on."""
+    maker = build.imu if kind == PacketType.IMU else MAKERS[kind]
+    payload = maker(draw(st.integers(0, 1024)), draw(st.integers(0, 2**40)))
+    if draw(st.booleans()):  # an impossible value with a good checksum, or a harmless one
+        word = struct.pack("<f", draw(st.floats(width=32)))
+        at = 4 * draw(st.integers(0, 30))
+        if at + 4 <= len(payload):
+            payload = payload[:at] + word + payload[at + 4 :]
+    data = bytearray(build.frame(kind, payload))
+    if draw(st.integers(0, 3)) == 0:
+        data[draw(st.integers(first, len(data) - 1))] ^= 1 << draw(st.integers(0, 7))
+    return bytes(data)
+
+
+@given(st.data(), st.sampled_from(KINDS))
+def test_points_decoded_together_are_those_decoded_one_by_one(data: Any, kind: Any) -> None:
+    frames = data.draw(st.lists(whole_frames(kind, wire.HEADER.size), min_size=1, max_size=4))
+    expected = [one_by_one(frame) for frame in frames]
+    packets = decode_points([Datagram(frame, HostNs(0)) for frame in frames])
+    assert packets == (None if None in expected else expected)
+
+
+@given(whole_frames(PacketType.IMU, 0))
+def test_a_whole_frame_of_the_imu_is_what_the_framer_makes_of_it(frame: bytes) -> None:
+    assert decode_imu(frame) == one_by_one(frame)
