@@ -154,7 +154,7 @@ def describe_transport(network: NetworkConfig) -> str:
     )
 
 
-TICK_S: Final = 0.01
+TICK_S: Final = 0.02
 _TICK_NS: Final = round(TICK_S * 1e9)
 
 
