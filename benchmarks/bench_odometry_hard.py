@@ -63,6 +63,7 @@ def _ours(given: Recording) -> Track:
     odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
     estimates = []
     first = 0
+    methods.load_libraries()
     begin = time.process_time()
     for sweep in given.sweeps():
         last = int(np.searchsorted(given.imu["stamp"], sweep.end)) + 1
@@ -83,6 +84,7 @@ def _ours(given: Recording) -> Track:
 
 def _plain(given: Recording) -> Track:
     odometry = PlainOdometry(OdometryConfig(mode="plain"))
+    methods.load_libraries()
     begin = time.process_time()
     estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
     seconds = time.process_time() - begin

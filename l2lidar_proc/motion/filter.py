@@ -35,13 +35,14 @@ TWIST: Final = slice(VELOCITY.start, GYRO_BIAS.stop)  # an error of the bias is 
 ERRORS: Final = 18
 
 
+LIBRARY: Final = "filterpy.kalman"
+"""Imported at the first prediction: it brings ``scipy.stats`` along, a second of work."""
+
+
 @cache
 def kalman() -> Any:
-    """Return ``filterpy.kalman``, imported when it is first asked for.
-
-    It brings ``scipy.stats`` along, which takes longer than all else that a node imports.
-    """
-    return import_module("filterpy.kalman")
+    """Return :data:`LIBRARY`, imported when it is first asked for."""
+    return import_module(LIBRARY)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ point: nothing of that kind gets past this module.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,15 @@ from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, S
 if TYPE_CHECKING:
     from kiss_icp.config import KISSConfig
 
+
+LIBRARIES: Final = (
+    "kiss_icp.config",
+    "kiss_icp.mapping",
+    "kiss_icp.registration",
+    "kiss_icp.threshold",
+    "kiss_icp.voxelization",
+)
+"""What is imported where it is first used."""
 
 _BITS = 21  # of a voxel's number along an axis, so that three fit
 _MASK = (1 << _BITS) - 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from enum import Enum
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry import kiss
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
@@ -29,6 +31,9 @@ from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.uncertainty import FrameJump, InnovationTest
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
+
+LIBRARIES: Final = (*kiss.LIBRARIES, eskf.LIBRARY, "scipy.spatial.transform")
+"""Imported with the first sweeps, unless something has done so before."""
 
 
 class Phase(Enum):

@@ -36,6 +36,7 @@ from l2lidar_proc.cloud import CloudError, position_problem, without_time
 from l2lidar_proc.deskew.config import AS_INPUT, DeskewNodeConfig, ScanConfig
 from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, of_period, of_sweep
+from l2lidar_proc.motion.filter import LIBRARY
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.tracker import KnownMotion, MotionTracker, carried_over
 from l2lidar_proc.ros import odometry_messages as messages
@@ -205,7 +206,7 @@ class DeskewNode(ManagedNode):
             self, topics.cloud_topic, on_leveling=self._warn_of_leveling
         )
         steady_timer(self, 1.0, guarded(self._diagnose))
-        load_libraries("filterpy.kalman")
+        load_libraries(LIBRARY)
 
     def pause(self) -> None:
         """Stop listening, publish waiting sweeps, and forget the motion."""

@@ -35,7 +35,7 @@ from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
-from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.odometry import LIBRARIES, Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
 from l2lidar_proc.recording import outputs
 from l2lidar_proc.ros import odometry_messages as messages
@@ -110,15 +110,7 @@ class OdometryNode(ManagedNode):
         map_period_s = self._settings.value.topics.map_period_s
         if map_period_s > 0.0:
             steady_timer(self, map_period_s, guarded(self._show_map))
-        load_libraries(
-            "kiss_icp.config",
-            "kiss_icp.mapping",
-            "kiss_icp.registration",
-            "kiss_icp.threshold",
-            "kiss_icp.voxelization",
-            "filterpy.kalman",
-            "scipy.spatial.transform",
-        )
+        load_libraries(*LIBRARIES)
 
     def pause(self) -> None:
         """Listen no more."""
