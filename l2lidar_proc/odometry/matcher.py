@@ -196,7 +196,8 @@ class SweepMatcher:
         state = motion.state
         points = xyz(moved) - self.lever
         placed = (state.rotation @ points.T + state.position[:, None]).T
-        fresh = self.surfaces.add(placed, self._sweeps)
+        ranges = np.sqrt((points**2).sum(axis=1))
+        fresh = self.surfaces.add(placed, self._sweeps, ranges)
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
         self.kiss.update(points, _pose(state), _pose(guess))
         self._walk(state.position)
