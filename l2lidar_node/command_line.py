@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ GROUP: Final = "l2lidar.verbs"
 
 UNIT: Final = "The unit"
 DATA: Final = "Its data"
+
+_UNWRAPPED: Final = re.compile(r"(?<![-\n])\n(?![-\n])")  # ends of lines within a paragraph
 
 
 class CommandError(RuntimeError):
@@ -99,6 +102,7 @@ def interruption_exits() -> Iterator[None]:
 def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
     """Return a command as any typer from 0.9 on, which Ubuntu 24.04 has, can run it.
 
+    The lines of a paragraph of its help are joined, so that they fit any terminal.
     ``X | None`` is spelt ``Optional[X]``: typer knows the former from 0.12.4 on. For Ctrl-C see
     :func:`interruption_exits`.
     """
@@ -113,6 +117,7 @@ def for_typer(command: Callable[..., Any]) -> Callable[..., Any]:
         with interruption_exits():
             return command(*args, **named)
 
+    run.__doc__ = _UNWRAPPED.sub(" ", inspect.getdoc(command) or "")
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # typer reads it
     run.__annotations__ = {item.name: item.annotation for item in parameters}
     return run

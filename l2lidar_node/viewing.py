@@ -216,7 +216,7 @@ def open_viewer(web: bool, save: Path | None) -> Any:
     Raises
     ------
     ViewerError
-        If rerun is not installed or its window cannot be opened.
+        If rerun is not installed, or its window or the file cannot be opened.
     """
     try:
         import rerun
@@ -264,8 +264,10 @@ def open_viewer(web: bool, save: Path | None) -> Any:
     )
     rerun.init("l2lidar")
     if save is not None:
-        save.parent.mkdir(parents=True, exist_ok=True)
-        rerun.save(save, default_blueprint=layout)
+        try:
+            rerun.save(save, default_blueprint=layout)
+        except RuntimeError as error:
+            raise ViewerError(str(error)) from None
     elif web:
         address = rerun.serve_grpc(default_blueprint=layout)
         rerun.serve_web_viewer(connect_to=address, open_browser=False)

@@ -24,6 +24,7 @@ from l2lidar_node.protocol.framing import Frame, Framer
 from l2lidar_node.protocol.packets import DecodeError, ImuPacket, PointPacket, Version, decode
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.packet_bag import open_packets
 from l2lidar_node.recording.recording import Received, Recorder, Recording
 
 _SPIN_UP_S: Final = 60.0
@@ -294,7 +295,7 @@ def capture_place(path: Path, power_up: int = 0) -> tuple[Place, str]:
     framer = Framer()
     firmware = ""
     try:
-        with path.open("rb") as stream:
+        with open_packets(path) as stream:
             for entry in Recording(stream):
                 if not isinstance(entry, Received):
                     continue

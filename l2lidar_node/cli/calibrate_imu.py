@@ -31,6 +31,7 @@ from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.packet_bag import open_packets
 from l2lidar_node.recording.recording import Recording, feed
 from l2lidar_node.settings import build
 from l2lidar_node.types import F64, IMU_SAMPLE, ImuSample, Sweep
@@ -261,7 +262,7 @@ def _measured(
     sweeps: list[Sweep] = []
     samples: list[ImuSample] = []
     try:
-        with path.open("rb") as stream:
+        with open_packets(path) as stream:
             events = [event for entry in Recording(stream) for event in feed(driver, entry)]
     except OSError as error:
         raise CommandError(f"{path}: {error.strerror}") from None

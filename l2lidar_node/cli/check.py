@@ -19,7 +19,7 @@ from l2lidar_node.check.report import as_data, judge, verdict
 from l2lidar_node.check.requirements import CONSUMERS, Consumer, Finding, Use, worst
 from l2lidar_node.cli.console import JsonOption, out, print_json
 from l2lidar_node.command_line import UsageError
-from l2lidar_node.recording.capture import is_capture_file
+from l2lidar_node.recording.packet_bag import is_of_packets
 from l2lidar_node.types import Level
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def _observe(
     if source and (path.exists() or not _TOPIC.fullmatch(source)):
         from l2lidar_node.cli import recorded
 
-        if is_capture_file(path):
+        if is_of_packets(path):
             return recorded.observe_capture(path, consumer.name, seconds)
         return recorded.observe_bag(path, asked, needs_imu, seconds)
     try:

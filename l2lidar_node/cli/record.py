@@ -171,7 +171,7 @@ def convert(
         raise UsageError(f"{result} exists already; choose another name, or remove it")
     try:
         with open_packets(recording) as stream:
-            read = Recording(stream, l2_ip)
+            read = Recording(stream, l2_ip, is_selected=True)
             if is_capture:
                 said = _write_capture(read, result)
             elif packets:
@@ -308,7 +308,7 @@ def replay(
     destination = _end(to)
     try:
         stream = open_packets(file)
-        recording = Recording(stream, l2_ip)
+        recording = Recording(stream, l2_ip, is_selected=True)
     except (OSError, CaptureError) as error:
         raise DeviceError(f"{file}: {error}") from None
     with stream, _bound(recording, source) as sender, _progress() as progress:

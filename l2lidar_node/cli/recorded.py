@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import yaml
 
+from l2lidar_node.calibration.file import CalibrationFileError, load
 from l2lidar_node.check.observation import (
     CLOUD,
     IMU,
@@ -30,6 +31,7 @@ from l2lidar_node.driver.health import metadata
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording import bag
 from l2lidar_node.recording.capture import CaptureError, is_capture_file
+from l2lidar_node.recording.packet_bag import open_packets
 from l2lidar_node.recording.recording import Received, Recording, feed, measurements
 from l2lidar_node.ros.parameter_files import parameters_for
 from l2lidar_node.settings import build
@@ -92,7 +94,7 @@ def observe_capture(
     gathering = Gathering()
     end = None
     try:
-        with path.open("rb") as stream:
+        with open_packets(path) as stream:
             recording = Recording(stream)
             gathering.transforms(messages.transforms(recording.start))
             for now, event in measurements(recording, config):
@@ -138,10 +140,13 @@ def describe(path: Path, l2_ip: str = "") -> dict[str, Any]:
         if is_capture_file(path):
             return _capture(path, l2_ip)
         if path.suffix in (".yaml", ".yml") and path.is_file():
-            return {"kind": "YAML file", "content": yaml.safe_load(path.read_text())}
+            load(path)
+            return {"kind": "calibration", "content": yaml.safe_load(path.read_text())}
         return _bag(path)
-    except (CaptureError, OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        words = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+    except CalibrationFileError as error:
+        raise CommandError(str(error)) from None
+    except (CaptureError, OSError) as error:
+        words = error.strerror if isinstance(error, OSError) else str(error)
         raise CommandError(f"{path}: {words}") from None
 
 

@@ -120,6 +120,8 @@ def _describe(file: Path, l2_ip: str, json_: bool) -> None:
 
 def _flat(values: object, above: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the leaves of nested mappings, each named by its path."""
+    if isinstance(values, list) and all(isinstance(item, dict) for item in values):
+        values = [item.get("name", item) for item in values]
     if not isinstance(values, dict):
         yield above or "content", values
         return

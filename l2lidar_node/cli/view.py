@@ -11,10 +11,12 @@ import typer
 
 from l2lidar_node import viewing
 from l2lidar_node.cli.console import say
-from l2lidar_node.command_line import CommandError
+from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
+from l2lidar_node.files import whole
 from l2lidar_node.recording import bag
-from l2lidar_node.recording.capture import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.packet_bag import is_of_packets, open_packets
 from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.settings import build
 from l2lidar_node.types import Sweep
@@ -54,12 +56,28 @@ def view(
     With the odometry's topics also at its standard deviations, the directions that it cannot see,
     and the map as it grows. Live topics need ROS 2; a recording does not.
     """
+    if save is None:
+        _open_and_show(file, namespace, seconds, None, web)
+        return
+    if save.suffix != ".rrd":
+        raise UsageError(f"'{save}' ends in '{save.suffix}'; expected FILE.rrd")
+    if save.is_dir():
+        raise UsageError(f"'{save}' is a folder; expected FILE.rrd")
+    save.parent.mkdir(parents=True, exist_ok=True)
+    with whole(save) as part:
+        _open_and_show(file, namespace, seconds, part, web)
+    say(f"written to {save}")
+
+
+def _open_and_show(
+    file: Path | None, namespace: str, seconds: float | None, save: Path | None, web: bool
+) -> None:
     try:
         sdk = viewing.open_viewer(web, save)
     except viewing.ViewerError as error:
         raise CommandError(str(error)) from None
     try:
-        _show(sdk, file, namespace, seconds, save, web)
+        _show(sdk, file, namespace, seconds, web)
     except KeyboardInterrupt:
         return
     finally:
@@ -71,14 +89,13 @@ def _show(
     file: Path | None,
     namespace: str,
     seconds: float | None,
-    save: Path | None,
     web: bool,
 ) -> None:
     if file is None:
         shown = _live(sdk, namespace, seconds)
     else:
         shown = _recorded(sdk, file, namespace, seconds)
-    say(f"{shown} messages shown" + (f", written to {save}" if save else ""))
+    say(f"{shown} messages shown")
     if not shown and file is None:
         raise CommandError(
             "no message arrived; check that the driver runs in the same ROS_DOMAIN_ID"
@@ -119,7 +136,7 @@ def _live(sdk: Any, namespace: str, seconds: float | None) -> int:
 def _recorded(sdk: Any, file: Path, namespace: str, seconds: float | None) -> int:
     viewer = Viewer(sdk)
     try:
-        if is_capture_file(file):
+        if is_of_packets(file):
             _show_capture(viewer, file, seconds)
         else:
             _show_bag(viewer, file, namespace.rstrip("/"), seconds)
@@ -133,7 +150,7 @@ def _recorded(sdk: Any, file: Path, namespace: str, seconds: float | None) -> in
 def _show_capture(viewer: Viewer, file: Path, seconds: float | None) -> None:
     config = build(DriverConfig, {"imu_adjust": False, "sweep_cut": "turn"})
     messages = bag.Messages(config)
-    with file.open("rb") as stream:
+    with open_packets(file) as stream:
         recording = Recording(stream)
         for now, event in measurements(recording, config):
             if seconds is not None and now > recording.start + seconds * 1e9:

@@ -36,6 +36,8 @@ CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 _DATATYPES: Final = {code: number for number, code in DATATYPES.items()}
+_BAG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
+_NO_END: Final = "File end magic is invalid."  # of an MCAP file whose writer was killed
 
 
 class RecordingError(ValueError):
@@ -48,13 +50,22 @@ def open_bag(path: Path) -> AnyReader:
 
 
 def unreadable(path: Path, error: Exception) -> RecordingError:
-    """Return the error message for a recording whose reader failed."""
+    """Return the error for a recording whose reader failed; its message names the file."""
+    return RecordingError(f"{path}: {why_unreadable(path, error)}")
+
+
+def why_unreadable(path: Path, error: Exception) -> str:
+    """Return what to tell the user of a recording whose reader failed."""
     if not path.exists():
-        return RecordingError(f"{path}: no such file or folder")
+        return "no such file or folder"
     if path.is_dir() and not (path / "metadata.yaml").exists():
-        return RecordingError(f"{path} is not a rosbag2 folder: it has no metadata.yaml")
+        return "not a rosbag2 folder: it has no metadata.yaml"
+    if path.is_file() and path.suffix not in _BAG_SUFFIXES:
+        return "cannot be read as a recording: neither a capture, nor MCAP, nor a rosbag2 folder"
     words = " ".join(str(error).split()) or type(error).__name__
-    return RecordingError(f"{path} cannot be read as a recording: {words}")
+    if words == _NO_END:
+        words = "its end is missing; 'mcap recover' saves what is there"
+    return f"cannot be read as a recording: {words}"
 
 
 def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:

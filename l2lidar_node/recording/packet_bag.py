@@ -100,7 +100,7 @@ class PacketBag(io.RawIOBase):
         from l2lidar_node.recording import bag  # rosbags is only needed here
 
         self._path = path
-        self._unreadable = bag.unreadable
+        self._why_unreadable = bag.why_unreadable
         self._is_open = False
         try:
             self._reader = bag.open_bag(path)
@@ -109,7 +109,7 @@ class PacketBag(io.RawIOBase):
             self._topics = [c for c in self._reader.connections if c.msgtype == PACKETS]
         except Exception as error:  # of a damaged file, any byte may lead anywhere
             self.close()
-            raise CaptureError(str(bag.unreadable(path, error))) from None
+            raise CaptureError(bag.why_unreadable(path, error)) from None
         self._chunks = self._captures()
         self._rest = b""
         self._at = 0
@@ -180,7 +180,7 @@ class PacketBag(io.RawIOBase):
                     yield data if is_first else data[HEADER_SIZE:]
                     is_first = False
         except Exception as error:
-            raise CaptureError(str(self._unreadable(self._path, error))) from None
+            raise CaptureError(self._why_unreadable(self._path, error)) from None
 
 
 class PacketBagWriter:
@@ -259,6 +259,20 @@ def open_packets(path: Path) -> BinaryIO:
     if path.is_dir() or (path.exists() and _is_bag(path)):
         return PacketBag(path)  # type: ignore[return-value]  # a stream, but for its class
     return path.open("rb")
+
+
+def is_of_packets(path: Path) -> bool:
+    """Tell whether a file is a capture, or a bag with raw packets and no clouds."""
+    if is_capture_file(path) or not (path.is_dir() or _is_bag(path)):
+        return is_capture_file(path)
+    from l2lidar_node.recording import bag  # rosbags is only needed here
+
+    try:
+        with bag.open_bag(path) as reader:
+            kinds = {connection.msgtype for connection in reader.connections}
+    except Exception:  # of a damaged file; whoever reads it will say so
+        return False
+    return PACKETS in kinds and bag.CLOUD not in kinds
 
 
 def _is_bag(path: Path) -> bool:

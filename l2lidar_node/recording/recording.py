@@ -121,7 +121,9 @@ class Recording:
         Seekable, pcap or pcapng; read anew for every iteration.
     l2_ip : str
         Whose packets to take if there are those of several. With only one L2 in the capture it is
-        taken whatever its address.
+        taken whatever its address, unless ``is_selected``.
+    is_selected : bool
+        Whether a user asked for this L2, rather than a parameter that is always set.
 
     Attributes
     ----------
@@ -139,7 +141,7 @@ class Recording:
         iterating, where the file is damaged.
     """
 
-    def __init__(self, stream: BinaryIO, l2_ip: str = "") -> None:
+    def __init__(self, stream: BinaryIO, l2_ip: str = "", *, is_selected: bool = False) -> None:
         self._stream = stream
         self._reader = CaptureReader(stream)
         talks: Counter[tuple[Endpoint, Endpoint]] = Counter()
@@ -153,6 +155,8 @@ class Recording:
             if not talks:  # what is before the damage can be used
                 raise
         self.device, self.host = _chosen(talks, l2_ip, seen, self._reader)
+        if is_selected and l2_ip not in ("", self.device.ip):
+            raise CaptureError(f"it has no packets of an L2 at {l2_ip}, only {self.device.ip}")
         self.start = starts[self.device]
 
     @property

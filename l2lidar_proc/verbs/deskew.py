@@ -11,6 +11,7 @@ from rosbags.highlevel import AnyReaderError
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.frames import FrameTree
+from l2lidar_node.recording.packet_bag import is_of_packets
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.types import is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
@@ -209,11 +210,16 @@ def deskew(
             f"'{target}' ends in '{target.suffix}'; expected FILE.mcap, or a name without a "
             "suffix for a rosbag2 folder"
         )
+    if target.exists():
+        raise UsageError(f"{target} exists already; choose another name, or remove it")
+    if is_of_packets(source):
+        raise UsageError(
+            f"{source} holds raw packets; make clouds of them first: l2lidar convert {source} "
+            "FILE.mcap"
+        )
     try:
         config = settings_for(params_file, "deskew_node", DeskewNodeConfig)
         counts, refused = deskew_recording(source, target, config)
-    except FileExistsError as error:
-        raise UsageError(str(error)) from None
     except OSError as error:
         raise CommandError(f"{error.filename or target}: {error.strerror}") from None
     except RecordingError as error:

@@ -19,7 +19,8 @@ from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.files import whole, write_whole
 from l2lidar_node.frames import FrameTree
-from l2lidar_node.recording.capture import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.packet_bag import is_of_packets, open_packets
 from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_node.settings import build
@@ -195,7 +196,7 @@ def run_capture(
     Parameters
     ----------
     source : Path
-        pcap or pcapng file.
+        pcap or pcapng file, or a bag of raw packets.
     config : OdometryNodeConfig
     progress : callable
         Told how far it is.
@@ -209,14 +210,14 @@ def run_capture(
     CaptureError
         If the capture cannot be read.
     """
-    size = max(source.stat().st_size, 1)
-    with source.open("rb") as stream:
-        recording = Recording(stream, l2_ip)
+    size = max(sum(file.stat().st_size for file in (source, *source.rglob("*"))), 1)
+    with open_packets(source) as stream:
+        recording = Recording(stream, l2_ip, is_selected=True)
 
         def taken() -> Iterator[Event]:
             for now, event in measurements(recording, build(DriverConfig, _CAPTURE)):
                 if isinstance(event, Sweep):
-                    progress(recording.position / size)
+                    progress(min(recording.position / size, 1.0))
                     yield now, event
                 else:
                     yield now, np.array([tuple(event)], IMU_SAMPLE)
@@ -534,7 +535,7 @@ def odometry(
             def progress(share: float) -> None:
                 bar.update(task, completed=share)
 
-            if is_capture_file(source):
+            if is_of_packets(source):
                 run = run_capture(source, config, progress, l2_ip)
             else:
                 run = run_bag(source, config, progress)

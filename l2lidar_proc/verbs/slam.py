@@ -10,7 +10,8 @@ from rich.progress import Progress as Bar
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.files import write_whole
-from l2lidar_node.recording.capture import CaptureError, is_capture_file
+from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.packet_bag import is_of_packets
 from l2lidar_node.ros.parameter_files import settings_for
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate
@@ -79,7 +80,7 @@ def slam(
             def progress(share: float) -> None:
                 bar.update(task, completed=share)
 
-            if is_capture_file(source):
+            if is_of_packets(source):
                 run = run_capture(source, odometry_config, progress, l2_ip, take)
             else:
                 run = run_bag(source, odometry_config, progress, take)

@@ -174,7 +174,11 @@ def test_what_is_no_recording_is_refused(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"nothing")
     outcome = run("view", str(tmp_path / "a.mcap"), "--save", str(tmp_path / "a.rrd"))
     assert outcome.code == 1
-    assert "a.mcap cannot be read as a recording" in outcome.err
+    assert "a.mcap: cannot be read as a recording" in outcome.err
+    assert [item.name for item in tmp_path.iterdir()] == ["a.mcap"]
+    outcome = run("view", str(tmp_path / "a.mcap"), "--save", str(tmp_path / "a.txt"))
+    assert outcome.code == 2
+    assert "ends in '.txt'; expected FILE.rrd" in outcome.err
 
 
 def test_without_a_display_it_says_what_else_there_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.files import free_name
@@ -619,7 +620,7 @@ def test_bags_of_packets_and_captures_hold_the_same(
     damaged.write_bytes(packets.read_bytes()[: packets.stat().st_size // 2])
     outcome = run("replay", str(damaged))
     assert outcome.code == 1
-    assert "damaged.mcap cannot be read as a recording" in outcome.err
+    assert "damaged.mcap: cannot be read as a recording: its end is missing" in outcome.err
 
 
 def test_info_describes_recordings(
@@ -649,9 +650,12 @@ def test_info_describes_recordings(
 
 def test_info_of_a_calibration_says_what_is_in_it(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "unit.yaml"
-    path.write_text("serial: L2-7\ncorrections:\n  beta_angle: 0.25\n")
-    assert json.loads(run("info", str(path), "--json").out)["content"]["serial"] == "L2-7"
-    assert "corrections beta angle  0.25" in run("info", str(path)).out
+    CalibrationFile(bytes(32), {"beta_angle": 0.004}, about={"places": [{"name": "a"}]}).save(path)
+    content = json.loads(run("info", str(path), "--json").out)["content"]
+    assert content["correction"] == {"beta_angle": 0.004}
+    said = run("info", str(path)).out
+    assert re.search(r"^correction beta angle +0\.004 *$", said, re.M)
+    assert re.search(r"^about places +a *$", said, re.M)
 
 
 @pytest.mark.parametrize(
@@ -659,7 +663,9 @@ def test_info_of_a_calibration_says_what_is_in_it(run: Run, tmp_path: Path) -> N
     [
         ("a.pcap", b"", "not a capture file"),
         ("a.mcap", b"nothing", "cannot be read as a recording"),
-        ("a.yaml", b"{", "a.yaml: while parsing"),
+        ("a.txt", b"nothing", "neither a capture, nor MCAP, nor a rosbag2 folder"),
+        ("a.yaml", b"{", "a.yaml: not YAML (while parsing"),
+        ("a.yaml", b"a: 1", "a.yaml: format is None, expected 1"),
         ("a.yaml", bytes([0xC3, 0x28]), "a.yaml: "),
         ("nothing", None, "no such file"),
     ],
@@ -676,7 +682,7 @@ def test_info_of_what_is_neither_says_so(
 
 
 def test_check_judges_a_capture_as_the_consumer_would_get_it(
-    run: Run, capture: tuple[Path, list[Received]]
+    run: Run, capture: tuple[Path, list[Received]], tmp_path: Path
 ) -> None:
     outcome = run("check", str(capture[0]), "--for", "lio_sam", "--json")
     found = json.loads(outcome.out)
@@ -685,3 +691,9 @@ def test_check_judges_a_capture_as_the_consumer_would_get_it(
     assert any("imu_adjust is false" in text for text in texts)
     outcome = run("check", str(capture[0]), "--for", "kiss_icp")
     assert "KISS-ICP" in outcome.out.splitlines()[-1]
+    packets = tmp_path / "packets.mcap"
+    assert run("convert", str(capture[0]), str(packets), "--packets").code == 0
+    assert run("check", str(packets), "--for", "kiss_icp") == outcome
+    outcome = run("convert", str(capture[0]), str(tmp_path / "a.mcap"), "--l2-ip", "192.0.2.9")
+    assert outcome.code == 1
+    assert "no packets of an L2 at 192.0.2.9, only 192.168.1.62" in outcome.err

@@ -95,5 +95,5 @@ def test_what_is_not_a_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"not a rosbag2 folder: it has no metadata\.yaml"):
         run_bag(tmp_path, OdometryNodeConfig())
     (tmp_path / "words.mcap").write_text("words")
-    with pytest.raises(RecordingError, match=r"words\.mcap cannot be read as a recording: "):
+    with pytest.raises(RecordingError, match=r"words\.mcap: cannot be read as a recording: "):
         run_bag(tmp_path / "words.mcap", OdometryNodeConfig())
