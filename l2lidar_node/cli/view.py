@@ -13,7 +13,6 @@ from l2lidar_node import viewing
 from l2lidar_node.cli.console import say
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
-from l2lidar_node.files import whole
 from l2lidar_node.recording import bag
 from l2lidar_node.recording.capture import CaptureError
 from l2lidar_node.recording.packet_bag import is_of_packets, open_packets
@@ -64,8 +63,11 @@ def view(
     if save.is_dir():
         raise UsageError(f"'{save}' is a folder; expected FILE.rrd")
     save.parent.mkdir(parents=True, exist_ok=True)
-    with whole(save) as part:
-        _open_and_show(file, namespace, seconds, part, web)
+    try:
+        _open_and_show(file, namespace, seconds, save, web)
+    except CommandError:
+        save.unlink(missing_ok=True)  # it shows nothing
+        raise
     say(f"written to {save}")
 
 
