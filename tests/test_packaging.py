@@ -86,6 +86,16 @@ def test_every_ros_package_imported_is_declared() -> None:
     assert used - declared == set()
 
 
+def test_rosdep_knows_the_python_packages_declared() -> None:
+    """One key that it does not know makes it refuse all others."""
+    known = (
+        "filterpy-pip hypothesis matplotlib numpy open3d-pip pytest rich rosbags-pip scipy typer"
+    )
+    keys = {f"python3-{name}" for name in (*known.split(), "yaml")}  # looked up in its database
+    declared = {str(item.text) for item in MANIFEST if item.tag.endswith("_depend")}
+    assert {name for name in declared if name.startswith("python3-")} <= keys
+
+
 def test_the_page_on_installing_names_what_is_declared() -> None:
     """What pip brings to a machine with ROS is a part of what setup.py asks for."""
     declared = {

@@ -114,7 +114,10 @@ def slam(
 
 def export_map(
     run: Annotated[
-        Path, typer.Argument(help="Folder that `l2lidar slam` wrote, or a saved map.", exists=True)
+        Path,
+        typer.Argument(
+            help="Folder that `l2lidar slam` wrote, or a saved map.", exists=True, file_okay=False
+        ),
     ],
     to: Annotated[str, typer.Option(help=f"One of: {', '.join(_FORMATS)}.")],
     folder: Annotated[
