@@ -283,7 +283,6 @@ class Odometry:
     def _consistency(self, quality: AlignmentQuality) -> AlignmentQuality:
         """Return the quality of an alignment with what the innovations of late say."""
         found = self._innovations
-        self._predictor.excess = found.excess
         return dataclasses.replace(
             quality, nis=found.nis, velocity_nis=found.velocity_nis, excess=found.excess
         )
@@ -317,12 +316,7 @@ class Odometry:
         rests = self._zero_velocity.watch(state, covariance, samples)
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
         if rests:
-            self._forget_innovations()
-
-    def _forget_innovations(self) -> None:
-        """Judge only what comes from now on."""
-        self._innovations.clear()
-        self._predictor.excess = 1.0
+            self._innovations.clear()
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map at the predicted pose; keep the one before, it may be seen again."""
@@ -337,7 +331,7 @@ class Odometry:
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
         self._unmatched_ns = 0
-        self._forget_innovations()
+        self._innovations.clear()
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
 
@@ -356,7 +350,7 @@ class Odometry:
         self._initializer = self._new_initializer()
         self.matcher.meet(back.alignment, 0.0)
         self._zero_velocity.clear()
-        self._forget_innovations()
+        self._innovations.clear()
         self._unmatched_ns = 0
         self.phase = Phase.TRACKING
         return motion.with_state(back.alignment.state, back.alignment.covariance)
@@ -463,7 +457,7 @@ class Odometry:
         self._jump = self._jump.unseen(self._belief[0])
         self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
         self._zero_velocity.clear()
-        self._forget_innovations()
+        self._innovations.clear()
         if self.phase is Phase.STATIONARY:
             self._leave_rest()
 

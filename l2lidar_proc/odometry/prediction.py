@@ -52,8 +52,6 @@ class Predictor:
         Whether the accelerometer is sound.
     steady_rate : ndarray, shape (3,)
         Rate without bias where there is no gyro [rad/s], cloud axes.
-    excess : float
-        By how much larger the variances of the IMU's noise are than they look.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
@@ -66,7 +64,6 @@ class Predictor:
         """Forget what was found out about the motion; the samples stay."""
         self.trusts_gravity = False
         self.steady_rate: F64 = np.zeros(3)
-        self.excess = 1.0
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
@@ -143,7 +140,7 @@ class Predictor:
     def _noise(self, samples: Samples) -> Noise:
         """Return the noise of samples: the parameter, or more where more shows."""
         settings = self.config.inertial
-        scale = float(np.sqrt(tuning.IMU_PERIOD_S * self.excess))
+        scale = float(np.sqrt(tuning.IMU_PERIOD_S))
         return Noise(
             max(settings.gyro_noise, white_noise(samples["angular_velocity"])) * scale,
             max(settings.accel_noise, white_noise(samples["linear_acceleration"])) * scale,
