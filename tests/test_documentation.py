@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
+from typer.main import get_command
 
+from l2lidar_node.cli.main import app
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.settings import settings_of
 
@@ -77,6 +81,61 @@ def commands() -> list[tuple[str, str]]:
 def test_a_command_is_run_or_excused(page: Any, command: Any) -> None:
     known = [*RUN_BY, *NOT_RUN]
     assert any(re.fullmatch(pattern, command) for pattern in known), f"{page}: {command}"
+
+
+ALL_PAGES = [*PAGES, *sorted((ROOT / "docs/results").glob("*.md"))]
+
+
+def typed(program: str) -> list[tuple[str, str]]:
+    """Return what stands in blocks and lines of a page that begins so, with the page."""
+    found = {(page, line) for page, line in commands() if line.startswith(program)}
+    for page in ALL_PAGES:
+        prose = re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.M | re.S)
+        lines = (" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose))
+        found |= {(page.name, line) for line in lines if line.startswith(program)}
+    return sorted(found)
+
+
+@pytest.mark.parametrize(("page", "line"), typed("l2lidar "))
+def test_verbs_and_options_exist(page: str, line: str) -> None:
+    assert_is_understood(shlex.split(line, comments=True)[1:])
+
+
+def assert_is_understood(words: list[str]) -> None:
+    """Parse a command line of l2lidar as far as it goes: no verb, option or argument too many."""
+    command: Any = get_command(app())
+    context = click.Context(command)
+    while words and hasattr(command, "resolve_command") and not words[0].startswith("-"):
+        if words[0] == "VERB":
+            return
+        _, command, words = command.resolve_command(context, words)
+        context = click.Context(command, parent=context)
+    options = {text: item for item in command.get_params(context) for text in item.opts}
+    places = sum(20 if item.nargs < 0 else 1 for item in command.params if item.opts[0][0] != "-")
+    while words:
+        option, _, value = words.pop(0).partition("=")
+        if not option.startswith("-"):
+            places -= 1
+        elif option == "--":
+            break
+        elif not getattr(options[option], "is_flag", False) and not value:
+            words = words[1:]
+    assert places >= 0
+
+
+@pytest.mark.parametrize(("page", "line"), typed("make "))
+def test_targets_and_their_options_exist(page: str, line: str) -> None:
+    target, *rest = shlex.split(line)[1:]
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M)
+    bench = ROOT / f"benchmarks/{target.replace('-', '_')}.py"
+    assert target in targets or bench.exists() or target == "bench-X"
+    options = [word for item in rest for word in item.partition("=")[2].split()]
+    if target == "demo":
+        assert_is_understood(["demo", *options])
+        return
+    code = "".join(path.read_text() for path in (ROOT / "benchmarks").glob("*.py"))
+    for option in (word for word in options if word.startswith("--")):
+        assert f'"{option}"' in code
 
 
 @pytest.mark.parametrize("where", [text for text in RUN_BY.values() if text.startswith("tests/")])
