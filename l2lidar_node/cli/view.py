@@ -56,15 +56,17 @@ def view(
     and the map as it grows. Live topics need ROS 2; a recording does not.
     """
     if save is None:
-        _open_and_show(file, namespace, seconds, None, web)
+        _open_and_show(file, namespace, seconds, None, web=web)
         return
+    if web:
+        raise UsageError("--web and --save exclude each other")
     if save.suffix != ".rrd":
         raise UsageError(f"'{save}' ends in '{save.suffix}'; expected FILE.rrd")
     if save.is_dir():
         raise UsageError(f"'{save}' is a folder; expected FILE.rrd")
     save.parent.mkdir(parents=True, exist_ok=True)
     try:
-        _open_and_show(file, namespace, seconds, save, web)
+        _open_and_show(file, namespace, seconds, save, web=False)
     except CommandError:
         save.unlink(missing_ok=True)  # it shows nothing
         raise
@@ -72,7 +74,7 @@ def view(
 
 
 def _open_and_show(
-    file: Path | None, namespace: str, seconds: float | None, save: Path | None, web: bool
+    file: Path | None, namespace: str, seconds: float | None, save: Path | None, *, web: bool
 ) -> None:
     try:
         sdk = viewing.open_viewer(web, save)

@@ -179,6 +179,8 @@ def test_what_is_no_recording_is_refused(run: Run, tmp_path: Path) -> None:
     outcome = run("view", str(tmp_path / "a.mcap"), "--save", str(tmp_path / "a.txt"))
     assert outcome.code == 2
     assert "ends in '.txt'; expected FILE.rrd" in outcome.err
+    outcome = run("view", str(tmp_path / "a.mcap"), "--save", str(tmp_path / "a.rrd"), "--web")
+    assert outcome.code == 2
 
 
 def test_without_a_display_it_says_what_else_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
