@@ -162,7 +162,8 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
     shown = Table(*rows[0], title=title)
     for row in rows:
         shown.add_row(*(_text(value) for value in row.values()))
-    Console().print(shown)
+    # A file has no width: rich would squeeze every column into 80 letters.
+    Console(width=None if sys.stdout.isatty() else 200).print(shown)
 
 
 def publish(name: str, title: str, rows: list[dict[str, Any]], targets: Iterable[Target]) -> Path:
