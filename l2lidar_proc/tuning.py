@@ -113,8 +113,6 @@ ODOMETRY_MEMORY_S: Final = 12.0  # [s] of IMU samples; more than a held-up node 
 FIRST_REACH_M: Final = 0.5  # [m] farthest point from its plane in the first step; halved each step
 LAST_REACH_SCALES: Final = 3.0  # outlier scales, down to which it shrinks
 SCATTER_SHARED: Final = 3.0  # points in a cell that is not flat err together. Tuned on: foliage
-SEARCHES: Final = 2  # steps of an alignment that search the surfaces of the points,
-SEARCH_AGAIN: Final = 0.001  # [rad, m] and later ones only so far from the latest search
 # A smaller step is the last. At 2e-4 it takes a third more steps, and no ATE is better.
 CONVERGED: Final = 5e-4  # [rad, m]
 # Without an IMU it is the velocity that has to settle. Tuned on: bushes, poles
@@ -138,18 +136,12 @@ RANGE_NOISE_FACTOR: Final = 2.0  # on the standard deviation: neighbors err toge
 
 # ---- odometry: map of surfaces
 
-# Of a point's range: smallest cell that it enters. Tuned on: halls and woods of 60 s, imperfect
-# units; with 0.02 the largest hall takes three quarters of the time, but a hall with hits is 48 mm
-# off instead of 21, and a wood turned by 2 degrees more
-CELL_SHARE: Final = 0.01
 ELONGATED: Final = 9.0  # variance ratio: a surface is at least 3 times wider than it is thick
 FLAT_WIDTH: Final = 0.08  # of its cell (1 sigma) in its shorter direction
 NARROW: Final = 0.16  # of the cell's edge: largest scatter that fixes a place; evenly filled: 0.29
 NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is narrow as well
 EDGE_SHARE: Final = 0.4  # of the points that may lack a flat surface where flat ones abound
-# Growth of the count before a cell is fitted again. At 1.5 half turns among poles, without an IMU,
-# are 0.6 m off.
-REFIT_GROWTH: Final = 1.2
+REFIT_GROWTH: Final = 1.2  # growth of the count before a cell is fitted again. Speed only
 
 # ---- odometry: uncertainty of the map
 

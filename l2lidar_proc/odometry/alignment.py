@@ -117,16 +117,12 @@ def align(
     at = prior if start is None else start
     root = square_root(covariance)
     step, weak = None, None
-    found, found_at = None, at
     last = config.iterations - 1
     for number in range(config.iterations + tuning.WEAK_STEPS):
         reach = max(
             tuning.FIRST_REACH_M * 0.5**number, tuning.LAST_REACH_SCALES * config.outlier_scale
         )
-        if found is None or number < tuning.SEARCHES or _is_far(at.boxminus(found_at)):
-            found, found_at = correspondences(prior, at, source, surfaces, config, reach), at
-        else:
-            found = found.seen_from(at, prior, source)
+        found = correspondences(prior, at, source, surfaces, config, reach)
         if len(found.index) < least:
             break
         step = _step(prior, root, at, found, weak, number + 1)
@@ -198,11 +194,6 @@ def _step(
         prior, root, at, information, -(weighted.T @ found.distances)
     )
     return _Step(state, posterior, information, pose[:, 3:], found, number)
-
-
-def _is_far(change: F64) -> bool:
-    """Return whether points may have come to other surfaces."""
-    return bool(np.abs(change[POSE]).max() > tuning.SEARCH_AGAIN)
 
 
 def _is_small(change: F64) -> bool:

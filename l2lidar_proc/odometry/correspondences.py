@@ -7,7 +7,6 @@ linearly in dt: so a sweep corrects the motion within itself as well as its plac
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -71,8 +70,6 @@ class Correspondences:
         Instant after the reference [s].
     normals : ndarray, shape (M, 3)
         Of the surfaces, map axes.
-    offsets : ndarray, shape (M,)
-        Of the surfaces' planes from the map's origin along their normals [m].
     distances : ndarray, shape (M,)
         The residuals [m].
     variances : ndarray, shape (M,)
@@ -95,7 +92,6 @@ class Correspondences:
     points: F64
     times: F64
     normals: F64
-    offsets: F64
     distances: F64
     variances: F64
     scales: F64
@@ -113,7 +109,6 @@ class Correspondences:
             self.points[some],
             self.times[some],
             self.normals[some],
-            self.offsets[some],
             self.distances[some],
             self.variances[some],
             self.scales[some],
@@ -122,29 +117,6 @@ class Correspondences:
             self.opened[some],
             met,
             self.latest,
-        )
-
-    def seen_from(
-        self, state: InertialState, prior: InertialState, source: Source
-    ) -> Correspondences:
-        """Return the same points and surfaces from another state: a third of a search's time.
-
-        Parameters
-        ----------
-        state : InertialState
-            Nearby, so that the points hardly leave their cells.
-        prior, source
-            As for :func:`correspondences`.
-        """
-        error = state.boxminus(prior)
-        points = _deskewed_again(source.some(self.index), error, prior.rotation)
-        seen = points @ state.rotation.T + state.position
-        distances = np.einsum("ni,ni->n", seen, self.normals) - self.offsets
-        return dataclasses.replace(
-            self,
-            points=points,
-            distances=distances,
-            weights=robust_weights(distances, self.scales) / self.variances,
         )
 
     @property
@@ -239,8 +211,7 @@ def correspondences_of(
         for points, (state, _) in zip(deskewed, views, strict=True)
     ]
     sizes = [len(points) for points in seen]
-    places = _joined(seen)
-    matches = surfaces.match(places, narrow=True, sizes=sizes)
+    matches = surfaces.match(_joined(seen), narrow=True, sizes=sizes)
     points, times, ranges = (
         _joined(items)
         for items in (
@@ -255,13 +226,11 @@ def correspondences_of(
     far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * ranges[index]
     surface = matches.variances[near] + tuning.SCATTER_SHARED * matches.scatter[near]
     variances = config.point_noise**2 + far**2 + surface
-    normals = matches.normals[near]
     found = Correspondences(
         index,
         points[index],
         times[index],
-        normals,
-        np.einsum("ni,ni->n", places[index], normals) - distances,
+        matches.normals[near],
         distances,
         variances,
         scales,

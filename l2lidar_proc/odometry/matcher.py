@@ -196,8 +196,7 @@ class SweepMatcher:
         state = motion.state
         points = xyz(moved) - self.lever
         placed = (state.rotation @ points.T + state.position[:, None]).T
-        ranges = np.sqrt((points**2).sum(axis=1))
-        fresh = self.surfaces.add(placed, self._sweeps, ranges)
+        fresh = self.surfaces.add(placed, self._sweeps)
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
         self.kiss.update(points, _pose(state), _pose(guess))
         self._walk(state.position)

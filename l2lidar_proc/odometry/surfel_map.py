@@ -238,16 +238,14 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Groups:
-    """Points by cell of the finest level that they enter.
+    """Points by cell of the finest level.
 
     Attributes
     ----------
     group : ndarray, shape (N,)
         Of each point.
     keys : ndarray, shape (G,)
-        Ascending, so level by level.
-    ends : ndarray, shape (L,)
-        How many groups are of a level or finer: so many enter its cells.
+        Ascending.
     middles : ndarray, shape (G, 3)
         Of the cells [m].
     counts : ndarray, shape (G,)
@@ -256,7 +254,6 @@ class _Groups:
 
     group: I64
     keys: I64
-    ends: I64
     middles: F64
     counts: F64
 
@@ -328,7 +325,7 @@ class SurfelMap:
         self._cells[:used] = np.zeros(1, CELL)
         self._kind[:used] = 0
 
-    def add(self, points: F64, sweep: int = 0, ranges: F64 | None = None) -> float:
+    def add(self, points: F64, sweep: int = 0) -> float:
         """Add points, and return the share of them in places where there were none before.
 
         Parameters
@@ -337,14 +334,11 @@ class SurfelMap:
             [m], map frame.
         sweep : int
             Number of the sweep that they come from.
-        ranges : ndarray, shape (N,), optional
-            At which they were measured [m]: far points lie too far apart to make out small
-            surfaces, so they enter coarse cells only. Without it all are near.
         """
         if not len(points):
             return 0.0
         self.latest = sweep
-        groups = self._groups(points, ranges)
+        groups = self._groups(points)
         distinct, cell = self._cells_of(groups)
         rows = self._index.find(distinct)
         new = rows == 0
@@ -353,39 +347,35 @@ class SurfelMap:
         self._extend(points, groups, rows, distinct, cell)
         return fresh
 
-    def _groups(self, points: F64, ranges: F64 | None) -> _Groups:
-        """Return which points (N, 3) lie in the same cell of the finest level they enter."""
-        level: I64 | int = 0
-        if ranges is not None:
-            reach = self._sizes[:-1] / tuning.CELL_SHARE
-            level = (ranges > reach[:, None]).sum(axis=0)
-        keys = self._key(np.ascontiguousarray(points.T), level)
+    def _groups(self, points: F64) -> _Groups:
+        """Return which points (N, 3) lie in the same cell of the finest level."""
+        keys = self._keys(points, slice(1))[0]
         # neighbors in a scan line mostly share a cell: look up runs of equal keys
         begins = np.flatnonzero(np.diff(keys, prepend=-1))
         lengths = np.diff(begins, append=len(keys))
         distinct, group = np.unique(keys[begins], return_inverse=True)
         counts = np.bincount(group, lengths, len(distinct)).astype(np.float64)
-        ends = np.searchsorted(distinct, np.arange(1, len(self._sizes) + 1) << 3 * _BITS)
-        return _Groups(np.repeat(group, lengths), distinct, ends, self._middles(distinct), counts)
+        return _Groups(np.repeat(group, lengths), distinct, self._middles(distinct), counts)
 
-    def _cells_of(self, groups: _Groups) -> tuple[I64, list[I64]]:
-        """Return the cells (C,) that groups (G,) lie in, and which is whose, level by level.
+    def _cells_of(self, groups: _Groups) -> tuple[I64, I64]:
+        """Return the cells (C,) of all levels that groups (G,) lie in, and which is whose (L, G).
 
-        The first groups enter a level, each entry has as many. A group belongs to the coarser
-        cells around its middle, so the sizes need not be multiples.
+        A group belongs to the coarser cells around its middle, so the sizes need not be multiples.
         """
-        found, cell = [], []
-        first = 0
-        for level, end in enumerate(groups.ends.tolist()):
-            keys = self._keys(groups.middles[:end], slice(level, level + 1))[0]
+        coarser = self._keys(groups.middles, slice(1, None))
+        found = [groups.keys]
+        cell = np.empty((len(self._sizes), len(groups.keys)), np.int64)
+        cell[0] = np.arange(len(groups.keys))
+        first = len(groups.keys)
+        for keys, where in zip(coarser, cell[1:], strict=True):
             distinct, number = np.unique(keys, return_inverse=True)
-            cell.append(first + number)
+            where[:] = first + number
             found.append(distinct)
             first += len(distinct)
         return np.concatenate(found), cell
 
     def _note_sweep(
-        self, rows: I64, new: NDArray[np.bool_], cell: list[I64], counts: F64, sweep: int
+        self, rows: I64, new: NDArray[np.bool_], cell: I64, counts: F64, sweep: int
     ) -> float:
         """Note who opened the new cells (C,) among some, and who has seen all of these last.
 
@@ -395,8 +385,8 @@ class SurfelMap:
         Parameters
         ----------
         rows, new : ndarray, shape (C,)
-        cell : list of ndarray
-            The cells that groups of points lie in, as :meth:`_cells_of` gives them.
+        cell : ndarray, shape (L, G)
+            The cells that groups of points lie in.
         counts : ndarray, shape (G,)
             Points of each group.
         sweep : int
@@ -406,34 +396,31 @@ class SurfelMap:
         self._cells["born"][rows[new]] = self._cells["opened"][rows[new]] = sweep
         if fresh < 1.0 and new.any():
             around = np.empty(len(rows), np.int64)
-            coarsest = rows[cell[-1]]
-            for where in cell:
-                around[where] = coarsest[: len(where)]
+            around[cell] = rows[cell[-1]]
             self._cells["born"][rows[new]] = self._cells["born"][around[new]]
         return fresh
 
-    def _extend(self, points: F64, groups: _Groups, rows: I64, keys: I64, cell: list[I64]) -> None:
+    def _extend(self, points: F64, groups: _Groups, rows: I64, keys: I64, cell: I64) -> None:
         """Add points (N, 3) to the sums of their cells (C,), as far as these still change.
 
-        The sums of a cell are those of its groups, moved to its middle (parallel axis theorem).
+        The sums of a coarser cell are those of its groups, moved to its middle (parallel axis
+        theorem).
         """
         known = self._cells["count"][rows]
         changing = known < self._capacity
-        some = np.zeros(len(groups.keys), np.bool_)
-        for where in cell:
-            some[: len(where)] |= changing[where]
-        moments = groups.moments(points, some)
+        wanted = changing[cell]
+        moments = groups.moments(points, np.logical_or.reduce(wanted))
         middles = self._middles(keys)
         cells = self._cells
+        size = len(groups.keys)
         added = np.zeros((10, len(rows)))
-        first = 0
-        for where in cell:
-            bins = int(where.max(initial=first - 1)) + 1 - first
-            here = np.flatnonzero(changing[where])
-            lines = _shifted(moments[:, here], groups.middles[here] - middles[where[here]])
-            numbers = where[here] - first
-            added[:, first : first + bins] = [np.bincount(numbers, line, bins) for line in lines]
-            first += bins
+        added[:, :size] = moments
+        for where, fits in zip(cell[1:], wanted[1:], strict=True):
+            here = np.flatnonzero(fits)
+            numbers = where[here] - size
+            some = _shifted(moments[:, here], groups.middles[here] - middles[size + numbers])
+            bins = len(rows) - size
+            added[:, size:] += [np.bincount(numbers, line, bins) for line in some]
         rows, added = rows[changing], added[:, changing]
         grown = records.selected(cells, rows)
         grown["count"] += added[0]
@@ -555,23 +542,19 @@ class SurfelMap:
 
     def _keys(self, points: F64, levels: slice = slice(None)) -> I64:
         """Return the keys of the cells that points (N, 3) lie in, level by level, (L, N)."""
-        axes = np.ascontiguousarray(points.T)
         numbers = range(len(self._sizes))[levels]
         keys = np.empty((len(numbers), len(points)), np.int64)
+        axes = np.ascontiguousarray(points.T)
         for level, key in zip(numbers, keys, strict=True):
-            key[:] = self._key(axes, level)
+            x, y, z = (
+                np.floor(axes * (1.0 / self._sizes[level])).astype(np.int64) + _HALF
+            ) & _MASK
+            np.left_shift(x, _BITS, out=key)
+            key |= y
+            key <<= _BITS
+            key |= z
+            key |= level << 3 * _BITS
         return keys
-
-    def _key(self, axes: F64, level: int | I64) -> I64:
-        """Return the keys (N,) of the cells at places (3, N), of one level or each of its own."""
-        inverse = (1.0 / self._sizes)[level]
-        x, y, z = (np.floor(axes * inverse).astype(np.int64) + _HALF) & _MASK
-        key = np.left_shift(x, _BITS, out=x)
-        key |= y
-        key <<= _BITS
-        key |= z
-        key |= level << 3 * _BITS
-        return np.asarray(key)
 
     def _middles(self, keys: I64) -> F64:
         """Return the middles of cells [m], shape (C, 3)."""

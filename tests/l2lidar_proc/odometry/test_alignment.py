@@ -68,32 +68,6 @@ def test_a_wrong_range_noise_costs_little(monkeypatch: pytest.MonkeyPatch) -> No
         assert errors(run, drive(run)).max() < right + 0.001
 
 
-def test_surfaces_once_found_give_the_residuals_of_another_search() -> None:
-    rng = np.random.default_rng(4)
-    surfaces = SurfelMap((1.5,))
-    surfaces.add(box(rng, 6000))
-    points = box(rng, 800)
-    source = source_of(points, rng.uniform(-0.1, 0.1, len(points)))
-    prior, config = still(), SurfaceConfig()
-    error = np.zeros(eskf.ERRORS)
-    error[eskf.ROTATION], error[eskf.POSITION] = 0.002, -0.004
-    error[eskf.VELOCITY], error[eskf.GYRO_BIAS] = 0.03, 0.01
-    state = prior.boxplus(error)
-    searched = correspondences(prior, state, source, surfaces, config, 0.5)
-    again = correspondences(prior, prior, source, surfaces, config, 0.5).seen_from(
-        state, prior, source
-    )
-    _, left, right = np.intersect1d(searched.index, again.index, return_indices=True)
-    same = np.abs((searched.normals[left] * again.normals[right]).sum(axis=1)) > 1.0 - 1e-12
-    assert same.mean() > 0.8  # the others have come into another cell
-    left, right = left[same], right[same]
-    # where on its plane a point lies, which the weights depend on, is kept
-    for name, tolerance in (("points", 1e-9), ("distances", 1e-9), ("weights", 0.002)):
-        np.testing.assert_allclose(
-            getattr(searched, name)[left], getattr(again, name)[right], rtol=tolerance, atol=1e-12
-        )
-
-
 STEP = 1e-6
 SIZES = (0.15, 0.3, 0.6, 1.5)
 

@@ -316,7 +316,7 @@ def test_lost_elsewhere_it_begins_a_new_map_and_returns_into_the_old_one() -> No
     """Carried blindly into another place, and back: the pose jumps back to where it is."""
     room, yard = recording("room", "walk", 10.5), recording("yard", "walk", 10.5)
     epoch = sweep_epoch(room)
-    away, home = epoch + 3_300_000_000, epoch + 8_750_000_000
+    away, home = epoch + 3_300_000_000, epoch + 9_000_000_000
     some = [one for one in sweeps(room, "turn") if one.end < away]
     some += [one for one in sweeps(yard, "turn") if away <= one.start < home]
     some += [one for one in sweeps(room, "turn") if one.start >= home]

@@ -9,7 +9,6 @@ import numpy as np
 from hypothesis import given, strategies as st
 
 from l2lidar_node.types import HostNs
-from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, InertialState
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.matcher import SweepMatcher
@@ -141,30 +140,6 @@ def test_every_cell_of_every_level_holds_what_lies_in_it() -> None:
         cell = np.floor(points / size).astype(np.int64)
         for place, mean in zip(places, means, strict=True):
             inside = points[(cell == place).all(axis=1)]
-            np.testing.assert_allclose(mean, inside.mean(axis=0), atol=1e-9)
-
-
-def test_points_from_afar_enter_the_cells_that_they_can_fill() -> None:
-    sizes = (0.15, 0.3, 0.6, 1.5)
-    near, far = wall(2.12), wall(5.62)
-    points = np.concatenate((near, far))
-    ranges = np.repeat((2.5, 0.45 / tuning.CELL_SHARE), len(near))
-    surfaces, alone = (SurfelMap(sizes, capacity=10**6) for _ in range(2))
-    shares = [surfaces.add(points, sweep, ranges) for sweep in range(2)]
-    assert shares == [1.0, 0.0]
-    alone.add(near)
-    alone.add(near)
-    others = alone.flat_cells()
-    found = surfaces.flat_cells()
-    for number, (size, places, means, _) in enumerate(found):
-        is_far = means[:, 0] > 4.0
-        assert is_far.any() == (number >= 2)
-        np.testing.assert_array_equal(places[~is_far], others[number][1])
-        np.testing.assert_array_equal(means[~is_far], others[number][2])
-        for place, mean in zip(places[is_far], means[is_far], strict=True):
-            # a finer cell lies in the coarser one that holds its middle
-            cell = np.floor((np.floor(far / 0.6) + 0.5) * 0.6 / size).astype(np.int64)
-            inside = far[(cell == place).all(axis=1)]
             np.testing.assert_allclose(mean, inside.mean(axis=0), atol=1e-9)
 
 
