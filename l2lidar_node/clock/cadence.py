@@ -93,17 +93,17 @@ class Cadence:
         history.clear()
         return True
 
-    def deviation(self, seq: int, advance: int) -> float | None:
-        """Return how far a packet is from where the loop predicts it [ns].
+    def deviation(self, seq: int, advance: int) -> tuple[int, float] | None:
+        """Return by how many numbers a packet is after the last one, and its deviation [ns].
 
-        None if that is too far for the next packet of the stream.
+        That is how far it is from where the loop predicts it. None if it is too far.
         """
         gap = seq - self._seq
         if gap <= 0:
             gap += self._modulus
         off = advance - gap * self._period - self._phase
         tolerance = self._tolerance if gap == 1 else self.noise(gap)
-        return off if gap > 0 and -tolerance <= off <= tolerance else None
+        return (gap, off) if gap > 0 and -tolerance <= off <= tolerance else None
 
     def follows(self, seq: int, advance: int) -> bool:
         """Update the loop with the next packet, if that is where the loop predicts it.
@@ -119,12 +119,10 @@ class Cadence:
         bool
             False if it is elsewhere; the loop is unchanged then.
         """
-        off = self.deviation(seq, advance)
-        if off is None:
+        found = self.deviation(seq, advance)
+        if found is None:
             return False
-        gap = seq - self._seq
-        if gap <= 0:
-            gap += self._modulus
+        gap, off = found
         if seq < self._seq:
             self._is_modulus_confirmed = True
         self._phase = (self._gain - 1.0) * off

@@ -72,7 +72,7 @@ _GUESS: Final = 1e-3  # deviation of units from the guess, as a share; those mea
 # the guess was right it was below this in 99 of 100 simulated loads of 16 batches and more.
 _CONTRADICTED: Final = 1.5
 
-_x: Final = itemgetter(0)
+_DEVICE_TIME: Final = itemgetter(0)  # of a point
 
 BLOCK_NS: Final = int(_BLOCK_S * 1e9)
 """Length of a block [ns host]: of the packets in one, only the least delayed one is kept."""
@@ -470,7 +470,10 @@ class LowerEnvelope:
         end = points[-1][0]
         cuts = [
             0,
-            *(bisect_left(points, part * end / _PARTS, key=_x) for part in range(1, _PARTS)),
+            *(
+                bisect_left(points, part * end / _PARTS, key=_DEVICE_TIME)
+                for part in range(1, _PARTS)
+            ),
         ]
         least = [min(heights[a:b]) for a, b in pairwise([*cuts, len(points)]) if a < b]
         chance = sorted(heights)[len(heights) // 2] * _PARTS / len(heights)

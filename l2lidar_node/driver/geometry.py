@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import takewhile
+from itertools import groupby
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -92,7 +92,6 @@ class _Table(NamedTuple):
     bias: float
     lo: float
     hi: float
-    used: int  # slots
 
 
 class _Work(NamedTuple):
@@ -204,15 +203,10 @@ class Projector:
 
         These are the same to the bit and the steps of the head's angle nearly so.
         """
-        calibration, limits, used = self._constants
-        of_packets = [data[calibration] + data[limits] + data[used] for data in payloads]
+        calibration, limits = self._constants
         end = 0
-        while end < len(of_packets):
-            begin, constants = end, of_packets[end]
-            if of_packets.count(constants) == len(of_packets):
-                end = len(of_packets)
-            else:
-                end += sum(1 for _ in takewhile(constants.__eq__, of_packets[begin:]))
+        for constants, group in groupby(data[calibration] + data[limits] for data in payloads):
+            begin, end = end, end + sum(1 for _ in group)
             for lo in range(begin, end, self._block):
                 block = slice(lo, min(lo + self._block, end))
                 if not self._is_3d or _is_even(raw["com_horizontal_angle_step"][block].tolist()):
@@ -221,17 +215,14 @@ class Projector:
                     yield from ((slice(i, i + 1), constants) for i in range(lo, block.stop))
 
 
-def _constants(layout: np.dtype[np.void]) -> tuple[slice, slice, slice]:
-    """Return where a payload has its calibration, its limits and angles, and ``point_num``."""
+def _constants(layout: np.dtype[np.void]) -> tuple[slice, slice]:
+    """Return where a payload has its calibration, and its limits and angles."""
     fields = layout.fields
     assert fields is not None
-    (_, calibration, *_), (_, limits, *_), (_, used, *_) = (
-        fields[name] for name in ("calibration", "range_min", "point_num")
-    )
+    calibration, limits = fields["calibration"][1], fields["range_min"][1]
     return (
         slice(calibration, calibration + wire.CALIBRATION.itemsize),
         slice(limits, limits + 16),  # range_min, range_max, angle_min, angle_increment
-        slice(used, used + 4),
     )
 
 
@@ -243,14 +234,13 @@ def _is_even(steps: list[float]) -> bool:
 
 @lru_cache(maxsize=16)
 def _table(constants: bytes, count: int) -> _Table:
-    """Return the table of a block: calibration, limits and angles, and ``point_num``."""
+    """Return the table of a block: calibration, and limits and angles."""
     calibration = np.frombuffer(constants, wire.CALIBRATION, 1)[0].astype(
         [(name, "f8") for name in wire.CALIBRATION.names or ()]
     )
     range_min, range_max, angle_min, increment = np.frombuffer(
         constants, "<f4", 4, wire.CALIBRATION.itemsize
     ).astype(np.float64)
-    (used,) = np.frombuffer(constants[-4:], "<u4")
     alpha = angle_min + calibration["alpha_angle_bias"] + np.arange(count) * increment
     j: F64 = np.arange(count, dtype=np.float64) - (count - 1) / 2
     cos_beta, sin_beta = np.cos(calibration["beta_angle"]), np.sin(calibration["beta_angle"])
@@ -268,7 +258,6 @@ def _table(constants: bytes, count: int) -> _Table:
         bias=float(calibration["range_bias"]),
         lo=float(range_min),
         hi=float(range_max),
-        used=int(used),
     )
 
 
@@ -282,7 +271,7 @@ def _fill_ranges(
 ) -> None:
     """Fill the calibrated ranges, the intensities and which slots are kept."""
     scale, bias = override or (table.scale, table.bias)
-    counts = raw["ranges"]
+    counts, used = raw["ranges"], raw["point_num"]
     distance, within = work.distance, work.within
     np.multiply(counts, scale, out=work.precise)
     np.add(work.precise, scale * bias, out=distance, casting="same_kind")
@@ -293,7 +282,8 @@ def _fill_ranges(
     np.logical_and(keep, within, out=keep)
     np.not_equal(counts, 0, out=within)
     np.logical_and(keep, within, out=keep)
-    keep[:, table.used :] = False
+    if used.min() < counts.shape[1]:
+        keep &= np.arange(counts.shape[1]) < used[:, None]
 
 
 def _leave_out(unknown: NDArray[np.bool_], keep: NDArray[np.bool_]) -> int:
