@@ -12,6 +12,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +117,7 @@ def socket_rate(seconds: float, with_imu: bool) -> dict[str, float]:
 def vendor_rate(seconds: float, program: Path) -> float:
     """Return how many packets per CPU second the vendor's client makes into full-turn clouds."""
     host_port, lidar_port = ports = free_udp_ports(2)
-    with VendorClient(program, host_port, lidar_port, FULL_TURN) as client:
+    with closing(VendorClient(program, host_port, lidar_port, FULL_TURN)) as client:
 
         def take(datagrams: Sequence[bytes]) -> float | None:
             spent = client.take(datagrams)

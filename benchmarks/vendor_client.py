@@ -10,8 +10,7 @@ import platform
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from benchmarks.results import FOLDER
 
@@ -93,16 +92,7 @@ class VendorClient:
             raise RuntimeError(f"the vendor's client ended with {self._process.wait()}")
         return line.strip()
 
-    def __enter__(self) -> Self:
-        """Return the client."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """End it."""
         self._process.terminate()
         self._process.wait()

@@ -68,7 +68,7 @@ GRAVITY_IN_MOTION: Final = (7.5, 12.5)  # [m/s^2] mean of |a| over a second of w
 
 START_POSE_SIGMA: Final = 1e-4  # [m, rad] the first pose defines the map frame
 START_VELOCITY_SIGMA: Final = (0.02, 1.0)  # [m/s]
-# [rad/s] in motion: a third of the largest zero-rate levels of data sheets, see MOST_GYRO_BIAS
+# [rad/s] in motion: a third of the zero-rate levels of data sheets (MOST_GYRO_BIAS) on average
 START_GYRO_BIAS_SIGMA: Final = (0.01, 0.025)
 START_ACCEL_BIAS_SIGMA: Final = (0.02, 0.15)  # [m/s^2]
 START_GRAVITY_SIGMA: Final = ((0.01, 0.01, 0.01), (0.7, 0.7, 0.01))  # [m/s^2] x, y, z of the map
