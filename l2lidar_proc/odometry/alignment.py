@@ -73,6 +73,10 @@ class Alignment:
     weakly : tuple of ndarray and Support, optional
         Direction of the place (3,), map axes, that the points fix least, and the support of the
         surfaces that fix it; None where it was not surfaces that fixed the place.
+    fine_inliers : int
+        Points near surfaces of the finest cells.
+    fine_ratio : float
+        Share of the points in such cells that these are, 0 to 1.
     """
 
     state: InertialState
@@ -85,6 +89,8 @@ class Alignment:
     steps: int
     support: Support
     weakly: tuple[F64, Support] | None = None
+    fine_inliers: int = 0
+    fine_ratio: float = 0.0
 
 
 def align(
@@ -172,6 +178,8 @@ class _Step(NamedTuple):
             self.number,
             found.support,
             (weakest, found.support_along(self.normals @ weakest)),
+            found.fine_inliers,
+            found.fine_inliers / max(found.met_fine, 1),
         )
 
 

@@ -82,8 +82,12 @@ class Correspondences:
         Number of the sweep that was the first at the surface's place.
     opened : ndarray, shape (M,)
         Number of the sweep that opened the surface itself.
+    is_fine : ndarray, shape (M,)
+        Whether the surface is that of one of the finest cells.
     met : int
         Points at known surfaces, near or not.
+    met_fine : int
+        Likewise in the finest cells.
     latest : int
         Number of the sweep that was added to the map last.
     """
@@ -98,10 +102,12 @@ class Correspondences:
     weights: F64
     born: I64
     opened: I64
+    is_fine: NDArray[np.bool_]
     met: int
+    met_fine: int
     latest: int
 
-    def part(self, first: int, last: int, met: int) -> Correspondences:
+    def part(self, first: int, last: int, met: int, met_fine: int) -> Correspondences:
         """Return those of the points from one index to another, counted from the first."""
         some = (self.index >= first) & (self.index < last)
         return Correspondences(
@@ -115,14 +121,25 @@ class Correspondences:
             self.weights[some],
             self.born[some],
             self.opened[some],
+            self.is_fine[some],
             met,
+            met_fine,
             self.latest,
         )
 
     @property
     def inlier_ratio(self) -> float:
         """Share of the points at known surfaces that are near them, 0 to 1."""
-        return np.count_nonzero(np.abs(self.distances) < 2.0 * self.scales) / max(self.met, 1)
+        return np.count_nonzero(self._is_inlier) / max(self.met, 1)
+
+    @property
+    def fine_inliers(self) -> int:
+        """Points near a surface of one of the finest cells."""
+        return int(np.count_nonzero(self._is_inlier & self.is_fine))
+
+    @property
+    def _is_inlier(self) -> NDArray[np.bool_]:
+        return np.asarray(np.abs(self.distances) < 2.0 * self.scales)
 
     @property
     def residual(self) -> float:
@@ -237,16 +254,23 @@ def correspondences_of(
         robust_weights(distances, scales) / variances,
         matches.born[near],
         matches.opened[near],
+        matches.is_fine[near],
         len(near),
+        int(np.count_nonzero(matches.is_fine)),
         surfaces.latest,
     )
     if len(views) == 1:
         return [found]
     edges = np.cumsum([0, *sizes])
-    met = np.diff(np.searchsorted(np.sort(matches.index), edges))
+    met, met_fine = (
+        np.diff(np.searchsorted(np.sort(some), edges)).tolist()
+        for some in (matches.index, matches.index[matches.is_fine])
+    )
     return [
-        found.part(int(first), int(last), int(count))
-        for first, last, count in zip(edges[:-1], edges[1:], met, strict=True)
+        found.part(first, last, count, fine)
+        for first, last, count, fine in zip(
+            edges[:-1].tolist(), edges[1:].tolist(), met, met_fine, strict=True
+        )
     ]
 
 

@@ -173,6 +173,10 @@ class SweepMatcher:
         best = max(good, key=lambda other: other.inlier_ratio * other.matched, default=None)
         if strict and best is not None and is_ambiguous(best, others, motion):
             best = None
+        elif strict and self._is_confirmed(found, source, motion):
+            assert found is not None
+            if best is None or best.fine_inliers <= found.fine_inliers:
+                best = found
         if best is None and motion.imu.missing.all():
             # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
             best = self._placed(source, motion, np.inf)
@@ -261,11 +265,24 @@ class SweepMatcher:
         self, found: Alignment | None, source: Source, motion: SweepMotion, strict: bool
     ) -> bool:
         """Return whether the result of an alignment fits the map as wrong ones do not."""
+        if found is None or found.matched < tuning.OVERLAP[strict] * len(source.points):
+            return False
+        if strict and self._is_far_fetched(found, motion):
+            return False
+        return found.inlier_ratio >= self._needed_inliers(strict)
+
+    def _is_confirmed(self, found: Alignment | None, source: Source, motion: SweepMotion) -> bool:
+        """Return whether the finest cells confirm a loose prediction.
+
+        Where a new place comes into sight, most of it lies in coarse cells of what is known
+        beside it, off their surfaces: these outliers are no sign of a wrong pose.
+        """
+        least = max(self.config.min_points, tuning.OVERLAP[True] * len(source.points))
         return (
             found is not None
-            and found.inlier_ratio >= self._needed_inliers(strict)
-            and found.matched >= tuning.OVERLAP[strict] * len(source.points)
-            and not (strict and self._is_far_fetched(found, motion))
+            and not is_far(found, motion)
+            and found.fine_inliers >= least
+            and found.fine_ratio >= self._needed_inliers(True)
         )
 
     def _is_far_fetched(self, found: Alignment, motion: SweepMotion) -> bool:

@@ -225,6 +225,9 @@ class Matches:
         Number of the sweep that was the first at the surface's place, of the coarsest size.
     opened : ndarray, shape (M,)
         Number of the sweep that opened the surface's own cell.
+    is_fine : ndarray, shape (M,)
+        Whether that cell is one of the finest: what lies in a coarse one off its surface may be
+        new, what lies in a fine one contradicts it.
     """
 
     index: I64
@@ -234,6 +237,7 @@ class Matches:
     scatter: F64
     born: I64
     opened: I64
+    is_fine: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -638,6 +642,7 @@ def _matches(
         np.where(kind == _FLAT, 0.0, across),
         cells["born"],
         cells["opened"],
+        cells["key"] >> 3 * _BITS < tuning.FINE_LEVELS,
     )
 
 

@@ -127,6 +127,26 @@ def test_a_few_points_do_not_move_a_loose_prediction_far(grown: SweepMatcher, co
         assert place is None or place == pytest.approx(-0.2, abs=0.01)
 
 
+def test_a_room_that_comes_into_sight_does_not_contradict_what_is_known_beside_it() -> None:
+    """The coarse cells of a wall reach into the room behind its door."""
+    rng, matcher = np.random.default_rng(20), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def known(count: int) -> F64:
+        points = rng.uniform((0.0, -2.0, -1.2), (2.0, 1.0, 1.0), (count, 3))
+        side = rng.integers(0, 3, count)
+        points[side == 0, 0], points[side == 1, 1], points[side == 2, 2] = 2.0, 1.0, -1.2
+        return np.asarray(points + rng.normal(0.0, 0.005, points.shape))
+
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, known(3000))
+    behind = rng.uniform((2.15, -1.5, -0.9), (2.5, 1.0, 0.9), (200, 3))
+    cloud = source(np.vstack((known(300), behind)))
+    found = matcher.match(cloud, motion(LOOSE, np.array([0.0, 0.03, 0.0]))).alignment
+    assert found is not None
+    assert found.inlier_ratio < tuning.INLIER_RATIO[True] < found.fine_ratio
+    assert np.abs(found.state.position).max() < 0.01
+
+
 @pytest.mark.parametrize("error", [0.03, 0.3])
 def test_forty_points_confirm_a_loose_prediction_but_do_not_move_it_far(
     grown: SweepMatcher, seen: Source, error: float
@@ -212,7 +232,8 @@ def test_a_scene_with_strays_lowers_what_is_needed_after_a_loose_prediction() ->
         points[near] *= rng.uniform(0.85, 0.95, (len(points), 1))[near]
         return source(points - PLACE)
 
-    loose = motion(LOOSE, PLACE + 0.01)
+    # too far off for the finest cells to confirm it
+    loose = motion(LOOSE, PLACE + 1.5 * tuning.FAR_MOVE)
     assert matcher.match(rainy(0.2), loose).alignment is None
     for _ in range(30):
         assert off(matcher.match(rainy(0.2), motion(TIGHT, PLACE))) < 0.02
