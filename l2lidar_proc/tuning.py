@@ -54,7 +54,11 @@ STATIC_SAMPLES: Final = 100  # needed to learn a reference
 STATIC_RATE_FLOOR: Final = 0.005  # [rad/s] no change, however quiet the unit
 STATIC_FORCE_FLOOR: Final = 0.03  # [m/s^2]
 STATIC_RATE_SPREAD: Final = 0.5  # [rad/s] stronger shaking is not rest
-STATIC_FORCE_SPREAD: Final = 1.2  # [m/s^2] tuned on: units of the hard runs, 0.74 to 1.14
+# [m/s^2] of means over STATIC_SMOOTHED samples (40 ms). Motors shake above 25 Hz, which these
+# hardly show; carriers move below. Units of the hard runs: 0.16 at rest, 0.26 to 2.6 in motion
+STATIC_FORCE_SPREAD: Final = 1.2
+STATIC_SMOOTHED: Final = 10
+STATIC_VIBRATION: Final = 2.5  # [m/s^2] of single samples; beyond it slow motion does not show
 STATIC_ENTRY_SIGMAS: Final = 3.0  # to enter rest; missing one costs little, a wrong one teaches
 STATIC_BLEND: Final = 0.1  # share of each newer second in the reference
 START_SAMPLES: Final = 20

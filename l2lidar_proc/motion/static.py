@@ -149,7 +149,8 @@ def static_reference(
     )
     shakes = (
         found.rate_spread.max() > tuning.STATIC_RATE_SPREAD
-        or found.force_spread.max() > tuning.STATIC_FORCE_SPREAD
+        or found.force_spread.max() > tuning.STATIC_VIBRATION
+        or _without_vibration(forces).std(axis=0).max() > tuning.STATIC_FORCE_SPREAD
     )
     if shakes or _drifts(samples, found.rate_spread, found.force_spread, LEARNING):
         return None
@@ -205,6 +206,12 @@ def gravity_is_plausible(samples: Samples, *, at_rest: bool) -> bool:
         size = float(np.linalg.norm(forces, axis=1).mean())
         low, high = tuning.GRAVITY_IN_MOTION
     return low < size < high
+
+
+def _without_vibration(values: F64) -> F64:
+    """Return the means of successive parts of samples (N, 3), in which motors hardly show."""
+    size = tuning.STATIC_SMOOTHED
+    return np.asarray(values[: len(values) // size * size].reshape(-1, size, 3).mean(axis=1))
 
 
 def _hann_mean(values: F64) -> F64:

@@ -79,6 +79,17 @@ def test_a_known_bias_forbids_a_slow_turn_to_pass_for_rest() -> None:
     assert static_reference(slow[:250], np.array(BIAS), 0.01) is None
 
 
+@pytest.mark.parametrize(
+    ("hertz", "spread", "rests"), [(71.0, 1.7, True), (71.0, 3.0, False), (6.0, 1.7, False)]
+)
+def test_motors_may_shake_a_sensor_at_rest(hertz: float, spread: float, rests: bool) -> None:
+    """A vibration at 71 Hz moves nothing by more than 10 um; one at 6 Hz is a motion."""
+    samples = still(LEVELS["usual"], 1.0)
+    phase = 2.0 * np.pi * hertz * 1e-9 * samples["stamp"]
+    samples["linear_acceleration"][:, 2] += spread * np.sqrt(2.0) * np.sin(phase)
+    assert (static_reference(samples, UNKNOWN, 0.1) is not None) == rests
+
+
 def test_too_few_samples_prove_nothing() -> None:
     samples = still((0, 0, 0), 1.0)
     assert static_reference(samples[:99], UNKNOWN, 0.1) is None
