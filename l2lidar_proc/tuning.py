@@ -163,6 +163,9 @@ UNIT_WAY_SHARE: Final = 0.002  # of the way, around and back. Tuned on: as MAP_W
 UNIT_TURN: Final = 0.0075  # [rad] each axis
 UNIT_SHIFT: Final = 0.005  # [m] each axis
 UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
+# [m, rad] of the first pose of a map begun in motion. Derived: 0.1 m/s and START_GYRO_BIAS_SIGMA
+# over the 0.45 s of the first sweeps
+BEGUN_IN_MOTION: Final = (0.045, 0.011)
 # The map bends where it grows, so the vertical where it began is not quite that of its other end.
 # Tuned on: corridors with narrow views, where 0.01 m/s^2 (0.06 degrees) made 1 to 5 m.
 MAP_BEND: Final = 0.0008  # [rad/sqrt(m)] of the way

@@ -256,6 +256,7 @@ class MapInitializer:
     ) -> Trial:
         matcher = self._matcher
         matcher.clear()
+        matcher.drift.begun_in_motion = not initial.at_rest
         first = self._predictor.over_sweep(sweeps[0], start, initial.covariance, since)
         motions = [first]
         matcher.extend(matcher.deskewed(sweeps[0], first), first, first.state)

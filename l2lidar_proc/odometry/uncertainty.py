@@ -40,6 +40,12 @@ class MapDrift:
     """Uncertainty of the map in use, as a small motion of the whole map.
 
     Covariances (6, 6) are of a shift and a turn of the map about its origin [m, rad], in its axes.
+
+    Attributes
+    ----------
+    begun_in_motion : bool
+        The first sweeps were deskewed with a velocity and a gyro bias that were hardly known, so
+        the first pose is shifted and turned against the map that followed.
     """
 
     def __init__(self) -> None:
@@ -49,6 +55,7 @@ class MapDrift:
 
     def clear(self) -> None:
         """Forget everything: a new map begins, without error by definition."""
+        self.begun_in_motion = False
         self._known = 0
         self._current = np.zeros((6, 6))
         self._reported = np.zeros((6, 6))  # the same, but falling over some sweeps
@@ -208,7 +215,8 @@ class MapDrift:
         bend = tuning.MAP_BEND**2 * max(away, self._behind)
         unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
         unit[3:, 3:] += np.outer(self._lean, self._lean)
-        return np.asarray(moved @ self._reported @ moved.T + unit)
+        begun = np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3) * self.begun_in_motion
+        return np.asarray(moved @ (self._reported + np.diag(begun)) @ moved.T + unit)
 
 
 def _carried(place: F64) -> F64:

@@ -48,6 +48,19 @@ def test_the_first_pose_has_no_error_by_definition() -> None:
     np.testing.assert_array_equal(MapDrift().at(np.zeros(3)), np.zeros((6, 6)))
 
 
+def test_the_first_pose_of_a_map_begun_in_motion_may_be_turned_against_all_others() -> None:
+    drift = MapDrift()
+    drift.begun_in_motion = True
+    shift, turn = np.square(tuning.BEGUN_IN_MOTION)
+    added = drift.at(np.array([10.0, 0.0, 0.0])) - unit_alone(np.array([10.0, 0.0, 0.0]))
+    expected = np.diag([shift, shift + 100.0 * turn, shift + 100.0 * turn, turn, turn, turn])
+    expected[1, 5] = expected[5, 1] = 10.0 * turn
+    expected[2, 4] = expected[4, 2] = -10.0 * turn
+    np.testing.assert_allclose(added, expected, atol=1e-12)
+    drift.clear()
+    np.testing.assert_array_equal(drift.at(ZERO), np.zeros((6, 6)))
+
+
 def test_a_pose_is_as_uncertain_as_what_holds_it() -> None:
     drift = MapDrift()
     place = np.array([3.0, -2.0, 1.0])
