@@ -174,6 +174,31 @@ MAP_BEND: Final = 0.0008  # [rad/sqrt(m)] of the way
 LEAN_KNOWN: Final = 0.02  # [rad]
 LEAN_FROM: Final = 0.015  # [rad]
 
+# ---- odometry: beam angles. Tuned on: imperfect rooms, halls and woods, seeds 0 to 2
+
+BEAM_SIGMA: Final = 0.009  # [rad] of units; source: captures of a real one, 0.4 degrees
+BEAM_POINTS: Final = 200  # of a cloud that show the turning of the head
+BEAM_CELL: Final = 0.5  # [m] edge of the cells in which halves are compared
+BEAM_CELL_POINTS: Final = 12  # of either half in a cell
+BEAM_CELLS: Final = 5  # flat ones of a sweep, at least
+BEAM_THICKNESS: Final = 0.03  # [m] of a flat cell, each half by itself
+BEAM_WIDTH: Final = 0.15  # of the cell's edge (1 sigma) in its shorter direction
+BEAM_GAP_SIGMA: Final = 0.02  # [m] of the gap in one cell; 12 mm of range noise hardly count
+BEAM_GAP_SCALE: Final = 0.04  # [m] off, a gap keeps a quarter of its weight
+BEAM_GAP_MOST: Final = 0.2  # [m] farther apart, they are two surfaces
+# By which the motion that deskewed a sweep may be off. With 0.05 m/s, a constant error of 0.1 m/s
+# passed for 0.3 degrees of a unit that was right.
+BEAM_SPEED: Final = 0.2  # [m/s]
+BEAM_RATE: Final = 0.08  # [rad/s]
+BEAM_FLOOR: Final = (
+    3.5e-4  # [rad] 0.02 degrees; source: calibrations of one unit from part to part
+)
+BEAM_KNOWN: Final = 0.00175  # [rad] 0.1 degrees: less certain, a direction is not corrected
+BEAM_SIGMAS: Final = 3.0  # nor if it may as well be zero
+BEAM_OFTEN: Final = 50  # sweeps that all teach the angles; then only
+BEAM_SELDOM: Final = 10  # each tenth. Speed only
+BEAM_CHANGE: Final = 0.0009  # [rad] after which a map at rest is begun again: 5 mm at 5 m
+
 # ---- odometry: innovation consistency
 
 NIS_WINDOW_NS: Final = 3_000_000_000  # [ns] over which innovations are judged

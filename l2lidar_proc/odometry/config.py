@@ -166,6 +166,11 @@ class OdometryConfig:
     min_points: int = setting(
         30, "a sweep with fewer points is predicted instead of aligned", lo=10, hi=100_000
     )
+    correct_beams: bool = setting(
+        True,
+        "estimate the unit's errors of xi and beta from the clouds, and correct these; a cloud "
+        "without the pattern of an L2 is left as it is",
+    )
     max_speed: float = setting(
         30.0,
         "largest speed of the carrier; a faster estimate is bounded and SUSPECT; 3 suits a "

@@ -75,6 +75,8 @@ class AlignmentQuality:
         alignments contradict each other for seconds.
     excess : float
         By how much the variances of pose and velocity were raised for that, at least 1.
+    beam_correction : tuple of float
+        What was added to the unit's ``xi_angle`` and ``beta_angle`` [rad].
     """
 
     points: int = 0
@@ -88,6 +90,7 @@ class AlignmentQuality:
     nis: float = 0.0
     velocity_nis: float = 0.0
     excess: float = 1.0
+    beam_correction: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

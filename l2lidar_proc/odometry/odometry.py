@@ -17,6 +17,7 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
 from l2lidar_proc.odometry.alignment import Alignment
+from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
 from l2lidar_proc.odometry.estimate import (
@@ -94,7 +95,10 @@ class Odometry:
         self._zero_velocity = ZeroVelocityTest()
         self._innovations = InnovationTest()
         self._initializer = self._new_initializer()
-        self._first_sweeps: list[Sweep] = []  # of a rest that may still turn out to be none
+        # as measured, of a rest that may still turn out to be none
+        self._first_sweeps: list[Sweep] = []
+        self._beams = BeamAngles()
+        self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
         self._unmatched_ns = 0
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
@@ -131,7 +135,9 @@ class Odometry:
             if not 0 < step <= tuning.TIME_JUMP_NS:
                 self._begin_time_line(self._predictor.reference(sweep))
                 status.append(Status.RESTARTED)
-        sweep = cropped(sweep, self.config.min_range, self.config.max_range)
+        sweep = self._raw = cropped(sweep, self.config.min_range, self.config.max_range)
+        if self.config.correct_beams:
+            sweep = self._beams.corrected(sweep)
         if self.phase is Phase.INITIALIZING:
             return self._initialize(sweep)
         if may_skip and not status:
@@ -231,6 +237,8 @@ class Odometry:
         self._keep(motion)
         quality = self._consistency(self.matcher.quality(len(source.points), found))
         estimate = self._estimate(sweep, motion, status, quality)
+        if found is not None:
+            self._beams.learn(sweep, estimate.points, at_rest=False)
         if found is not None or uncharted or Status.LOST in status:
             fresh = self.matcher.extend(estimate.points, motion, guess)
             self._anchor_anew(fresh)
@@ -387,8 +395,20 @@ class Odometry:
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
-        self.matcher.extend(estimate.points, still, still.state)
+        self._beams.learn(sweep, estimate.points, at_rest=True)
+        changed = np.abs(self._beams.correction - self._mapped_with).max() > tuning.BEAM_CHANGE
+        if changed and self._first_sweeps:
+            self._map_first_sweeps_again(still)
+        else:
+            self.matcher.extend(estimate.points, still, still.state)
         return estimate
+
+    def _map_first_sweeps_again(self, still: SweepMotion) -> None:
+        """Begin the map of a rest again with the first sweeps, as the beams are known now."""
+        self._mapped_with = self._beams.correction
+        self.matcher.clear()
+        for sweep in self._first_sweeps:
+            self.matcher.extend(self._beams.corrected(sweep).points, still, still.state)
 
     def _stays_at_rest(self, sweep: Sweep) -> bool:
         """Return whether the sensor rests and the IMU does not object; if it does, let go."""
@@ -402,7 +422,7 @@ class Odometry:
             self._leave_rest()
             return False
         if self._first_sweeps:
-            self._first_sweeps.append(sweep)
+            self._first_sweeps.append(self._raw)
         return True
 
     def _leave_rest(self) -> None:
@@ -417,6 +437,7 @@ class Odometry:
         self._belief = state, self._zero_velocity.widened(covariance)
         first = self._first_sweeps
         if first and self._zero_velocity.drifted:
+            first = [self._beams.corrected(one) for one in first]
             for may_rest in (False, True):
                 motions = self._initializer.begin(first, first[0].start, may_rest)
                 if not motions:
@@ -471,12 +492,13 @@ class Odometry:
         """Deskew a sweep with its motion and report it."""
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
+        xi, beta = self._beams.correction.tolist()
         self._last = estimate_of(
             motion,
             self._lever,
             self.matcher.deskewed(sweep, motion),
             tuple(status),
-            quality,
+            dataclasses.replace(quality, beam_correction=(xi, beta)),
             self.config.inertial.gyro_noise,
             self._jump,
             self.matcher.drift,

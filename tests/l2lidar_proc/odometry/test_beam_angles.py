@@ -1,0 +1,204 @@
+"""Errors of a unit's beam angles are found from its clouds, and none where there are none."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from l2lidar_node.calibration import model
+from l2lidar_node.calibration.model import BETA, NAMES, RETURN, XI, Block
+from l2lidar_node.protocol import wire
+from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
+from l2lidar_proc.odometry.beam_angles import BeamAngles, halves
+from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.odometry import Odometry, Phase
+from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
+from tests.support.odometry_runs import record, sweeps
+
+HEAD_RATE, SLOTS, PACKETS = 27.1, 300, 50
+BLOCK = Block(np.zeros(1, wire.CALIBRATION).tobytes())
+ROOM = np.array([4.2, 3.3, 2.7])  # [m] half the edges
+CLOUD = np.dtype([(name, "<f4") for name in ("x", "y", "z", "time")])
+UNIT = (0.4, -0.3)  # [degrees]
+
+
+def turn(unit: Any, number: int, rate: float = HEAD_RATE, drift: Any = (0.0, 0.0, 0.0)) -> Any:
+    """Return one turn in a box, as a unit off by (xi, beta) [degrees] reports it, and halves.
+
+    ``drift`` is the velocity of the sensor [m/s], for which nobody corrects the points.
+    """
+    rng = np.random.default_rng(number)
+    returns = np.zeros(SLOTS * PACKETS, RETURN)
+    slot = np.tile(np.arange(SLOTS), PACKETS)
+    packet = np.repeat(np.arange(PACKETS), SLOTS)
+    time = 1.53e-5 * (packet * SLOTS + slot)
+    # packets do not begin at the same angles in every turn
+    returns["theta"] = 1.7 + 0.37 * number + rate * time[packet * SLOTS]
+    returns["alpha"] = np.pi * (slot + rng.random()) / SLOTS
+    correction = np.zeros(len(NAMES))
+    correction[[XI, BETA]] = np.radians(unit)
+    returns["range"] = 1.0
+    direction = model.beams(returns, BLOCK, correction).direction
+    place = time[:, None] * drift
+    reach = (np.sign(direction) * ROOM - place) / np.where(direction == 0.0, 1e-9, direction)
+    returns["range"] = reach.min(axis=1) + 0.01 * rng.standard_normal(len(returns))
+    reported = model.beams(returns, BLOCK, np.zeros(len(NAMES))).points
+    cloud = np.zeros(len(returns), CLOUD)
+    for name, line in zip("xyz", reported.T, strict=True):
+        cloud[name] = line
+    cloud["time"] = time
+    start = HostNs(number * 230_000_000)
+    sweep = Sweep(start, HostNs(start + 229_000_000), cloud, PACKETS, 0)
+    return sweep, np.where(returns["alpha"] < np.pi / 2, 1.0, -1.0)
+
+
+def learned(unit: Any, at_rest: bool = True, drift: Any = (0.0, 0.0, 0.0)) -> BeamAngles:
+    beams = BeamAngles()
+    for number in range(12):
+        sweep = beams.corrected(turn(unit, number, drift=drift)[0])
+        beams.learn(sweep, sweep.points, at_rest=at_rest)
+    return beams
+
+
+@pytest.mark.parametrize("rate", [27.1, 34.9])
+@pytest.mark.parametrize("number", range(4))
+def test_the_half_of_every_point_is_found(rate: float, number: int) -> None:
+    sweep, true = turn(UNIT, number, rate)
+    found = halves(sweep.points)
+    assert found is not None
+    assert found.rate == pytest.approx(rate, rel=0.02)
+    radius = np.hypot(sweep.points["x"], sweep.points["y"])
+    assert np.mean((found.sign == true)[radius > 0.5]) > 0.995
+    half = sweep.points[: len(sweep.points) // 2]
+    again = halves(half, found.rate)
+    assert again is not None
+    assert np.mean((again.sign == true[: len(half)])[radius[: len(half)] > 0.5]) > 0.995
+
+
+@pytest.mark.parametrize("at_rest", [True, False])
+@pytest.mark.parametrize("unit", [UNIT, (-0.4, 0.4), (0.5, 0.1)])
+def test_what_moves_the_halves_apart_is_found(unit: Any, at_rest: bool) -> None:
+    """Along the other direction, both angles together, 12 turns tell nothing: it is not used."""
+    found = np.degrees(learned(unit, at_rest).correction)
+    size = float(np.linalg.norm(found))
+    axis = found / size
+    assert abs(axis[0]) > 0.9
+    assert size == pytest.approx(np.dot(unit, axis), abs=0.05)
+
+
+def test_a_unit_that_is_right_is_left_alone() -> None:
+    beams = learned((0.0, 0.0), at_rest=False)
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+    sweep, _ = turn((0.0, 0.0), 20)
+    assert beams.corrected(sweep) is sweep
+
+
+@pytest.mark.parametrize("drift", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (-0.1, 0.1, 0.0)])
+def test_a_velocity_that_is_off_does_not_pass_for_beam_angles(drift: Any) -> None:
+    """10 cm/s move the halves apart by 12 mm where they see the same surface half a turn later."""
+    right = learned((0.0, 0.0), at_rest=False, drift=drift)
+    np.testing.assert_array_equal(right.correction, (0.0, 0.0))
+    assert learned((0.0, 0.0), at_rest=True, drift=(0.0, 0.1, 0.0)).correction.any()
+
+
+def test_corrected_clouds_lie_on_the_walls() -> None:
+    beams = learned(UNIT)
+    sweep, _ = turn(UNIT, 30)
+    better = beams.corrected(sweep)
+    assert better is not sweep
+
+    def off(cloud: Any) -> float:
+        wall = (np.abs(cloud["x"]) < 2.0) & (np.abs(cloud["z"]) < 2.0) & (cloud["z"] > 0.1)
+        radius = np.hypot(cloud["x"], cloud["y"])
+        oblique = wall & (np.abs(cloud["x"]) > 0.4 * radius)
+        return float(np.sqrt(np.mean((np.abs(cloud["y"][oblique]) - ROOM[1]) ** 2)))
+
+    assert off(sweep.points) > 0.013
+    assert off(better.points) < 0.0105
+    assert sweep.points.dtype == better.points.dtype
+    for name in ("z", "time"):
+        np.testing.assert_array_equal(better.points[name], sweep.points[name])
+
+
+def _spinning(number: int) -> Any:
+    """Return a turn of a lidar with 16 rings."""
+    rng = np.random.default_rng(number)
+    cloud = np.zeros(16 * 900, CLOUD)
+    azimuth = np.repeat(np.linspace(0.0, 2.0 * np.pi, 900), 16)
+    cloud["x"], cloud["y"] = 5.0 * np.cos(azimuth), 5.0 * np.sin(azimuth)
+    cloud["z"] = 5.0 * np.tan(np.radians(np.tile(np.arange(-15.0, 16.0, 2.0), 900)))
+    cloud["z"] += 0.01 * rng.standard_normal(len(cloud))
+    cloud["time"] = azimuth / (2.0 * np.pi) * 0.1
+    return cloud
+
+
+def _camera(number: int) -> Any:
+    """Return an image of a depth camera, all pixels at once."""
+    rng = np.random.default_rng(number)
+    cloud = np.zeros(1500, CLOUD)
+    cloud["x"] = 3.0
+    cloud["y"], cloud["z"] = rng.uniform(-2.0, 2.0, (2, 1500))
+    return cloud
+
+
+@pytest.mark.parametrize("measure", [_spinning, _camera])
+def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
+    beams = BeamAngles()
+    for number in range(30):
+        sweep = Sweep(HostNs(number), HostNs(number + 1), measure(number), 0, 0)
+        assert beams.corrected(sweep) is sweep
+        beams.learn(sweep, sweep.points, at_rest=True)
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+    # it has given up: an L2 later is not looked at
+    sweep, _ = turn(UNIT, 0)
+    beams.corrected(sweep)
+    beams.learn(sweep, sweep.points, at_rest=True)
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+
+
+def test_nonsense_does_no_harm() -> None:
+    beams = BeamAngles()
+    sweep, _ = turn(UNIT, 0)
+    for points in (sweep.points[:0], sweep.points[:100], sweep.points[::-1].copy()):
+        odd = dataclasses.replace(sweep, points=points)
+        assert beams.corrected(odd) is odd
+        beams.learn(odd, points, at_rest=False)
+    kept = beams.corrected(sweep)
+    beams.learn(kept, kept.points[:-1], at_rest=True)  # not the same points
+    beams.learn(turn(UNIT, 1)[0], kept.points, at_rest=True)  # not the latest sweep
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+
+
+@lru_cache(maxsize=2)
+def ends(correct: bool) -> Any:
+    run = record("yard", "walk", 1, 8.0, unit="typical")
+    odometry = Odometry(OdometryConfig(correct_beams=correct), T_CLOUD_IMU)
+    estimates = feed(odometry, run, list(sweeps(run, "turn")))
+    off = errors(run, estimates)
+    return float(np.sqrt(np.mean(off**2))), estimates
+
+
+def test_the_odometry_of_an_uncalibrated_unit_is_better_for_it() -> None:
+    assert ends(True)[0] < 0.9 * ends(False)[0]
+
+
+def test_a_map_begun_at_rest_is_begun_again_once_the_beams_are_known() -> None:
+    """What was mapped before does not stay beside it, so later sweeps fit as well as they can."""
+    rng = np.random.default_rng(0)
+    imu = np.zeros(1000, IMU_SAMPLE)
+    imu["stamp"] = np.arange(-100, 900) * 4_000_000
+    imu["angular_velocity"] = 0.02 * rng.standard_normal((1000, 3))
+    imu["linear_acceleration"] = rng.normal((0.0, 0.0, STANDARD_GRAVITY), 0.05, (1000, 3))
+    residuals = []
+    for correct in (False, True):
+        odometry = Odometry(OdometryConfig(correct_beams=correct), np.eye(4))
+        odometry.imu(imu)
+        estimates = [item for k in range(14) for item in odometry.register(turn(UNIT, k)[0])]
+        assert odometry.phase is Phase.STATIONARY
+        residuals.append(np.mean([item.quality.residual_m for item in estimates[-4:]]))
+    assert residuals[1] < 0.012  # of 10 mm of range noise
+    assert residuals[1] < 0.8 * residuals[0]
