@@ -151,7 +151,7 @@ class BeamAngles:
         if self._latest is None or self._latest[0] is not sweep or len(moved) != len(sweep.points):
             return
         _, sign, used = self._latest
-        gaps = _gaps(sweep.points, moved, sign)
+        gaps = between_halves(sweep.points, moved, sign)
         if gaps is None:
             return
         measured = gaps.levers @ used - gaps.gap
@@ -188,12 +188,22 @@ class BeamAngles:
         return np.asarray(axes @ np.where(sure, parts, 0.0))
 
 
-class _Gaps(NamedTuple):
-    """Flat cells that both halves see."""
+class Gaps(NamedTuple):
+    """Flat cells that both halves see.
 
-    gap: F64  # (C,) of the rising half from the falling one along the normal [m]
-    levers: F64  # (C, 2) derivatives of the gap by xi and beta [m/rad]
-    motion: F64  # (C, 6) by errors of velocity and rate [s, m s/rad]
+    Attributes
+    ----------
+    gap : ndarray, shape (C,)
+        Of the rising half from the falling one along the normal [m].
+    levers : ndarray, shape (C, 2)
+        Derivatives of the gap by xi and beta [m/rad].
+    motion : ndarray, shape (C, 6)
+        Derivatives by errors of velocity [s] and rate [m s/rad] of what deskewed the points.
+    """
+
+    gap: F64
+    levers: F64
+    motion: F64
 
 
 def _levers(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
@@ -204,7 +214,7 @@ def _levers(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
     return lever * (sign * y / radius), lever * (-sign * x / radius)
 
 
-def _gaps(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> _Gaps | None:
+def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> Gaps | None:
     """Return the gaps between the halves of a cloud, None where no flat cell has both.
 
     Parameters
@@ -212,6 +222,7 @@ def _gaps(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> _Gaps
     points, moved : ndarray, shape (N,)
         As measured, and deskewed.
     sign : ndarray, shape (N,)
+        As :class:`Halves` has it.
     """
     at = np.stack([moved[name].astype(np.float64) for name in "xyz"])
     cell = _cells(at)
@@ -252,7 +263,7 @@ def _gaps(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> _Gaps
     levers = normal[0] * apart[3:5] + normal[1] * apart[5:7]
     turned = np.cross(apart[8:11].T, normal.T)
     motion = np.column_stack(((normal * apart[7]).T, turned))
-    return _Gaps(gap[flat], levers.T[flat], motion[flat])
+    return Gaps(gap[flat], levers.T[flat], motion[flat])
 
 
 def _means(lines: F64, cell: I64, some: NDArray[np.bool_], numbers: I64) -> F64:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from l2lidar_node.calibration import model
 from l2lidar_node.calibration.model import BETA, NAMES, RETURN, XI, Block
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
-from l2lidar_proc.odometry.beam_angles import BeamAngles, halves
+from l2lidar_proc.odometry.beam_angles import BeamAngles, between_halves, halves
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
@@ -24,6 +25,7 @@ BLOCK = Block(np.zeros(1, wire.CALIBRATION).tobytes())
 ROOM = np.array([4.2, 3.3, 2.7])  # [m] half the edges
 CLOUD = np.dtype([(name, "<f4") for name in ("x", "y", "z", "time")])
 UNIT = (0.4, -0.3)  # [degrees]
+REAL = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"
 
 
 def turn(unit: Any, number: int, rate: float = HEAD_RATE, drift: Any = (0.0, 0.0, 0.0)) -> Any:
@@ -171,6 +173,32 @@ def test_nonsense_does_no_harm() -> None:
     beams.learn(kept, kept.points[:-1], at_rest=True)  # not the same points
     beams.learn(turn(UNIT, 1)[0], kept.points, at_rest=True)  # not the latest sweep
     np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the recordings are not here")
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_halves_of_a_real_unit_come_together_within_a_second(number: int) -> None:
+    returned = np.isfinite(np.load(REAL / f"capture_00{number}_packets.npz")["range_m"])
+    xyz = np.load(REAL / f"capture_00{number}.npy")
+    ends = np.cumsum(returned.sum(axis=1))
+    beams, gaps = BeamAngles(), []
+    for first in range(0, 500, 50):
+        packet, slot = np.nonzero(returned[first : first + 50])
+        cloud = np.zeros(len(packet), CLOUD)
+        for name, line in zip("xyz", xyz[ends[first + 49] - len(packet) : ends[first + 49]].T,
+                              strict=True):  # fmt: skip
+            cloud[name] = line
+        cloud["time"] = packet * 4.639e-3 + slot * 4.639e-3 / 600
+        sweep = Sweep(HostNs(first), HostNs(first + 50), cloud, 50, 0)
+        better = beams.corrected(sweep)
+        beams.learn(better, better.points, at_rest=True)
+        sides = halves(cloud)
+        assert sides is not None
+        found = [between_halves(one.points, one.points, sides.sign) for one in (sweep, better)]
+        gaps.append([np.median(np.abs(item.gap)) for item in found if item is not None])
+    reported, corrected = np.median(gaps[5:], axis=0)
+    assert reported > 0.018
+    assert corrected < 0.5 * reported
 
 
 @lru_cache(maxsize=2)
