@@ -195,8 +195,10 @@ BEAM_FLOOR: Final = (
 )
 BEAM_KNOWN: Final = 0.00175  # [rad] 0.1 degrees: less certain, a direction is not corrected
 BEAM_SIGMAS: Final = 3.0  # nor if it may as well be zero
-BEAM_OFTEN: Final = 50  # sweeps that all teach the angles; then only
-BEAM_SELDOM: Final = 10  # each tenth. Speed only
+# The first sweeps teach the angles, more of them where these are not well known yet, then a few.
+BEAM_OFTEN: Final = (20, 250)  # Speed only, as both below
+BEAM_SURE: Final = 0.0009  # [rad] along the best known direction
+BEAM_SELDOM: Final = 16  # each so many'th
 BEAM_CHANGE: Final = 0.0009  # [rad] after which a map at rest is begun again: 5 mm at 5 m
 
 # ---- odometry: innovation consistency

@@ -28,10 +28,11 @@ from l2lidar_node.types import F64, I64, Sweep
 from l2lidar_proc import tuning
 
 _HEAD_HZ: Final = np.arange(3.0, 8.0, 0.05)  # units were measured from 4.3 to 5.6
-_RATE_NEAR: Final = 1.0 + np.arange(-0.02, 0.0201, 0.002)  # of a head whose rate is known
+_RATE_NEAR: Final = 1.0 + np.arange(-0.02, 0.0201, 0.004)  # of a head whose rate is known
 _NEAR_M: Final = 0.5  # from the head's axis; nearer, the azimuth says little
 _FAN_S: Final = 2e-4  # between points that follow each other in a fan
-_MOST: Final = 400  # points that show the head's angle
+_MOST: Final = 200  # points that show the head's angle
+_SHOWN: Final = 3000  # points whose order tells the halves apart
 _FITS: Final = 0.9  # length of the mean of unit vectors; 1 where a line fits all points
 _RISES: Final = 0.1  # mean of the signs by which elevations change; 0 where there is no fan
 _HALF_LEAST: Final = 0.05  # share of the points that the smaller half has
@@ -63,23 +64,25 @@ def halves(points: NDArray[np.void], rate: float | None = None) -> Halves | None
     rate : float, optional
         Of the head as known so far [rad/s].
     """
-    x, y, z, time = (points[name].astype(np.float64) for name in ("x", "y", "z", "time"))
-    radius = np.maximum(np.sqrt(x * x + y * y), 1e-6)
+    x, y, z, time = (points[name].astype(np.float32) for name in ("x", "y", "z", "time"))
+    radius = np.maximum(np.sqrt(x * x + y * y), np.float32(1e-6))
     far = np.flatnonzero(radius > _NEAR_M)
     if len(far) < tuning.BEAM_POINTS:
         return None
     some = far[:: -(-len(far) // _MOST)]
     doubled = ((x[some] + 1j * y[some]) / radius[some]) ** 2
     rates = 2.0 * np.pi * _HEAD_HZ if rate is None else rate * _RATE_NEAR
-    means = (doubled * np.exp(-2j * np.outer(rates, time[some]))).mean(axis=1)
+    means = np.exp(-2j * np.outer(rates, time[some])) @ doubled / len(some)
     best = int(np.abs(means).argmax())
     if np.abs(means[best]) < _FITS:
         return None
     found = float(rates[best])
-    fan = found * time + 0.5 * np.angle(means[best])
+    fan = np.float32(found) * time + np.float32(0.5 * np.angle(means[best]))
     sign = np.where(x * np.cos(fan) + y * np.sin(fan) >= 0.0, 1.0, -1.0)
-    follows = (np.diff(time) < _FAN_S) & (sign[1:] == sign[:-1])
-    rises = (np.sign(np.diff(z / radius)) * sign[1:])[follows]
+    part = slice(_SHOWN)
+    height = z[part] / radius[part]
+    follows = (np.diff(time[part]) < _FAN_S) & (sign[1:_SHOWN] == sign[: len(height) - 1])
+    rises = (np.sign(np.diff(height)) * sign[1:_SHOWN])[follows]
     if len(rises) < tuning.BEAM_POINTS or abs(rises.mean()) < _RISES:
         return None
     share = np.count_nonzero(sign > 0.0) / len(sign)
@@ -116,7 +119,7 @@ class BeamAngles:
         """
         self._latest = None
         self._sweeps += 1
-        is_due = self._sweeps < tuning.BEAM_OFTEN or self._sweeps % tuning.BEAM_SELDOM == 0
+        is_due = self._teaches()
         if self._failures >= _GIVE_UP or not (is_due or self.correction.any()):
             return sweep
         found = halves(sweep.points, self._rate)
@@ -172,6 +175,14 @@ class BeamAngles:
         self._weighted = self._weighted + gradient
         self.correction = self._known()
 
+    def _teaches(self) -> bool:
+        """Return whether the present sweep is worth the time that its gaps take."""
+        first, most = tuning.BEAM_OFTEN
+        if self._sweeps < first or self._sweeps % tuning.BEAM_SELDOM == 0:
+            return True
+        unsure = np.linalg.eigvalsh(self._information)[-1] < 1.0 / tuning.BEAM_SURE**2
+        return bool(unsure) and self._sweeps < most
+
     @property
     def _estimate(self) -> F64:
         return np.asarray(np.linalg.solve(self._information, self._weighted), dtype=np.float64)
@@ -209,9 +220,10 @@ class Gaps(NamedTuple):
 def _levers(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
     """Return how points move along x and y, (2, N) each, with errors of xi and beta [m/rad]."""
     x, y, z = (points[name].astype(np.float64) for name in "xyz")
-    radius = np.maximum(np.hypot(x, y), 1e-6)
-    lever = np.stack((-np.hypot(radius, z), z))
-    return lever * (sign * y / radius), lever * (-sign * x / radius)
+    flat = x * x + y * y
+    radius = np.maximum(np.sqrt(flat), 1e-6)
+    lever = np.stack((-np.sqrt(flat + z * z), z)) * (sign / radius)
+    return lever * y, lever * -x
 
 
 def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> Gaps | None:
