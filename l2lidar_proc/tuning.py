@@ -153,6 +153,10 @@ DRIFT_GROUP: Final = 4  # sweeps that share an entry. Memory: 144 bytes per seco
 # Share left a sweep later of what the uncertainty was larger. Tuned on: camera looking into rooms,
 # 0.5 m -> 0.03 -> 0.17 in three sweeps, 0.37 m off
 DRIFT_FALL: Final = 0.6
+# A cell is as old as the coarsest one around it, unless the pose that opens it is so uncertain and
+# by so much more than the one that opened that. Derived: as LOOSE_POSITION, a surface off
+APART_LEAST: Final = 0.06  # [m] 1 sigma of the place
+APART_SHARE: Final = 0.5  # of that
 DRIFT_MOST_FRESH: Final = 0.9  # share of a sweep that counts as new map at most
 # Of a unit whose block of calibration is not quite its own. Derived: captures of a real one show
 # beam angles 0.4 degrees off; with that, ranges 0.2 % off and an IMU turned by 0.5 degrees the

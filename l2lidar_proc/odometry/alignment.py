@@ -73,6 +73,8 @@ class Alignment:
     weakly : tuple of ndarray and Support, optional
         Direction of the place (3,), map axes, that the points fix least, and the support of the
         surfaces that fix it; None where it was not surfaces that fixed the place.
+    strongly : tuple of tuple of ndarray and Support
+        Likewise of the other two directions; of these, the sweeps that were the first there.
     fine_inliers : int
         Points near surfaces of the finest cells.
     fine_ratio : float
@@ -89,6 +91,7 @@ class Alignment:
     steps: int
     support: Support
     weakly: tuple[F64, Support] | None = None
+    strongly: tuple[tuple[F64, Support], ...] = ()
     fine_inliers: int = 0
     fine_ratio: float = 0.0
 
@@ -166,7 +169,7 @@ class _Step(NamedTuple):
     def alignment(self) -> Alignment:
         """What is reported where this is the last one."""
         found = self.found
-        weakest = np.linalg.eigh(self.information[POSITION, POSITION])[1][:, 0]
+        weakest, *others = np.linalg.eigh(self.information[POSITION, POSITION])[1].T
         return Alignment(
             self.state,
             self.covariance,
@@ -178,6 +181,7 @@ class _Step(NamedTuple):
             self.number,
             found.support,
             (weakest, found.support_along(self.normals @ weakest)),
+            tuple((axis, found.places_along(self.normals @ axis)) for axis in others),
             found.fine_inliers,
             found.fine_inliers / max(found.met_fine, 1),
         )

@@ -171,6 +171,10 @@ class Correspondences:
         """
         return _support(self.opened, self.weights * levers**2)
 
+    def places_along(self, levers: F64) -> Support:
+        """Return the sweeps that were the first where the surfaces are which hold a direction."""
+        return _support(self.born, self.weights * levers**2)
+
 
 def _support(sweeps: I64, weights: F64) -> Support:
     numbers, place = np.unique(sweeps, return_inverse=True)

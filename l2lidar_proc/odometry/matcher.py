@@ -200,8 +200,9 @@ class SweepMatcher:
         state = motion.state
         points = xyz(moved) - self.lever
         placed = (state.rotation @ points.T + state.position[:, None]).T
-        fresh = self.surfaces.add(placed, self._sweeps)
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
+        apart = self.drift.more_certain(state.position)
+        fresh = self.surfaces.add(placed, self._sweeps, apart)
         self.kiss.update(points, _pose(state), _pose(guess))
         self._walk(state.position)
         self._sweeps += 1
@@ -238,11 +239,15 @@ class SweepMatcher:
         """
         free = unobserved_directions(found.information[POSITION, POSITION])
         if not free.size:
-            self.drift.meet(found.support, found.state.position, found.weakly)
+            self.drift.meet(found.support, found.state.position, found.weakly, found.strongly)
             return
         speeds = np.einsum("ik,ij,jk->k", free, found.covariance[VELOCITY, VELOCITY], free)
         self.drift.meet_partly(
-            found.support, found.state.position, free, np.sqrt(speeds) * seconds
+            found.support,
+            found.state.position,
+            free,
+            np.sqrt(speeds) * seconds,
+            found.strongly,
         )
 
     def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:

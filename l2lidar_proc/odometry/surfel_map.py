@@ -329,7 +329,7 @@ class SurfelMap:
         self._cells[:used] = np.zeros(1, CELL)
         self._kind[:used] = 0
 
-    def add(self, points: F64, sweep: int = 0) -> float:
+    def add(self, points: F64, sweep: int = 0, apart: NDArray[np.bool_] | None = None) -> float:
         """Add points, and return the share of them in places where there were none before.
 
         Parameters
@@ -338,6 +338,8 @@ class SurfelMap:
             [m], map frame.
         sweep : int
             Number of the sweep that they come from.
+        apart : ndarray, shape (S,), optional
+            Sweeps whose places these points are not known to belong to: they are the first there.
         """
         if not len(points):
             return 0.0
@@ -347,7 +349,7 @@ class SurfelMap:
         rows = self._index.find(distinct)
         new = rows == 0
         rows[new] = self._open(distinct[new])
-        fresh = self._note_sweep(rows, new, cell, groups.counts, sweep)
+        fresh = self._note_sweep(rows, new, cell, groups.counts, sweep, apart)
         self._extend(points, groups, rows, distinct, cell)
         return fresh
 
@@ -379,7 +381,13 @@ class SurfelMap:
         return np.concatenate(found), cell
 
     def _note_sweep(
-        self, rows: I64, new: NDArray[np.bool_], cell: I64, counts: F64, sweep: int
+        self,
+        rows: I64,
+        new: NDArray[np.bool_],
+        cell: I64,
+        counts: F64,
+        sweep: int,
+        apart: NDArray[np.bool_] | None,
     ) -> float:
         """Note who opened the new cells (C,) among some, and who has seen all of these last.
 
@@ -394,6 +402,7 @@ class SurfelMap:
         counts : ndarray, shape (G,)
             Points of each group.
         sweep : int
+        apart : ndarray, shape (S,), optional
         """
         self._cells["seen"][rows] = sweep
         fresh = float(counts[new[cell[-1]]].sum() / counts.sum())
@@ -401,7 +410,11 @@ class SurfelMap:
         if fresh < 1.0 and new.any():
             around = np.empty(len(rows), np.int64)
             around[cell] = rows[cell[-1]]
-            self._cells["born"][rows[new]] = self._cells["born"][around[new]]
+            born = self._cells["born"][around[new]]
+            if apart is not None:
+                is_apart = apart[np.minimum(born, len(apart) - 1)]
+                born = np.where(is_apart, sweep, born)
+            self._cells["born"][rows[new]] = born
         return fresh
 
     def _extend(self, points: F64, groups: _Groups, rows: I64, keys: I64, cell: I64) -> None:

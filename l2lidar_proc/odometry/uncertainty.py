@@ -69,6 +69,7 @@ class MapDrift:
         support: Support,
         place: F64 | None = None,
         weakly: tuple[F64, Support] | None = None,
+        strongly: tuple[tuple[F64, Support], ...] = (),
     ) -> None:
         """Take the surfaces that hold the latest sweep.
 
@@ -81,6 +82,8 @@ class MapDrift:
         weakly : tuple of ndarray and Support, optional
             The direction (3,), unit, map axes, that they hold least, and the support of those that
             hold it. The others, however old, say nothing about it.
+        strongly : tuple of tuple of ndarray and Support
+            Likewise other directions, orthogonal to it.
         """
         sweeps, shares = support
         if not len(sweeps) or not self._known:
@@ -88,14 +91,13 @@ class MapDrift:
         rows = self._rows(sweeps)
         self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
         self._behind = float(shares @ self._ways[rows])
-        if place is None or weakly is None:
-            self._fall()
-            return
-        weakest, (sweeps, shares) = weakly
-        holding = np.tensordot(shares, self._history[self._rows(sweeps)].astype(np.float64), 1)
-        along = np.zeros((6, 6))
-        along[:3, :3] = np.outer(weakest, weakest)
-        self._combine(place, self._current, holding, along)
+        if place is not None:
+            for direction, (sweeps, shares) in (*strongly, *([weakly] if weakly else [])):
+                rows = self._rows(sweeps)
+                holding = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
+                along = np.zeros((6, 6))
+                along[:3, :3] = np.outer(direction, direction)
+                self._combine(place, self._current, holding, along)
         self._fall()
 
     def _fall(self) -> None:
@@ -121,7 +123,14 @@ class MapDrift:
         self._current = back @ there @ back.T
         return np.asarray(there)
 
-    def meet_partly(self, support: Support, place: F64, free: F64, ways: F64) -> None:
+    def meet_partly(
+        self,
+        support: Support,
+        place: F64,
+        free: F64,
+        ways: F64,
+        strongly: tuple[tuple[F64, Support], ...] = (),
+    ) -> None:
         """Take surfaces that leave some directions free: along these nothing is held.
 
         What is registered along them is where the sensor is relative to what the last sweeps put
@@ -137,9 +146,11 @@ class MapDrift:
             The directions, orthonormal, map axes.
         ways : ndarray, shape (K,)
             By how much the place may have run away along each since the sweep before, 1 sigma [m].
+        strongly : tuple of tuple of ndarray and Support
+            As in :meth:`meet`.
         """
         before, reported = self._current, self._reported
-        self.meet(support)
+        self.meet(support, place, None, strongly)
         self._reported = reported
         along = np.zeros((6, 6))
         along[:3, :3] = free @ free.T
@@ -174,8 +185,29 @@ class MapDrift:
         self._before = place
         self._ways[self._known : row + 1] = self._way
         moved = _carried(-place)
-        self._history[self._known : row + 1] = self._current + moved @ covariance @ moved.T
+        found = self._current + moved @ covariance @ moved.T
+        here = _carried(place)[:3]
+        # of sweeps that share an entry, the least certain: sight may have been lost in between
+        if row < self._known and np.trace(here @ (found - self._history[row]) @ here.T) > 0.0:
+            self._history[row] = found
+        self._history[self._known : row + 1] = found
         self._known = max(self._known, row + 1)
+
+    def more_certain(self, place: F64) -> NDArray[np.bool_] | None:
+        """Return which sweeps (S,) were far more certain of a place (3,) [m] than the latest.
+
+        None where the latest is certain enough.
+        """
+        if not self._known:
+            return None
+        here = _carried(place)[:3]
+        latest = self._history[self._known - 1].astype(np.float64)
+        squared = float(np.trace(here @ latest @ here.T))
+        if squared < tuning.APART_LEAST**2:
+            return None
+        history = self._history[: self._known].astype(np.float64)
+        all_squared = np.einsum("jk,njk->n", here.T @ here, history)
+        return np.repeat(all_squared < tuning.APART_SHARE**2 * squared, tuning.DRIFT_GROUP)
 
     def lean(self, gravity: F64, covariance: F64) -> None:
         """Record how far gravity has turned in the map: so far the map has bent.

@@ -212,3 +212,14 @@ def test_cells_remember_the_sweep_that_opened_their_place() -> None:
     beyond = surfaces.match(wall(3.2)[:500])
     assert set(beyond.born.tolist()) == {12}
     assert surfaces.add(np.empty((0, 3)), 13) == 0.0
+
+
+def test_a_place_is_no_older_for_a_sweep_that_is_not_known_to_belong_to_it() -> None:
+    surfaces = SurfelMap((0.15, 1.5))
+    points = wall(2.0)
+    surfaces.add(points[:20], 0)
+    left = points[:, 1] < 0.0
+    surfaces.add(points[left], 1)
+    surfaces.add(points[~left], 2, np.array([True, False]))
+    for part, born in ((left, 0), (~left, 2)):
+        assert np.median(surfaces.match(points[part]).born) == born

@@ -250,3 +250,47 @@ def test_it_looks_back_some_seconds_and_forgets() -> None:
     test = run(3.0)
     test.clear()
     assert (test.nis, test.velocity_nis, test.excess) == (0.0, 0.0, 1.0)
+
+
+def grown() -> MapDrift:
+    """Return a map of which the sweeps from 40 on are 0.2 m uncertain along x."""
+    drift = MapDrift()
+    for sweep in range(80):
+        doubt = SURE + np.diag([0.04 * (sweep >= 40), 0.0, 0.0, 0.0, 0.0, 0.0])
+        drift.record(sweep, np.array([0.05 * sweep, 0.0, 0.0]), doubt)
+    return drift
+
+
+def test_sweeps_that_were_far_more_certain_are_told_apart() -> None:
+    place = np.array([4.0, 0.0, 0.0])
+    apart = grown().more_certain(place)
+    assert apart is not None
+    assert apart[:40].all()
+    assert not apart[40:].any()
+    certain = MapDrift()
+    assert certain.more_certain(place) is None
+    for sweep in range(80):
+        certain.record(sweep, place, SURE)
+    assert certain.more_certain(place) is None
+
+
+def test_sweeps_that_share_an_entry_are_as_uncertain_as_the_least_certain() -> None:
+    """The first of them came before sight was lost, the others after."""
+    drift = MapDrift()
+    last = tuning.DRIFT_GROUP
+    drift.record(0, ZERO, SURE)
+    drift.record(last, ZERO, SURE)
+    drift.record(last + 1, ZERO, np.diag([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    drift.meet(held_by(last + 1))
+    assert drift.at(ZERO)[0, 0] > 0.2
+
+
+def test_each_direction_is_as_uncertain_as_what_holds_it() -> None:
+    """A wall seen long ago says nothing of the place along it, even if that is not the weakest."""
+    drift = grown()
+    place = np.array([4.0, 0.0, 0.0])
+    x, y, z = np.eye(3)
+    drift.meet(held_by(0), place, (z, held_by(0)), ((x, held_by(60)), (y, held_by(0))))
+    added = np.diag(drift.at(place) - unit_alone(place))
+    assert added[0] == pytest.approx(0.04, rel=0.05)
+    assert added[1:3].max() < 1e-3
