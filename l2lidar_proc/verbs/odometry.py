@@ -135,6 +135,7 @@ class OdometryRunner:
         self.notes: list[str] = [problem] if problem else []
         self.base = BaseFrame(np.eye(4))
         self.refused: Counter[str] = Counter()
+        self._beams = 0.0, 0.0  # correction of xi and beta [rad]
 
     def take(self, event: Event) -> None:
         """Take a sweep or samples."""
@@ -147,6 +148,7 @@ class OdometryRunner:
 
     def _poll(self, now: int) -> None:
         for estimate in self.pipeline.poll(now):
+            self._beams = estimate.quality.beam_correction
             if self._observer is not None:
                 self._observer(estimate, self.base)
 
@@ -169,9 +171,16 @@ class OdometryRunner:
         )
 
     def _finding(self) -> list[str]:
-        """Return the problem with the IMU, and what to do."""
+        """Return what is wrong with IMU and beams, and what to do."""
         finding = self.pipeline.check.finding
-        return [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
+        found = [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
+        if any(self._beams):
+            xi, beta = np.degrees(self._beams)
+            found.append(
+                f"the unit's beams were corrected by {xi:+.2f} degrees (xi) and {beta:+.2f} "
+                "degrees (beta), estimated from the clouds: l2lidar calibrate still measures them"
+            )
+        return found
 
 
 def run_events(

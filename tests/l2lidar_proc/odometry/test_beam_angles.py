@@ -15,8 +15,9 @@ from l2lidar_node.calibration.model import BETA, NAMES, RETURN, XI, Block
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc.odometry.beam_angles import BeamAngles, between_halves, halves
-from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.verbs.odometry import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
 from tests.support.odometry_runs import record, sweeps
 
@@ -25,6 +26,7 @@ BLOCK = Block(np.zeros(1, wire.CALIBRATION).tobytes())
 ROOM = np.array([4.2, 3.3, 2.7])  # [m] half the edges
 CLOUD = np.dtype([(name, "<f4") for name in ("x", "y", "z", "time")])
 UNIT = (0.4, -0.3)  # [degrees]
+CONFIG = OdometryNodeConfig()
 REAL = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"
 
 
@@ -230,3 +232,14 @@ def test_a_map_begun_at_rest_is_begun_again_once_the_beams_are_known() -> None:
         residuals.append(np.mean([item.quality.residual_m for item in estimates[-4:]]))
     assert residuals[1] < 0.012  # of 10 mm of range noise
     assert residuals[1] < 0.8 * residuals[0]
+
+
+def test_a_run_over_a_recording_says_what_was_corrected() -> None:
+    imu = np.zeros(1000, IMU_SAMPLE)
+    imu["stamp"] = np.arange(-100, 900) * 4_000_000
+    imu["linear_acceleration"] = 0.0, 0.0, STANDARD_GRAVITY
+    for unit, said in ((UNIT, 1), ((0.0, 0.0), 0)):
+        turns = [turn(unit, k)[0] for k in range(12)]
+        run = run_events(iter([(0, imu), *((int(one.end), one) for one in turns)]), CONFIG)
+        notes = [note for note in run.report if "l2lidar calibrate still" in note]
+        assert len(notes) == said
