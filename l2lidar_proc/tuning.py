@@ -198,6 +198,7 @@ BEAM_FLOOR: Final = (
     3.5e-4  # [rad] 0.02 degrees; source: calibrations of one unit from part to part
 )
 BEAM_KNOWN: Final = 0.00175  # [rad] 0.1 degrees: less certain, a direction is not corrected
+BEAM_MOST: Final = 0.0175  # [rad] 1 degree, where `l2lidar calibrate` refuses as well
 BEAM_SIGMAS: Final = 3.0  # nor if it may as well be zero
 # The first sweeps teach the angles, more of them where these are not well known yet, then a few.
 BEAM_OFTEN: Final = (20, 250)  # Speed only, as both below

@@ -190,12 +190,14 @@ class BeamAngles:
     def _known(self) -> F64:
         """Return the estimate along those directions that are known, and differ from zero.
 
-        Both angles together move the halves apart only high above the sensor.
+        Both angles together move the halves apart only high above the sensor. No unit is off by
+        a degree: what seems so has another cause.
         """
         variances, axes = np.linalg.eigh(np.linalg.inv(self._information))
         variances += tuning.BEAM_FLOOR**2
         parts = axes.T @ self._estimate
         sure = (variances < tuning.BEAM_KNOWN**2) & (parts**2 > tuning.BEAM_SIGMAS**2 * variances)
+        sure &= np.abs(parts) < tuning.BEAM_MOST
         return np.asarray(axes @ np.where(sure, parts, 0.0))
 
 

@@ -109,6 +109,12 @@ def test_a_velocity_that_is_off_does_not_pass_for_beam_angles(drift: Any) -> Non
     assert learned((0.0, 0.0), at_rest=True, drift=(0.0, 0.1, 0.0)).correction.any()
 
 
+def test_no_unit_is_off_by_more_than_a_degree() -> None:
+    off = np.array((1.3, -1.0))
+    np.testing.assert_array_equal(learned(off).correction, (0.0, 0.0))
+    assert learned(0.5 * off).correction.any()
+
+
 def test_corrected_clouds_lie_on_the_walls() -> None:
     beams = learned(UNIT)
     sweep, _ = turn(UNIT, 30)
