@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import F64, I64, Sweep
 from l2lidar_proc import tuning
+from l2lidar_proc.odometry.surfel_map import principal_axes, products
 
 _HEAD_HZ: Final = np.arange(3.0, 8.0, 0.05)  # units were measured from 4.3 to 5.6
 _RATE_NEAR: Final = 1.0 + np.arange(-0.02, 0.0201, 0.004)  # of a head whose rate is known
@@ -259,13 +260,9 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
     apart = means[0] - means[1]
     around = at - np.where(rising, means[0, :3][:, cell], means[1, :3][:, cell])
     total = numbers.sum(axis=0)
-    covariance = np.empty((len(total), 3, 3))
-    for i in range(3):
-        for j in range(i, 3):
-            products = np.bincount(cell, around[i] * around[j], len(total)) / total
-            covariance[:, i, j] = covariance[:, j, i] = products
-    spread, axes = np.linalg.eigh(covariance)
-    normal = axes[:, :, 0].T
+    covariance = [np.bincount(cell, line, len(total)) / total for line in products(*around)]
+    spread, axes = principal_axes(np.stack(covariance))
+    normal = axes[:, 0].T
     gap = (normal * apart[:3]).sum(axis=0)
     beside = np.sqrt(np.maximum((apart[:3] ** 2).sum(axis=0) - gap**2, 0.0))
     flat = (spread[:, 0] < tuning.BEAM_THICKNESS**2) & (

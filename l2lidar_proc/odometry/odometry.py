@@ -135,7 +135,8 @@ class Odometry:
             if not 0 < step <= tuning.TIME_JUMP_NS:
                 self._begin_time_line(self._predictor.reference(sweep))
                 status.append(Status.RESTARTED)
-        sweep = self._raw = cropped(sweep, self.config.min_range, self.config.max_range)
+        sweep = cropped(sweep, self.config.min_range, self.config.max_range)
+        self._reported = sweep  # as the unit reports it, for what is mapped again
         if self.config.correct_beams:
             sweep = self._beams.corrected(sweep)
         if self.phase is Phase.INITIALIZING:
@@ -422,7 +423,7 @@ class Odometry:
             self._leave_rest()
             return False
         if self._first_sweeps:
-            self._first_sweeps.append(self._raw)
+            self._first_sweeps.append(self._reported)
         return True
 
     def _leave_rest(self) -> None:

@@ -272,9 +272,7 @@ class _Groups:
         x, y, z = (
             axis[taken] - middle[group] for axis, middle in zip(points.T, middles, strict=True)
         )
-        sums = [
-            np.bincount(group, line, len(self.keys)) for line in (x, y, z, *_products(x, y, z))
-        ]
+        sums = [np.bincount(group, line, len(self.keys)) for line in (x, y, z, *products(x, y, z))]
         return np.stack((np.where(wanted, self.counts, 0.0), *sums))
 
 
@@ -542,7 +540,7 @@ class SurfelMap:
         count = cells["count"][rows]
         mean = cells["sum"][rows] / count[:, None]
         covariance = cells["products"][rows].T / count
-        for line, product in zip(covariance, _products(*mean.T), strict=True):
+        for line, product in zip(covariance, products(*mean.T), strict=True):
             line -= product
         spread, axes = principal_axes(covariance)
         spread = np.maximum(spread, 1e-8)
@@ -584,8 +582,8 @@ def _places(keys: I64) -> I64:
     return np.asarray(cell - _HALF)
 
 
-def _products(x: F64, y: F64, z: F64) -> Iterator[F64]:
-    """Yield the products of the coordinates, in their order in a cell."""
+def products(x: F64, y: F64, z: F64) -> Iterator[F64]:
+    """Yield the products of coordinates (N,), in the order of :func:`principal_axes`."""
     axes = x, y, z
     return (axes[i] * axes[j] for i, j in _PAIRS)
 
