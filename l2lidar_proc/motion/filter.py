@@ -438,28 +438,62 @@ def update_static(
 
 
 def apply_zero_velocity_prior(
-    state: InertialState, covariance: F64, seconds: float
+    state: InertialState, covariance: F64, seconds: float, usual_speed: float
 ) -> tuple[InertialState, F64]:
     """Return state and covariance with a velocity that is hardly known drawn towards zero.
 
     Carriers are slow: a velocity of zero is measured all the time, but so coarsely that it only
-    counts where nothing else measures the velocity.
+    counts where nothing else measures the velocity. A carrier that drives may keep its velocity
+    for minutes; measuring zero again and again would brake it. So its velocity has to be unknown
+    compared with its usual speed. That does not hold for the vertical velocity: what walks or
+    drives comes back to its height.
 
     Parameters
     ----------
     state : InertialState
+        Without gravity, nothing is vertical.
     covariance : ndarray, shape (18, 18)
     seconds : float
         Time since this was done last.
+    usual_speed : float
+        Of this carrier, as far as it was measured [m/s].
     """
-    known = np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < tuning.PRIOR_FROM_SIGMA**2
-    if known or seconds <= 0.0:
+    if seconds <= 0.0:
         return state, covariance
-    jacobian = np.zeros((3, ERRORS))
-    jacobian[:, VELOCITY] = np.eye(3)
-    noise = tuning.PRIOR_SPEED**2 / seconds * np.eye(3)
-    found = update(state, covariance, -state.velocity, jacobian, noise)
+    least = min(tuning.PRIOR_FROM_SHARE * usual_speed, tuning.PRIOR_SPEED)
+    least = max(tuning.PRIOR_FROM_SIGMA, least)
+    axes = np.eye(3)
+    if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < least**2:
+        size = float(np.linalg.norm(state.gravity))
+        axes = state.gravity[None] / max(size, 1e-12)
+        variance = float((axes @ covariance[VELOCITY, VELOCITY] @ axes.T)[0, 0])
+        if variance < tuning.PRIOR_FROM_SIGMA**2:
+            return state, covariance
+    jacobian = np.zeros((len(axes), ERRORS))
+    jacobian[:, VELOCITY] = axes
+    noise = tuning.PRIOR_SPEED**2 / seconds * np.eye(len(axes))
+    found = update(state, covariance, -axes @ state.velocity, jacobian, noise)
     return found.state, found.covariance
+
+
+def usual_speed(before: float, state: InertialState, covariance: F64, seconds: float) -> float:
+    """Return a carrier's highest speed of late, as far as it is known [m/s].
+
+    Parameters
+    ----------
+    before : float
+        The same, so far [m/s].
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+        A velocity that is hardly known says nothing, nor is anything forgotten meanwhile.
+    seconds : float
+        Time since this was done last.
+    """
+    variance = np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1]
+    if variance > tuning.PRIOR_LEARN_SIGMA**2:
+        return before
+    left = before * float(np.exp(-seconds / tuning.PRIOR_MEMORY_S))
+    return max(left, float(np.linalg.norm(state.velocity)))
 
 
 def bound_speed(

@@ -296,7 +296,7 @@ class TwistFilter:
             seconds = (due - self._state.stamp) * 1e-9
             self._predict(HostNs(due))
             self._state, self._covariance = eskf.apply_zero_velocity_prior(
-                self._state, self._covariance, seconds
+                self._state, self._covariance, seconds, 0.0
             )
 
     def _use(self, twist: Twist, newest: int) -> None:

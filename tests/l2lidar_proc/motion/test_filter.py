@@ -159,11 +159,51 @@ def test_a_static_stretch_measures_bias_and_gravity() -> None:
 def test_the_prior_touches_only_a_velocity_that_is_hardly_known() -> None:
     state = some_state()
     tight = np.eye(eskf.ERRORS) * 0.1**2
-    assert eskf.apply_zero_velocity_prior(state, tight, 1.0)[0] is state
+    assert eskf.apply_zero_velocity_prior(state, tight, 1.0, 0.0)[0] is state
     loose = np.eye(eskf.ERRORS)
-    slowed, covariance = eskf.apply_zero_velocity_prior(state, loose, 1.0)
+    slowed, covariance = eskf.apply_zero_velocity_prior(state, loose, 1.0, 0.0)
     np.testing.assert_allclose(slowed.velocity, 0.5 * state.velocity, atol=1e-9)
     assert covariance[6, 6] == pytest.approx(0.5)
+    # however fast a carrier seems to be, a velocity that is not known at all is not believed
+    slowed, _ = eskf.apply_zero_velocity_prior(state, 1.01 * loose, 1.0, 1000.0)
+    assert np.linalg.norm(slowed.velocity) < 0.51 * np.linalg.norm(state.velocity)
+
+
+def test_a_minute_of_the_prior_brakes_no_drive_but_ends_a_climb() -> None:
+    # known by the IMU alone to 0.3 m/s, of a carrier that was seen to drive at 1.2 m/s
+    gravity = np.array([3.0, 0.0, -9.3])
+    up = -gravity / np.linalg.norm(gravity)
+    ahead = np.array([-up[2], 0.0, up[0]])
+    start = dataclasses.replace(some_state(), gravity=gravity, velocity=1.2 * ahead + 1.5 * up)
+    state, covariance = start, np.eye(eskf.ERRORS) * 0.3**2
+    for _ in range(600):
+        state, covariance = eskf.apply_zero_velocity_prior(state, covariance, 0.1, 1.2)
+    assert ahead @ state.velocity == pytest.approx(1.2, abs=1e-9)
+    # until the vertical velocity is known well enough
+    least = tuning.PRIOR_FROM_SIGMA**2
+    assert up @ covariance[eskf.VELOCITY, eskf.VELOCITY] @ up == pytest.approx(least, rel=0.01)
+    assert up @ state.velocity == pytest.approx(1.5 * least / 0.3**2, rel=0.01)
+    # a slow carrier stops; where gravity is not known nothing is vertical
+    slow, _ = eskf.apply_zero_velocity_prior(start, np.eye(eskf.ERRORS) * 0.3**2, 60.0, 0.3)
+    assert np.linalg.norm(slow.velocity) < 0.2 * np.linalg.norm(start.velocity)
+    adrift = dataclasses.replace(start, gravity=np.zeros(3))
+    assert (
+        eskf.apply_zero_velocity_prior(adrift, np.eye(eskf.ERRORS) * 0.3**2, 60.0, 1.2)[0]
+        is adrift
+    )
+
+
+def test_the_usual_speed_is_the_highest_that_was_known_of_late() -> None:
+    state = dataclasses.replace(some_state(), velocity=np.array([0.0, 1.2, 0.0]))
+    known = np.eye(eskf.ERRORS) * (0.9 * tuning.PRIOR_LEARN_SIGMA) ** 2
+    unknown = known.copy()
+    unknown[7, 7] = (1.1 * tuning.PRIOR_LEARN_SIGMA) ** 2
+    assert eskf.usual_speed(0.3, state, known, 0.1) == pytest.approx(1.2)
+    assert eskf.usual_speed(0.3, state, unknown, 0.1) == 0.3
+    # one that stands is slow after some minutes
+    left = eskf.usual_speed(2.4, state, known, tuning.PRIOR_MEMORY_S / 2.0)
+    assert left == pytest.approx(2.4 * np.exp(-0.5))
+    assert eskf.usual_speed(2.4, state, known, 3.0 * tuning.PRIOR_MEMORY_S) == pytest.approx(1.2)
 
 
 def test_the_size_of_gravity_comes_back_and_the_bias_with_it() -> None:
