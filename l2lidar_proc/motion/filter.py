@@ -438,14 +438,14 @@ def update_static(
 
 
 def apply_zero_velocity_prior(
-    state: InertialState, covariance: F64, seconds: float, usual_speed: float
+    state: InertialState, covariance: F64, seconds: float, peak_speed: float
 ) -> tuple[InertialState, F64]:
     """Return state and covariance with a velocity that is hardly known drawn towards zero.
 
     Carriers are slow: a velocity of zero is measured all the time, but so coarsely that it only
     counts where nothing else measures the velocity. A carrier that drives may keep its velocity
     for minutes; measuring zero again and again would brake it. So its velocity has to be unknown
-    compared with its usual speed. That does not hold for the vertical velocity: what walks or
+    compared with its peak speed. That does not hold for the vertical velocity: what walks or
     drives comes back to its height.
 
     Parameters
@@ -455,12 +455,12 @@ def apply_zero_velocity_prior(
     covariance : ndarray, shape (18, 18)
     seconds : float
         Time since this was done last.
-    usual_speed : float
-        Of this carrier, as far as it was measured [m/s].
+    peak_speed : float
+        Of this carrier of late, as :func:`peak_speed_after` returns it [m/s].
     """
     if seconds <= 0.0:
         return state, covariance
-    least = min(tuning.PRIOR_FROM_SHARE * usual_speed, tuning.PRIOR_SPEED)
+    least = min(tuning.PRIOR_FROM_SHARE * peak_speed, tuning.PRIOR_SPEED)
     least = max(tuning.PRIOR_FROM_SIGMA, least)
     axes = np.eye(3)
     if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < least**2:
@@ -476,13 +476,17 @@ def apply_zero_velocity_prior(
     return found.state, found.covariance
 
 
-def usual_speed(before: float, state: InertialState, covariance: F64, seconds: float) -> float:
+def peak_speed_after(
+    before: float, state: InertialState, covariance: F64, seconds: float
+) -> float:
     """Return a carrier's highest speed of late, as far as it is known [m/s].
+
+    A peak detector: it rises at once and decays exponentially.
 
     Parameters
     ----------
     before : float
-        The same, so far [m/s].
+        The peak so far [m/s].
     state : InertialState
     covariance : ndarray, shape (18, 18)
         A velocity that is hardly known says nothing, nor is anything forgotten meanwhile.

@@ -295,6 +295,7 @@ class TwistFilter:
         else:
             seconds = (due - self._state.stamp) * 1e-9
             self._predict(HostNs(due))
+            # no peak speed: a source that is silent for seconds may have stopped with the carrier
             self._state, self._covariance = eskf.apply_zero_velocity_prior(
                 self._state, self._covariance, seconds, 0.0
             )

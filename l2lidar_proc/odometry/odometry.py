@@ -99,7 +99,7 @@ class Odometry:
         self._first_sweeps: list[Sweep] = []
         self._beams = BeamAngles()
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
-        self._usual_speed = 0.0  # of this carrier [m/s]
+        self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
@@ -253,9 +253,9 @@ class Odometry:
         assert self._belief is not None
         before = self._belief[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
-        usual = eskf.usual_speed(self._usual_speed, after, covariance, lasted)
-        posterior = eskf.apply_zero_velocity_prior(after, covariance, lasted, usual)
-        self._usual_speed = usual
+        peak = eskf.peak_speed_after(self._peak_speed, after, covariance, lasted)
+        posterior = eskf.apply_zero_velocity_prior(after, covariance, lasted, peak)
+        self._peak_speed = peak
         posterior = eskf.with_gravity_of_known_size(*posterior)
         way = float(np.linalg.norm(posterior[0].position - before.position))
         lean = way * tuning.MAP_BEND**2

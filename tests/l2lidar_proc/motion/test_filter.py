@@ -193,17 +193,19 @@ def test_a_minute_of_the_prior_brakes_no_drive_but_ends_a_climb() -> None:
     )
 
 
-def test_the_usual_speed_is_the_highest_that_was_known_of_late() -> None:
+def test_the_peak_speed_is_the_highest_that_was_known_of_late() -> None:
     state = dataclasses.replace(some_state(), velocity=np.array([0.0, 1.2, 0.0]))
     known = np.eye(eskf.ERRORS) * (0.9 * tuning.PRIOR_LEARN_SIGMA) ** 2
     unknown = known.copy()
     unknown[7, 7] = (1.1 * tuning.PRIOR_LEARN_SIGMA) ** 2
-    assert eskf.usual_speed(0.3, state, known, 0.1) == pytest.approx(1.2)
-    assert eskf.usual_speed(0.3, state, unknown, 0.1) == 0.3
+    assert eskf.peak_speed_after(0.3, state, known, 0.1) == pytest.approx(1.2)
+    assert eskf.peak_speed_after(0.3, state, unknown, 0.1) == 0.3
     # one that stands is slow after some minutes
-    left = eskf.usual_speed(2.4, state, known, tuning.PRIOR_MEMORY_S / 2.0)
+    left = eskf.peak_speed_after(2.4, state, known, tuning.PRIOR_MEMORY_S / 2.0)
     assert left == pytest.approx(2.4 * np.exp(-0.5))
-    assert eskf.usual_speed(2.4, state, known, 3.0 * tuning.PRIOR_MEMORY_S) == pytest.approx(1.2)
+    assert eskf.peak_speed_after(2.4, state, known, 3.0 * tuning.PRIOR_MEMORY_S) == pytest.approx(
+        1.2
+    )
 
 
 def test_the_size_of_gravity_comes_back_and_the_bias_with_it() -> None:

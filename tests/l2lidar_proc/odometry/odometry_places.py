@@ -89,3 +89,11 @@ def visited(place: str, seconds: float = 6.0) -> Run:
         o3d.io.write_triangle_mesh(world, mesh)
         motion.write_text(tum.render(ring(seconds)), encoding="utf-8")
         return record(str(world), str(motion), 1, seconds)
+
+
+def driven_round(seconds: float, speed: float) -> Run:
+    """Return a recording of 2 s of rest and a fast drive round a circle in the built-in yard."""
+    with tempfile.TemporaryDirectory() as folder:
+        motion = Path(folder) / "motion.tum"
+        motion.write_text(tum.render(ring(seconds, speed)), encoding="utf-8")
+        return record("yard", str(motion), 1, seconds)

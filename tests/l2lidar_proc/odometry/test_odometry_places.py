@@ -21,7 +21,7 @@ from l2lidar_proc.odometry.matcher import SweepMatcher, xyz
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from tests.l2lidar_proc.odometry.odometry_places import SEED, shaken, visited
+from tests.l2lidar_proc.odometry.odometry_places import SEED, driven_round, shaken, visited
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
 from tests.support.odometry_runs import record, sweeps
 
@@ -113,6 +113,16 @@ def test_a_long_blindness_ends_where_the_sensor_is() -> None:
     blind = [item for item in estimates if not item.is_aligned]
     assert blind
     assert all(item.velocity @ item.velocity > 0.2 for item in blind)
+
+
+def test_a_drive_goes_on_while_nothing_is_seen() -> None:
+    """Slow carriers are drawn to rest after a second or two; one that was fast is not."""
+    run = driven_round(11.5, 1.6)
+    some = list(sweeps(run, "turn"))
+    some[24:] = [dataclasses.replace(one, points=one.points[:3]) for one in some[24:]]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some)
+    assert not any(item.is_aligned for item in estimates[24:])
+    assert errors(run, estimates[:46]).max() < 0.5  # 0.8 m if it counts as slow
 
 
 def _placed(estimate: OdometryEstimate) -> Any:
