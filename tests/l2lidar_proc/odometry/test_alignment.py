@@ -12,10 +12,8 @@ from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.odometry.alignment import (
     Alignment,
-    WeakDirections,
     align,
     unobserved_directions,
-    weak_directions,
 )
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import (
@@ -25,6 +23,7 @@ from l2lidar_proc.odometry.correspondences import (
     residual_jacobian,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.weak_directions import WeakDirections, weak_directions
 from tests.l2lidar_proc.odometry.odometry_world import drive, errors, recording
 
 ZERO = np.zeros(3)
