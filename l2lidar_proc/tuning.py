@@ -32,12 +32,12 @@ BLIND_GYRO: Final = 0.5  # [rad/s/sqrt(Hz)]
 BLIND_GYRO_SHARE: Final = 0.6  # [sqrt(s)] and this part of the rate held: what shakes turns back
 BLIND_ACCEL: Final = 1.0  # [m/s^2/sqrt(Hz)]
 ZERO_VELOCITY: Final = 0.003  # [m/s] noise of a zero-velocity update. Tuned on: captures
-# A velocity known worse than the first, and than the second of the carrier's peak speed, is
-# drawn towards zero as if that were measured once a second with the third. Derived: walking and
-# driving speeds are a few meters a second. Tuned on: corridors at 1.25 m/s, whose sigma is 0.2 to
-# 0.35 m/s between the doors, and cameras moved by hand at up to 0.6 m/s.
+# A carrier that has been faster than the first drives. A velocity known worse than the second, if
+# it drives worse than its peak speed, is drawn towards zero as if that were measured once a second
+# with the third. Derived: walking and driving speeds are a few meters a second. Tuned on:
+# corridors at 1.25 m/s, and cameras moved by hand at up to 0.6 m/s.
+DRIVING_SPEED: Final = 0.8  # [m/s]
 PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
-PRIOR_FROM_SHARE: Final = 0.3  # of the peak speed
 PRIOR_SPEED: Final = 1.0  # [m/s]
 PRIOR_LEARN_SIGMA: Final = 0.1  # [m/s] of velocities that show the peak speed
 PRIOR_MEMORY_S: Final = 60.0  # [s] time constant of its decay

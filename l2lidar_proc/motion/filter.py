@@ -444,9 +444,9 @@ def apply_zero_velocity_prior(
 
     Carriers are slow: a velocity of zero is measured all the time, but so coarsely that it only
     counts where nothing else measures the velocity. A carrier that drives may keep its velocity
-    for minutes; measuring zero again and again would brake it. So its velocity has to be unknown
-    compared with its peak speed. That does not hold for the vertical velocity: what walks or
-    drives comes back to its height.
+    for minutes; measuring zero again and again would brake it. So its velocity has to be known
+    worse than its peak speed, at which zero is as likely as any. That does not hold for the
+    vertical velocity: what walks or drives comes back to its height.
 
     Parameters
     ----------
@@ -460,8 +460,8 @@ def apply_zero_velocity_prior(
     """
     if seconds <= 0.0:
         return state, covariance
-    least = min(tuning.PRIOR_FROM_SHARE * peak_speed, tuning.PRIOR_SPEED)
-    least = max(tuning.PRIOR_FROM_SIGMA, least)
+    drives = peak_speed > tuning.DRIVING_SPEED
+    least = peak_speed if drives else tuning.PRIOR_FROM_SIGMA
     axes = np.eye(3)
     if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < least**2:
         size = float(np.linalg.norm(state.gravity))

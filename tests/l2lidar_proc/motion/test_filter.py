@@ -164,9 +164,15 @@ def test_the_prior_touches_only_a_velocity_that_is_hardly_known() -> None:
     slowed, covariance = eskf.apply_zero_velocity_prior(state, loose, 1.0, 0.0)
     np.testing.assert_allclose(slowed.velocity, 0.5 * state.velocity, atol=1e-9)
     assert covariance[6, 6] == pytest.approx(0.5)
-    # however fast a carrier seems to be, a velocity that is not known at all is not believed
-    slowed, _ = eskf.apply_zero_velocity_prior(state, 1.01 * loose, 1.0, 1000.0)
-    assert np.linalg.norm(slowed.velocity) < 0.51 * np.linalg.norm(state.velocity)
+    # nor does one that drives, until its velocity is known worse than it has ever driven
+    drives = tuning.DRIVING_SPEED + 0.1
+    known = np.eye(eskf.ERRORS) * (0.99 * drives) ** 2
+    level = dataclasses.replace(state, gravity=np.zeros(3))
+    assert eskf.apply_zero_velocity_prior(level, known, 1.0, drives)[0] is level
+    slowed, _ = eskf.apply_zero_velocity_prior(level, 1.1 * known, 1.0, drives)
+    assert np.linalg.norm(slowed.velocity) < 0.6 * np.linalg.norm(level.velocity)
+    crawls = tuning.DRIVING_SPEED - 0.1
+    assert eskf.apply_zero_velocity_prior(level, known, 1.0, crawls)[0] is not level
 
 
 def test_a_minute_of_the_prior_brakes_no_drive_but_ends_a_climb() -> None:
