@@ -135,6 +135,25 @@ WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above th
 WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller
 WEAK_STEPS: Final = 2  # iterations with the weak directions known
 WEAK_LEAST_ARM: Final = 0.3  # [m] however near the points are
+# The same where the carrier drives along them. Tuned on: seeds 0 to 5 of the hard corridors. Most
+# cells there that seem to face along the corridor and do not have fewer than 20 points of 2 to 5
+# sweeps, and normals 20 to 45 degrees off at a scatter of 3 to 15 mm. With the scatter below they
+# are 2 to 5 sigma from the wall's normal, reveals of doors more than 15.
+DRIVING_WAY: Final = 0.9  # of a direction's unit is place, not turn
+DRIVING_SLOPE: Final = 0.5  # sine of it against the horizontal
+DRIVING_AGE: Final = 3  # as WEAK_AGE
+DRIVING_POINTS: Final = 1600  # of a sweep; with fewer, it is thinned by
+DRIVING_VOXEL: Final = 0.5  # of source_voxel
+FACING_VOXEL: Final = 0.25  # of source_voxel: what faces the direction
+FACING_SIGMAS: Final = 5.0  # of the error of its normal, by which a surface faces a direction
+NORMAL_SCATTER: Final = 0.015  # [m] of points about their plane, at least: few happen to lie flat
+NORMAL_LEAST_EXTENT: Final = 0.001  # [m] Derived: keeps a division finite
+NORMAL_KNOWN: Final = 0.02  # [rad] from here on, a normal's error lowers its weight
+WALL_ROUNDS: Final = 2  # in which what faces the direction is left out
+WALL_LEAST: Final = 0.2  # share of the points that must be left
+WALL_BLEND: Final = 0.95  # share of the scatter that is left at each sweep: 4 s
+WALL_BEND: Final = 0.2  # [rad] between the sweep's direction and the steady one: a corner
+WALL_FLAT: Final = 0.1  # of the scatter's second eigenvalue: below it the first is a direction
 # Range noise of two captures of a real unit, along lines of smooth surface: 10-13 mm to 10 m,
 # 17 mm to 15 m, 24-30 mm to 25 m. A floor of 10 mm and a part linear in range fit that within
 # 2 mm. The floor is part of the parameter point_noise, whose size hides the rest: half or double

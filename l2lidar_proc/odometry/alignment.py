@@ -1,11 +1,14 @@
 """Scan alignment: iterated update of the filter with point-to-plane residuals.
 
 Directions that a sweep does not fix are found once it has converged
-(:mod:`~l2lidar_proc.odometry.weak_directions`)."""
+(:mod:`~l2lidar_proc.odometry.weak_directions`).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +34,13 @@ from l2lidar_proc.odometry.correspondences import (
     residual_jacobian,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry.weak_directions import Views, WeakDirections, weak_directions
+from l2lidar_proc.odometry.weak_directions import (
+    Views,
+    WeakAxes,
+    WeakDirections,
+    weak_axes,
+    weak_directions,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +74,9 @@ class Alignment:
         Points near surfaces of the finest cells.
     fine_ratio : float
         Share of the points in such cells that these are, 0 to 1.
+    scatter : ndarray, shape (3, 3), optional
+        Of the walls along which the carrier drives, as in
+        :class:`~l2lidar_proc.odometry.weak_directions.WeakAxes`.
     """
 
     state: InertialState
@@ -80,6 +92,7 @@ class Alignment:
     strongly: tuple[tuple[F64, Support], ...] = ()
     fine_inliers: int = 0
     fine_ratio: float = 0.0
+    scatter: F64 | None = None
 
 
 def align(
@@ -90,6 +103,7 @@ def align(
     config: SurfaceConfig,
     least: int,
     start: InertialState | None = None,
+    scatter: F64 | None = None,
 ) -> Alignment | None:
     """Return the posterior of a sweep, None where fewer than ``least`` points meet a surface.
 
@@ -108,6 +122,8 @@ def align(
     least : int
     start : InertialState, optional
         Where to begin instead of the prior.
+    scatter : ndarray, shape (3, 3), optional
+        That of the sweep before, zero if it has none; None where the carrier does not drive.
     """
     at = prior if start is None else start
     root = square_root(covariance)
@@ -123,14 +139,14 @@ def align(
         step = _step(prior, root, at, found, weak, number + 1)
         done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
-
-            def match_again(views: Views, reach: float = reach) -> list[Correspondences]:
-                seen = [(moved, source.some(some)) for moved, some in views]
-                return correspondences_of(seen, prior, surfaces, config, reach)
-
-            weak = weak_directions(at, found, match_again)
-            if weak is None:
+            axes = weak_axes(at, found, surfaces, scatter)
+            if axes is None:
                 break
+            views = _Views(prior, surfaces, config, reach)
+            if axes.scatter is not None:
+                source = views.with_facing(source, at, axes)
+                found = views.of([(at, source)])[0]
+            weak = weak_directions(at, found, axes, partial(views.of_some, source))
             before = step.state
             step = _step(prior, root, at, found, weak, number + 1)
             done = _is_small(step.state.boxminus(before))
@@ -139,6 +155,35 @@ def align(
             break
         at = step.state
     return None if step is None else step.alignment
+
+
+class _Views(NamedTuple):
+    """How the points of a sweep are matched with the map, from whatever state."""
+
+    prior: InertialState
+    surfaces: SurfelMap
+    config: SurfaceConfig
+    reach: float
+
+    def of(self, seen: Sequence[tuple[InertialState, Source]]) -> list[Correspondences]:
+        """Return the correspondences of several states and sources."""
+        return correspondences_of(seen, self.prior, self.surfaces, self.config, self.reach)
+
+    def of_some(self, source: Source, views: Views) -> list[Correspondences]:
+        """Return the correspondences of several states, each with some of the points."""
+        return self.of([(state, source.some(index)) for state, index in views])
+
+    def with_facing(self, source: Source, at: InertialState, weak: WeakAxes) -> Source:
+        """Return a source with all that its sweep has of surfaces that face the weakest direction.
+
+        The reveals of doors and niches are a hand wide: of these, thinning leaves a point or two.
+        """
+        if source.denser is None:
+            return source
+        more = source.denser()
+        found = self.of([(at, more)])[0]
+        facing = weak.faces(0, at, found, weak.levers(at, found)[:, 0])
+        return source.extended(more.some(np.unique(found.index[facing])))
 
 
 class _Step(NamedTuple):
@@ -150,6 +195,7 @@ class _Step(NamedTuple):
     normals: F64  # derivatives (M, 3) of the residuals by the place
     found: Correspondences
     number: int
+    weak: WeakDirections | None
 
     @property
     def alignment(self) -> Alignment:
@@ -170,6 +216,7 @@ class _Step(NamedTuple):
             tuple((axis, found.places_along(self.normals @ axis)) for axis in others),
             found.fine_inliers,
             found.fine_inliers / max(found.met_fine, 1),
+            None if self.weak is None else self.weak.weak.scatter,
         )
 
 
@@ -184,14 +231,14 @@ def _step(
     """Return the posterior of correspondences found from a state."""
     pose = pose_jacobian(found, at.rotation)
     if weak is not None:
-        pose = weak.reduced(pose, found.is_settled)
+        pose = weak.reduced(pose, weak.weak.facing(at, found))
     h = residual_jacobian(pose, found.times, at.rotation)
     weighted = h * found.weights[:, None]
     information = weighted.T @ h
     state, posterior = update_with_information(
         prior, root, at, information, -(weighted.T @ found.distances)
     )
-    return _Step(state, posterior, information, pose[:, 3:], found, number)
+    return _Step(state, posterior, information, pose[:, 3:], found, number, weak)
 
 
 def _is_small(change: F64) -> bool:

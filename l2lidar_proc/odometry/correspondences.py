@@ -7,7 +7,7 @@ linearly in dt: so a sweep corrects the motion within itself as well as its plac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,11 +45,22 @@ class Source:
         Instant of each point after the reference [s], negative before it.
     ranges : ndarray, shape (N,)
         [m]
+    denser : callable, optional
+        Gives more points of the same sweep, which thinning has left out.
     """
 
     points: F64
     times: F64
     ranges: F64
+    denser: Callable[[], Source] | None = None
+
+    def extended(self, more: Source) -> Source:
+        """Return these and more points."""
+        return Source(
+            np.concatenate((self.points, more.points)),
+            np.concatenate((self.times, more.times)),
+            np.concatenate((self.ranges, more.ranges)),
+        )
 
     def some(self, index: I64) -> Source:
         """Return the points of some indices."""
@@ -84,6 +95,8 @@ class Correspondences:
         Number of the sweep that opened the surface itself.
     is_fine : ndarray, shape (M,)
         Whether the surface is that of one of the finest cells.
+    cells, axis : ndarray, shape (M,)
+        Of the surfaces, as in :class:`~l2lidar_proc.odometry.surfel_map.Matches`.
     met : int
         Points at known surfaces, near or not.
     met_fine : int
@@ -103,6 +116,8 @@ class Correspondences:
     born: I64
     opened: I64
     is_fine: NDArray[np.bool_]
+    cells: I64
+    axis: I64
     met: int
     met_fine: int
     latest: int
@@ -122,6 +137,8 @@ class Correspondences:
             self.born[some],
             self.opened[some],
             self.is_fine[some],
+            self.cells[some],
+            self.axis[some],
             met,
             met_fine,
             self.latest,
@@ -152,10 +169,9 @@ class Correspondences:
         """Sweeps that were the first where the surfaces are, and their shares of the weight."""
         return _support(self.born, self.weights)
 
-    @property
-    def is_settled(self) -> NDArray[np.bool_]:
-        """Which surfaces are in the map for some sweeps already, shape (M,)."""
-        age = min(tuning.WEAK_AGE, self.latest // 2)  # a young map has no old ones
+    def settled(self, age: int) -> NDArray[np.bool_]:
+        """Return which surfaces are in the map for so many sweeps already, shape (M,)."""
+        age = min(age, self.latest // 2)  # a young map has no old ones
         return np.asarray(self.latest - self.opened >= age)
 
     def support_along(self, levers: F64) -> Support:
@@ -259,6 +275,8 @@ def correspondences_of(
         matches.born[near],
         matches.opened[near],
         matches.is_fine[near],
+        matches.cells[near],
+        matches.axis[near],
         len(near),
         int(np.count_nonzero(matches.is_fine)),
         surfaces.latest,

@@ -76,6 +76,8 @@ class SweepMatcher:
     kiss : KissMatcher
     drift : MapDrift
         How wrong the map may be where the latest sweep is.
+    driving : bool
+        Whether the carrier is one that drives, not one moved by hand.
     """
 
     def __init__(self, config: OdometryConfig, lever: F64) -> None:
@@ -90,6 +92,7 @@ class SweepMatcher:
         )
         self.kiss = KissMatcher(config)
         self.drift = MapDrift()
+        self.driving = False
         self._pruned_at = np.zeros(3)
         self._begin_way()
 
@@ -100,6 +103,8 @@ class SweepMatcher:
         self._oldest = 0  # sweep from which on places are still in the map
         self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
         self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
+        self._scatter: F64 = np.zeros((3, 3))  # of the walls along which the carrier drives
+        self._is_weak = False  # along them, in the latest sweep
 
     @property
     def is_young(self) -> bool:
@@ -120,8 +125,20 @@ class SweepMatcher:
     def source(self, sweep: Sweep, motion: SweepMotion) -> Source:
         """Return the points to align, deskewed along a predicted motion."""
         # thinned before they are moved: a tenth of the points is left to deskew
-        chosen = thinned_indices(xyz(sweep.points), self.config.surfaces.source_voxel)
-        chosen = chosen[:: max(-(-len(chosen) // self.config.surfaces.source_points), 1)]
+        settings, points = self.config.surfaces, xyz(sweep.points)
+        chosen = thinned_indices(points, settings.source_voxel)
+        if self._is_weak and len(chosen) < tuning.DRIVING_POINTS:
+            chosen = thinned_indices(points, tuning.DRIVING_VOXEL * settings.source_voxel)
+        chosen = chosen[:: max(-(-len(chosen) // settings.source_points), 1)]
+
+        def denser() -> Source:
+            dense = thinned_indices(points, tuning.FACING_VOXEL * settings.source_voxel)
+            return self._source(sweep, np.setdiff1d(dense, chosen), motion)
+
+        return dataclasses.replace(self._source(sweep, chosen, motion), denser=denser)
+
+    def _source(self, sweep: Sweep, chosen: NDArray[np.int64], motion: SweepMotion) -> Source:
+        """Return some points of a sweep, deskewed along a motion."""
         some = records.selected(sweep.points, chosen)
         moved = coordinates(some, sweep.start, motion.trajectory(self.lever), motion.state.stamp)
         points = np.stack(moved, axis=1).astype(np.float64)
@@ -237,6 +254,9 @@ class SweepMatcher:
         seconds : float
             Since the sweep before.
         """
+        self._is_weak = found.scatter is not None
+        if found.scatter is not None:
+            self._scatter = found.scatter
         free = unobserved_directions(found.information[POSITION, POSITION])
         if not free.size:
             self.drift.meet(found.support, found.state.position, found.weakly, found.strongly)
@@ -340,6 +360,7 @@ class SweepMatcher:
             self.config.surfaces,
             least,
             start,
+            self._scatter if self.driving else None,
         )
 
     def _placed(self, source: Source, motion: SweepMotion, most: float) -> Alignment:

@@ -256,6 +256,7 @@ class Odometry:
         peak = eskf.peak_speed_after(self._peak_speed, after, covariance, lasted)
         posterior = eskf.apply_zero_velocity_prior(after, covariance, lasted, peak)
         self._peak_speed = peak
+        self.matcher.driving = peak > tuning.DRIVING_SPEED
         posterior = eskf.with_gravity_of_known_size(*posterior)
         way = float(np.linalg.norm(posterior[0].position - before.position))
         lean = way * tuning.MAP_BEND**2

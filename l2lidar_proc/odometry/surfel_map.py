@@ -228,6 +228,10 @@ class Matches:
     is_fine : ndarray, shape (M,)
         Whether that cell is one of the finest: what lies in a coarse one off its surface may be
         new, what lies in a fine one contradicts it.
+    cells : ndarray, shape (M,)
+        The cells of the surfaces, as :meth:`SurfelMap.tilts` takes them; until the map changes.
+    axis : ndarray, shape (M,)
+        Which of its cell's axes a surface's normal is.
     """
 
     index: I64
@@ -238,6 +242,8 @@ class Matches:
     born: I64
     opened: I64
     is_fine: NDArray[np.bool_]
+    cells: I64
+    axis: I64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -485,10 +491,37 @@ class SurfelMap:
         return _matches(
             points,
             np.concatenate(indices),
+            row,
             records.selected(self._cells, row),
             axis,
             self._kind[row],
         )
+
+    def tilts(self, cells: I64, axis: I64) -> F64:
+        """Return how far normals may be tilted towards each axis of their cells, 1 sigma.
+
+        A plane fitted to points of extent l and scatter s is tilted by s / l / sqrt(n) (the first
+        order of the eigenvectors' errors). The sweeps are counted, not the points: those of one
+        sweep err together.
+
+        Parameters
+        ----------
+        cells, axis : ndarray, shape (M,)
+            Of :class:`Matches`; the map must not have changed since.
+
+        Returns
+        -------
+        ndarray, shape (M, 3, 3)
+            Row i is the cell's axis i, as long as the normal's tilt towards it [rad]; zero for
+            the normal itself.
+        """
+        some = records.selected(self._cells, cells)
+        each = np.arange(len(cells))
+        spread = some["spread"]
+        across = np.maximum(spread[each, axis], tuning.NORMAL_SCATTER**2) / some["sweeps"]
+        angles = np.sqrt(across[:, None] / np.maximum(spread, tuning.NORMAL_LEAST_EXTENT**2))
+        angles[each, axis] = 0.0
+        return np.asarray(some["axes"] * angles[:, :, None])
 
     def _rows(self, points: F64, levels: slice) -> I64:
         """Return the rows of the cells of some levels that points (N, 3) lie in, (L, N)."""
@@ -634,7 +667,12 @@ def _taken(rows: I64, wanted: NDArray[np.bool_], index: I64) -> Iterator[tuple[I
 
 
 def _matches(
-    points: F64, index: I64, cells: NDArray[np.void], axis: I64, kind: NDArray[np.int8]
+    points: F64,
+    index: I64,
+    rows: I64,
+    cells: NDArray[np.void],
+    axis: I64,
+    kind: NDArray[np.int8],
 ) -> Matches:
     """Return how far some points are from the middles of their cells (M,) along axes (M,)."""
     offset = points[index] - cells["mean"]
@@ -654,6 +692,8 @@ def _matches(
         cells["born"],
         cells["opened"],
         cells["key"] >> 3 * _BITS < tuning.FINE_LEVELS,
+        rows,
+        axis,
     )
 
 

@@ -11,6 +11,15 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
+
+A carrier that drives leaves the rims of its view behind, and what is wrong by its velocity adds up
+soon. There, three things are stricter, and in turn surfaces count sooner:
+
+* a surface faces the direction only if the error of its own normal cannot explain that;
+* the direction is that of the walls: what faces it is left out, and normals count as well as they
+  are known;
+* it is steadied over the last sweeps. One that differs from sweep to sweep lets the strong
+  directions speak about it.
 """
 
 from __future__ import annotations
@@ -30,6 +39,7 @@ from l2lidar_proc.odometry.correspondences import (
     pose_jacobian,
     robust_weights,
 )
+from l2lidar_proc.odometry.surfel_map import SurfelMap
 
 Views = Sequence[tuple[InertialState, NDArray[np.int64]]]
 """States, and which of the source's points are seen from each."""
@@ -39,6 +49,160 @@ MatchAgain = Callable[[Views], list[Correspondences]]
 
 
 _STEPS: Final = (tuning.WEAK_STEP, -tuning.WEAK_STEP)
+_PLACE: Final = slice(3, 6)  # of a direction
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeakAxes:
+    """Directions of the pose that are weak by the eigenvalues.
+
+    Attributes
+    ----------
+    scale : ndarray, shape (6,)
+        Errors of turn and place [rad, m] for a unit of a direction.
+    axes : ndarray, shape (6, K)
+        The directions, orthonormal in these units, weakest first.
+    surfaces : SurfelMap
+    scatter : ndarray, shape (3, 3), optional
+        Of the walls' normals, map axes, in this sweep and those before; None where the carrier
+        does not drive along the weakest direction.
+    """
+
+    scale: F64
+    axes: F64
+    surfaces: SurfelMap
+    scatter: F64 | None = None
+
+    def levers(self, state: InertialState, found: Correspondences) -> F64:
+        """Return the derivatives (M, K) of the residuals by the directions."""
+        return np.asarray((pose_jacobian(found, state.rotation) * self.scale) @ self.axes)
+
+    def facing(self, state: InertialState, found: Correspondences) -> NDArray[np.bool_]:
+        """Return which surfaces face each of the directions (M, K)."""
+        levers = self.levers(state, found)
+        return np.stack(
+            [self.faces(k, state, found, along) for k, along in enumerate(levers.T)], axis=1
+        )
+
+    def faces(
+        self, number: int, state: InertialState, found: Correspondences, levers: F64
+    ) -> NDArray[np.bool_]:
+        """Return which surfaces (M,) face a direction, so that they tell the place along it.
+
+        Parameters
+        ----------
+        number : int
+            Of the direction.
+        state : InertialState
+            From which the correspondences were found.
+        found : Correspondences
+        levers : ndarray, shape (M,)
+            Derivatives of the residuals along the direction.
+        """
+        age = tuning.WEAK_AGE if self.scatter is None else tuning.DRIVING_AGE
+        faces = (np.abs(levers) > tuning.WEAK_FACING) & found.settled(age)
+        if self.scatter is None:
+            return faces
+        some = np.flatnonzero(faces)
+        axis = self.scale * self.axes[:, number]
+        moves = np.cross(axis[:3], found.points[some]) @ state.rotation.T + axis[_PLACE]
+        tilts = self.surfaces.tilts(found.cells[some], found.axis[some])
+        sigma = np.linalg.norm(np.einsum("nij,nj->ni", tilts, moves), axis=1)
+        faces[some] = np.abs(levers[some]) > tuning.FACING_SIGMAS * sigma
+        return faces
+
+
+def weak_axes(
+    state: InertialState,
+    found: Correspondences,
+    surfaces: SurfelMap,
+    scatter: F64 | None = None,
+) -> WeakAxes | None:
+    """Return the directions that a sweep may not fix, None where it fixes all.
+
+    Parameters
+    ----------
+    state : InertialState
+        From which the correspondences were found.
+    found : Correspondences
+    surfaces : SurfelMap
+    scatter : ndarray, shape (3, 3), optional
+        As in :class:`WeakAxes`, of the sweeps before; None where the carrier does not drive.
+    """
+    # a turn counts as the way that it moves the points
+    arm = float(np.sqrt((found.points**2).sum(axis=1).mean()))
+    scale = np.repeat((1.0 / max(arm, tuning.WEAK_LEAST_ARM), 1.0), 3)
+    levers = pose_jacobian(found, state.rotation) * scale
+    strength, axes = np.linalg.eigh((levers * found.weights[:, None]).T @ levers)
+    weak = strength < tuning.WEAK_SHARE * strength[-1]
+    if not weak.any():
+        return None
+    axes = axes[:, weak]
+    if scatter is None or not _is_way(axes[:, 0], state.gravity):
+        return WeakAxes(scale, axes, surfaces)
+    tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
+    weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
+    axes = _along_walls(axes, levers, weights)
+    axes, scatter = _steadied(axes, found.normals, weights, scatter)
+    return WeakAxes(scale, axes, surfaces, scatter)
+
+
+def _is_way(axis: F64, gravity: F64) -> bool:
+    """Return whether a direction (6,) is a way that one may drive, not a turn, nor up."""
+    way = axis[_PLACE]
+    size = float(np.linalg.norm(gravity))
+    level = abs(float(way @ gravity)) < tuning.DRIVING_SLOPE * size
+    return level and float(np.linalg.norm(way)) > tuning.DRIVING_WAY
+
+
+def _along_walls(axes: F64, levers: F64, weights: F64) -> F64:
+    """Return the weak directions (6, K) without the surfaces that face the weakest.
+
+    Parameters
+    ----------
+    axes : ndarray, shape (6, K)
+    levers : ndarray, shape (M, 6)
+        Derivatives of the residuals by turn and place, scaled.
+    weights : ndarray, shape (M,)
+        The better a normal is known, the more.
+    """
+    for _ in range(tuning.WALL_ROUNDS):
+        walls = np.abs(levers @ axes[:, 0]) < tuning.WEAK_FACING
+        if np.count_nonzero(walls) < tuning.WALL_LEAST * len(walls):
+            break
+        some = levers[walls]
+        directions = np.linalg.eigh((some * weights[walls, None]).T @ some)[1]
+        axes = directions[:, : axes.shape[1]]
+    return axes
+
+
+def _steadied(axes: F64, normals: F64, weights: F64, before: F64) -> tuple[F64, F64]:
+    """Return the weak directions, the weakest steadied, and the scatter of the walls' normals.
+
+    Parameters
+    ----------
+    axes : ndarray, shape (6, K)
+    normals : ndarray, shape (M, 3)
+    weights : ndarray, shape (M,)
+    before : ndarray, shape (3, 3)
+        Scatter of the sweeps before.
+    """
+    way = axes[_PLACE, 0]
+    length = float(np.linalg.norm(way))
+    if length < tuning.DRIVING_WAY:
+        return axes, before
+    way = way / length
+    walls = np.abs(normals @ way) < tuning.WEAK_FACING
+    now = (normals[walls] * weights[walls, None]).T @ normals[walls]
+    scatter = tuning.WALL_BLEND * before + now
+    strength, directions = np.linalg.eigh(scatter)
+    steady = directions[:, 0] * np.sign(directions[:, 0] @ way)
+    bent = steady @ way < np.cos(tuning.WALL_BEND)
+    if bent or strength[0] > tuning.WALL_FLAT * strength[1]:
+        return axes, now
+    first = np.r_[np.zeros(3), steady]
+    others = np.linalg.qr(np.column_stack((first, axes[:, 1:])))[0][:, 1:]
+    return np.column_stack((first, others)), scatter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,79 +211,64 @@ class WeakDirections:
 
     Attributes
     ----------
-    scale : ndarray, shape (6,)
-        Errors of turn and place [rad, m] for a unit of a direction.
-    axes : ndarray, shape (6, K)
-        The directions, orthonormal in these units.
+    weak : WeakAxes
     shares : ndarray, shape (K,)
         How much of what facing surfaces claim is real, 0 to 1.
     """
 
-    scale: F64
-    axes: F64
+    weak: WeakAxes
     shares: F64
 
-    def reduced(self, pose: F64, is_settled: NDArray[np.bool_]) -> F64:
+    def reduced(self, pose: F64, facing: NDArray[np.bool_]) -> F64:
         """Return derivatives (M, 6) by turn and place, of residuals that claim no more than so.
 
-        ``is_settled`` (M,) tells whose surfaces are no longer new.
+        ``facing`` (M, K) tells which surfaces face which direction.
 
         A residual of which the share f is real measures 1/f times as coarsely: information falls
         by f^2 and the gradient by f, so that where it is zero stays.
         """
-        scaled = pose * self.scale
-        along = scaled @ self.axes
-        facing = (np.abs(along) > tuning.WEAK_FACING) & is_settled[:, None]
-        lost = along * np.where(facing, 1.0 - self.shares, 1.0)
-        return np.asarray((scaled - lost @ self.axes.T) / self.scale)
+        scale, axes = self.weak.scale, self.weak.axes
+        scaled = pose * scale
+        lost = (scaled @ axes) * np.where(facing, 1.0 - self.shares, 1.0)
+        return np.asarray((scaled - lost @ axes.T) / scale)
 
 
 def weak_directions(
-    state: InertialState, found: Correspondences, match_again: MatchAgain
-) -> WeakDirections | None:
-    """Return the directions that a sweep hardly fixes, None where it fixes all.
+    state: InertialState, found: Correspondences, weak: WeakAxes, match_again: MatchAgain
+) -> WeakDirections:
+    """Return how much of what is claimed about some directions a sweep confirms.
 
     Parameters
     ----------
     state : InertialState
         From which the correspondences were found.
     found : Correspondences
+    weak : WeakAxes
     match_again : callable
     """
-    pose = pose_jacobian(found, state.rotation)
-    # a turn counts as the way that it moves the points
-    arm = float(np.sqrt((found.points**2).sum(axis=1).mean()))
-    scale = np.repeat((1.0 / max(arm, tuning.WEAK_LEAST_ARM), 1.0), 3)
-    scaled = pose * scale
-    strength, axes = np.linalg.eigh((scaled * found.weights[:, None]).T @ scaled)
-    weak = strength < tuning.WEAK_SHARE * strength[-1]
-    if not weak.any():
-        return None
-    axes = axes[:, weak]
-    trials = [_Trial(state, found, scaled @ axis, scale * axis) for axis in axes.T]
+    trials = [_Trial(state, found, weak, number) for number in range(weak.axes.shape[1])]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
-    return WeakDirections(scale, axes, shares)
+    return WeakDirections(weak, shares)
 
 
 class _Trial:
-    """A sweep moved both ways along a direction (6,) of the pose [rad, m].
-
-    ``levers`` (M,) are the derivatives of the residuals along it.
-    """
+    """A sweep moved both ways along one of some weak directions."""
 
     def __init__(
-        self, state: InertialState, found: Correspondences, levers: F64, axis: F64
+        self, state: InertialState, found: Correspondences, weak: WeakAxes, number: int
     ) -> None:
-        self._axis = axis
-        facing = np.flatnonzero((np.abs(levers) > tuning.WEAK_FACING) & found.is_settled)
+        self._weak, self._number = weak, number
+        self._axis = weak.scale * weak.axes[:, number]  # [rad, m]
+        levers = pose_jacobian(found, state.rotation) @ self._axis
+        facing = np.flatnonzero(weak.faces(number, state, found, levers))
         self._facing = levers[facing], found.distances[facing], found.scales[facing]
         self._variances = found.variances[facing]
         self._some = np.unique(found.index[facing])
         move = np.zeros(ERRORS)
         self._moved = []
         for step in _STEPS if len(facing) else ():
-            move[POSE] = step * axis
+            move[POSE] = step * self._axis
             self._moved.append(state.boxplus(move))
 
     @property
@@ -138,7 +287,7 @@ class _Trial:
             )
             along = pose_jacobian(seen, moved.rotation) @ self._axis
             pulls = seen.weights * along * seen.distances
-            pulls = pulls[(np.abs(along) > tuning.WEAK_FACING) & seen.is_settled]
+            pulls = pulls[self._weak.faces(self._number, moved, seen, along)]
             pulled += step * float(pulls.sum())
             noise += step**2 * float((pulls**2).sum())
         if claimed <= 0.0:

@@ -23,7 +23,7 @@ from l2lidar_proc.odometry.correspondences import (
     residual_jacobian,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry.weak_directions import WeakDirections, weak_directions
+from l2lidar_proc.odometry.weak_directions import WeakAxes, WeakDirections, weak_axes
 from tests.l2lidar_proc.odometry.odometry_world import drive, errors, recording
 
 ZERO = np.zeros(3)
@@ -193,34 +193,24 @@ def test_all_is_kept_where_the_scene_fixes_the_pose() -> None:
         surfaces.add(box(), number)
     source = source_of(box(), np.zeros(6000))
 
-    def match_again(state: InertialState, some: np.ndarray) -> object:
-        raise AssertionError("nothing is weak")
-
     found = correspondences(still(), still(), source, surfaces, SurfaceConfig(), 0.15)
-    assert weak_directions(still(), found, match_again) is None  # type: ignore[arg-type]
+    assert weak_axes(still(), found, surfaces) is None
 
 
 def test_reduced_derivatives_scale_information_by_the_square_of_the_share() -> None:
     rng = np.random.default_rng(1)
     scale = np.repeat((0.5, 1.0), 3)
     axes, _ = np.linalg.qr(rng.normal(size=(6, 6)))
-    shares = np.array([0.0, 0.5])
-    weak = WeakDirections(scale, axes[:, :2], shares)
-    pose = rng.normal(size=(200, 6)) * 3.0  # all of them face both directions
-    along = (pose * scale) @ axes
-    pose = pose[(np.abs(along[:, :2]) > tuning.WEAK_FACING).all(axis=1)]
-    settled = np.ones(len(pose), np.bool_)
-    before, after = (pose * scale) @ axes, (weak.reduced(pose, settled) * scale) @ axes
+    weak = WeakDirections(WeakAxes(scale, axes[:, :2], SurfelMap(SIZES)), np.array([0.0, 0.5]))
+    pose = rng.normal(size=(200, 6)) * 3.0
+    facing = np.ones((len(pose), 2), np.bool_)
+    before, after = (pose * scale) @ axes, (weak.reduced(pose, facing) * scale) @ axes
     np.testing.assert_allclose(after[:, 0], 0.0, atol=1e-12)
     np.testing.assert_allclose(after[:, 1], 0.5 * before[:, 1])
     np.testing.assert_allclose(after[:, 2:], before[:, 2:])
-    # residuals that hardly face a direction say nothing of it, whatever the share
-    slight = (axes[:, 3] + 0.1 * axes[:, 1]) / scale
-    reduced = weak.reduced(slight[None], settled[:1]) * scale @ axes
-    assert reduced[0, 1] == pytest.approx(0.0, abs=1e-12)
-    # nor do surfaces that are new
-    new = (weak.reduced(pose, ~settled) * scale) @ axes
-    np.testing.assert_allclose(new[:, :2], 0.0, atol=1e-12)
+    # residuals that do not face a direction say nothing of it, whatever the share
+    after = (weak.reduced(pose, ~facing) * scale) @ axes
+    np.testing.assert_allclose(after[:, :2], 0.0, atol=1e-12)
 
 
 def test_derivatives_by_all_errors_are_those_of_the_residuals() -> None:

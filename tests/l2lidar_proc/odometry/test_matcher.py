@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node import rotations
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
@@ -242,3 +242,44 @@ def test_a_scene_with_strays_lowers_what_is_needed_after_a_loose_prediction() ->
     assert 0.75 < usual < tuning.INLIER_RATIO[True]
     assert off(matcher.match(rainy(0.2), loose)) < 0.02
     assert matcher.match(rainy(0.7), loose).alignment is None
+
+
+def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
+    """What faces the way along a corridor is small; of it, thinning must leave something."""
+    rng, matcher = np.random.default_rng(21), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def corridor(count: int) -> F64:
+        points = rng.uniform((-4.0, -1.2, -1.0), (4.0, 1.2, 1.0), (count, 3))
+        side = rng.integers(0, 3, count)
+        points[side == 0, 1], points[side == 1, 1], points[side == 2, 2] = -1.2, 1.2, -1.0
+        return np.asarray(points + rng.normal(0.0, 0.01, points.shape))
+
+    def sweep(points: F64) -> Sweep:
+        cloud = np.zeros(len(points), [(axis, "<f4") for axis in ("x", "y", "z", "time")])
+        cloud["x"], cloud["y"], cloud["z"] = points.T
+        return Sweep(EPOCH, HostNs(EPOCH + 200_000_000), cloud, 1, 0)
+
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, corridor(4000))
+    at = motion(TIGHT, np.zeros(3))
+    sparse, dense = sweep(corridor(2000)), sweep(corridor(30_000))
+
+    def kept(some: Sweep) -> int:
+        found = matcher.source(some, at)
+        alignment = matcher.match(found, at).alignment
+        assert alignment is not None
+        matcher.meet(alignment, 0.2)
+        return len(found.points)
+
+    first = [kept(one) for one in (sparse, sparse, dense)]
+    assert first[0] == first[1] < tuning.DRIVING_POINTS < first[2]
+    matcher.driving = True
+    driven = [kept(one) for one in (sparse, sparse, dense)]
+    assert driven[0] == first[0]  # nothing has been seen to be weak yet
+    assert driven[1] > 1.2 * first[1]
+    assert driven[2] == first[2]
+    # thinning leaves nothing out twice
+    found = matcher.source(sparse, at)
+    assert found.denser is not None
+    both = np.vstack((found.points, found.denser().points))
+    assert len(np.unique(both, axis=0)) == len(both) > len(found.points)

@@ -120,9 +120,11 @@ def test_a_drive_goes_on_while_nothing_is_seen() -> None:
     run = driven_round(11.5, 1.6)
     some = list(sweeps(run, "turn"))
     some[24:] = [dataclasses.replace(one, points=one.points[:3]) for one in some[24:]]
-    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, some)
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some)
     assert not any(item.is_aligned for item in estimates[24:])
     assert errors(run, estimates[:46]).max() < 0.5  # 0.8 m if it counts as slow
+    assert odometry.matcher.driving
 
 
 def _placed(estimate: OdometryEstimate) -> Any:

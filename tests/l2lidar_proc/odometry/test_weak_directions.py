@@ -1,0 +1,207 @@
+"""Weak directions of a carrier that drives: whose normals count, and which way is weak."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc import tuning
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.odometry.alignment import Alignment, align
+from l2lidar_proc.odometry.config import SurfaceConfig
+from l2lidar_proc.odometry.correspondences import Source, correspondences
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.weak_directions import WeakAxes, weak_axes
+
+SIZES = (0.15, 0.3, 0.6, 1.5)
+REACH = 0.15
+NOTHING = np.zeros((3, 3))  # scatter of no sweep
+
+
+def at(*place: float) -> InertialState:
+    zero = np.zeros(3)
+    down = np.array([0.0, 0.0, -9.8])
+    where = np.array(place) if place else zero
+    return InertialState(HostNs(0), np.eye(3), where, zero, zero, zero, down)
+
+
+def source(points: F64) -> Source:
+    return Source(points, np.zeros(len(points)), np.linalg.norm(points, axis=1))
+
+
+def walls(rng: np.random.Generator, count: int, turn: float = 0.0) -> F64:
+    """Return points of two walls and a floor along x, turned about z by an angle."""
+    points = rng.uniform((-4.0, -1.2, -1.0), (4.0, 1.2, 1.5), (count, 3))
+    kind = rng.integers(0, 3, count)
+    points[kind == 0, 1], points[kind == 1, 1], points[kind == 2, 2] = -1.2, 1.2, -1.0
+    points += 0.01 * rng.standard_normal(points.shape)
+    c, s = np.cos(turn), np.sin(turn)
+    return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def reveals(rng: np.random.Generator, count: int) -> F64:
+    """Return points of three strips at a wall that face along x."""
+    strips = [
+        rng.uniform((x, 0.7, -0.9), (x, 1.15, 1.4), (count // 3, 3)) for x in (-2.02, 0.52, 2.92)
+    ]
+    points = np.vstack(strips)
+    points[:, 0] += 0.01 * rng.standard_normal(len(points))
+    return points
+
+
+def mapped(rng: np.random.Generator, sweeps: int = 12, *, facing: int = 0) -> SurfelMap:
+    """Return a map of the corridor, with so many points of reveals in each sweep."""
+    surfaces = SurfelMap(SIZES)
+    for number in range(sweeps):
+        surfaces.add(np.vstack((walls(rng, 4000), reveals(rng, facing))), number)
+    return surfaces
+
+
+def weak_in(
+    surfaces: SurfelMap, points: F64, scatter: F64 | None, state: InertialState | None = None
+) -> WeakAxes:
+    state = at() if state is None else state
+    found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    weak = weak_axes(state, found, surfaces, scatter)
+    assert weak is not None
+    return weak
+
+
+@pytest.mark.parametrize("count", [8, 40])
+def test_tilts_are_the_errors_of_fitted_normals(count: int) -> None:
+    """One point in each sweep, so that the errors are independent.
+
+    A plane through few points takes up some of their scatter, so their tilts come out smaller.
+    """
+    rng, noise = np.random.default_rng(3), 1.5 * tuning.NORMAL_SCATTER
+    angles, expected = [], []
+    for _ in range(300):
+        surfaces = SurfelMap((1.0,), thickness=0.1)
+        points = rng.uniform((0.1, 0.1, 0.5), (0.9, 0.5, 0.5), (count, 3))
+        points[:, 2] += noise * rng.standard_normal(count)
+        for number, point in enumerate(points):
+            surfaces.add(point[None], number)
+        met = surfaces.match(np.array([[0.5, 0.3, 0.5]]))
+        if not len(met.index):
+            continue
+        normal = met.normals[0] * np.sign(met.normals[0, 2])
+        tilts = surfaces.tilts(met.cells, met.axis)[0]
+        np.testing.assert_allclose(tilts @ met.normals[0], 0.0, atol=1e-9)
+        angles.append(normal[:2])
+        expected.append((tilts**2).sum(axis=0)[:2])  # towards x and y
+    assert len(angles) > 200
+    ratio = np.mean(np.square(angles), axis=0) / np.mean(expected, axis=0)
+    assert (np.abs(np.log(ratio)) < np.log(2.0)).all(), ratio
+
+
+def test_a_normal_that_is_hardly_known_faces_nothing() -> None:
+    """A few points in two sweeps, 30 degrees off the wall by chance, against a reveal."""
+    rng = np.random.default_rng(5)
+    surfaces = mapped(rng, facing=600)
+    slope = np.tan(np.radians(30.0))
+    patch = rng.uniform((0.01, 0.0, 0.01), (0.13, 0.0, 0.13), (6, 3))
+    patch[:, 1] = 0.14 - slope * patch[:, 0]
+    patch += (3.6, 0.3, 0.15)  # in one cell of the finest level
+    for number in (0, 1):
+        surfaces.add(patch + rng.normal(0.0, 0.001, patch.shape), number)
+    surfaces.add(walls(rng, 100), 12)
+    seen = np.vstack((walls(rng, 2000), reveals(rng, 90), patch))
+    found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
+    is_chance = found.index >= len(seen) - len(patch)
+    assert np.count_nonzero(is_chance) >= 3
+    by_hand, driven = weak_axes(at(), found, surfaces), weak_axes(at(), found, surfaces, NOTHING)
+    assert by_hand is not None
+    assert driven is not None
+    assert by_hand.scatter is None
+    assert by_hand.facing(at(), found)[is_chance, 0].all()
+    assert not driven.facing(at(), found)[is_chance, 0].any()
+    is_reveal = (found.index >= 2000) & ~is_chance & (np.abs(found.normals[:, 0]) > 0.9)
+    assert np.count_nonzero(is_reveal) > 20
+    assert driven.facing(at(), found)[is_reveal, 0].mean() > 0.9
+
+
+def test_what_faces_the_direction_does_not_bend_it() -> None:
+    """Oblique surfaces on one side only turn the weakest direction of all points away."""
+    rng = np.random.default_rng(8)
+    surfaces = SurfelMap(SIZES)
+    oblique = rng.uniform((-3.0, 0.0, -0.5), (3.0, 0.0, 0.5), (1500, 3))
+    oblique[:, 1] = 0.8 - np.mod(oblique[:, 0], 0.6)  # saw teeth of 45 degrees
+    for number in range(12):
+        surfaces.add(np.vstack((walls(rng, 4000), oblique)), number)
+    seen = np.vstack((walls(rng, 2000), oblique[::10]))
+    plain, steady = weak_in(surfaces, seen, None), weak_in(surfaces, seen, NOTHING)
+
+    def off(weak: WeakAxes) -> float:
+        return float(np.degrees(np.arccos(min(abs(weak.axes[3, 0]), 1.0))))
+
+    assert off(plain) > 2.0
+    assert off(steady) < 0.5
+    np.testing.assert_allclose(
+        steady.axes.T @ steady.axes, np.eye(steady.axes.shape[1]), atol=1e-9
+    )
+
+
+def test_the_direction_is_steadied_until_the_way_bends() -> None:
+    rng = np.random.default_rng(9)
+    surfaces = mapped(rng)
+    scatter, single, steadied = NOTHING, [], []
+    for _ in range(30):
+        seen = walls(rng, 150)
+        single.append(weak_in(surfaces, seen, NOTHING).axes[4, 0])
+        weak = weak_in(surfaces, seen, scatter)
+        assert weak.scatter is not None
+        scatter = weak.scatter
+        steadied.append(weak.axes[4, 0] * np.sign(weak.axes[3, 0]))
+    assert np.std(steadied[10:]) < 0.5 * np.std(np.abs(single))
+    # around a corner, only what is seen now counts
+    corner = SurfelMap(SIZES)
+    for number in range(12):
+        corner.add(walls(rng, 4000, np.pi / 2.0), number)
+    weak = weak_in(corner, walls(rng, 1000, np.pi / 2.0), scatter)
+    assert abs(weak.axes[4, 0]) > 0.999
+
+
+def test_up_is_no_way_to_drive() -> None:
+    """A shaft leaves the height open: there the carrier is as any other."""
+    rng = np.random.default_rng(10)
+    surfaces = SurfelMap(SIZES)
+
+    def shaft(count: int) -> F64:
+        points = rng.uniform(-1.2, 1.2, (count, 3))
+        side = rng.integers(0, 2, count)
+        points[np.arange(count), side] = rng.choice((-1.2, 1.2), count)
+        return points + 0.01 * rng.standard_normal(points.shape)
+
+    for number in range(12):
+        surfaces.add(shaft(4000), number)
+    weak = weak_in(surfaces, shaft(2000), NOTHING)
+    assert abs(weak.axes[5, 0]) > 0.99
+    assert weak.scatter is None
+
+
+def test_points_that_thinning_left_out_fix_the_place_if_they_face_the_way() -> None:
+    rng = np.random.default_rng(4)
+    surfaces = mapped(rng, facing=600)
+    thin, more = source(walls(rng, 1000)), source(np.vstack((walls(rng, 1000), reveals(rng, 90))))
+    thin = dataclasses.replace(thin, denser=lambda: more)
+    covariance = 1e-6 * np.eye(eskf.ERRORS)
+    covariance[eskf.POSITION, eskf.POSITION] = 0.02**2 * np.eye(3)
+
+    def found(scatter: F64 | None) -> Alignment:
+        alignment = align(
+            at(0.015, 0.0, 0.0), covariance, thin, surfaces, SurfaceConfig(), 100, None, scatter
+        )
+        assert alignment is not None
+        return alignment
+
+    by_hand, driven = found(None), found(NOTHING)
+    assert by_hand.scatter is None
+    assert by_hand.state.position[0] == pytest.approx(0.015, abs=0.005)
+    assert driven.state.position[0] == pytest.approx(0.0, abs=0.006)
+    assert driven.covariance[3, 3] < 0.3 * by_hand.covariance[3, 3]
+    # of the others, which say nothing new, none is added
+    assert len(thin.points) < driven.matched < len(thin.points) + 2 * 90
