@@ -269,12 +269,17 @@ def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
         alignment = matcher.match(found, at).alignment
         assert alignment is not None
         matcher.meet(alignment, 0.2)
+        scatters.append(0.0 if alignment.scatter is None else float(alignment.scatter.trace()))
         return len(found.points)
 
+    scatters: list[float] = []
     first = [kept(one) for one in (sparse, sparse, dense)]
     assert first[0] == first[1] < tuning.DRIVING_POINTS < first[2]
     matcher.driving = True
-    driven = [kept(one) for one in (sparse, sparse, dense)]
+    assert not any(scatters)
+    driven = [kept(one) for one in (sparse, sparse, dense, sparse)]
+    assert np.diff(scatters[3:]).min() > 0.0  # of all sweeps so far
+    assert scatters[-1] > 1.5 * scatters[-3]
     assert driven[0] == first[0]  # nothing has been seen to be weak yet
     assert driven[1] > 1.2 * first[1]
     assert driven[2] == first[2]

@@ -53,12 +53,18 @@ def reveals(rng: np.random.Generator, count: int) -> F64:
     return points
 
 
-def mapped(rng: np.random.Generator, sweeps: int = 12, *, facing: int = 0) -> SurfelMap:
-    """Return a map of the corridor, with so many points of reveals in each sweep."""
+def mapped(rng: np.random.Generator, *, facing: int = 0, since: int = 0) -> SurfelMap:
+    """Return a map of the corridor, with so many points of reveals in each sweep since one."""
     surfaces = SurfelMap(SIZES)
-    for number in range(sweeps):
-        surfaces.add(np.vstack((walls(rng, 4000), reveals(rng, facing))), number)
+    for number in range(12):
+        seen = reveals(rng, facing * (number >= since))
+        surfaces.add(np.vstack((walls(rng, 4000), seen)), number)
     return surfaces
+
+
+def off(weak: WeakAxes) -> float:
+    """Return how far the weakest direction is off the corridor's [degrees]."""
+    return float(np.degrees(np.arccos(min(abs(weak.axes[3, 0]), 1.0))))
 
 
 def weak_in(
@@ -105,7 +111,7 @@ def test_a_normal_that_is_hardly_known_faces_nothing() -> None:
     slope = np.tan(np.radians(30.0))
     patch = rng.uniform((0.01, 0.0, 0.01), (0.13, 0.0, 0.13), (6, 3))
     patch[:, 1] = 0.14 - slope * patch[:, 0]
-    patch += (3.6, 0.3, 0.15)  # in one cell of the finest level
+    patch += np.array([3.6, 0.3, 0.15])  # in one cell of the finest level
     for number in (0, 1):
         surfaces.add(patch + rng.normal(0.0, 0.001, patch.shape), number)
     surfaces.add(walls(rng, 100), 12)
@@ -135,11 +141,10 @@ def test_what_faces_the_direction_does_not_bend_it() -> None:
     seen = np.vstack((walls(rng, 2000), oblique[::10]))
     plain, steady = weak_in(surfaces, seen, None), weak_in(surfaces, seen, NOTHING)
 
-    def off(weak: WeakAxes) -> float:
-        return float(np.degrees(np.arccos(min(abs(weak.axes[3, 0]), 1.0))))
-
     assert off(plain) > 2.0
     assert off(steady) < 0.5
+    # also where the way before was another, so that only this sweep counts
+    assert off(weak_in(surfaces, seen, np.diag([1.0, 0.0, 1.0]) * 1e6)) < 1.0
     np.testing.assert_allclose(
         steady.axes.T @ steady.axes, np.eye(steady.axes.shape[1]), atol=1e-9
     )
@@ -163,6 +168,44 @@ def test_the_direction_is_steadied_until_the_way_bends() -> None:
         corner.add(walls(rng, 4000, np.pi / 2.0), number)
     weak = weak_in(corner, walls(rng, 1000, np.pi / 2.0), scatter)
     assert abs(weak.axes[4, 0]) > 0.999
+    bend = SurfelMap(SIZES)
+    for number in range(12):
+        bend.add(walls(rng, 4000, 1.5 * tuning.WALL_BEND), number)
+    weak = weak_in(bend, walls(rng, 1000, 1.5 * tuning.WALL_BEND), scatter)
+    slope = np.arctan(weak.axes[4, 0] / weak.axes[3, 0])
+    assert slope == pytest.approx(1.5 * tuning.WALL_BEND, abs=0.02)
+
+
+def test_normals_that_are_hardly_known_do_not_bend_the_direction() -> None:
+    """Cells of a few points in two sweeps, all of them 15 degrees off the wall."""
+    rng = np.random.default_rng(12)
+    surfaces = mapped(rng)
+    patches = []
+    for x in np.arange(-3.6, 3.6, 0.3):
+        patch = rng.uniform((0.01, 0.0, 0.01), (0.13, 0.0, 0.13), (6, 3))
+        patch[:, 1] = 0.1 - np.tan(np.radians(15.0)) * patch[:, 0]
+        patches.append(patch + np.array([x, 0.3, 0.15]))
+    cells = np.vstack(patches)
+    for number in (0, 1):
+        surfaces.add(cells + rng.normal(0.0, 0.001, cells.shape), number)
+    surfaces.add(walls(rng, 100), 12)
+    seen = np.vstack((walls(rng, 300), cells))
+    assert off(weak_in(surfaces, seen, None)) > 2.0
+    assert off(weak_in(surfaces, seen, NOTHING)) < 0.6
+
+
+def test_surfaces_count_sooner_where_the_carrier_drives() -> None:
+    rng = np.random.default_rng(13)
+    surfaces = mapped(rng, facing=600, since=12 - tuning.DRIVING_AGE - 2)
+    seen = np.vstack((walls(rng, 2000), reveals(rng, 90)))
+    found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
+    by_hand, driven = weak_axes(at(), found, surfaces), weak_axes(at(), found, surfaces, NOTHING)
+    assert by_hand is not None
+    assert driven is not None
+    is_reveal = (found.index >= 2000) & (np.abs(found.normals[:, 0]) > 0.9)
+    assert np.count_nonzero(is_reveal) > 20
+    assert not by_hand.facing(at(), found)[is_reveal, 0].any()
+    assert driven.facing(at(), found)[is_reveal, 0].mean() > 0.5
 
 
 def test_up_is_no_way_to_drive() -> None:
