@@ -41,6 +41,13 @@ PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
 PRIOR_SPEED: Final = 1.0  # [m/s]
 PRIOR_LEARN_SIGMA: Final = 0.1  # [m/s] of velocities that show the peak speed
 PRIOR_MEMORY_S: Final = 60.0  # [s] time constant of its decay
+# The same for the vertical velocity where sweeps hardly ever fix the height. Derived: the height
+# of what walks or drives wanders by half a meter in a minute. Tuned on: bare trunks. The first is
+# the least sigma, as the IMU may know better.
+RISE_FROM_SIGMA: Final = 0.02  # [m/s]
+RISE_SPEED: Final = 0.07  # [m/s]
+HEIGHT_MEMORY_S: Final = 20.0  # [s] of which the height is fixed for less than the share below
+HEIGHT_SHARE: Final = 0.1  # where a floor or a crown is in view now and then it is 0.15 and more
 SPEED_BOUND_SHARE: Final = 0.02  # of max_speed: its noise as a measurement. Derived: a hard bound
 MAP_ORIGIN_SIGMA: Final = 1e-3  # [m, rad] of the pose with which a new map begins
 # After a time jump. Derived: the sensor may have been moved by hand meanwhile.

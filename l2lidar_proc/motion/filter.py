@@ -438,7 +438,12 @@ def update_static(
 
 
 def apply_zero_velocity_prior(
-    state: InertialState, covariance: F64, seconds: float, peak_speed: float
+    state: InertialState,
+    covariance: F64,
+    seconds: float,
+    peak_speed: float,
+    *,
+    height_observed: bool = True,
 ) -> tuple[InertialState, F64]:
     """Return state and covariance with a velocity that is hardly known drawn towards zero.
 
@@ -446,7 +451,8 @@ def apply_zero_velocity_prior(
     counts where nothing else measures the velocity. A carrier that drives may keep its velocity
     for minutes; measuring zero again and again would brake it. So its velocity has to be known
     worse than its peak speed, at which zero is as likely as any. That does not hold for the
-    vertical velocity: what walks or drives comes back to its height.
+    vertical velocity: what walks or drives comes back to its height. Where nothing observes the
+    height for long, that is all that is known of it, and counts for more.
 
     Parameters
     ----------
@@ -457,21 +463,34 @@ def apply_zero_velocity_prior(
         Time since this was done last.
     peak_speed : float
         Of this carrier of late, as :func:`peak_speed_after` returns it [m/s].
+    height_observed : bool
+        Whether sweeps have fixed the height of late.
     """
     if seconds <= 0.0:
         return state, covariance
+    size = float(np.linalg.norm(state.gravity))
+    up = state.gravity[None] / max(size, 1e-12)
+    rise_sigma = float(np.sqrt((up @ covariance[VELOCITY, VELOCITY] @ up.T)[0, 0]))
+    if not height_observed and rise_sigma >= tuning.RISE_FROM_SIGMA:
+        variance = tuning.RISE_SPEED**2 / seconds
+        state, covariance = _drawn_to_zero(state, covariance, up, variance)
     drives = peak_speed > tuning.DRIVING_SPEED
     least = peak_speed if drives else tuning.PRIOR_FROM_SIGMA
-    axes = np.eye(3)
-    if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] < least**2:
-        size = float(np.linalg.norm(state.gravity))
-        axes = state.gravity[None] / max(size, 1e-12)
-        variance = float((axes @ covariance[VELOCITY, VELOCITY] @ axes.T)[0, 0])
-        if variance < tuning.PRIOR_FROM_SIGMA**2:
-            return state, covariance
+    variance = tuning.PRIOR_SPEED**2 / seconds
+    if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] >= least**2:
+        return _drawn_to_zero(state, covariance, np.eye(3), variance)
+    if rise_sigma >= tuning.PRIOR_FROM_SIGMA:
+        return _drawn_to_zero(state, covariance, up, variance)
+    return state, covariance
+
+
+def _drawn_to_zero(
+    state: InertialState, covariance: F64, axes: F64, variance: float
+) -> tuple[InertialState, F64]:
+    """Return state and covariance with the velocity along axes (K, 3) measured as zero."""
     jacobian = np.zeros((len(axes), ERRORS))
     jacobian[:, VELOCITY] = axes
-    noise = tuning.PRIOR_SPEED**2 / seconds * np.eye(len(axes))
+    noise = variance * np.eye(len(axes))
     found = update(state, covariance, -axes @ state.velocity, jacobian, noise)
     return found.state, found.covariance
 

@@ -105,11 +105,18 @@ class SweepMatcher:
         self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
         self._scatter: F64 = np.zeros((3, 3))  # of the walls along which the carrier drives
         self._is_weak = False  # along them, in the latest sweep
+        self._height_s = 0.0, 0.0  # of late, with the height fixed, and in all
 
     @property
     def is_young(self) -> bool:
         """Whether the maps have only just begun."""
         return self._sweeps < tuning.YOUNG_SWEEPS
+
+    @property
+    def observes_height(self) -> bool:
+        """Whether sweeps have fixed the height of late, now and then at least."""
+        fixed, total = self._height_s
+        return fixed >= tuning.HEIGHT_SHARE * total
 
     def clear(self) -> None:
         """Forget the maps."""
@@ -254,6 +261,7 @@ class SweepMatcher:
         seconds : float
             Since the sweep before.
         """
+        self._note_height(found, seconds)
         self._is_weak = found.scatter is not None
         if found.scatter is not None:
             self._scatter = found.scatter
@@ -269,6 +277,14 @@ class SweepMatcher:
             np.sqrt(speeds) * seconds,
             found.strongly,
         )
+
+    def _note_height(self, found: Alignment, seconds: float) -> None:
+        up = found.state.gravity
+        places = found.information[POSITION, POSITION]
+        fixes = up @ places @ up > tuning.DEGENERATE_SHARE * (up @ up) * np.trace(places)
+        left = float(np.exp(-seconds / tuning.HEIGHT_MEMORY_S))
+        fixed, total = self._height_s
+        self._height_s = left * fixed + seconds * bool(fixes), left * total + seconds
 
     def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
         """Return how well a sweep with so many points to align could be matched."""

@@ -254,7 +254,10 @@ class Odometry:
         before = self._belief[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
         peak = eskf.peak_speed_after(self._peak_speed, after, covariance, lasted)
-        posterior = eskf.apply_zero_velocity_prior(after, covariance, lasted, peak)
+        height = self.matcher.observes_height
+        posterior = eskf.apply_zero_velocity_prior(
+            after, covariance, lasted, peak, height_observed=height
+        )
         self._peak_speed = peak
         self.matcher.driving = peak > tuning.DRIVING_SPEED
         posterior = eskf.with_gravity_of_known_size(*posterior)

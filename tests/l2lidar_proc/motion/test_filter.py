@@ -199,6 +199,37 @@ def test_a_minute_of_the_prior_brakes_no_drive_but_ends_a_climb() -> None:
     )
 
 
+def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
+    gravity = np.array([3.0, 0.0, -9.3])
+    up = -gravity / np.linalg.norm(gravity)
+    ahead = np.array([-up[2], 0.0, up[0]])
+    start = dataclasses.replace(some_state(), gravity=gravity, velocity=0.5 * ahead + 0.1 * up)
+    sigma = 1.1 * tuning.RISE_FROM_SIGMA
+    loose = np.eye(eskf.ERRORS) * sigma**2
+    assert eskf.apply_zero_velocity_prior(start, loose, 0.1, 1.2)[0] is start
+    noise = tuning.RISE_SPEED**2 / 0.1
+    left = noise / (noise + sigma**2)
+    state, covariance = eskf.apply_zero_velocity_prior(
+        start, loose, 0.1, 1.2, height_observed=False
+    )
+    assert up @ state.velocity == pytest.approx(0.1 * left, rel=1e-6)
+    assert ahead @ state.velocity == pytest.approx(0.5, abs=1e-12)
+    speeds = covariance[eskf.VELOCITY, eskf.VELOCITY]
+    assert up @ speeds @ up == pytest.approx(sigma**2 * left, rel=1e-6)
+    assert ahead @ speeds @ ahead == pytest.approx(sigma**2)
+    # what the IMU knows better stays as it is
+    known = loose * (0.9 / 1.1) ** 2
+    assert (
+        eskf.apply_zero_velocity_prior(start, known, 0.1, 1.2, height_observed=False)[0] is start
+    )
+    # in all directions a velocity that is hardly known at all is drawn as before
+    lost, _ = eskf.apply_zero_velocity_prior(
+        start, np.eye(eskf.ERRORS), 1.0, 0.3, height_observed=False
+    )
+    assert ahead @ lost.velocity == pytest.approx(0.25)
+    assert up @ lost.velocity < 0.001
+
+
 def test_the_peak_speed_is_the_highest_that_was_known_of_late() -> None:
     state = dataclasses.replace(some_state(), velocity=np.array([0.0, 1.2, 0.0]))
     known = np.eye(eskf.ERRORS) * (0.9 * tuning.PRIOR_LEARN_SIGMA) ** 2

@@ -288,3 +288,37 @@ def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
     assert found.denser is not None
     both = np.vstack((found.points, found.denser().points))
     assert len(np.unique(both, axis=0)) == len(both) > len(found.points)
+
+
+def test_a_height_that_was_not_fixed_for_long_is_not_observed() -> None:
+    """Walls without a floor or a ceiling; a floor in one sweep of five is enough."""
+    rng, matcher = np.random.default_rng(22), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def walls(count: int, *, floor: bool) -> F64:
+        points = rng.uniform((-4.0, -3.0, -1.0), (4.0, 3.0, 1.0), (count, 3))
+        side = rng.integers(0, 4 if floor else 2, count)
+        points[side == 0, 0], points[side == 1, 1], points[side >= 2, 2] = 4.0, 3.0, -1.0
+        return np.asarray(points + rng.normal(0.0, 0.01, points.shape))
+
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, walls(4000, floor=True))
+    at = motion(TIGHT, np.zeros(3))
+    bare, full = (
+        matcher.match(source(walls(2000, floor=floor)), at).alignment for floor in (False, True)
+    )
+    assert bare is not None
+    assert full is not None
+
+    def seen(seconds: float, share: float) -> bool:
+        floors = round(5 * share)
+        for number in range(int(5 * seconds)):
+            matcher.meet(full if number % 5 < floors else bare, 0.2)
+        return matcher.observes_height
+
+    assert matcher.observes_height  # nothing is known yet
+    assert seen(10.0, 1.0)
+    assert seen(5.0, 0.0)
+    assert not seen(60.0, 0.0)
+    assert seen(20.0, 0.2)
+    assert not seen(60.0, 0.0)
+    assert seen(5.0, 1.0)

@@ -23,7 +23,7 @@ from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from tests.l2lidar_proc.odometry.odometry_places import SEED, driven_round, shaken, visited
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
-from tests.support.odometry_runs import record, sweeps
+from tests.support.odometry_runs import record, sweeps, truth
 
 
 @pytest.mark.parametrize(
@@ -45,6 +45,23 @@ def test_a_start_while_walking_along_a_corridor_is_not_taken_for_slow() -> None:
     estimates = drive(run)
     assert len(estimates) >= 5
     assert errors(run, estimates).max() < 0.03
+
+
+def test_between_walls_without_a_floor_the_height_does_not_wander_off() -> None:
+    """Only the IMU and that carriers come back to their height tell it."""
+    run = recording("box", "walk", 14.0)
+    bare = [
+        dataclasses.replace(sweep, points=sweep.points[np.abs(sweep.points["z"]) < 0.5])
+        for sweep in sweeps(run, "turn")
+    ]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, bare)
+    assert {item.status for item in estimates[5:]} == {(Status.DEGENERATE,)}
+    rise_sigmas = np.sqrt([item.twist_covariance[2, 2] for item in estimates])
+    assert rise_sigmas.max() < 0.045  # of the accelerometer alone 0.07
+    true, _ = truth(run, np.array([item.stamp for item in estimates]))
+    rises = np.array([item.T_map_lidar[2, 3] for item in estimates]) - true[:, 2]
+    sigmas = np.sqrt([item.covariance[2, 2] for item in estimates])
+    assert (np.abs(rises - rises[0]) < 3.0 * sigmas + 0.01).all()
 
 
 def test_short_sweeps_below_an_open_sky_are_enough() -> None:
