@@ -469,25 +469,28 @@ def apply_zero_velocity_prior(
     if seconds <= 0.0:
         return state, covariance
     size = float(np.linalg.norm(state.gravity))
-    up = state.gravity[None] / max(size, 1e-12)
-    rise_sigma = float(np.sqrt((up @ covariance[VELOCITY, VELOCITY] @ up.T)[0, 0]))
+    vertical = state.gravity[None] / max(size, 1e-12)
+    rise_sigma = float(np.sqrt((vertical @ covariance[VELOCITY, VELOCITY] @ vertical.T)[0, 0]))
     if not height_observed and rise_sigma >= tuning.RISE_FROM_SIGMA:
         variance = tuning.RISE_SPEED**2 / seconds
-        state, covariance = _drawn_to_zero(state, covariance, up, variance)
+        state, covariance = _drawn_to_zero(state, covariance, vertical, variance)
     drives = peak_speed > tuning.DRIVING_SPEED
     least = peak_speed if drives else tuning.PRIOR_FROM_SIGMA
     variance = tuning.PRIOR_SPEED**2 / seconds
     if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] >= least**2:
         return _drawn_to_zero(state, covariance, np.eye(3), variance)
     if rise_sigma >= tuning.PRIOR_FROM_SIGMA:
-        return _drawn_to_zero(state, covariance, up, variance)
+        return _drawn_to_zero(state, covariance, vertical, variance)
     return state, covariance
 
 
 def _drawn_to_zero(
     state: InertialState, covariance: F64, axes: F64, variance: float
 ) -> tuple[InertialState, F64]:
-    """Return state and covariance with the velocity along axes (K, 3) measured as zero."""
+    """Return state and covariance with the velocity along axes (K, 3) measured as zero.
+
+    The variance is that of each measurement [m²/s²].
+    """
     jacobian = np.zeros((len(axes), ERRORS))
     jacobian[:, VELOCITY] = axes
     noise = variance * np.eye(len(axes))

@@ -105,7 +105,7 @@ class SweepMatcher:
         self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
         self._scatter: F64 = np.zeros((3, 3))  # of the walls along which the carrier drives
         self._is_weak = False  # along them, in the latest sweep
-        self._height_s = 0.0, 0.0  # of late, with the height fixed, and in all
+        self._height_fixed_s = 0.0, 0.0  # of late, and the time that counts in all
 
     @property
     def is_young(self) -> bool:
@@ -115,7 +115,7 @@ class SweepMatcher:
     @property
     def observes_height(self) -> bool:
         """Whether sweeps have fixed the height of late, now and then at least."""
-        fixed, total = self._height_s
+        fixed, total = self._height_fixed_s
         return fixed >= tuning.HEIGHT_SHARE * total
 
     def clear(self) -> None:
@@ -279,12 +279,14 @@ class SweepMatcher:
         )
 
     def _note_height(self, found: Alignment, seconds: float) -> None:
-        up = found.state.gravity
+        """Note for how long the height has been fixed, of late."""
+        gravity = found.state.gravity
         places = found.information[POSITION, POSITION]
-        fixes = up @ places @ up > tuning.DEGENERATE_SHARE * (up @ up) * np.trace(places)
+        least = tuning.DEGENERATE_SHARE * (gravity @ gravity) * np.trace(places)
+        fixes = bool(gravity @ places @ gravity > least)
         left = float(np.exp(-seconds / tuning.HEIGHT_MEMORY_S))
-        fixed, total = self._height_s
-        self._height_s = left * fixed + seconds * bool(fixes), left * total + seconds
+        fixed, total = self._height_fixed_s
+        self._height_fixed_s = left * fixed + seconds * fixes, left * total + seconds
 
     def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
         """Return how well a sweep with so many points to align could be matched."""
