@@ -1,9 +1,15 @@
-"""Earlier maps: kept when the odometry is lost, and searched until one is matched again.
+"""The way back into maps that are more certain than the pose, and that a sweep meets again.
 
-A map begun after a loss lies in the odometry frame where the prediction had come to, and stays as
-uncertain as that for good. When a sweep meets an earlier map, the odometry goes on in that one
-and the pose jumps back. A wrong jump is worse than none, so a meeting counts only if it fixes the
-place in every direction and the next one says the same.
+:class:`EarlierMaps` are kept when the odometry is lost. A map begun after a loss lies in the
+odometry frame where the prediction had come to, and stays as uncertain as that for good.
+
+:class:`MapRevisit` looks for the older part of the map in use. Where a narrow view sees one wall
+only, the pose drifts; what it then adds to the map lies beside what was there before, and agrees
+with the drifted pose.
+
+When a sweep meets such a map, the odometry goes on in it and the pose jumps back. A wrong jump is
+worse than none, so a meeting counts only if it fixes the place in every direction and the next one
+says the same.
 """
 
 from __future__ import annotations
@@ -34,7 +40,7 @@ from l2lidar_proc.odometry.uncertainty import FrameJump
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarlierMap:
-    """A map that was in use until the odometry was lost.
+    """A map that was in use until the odometry was lost, or the older part of the one in use.
 
     Attributes
     ----------
@@ -49,7 +55,7 @@ class EarlierMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Return:
-    """The way back into an earlier map.
+    """The way back into an earlier map, or the older part of the one in use.
 
     Attributes
     ----------
@@ -69,7 +75,7 @@ class EarlierMaps:
         self._maps: list[EarlierMap] = []
         self._next_search = 0
         self._lost_at = 0
-        self._met: tuple[EarlierMap, F64] | None = None  # where its last meeting moves the poses
+        self._meetings = _Meetings()
 
     def __len__(self) -> int:
         """Return the number of maps kept."""
@@ -79,9 +85,14 @@ class EarlierMaps:
         """Iterate over the maps kept."""
         return iter(self._maps)
 
+    def restart(self, stamp: HostNs) -> None:
+        """Go on at an instant of another time line."""
+        self._meetings.clear()
+        self._lost_at = self._next_search = int(stamp)
+
     def keep(self, matcher: SweepMatcher, jump: FrameJump, stamp: HostNs) -> None:
         """Keep a map that is left at an instant, and no more than a few of the largest."""
-        self._met = None
+        self._meetings.clear()
         self._lost_at = int(stamp)
         self._next_search = self._lost_at + tuning.EARLIER_PAUSE_NS
         self._maps.append(EarlierMap(matcher, jump))
@@ -111,16 +122,125 @@ class EarlierMaps:
             found = _met_in(kept, source, motion, jump)
             if found is None:
                 continue
-            moves = _pose(found.state) @ np.linalg.inv(_pose(motion.state))
-            before, self._met = self._met, (kept, moves)
-            if before is not None and before[0] is kept and _are_one(before[1], moves):
-                self._met = None
+            if self._meetings.confirm(kept, _moves(motion.state, found.state)):
                 self._maps.remove(kept)
                 return Return(kept, found)
             self._next_search = stamp + 1
             return None
-        self._met = None
+        self._meetings.clear()
         return None
+
+
+class MapRevisit:
+    """Search of the older part of the map in use while the pose is less certain than that."""
+
+    def __init__(self) -> None:
+        self._certain_at: int | None = None  # stamp until which the pose was certain enough
+        self._meetings = _Meetings()
+        self.restart(HostNs(0))
+
+    def restart(self, stamp: HostNs) -> None:
+        """Begin anew at an instant of another time line."""
+        self._next_search = int(stamp)
+        self._met_until = int(stamp)  # until then a meeting may be confirmed
+        self._certain_at = None
+        self._meetings.clear()
+
+    def part_due(self, matcher: SweepMatcher, state: InertialState) -> SweepMatcher | None:
+        """Return the older part of the map if it should be searched now: ever more rarely.
+
+        Parameters
+        ----------
+        matcher : SweepMatcher
+            In use. Not that of a carrier that drives: one niche of a corridor looks like the next.
+        state : InertialState
+        """
+        stamp = int(state.stamp)
+        if stamp < self._next_search:
+            return None
+        older = matcher.drift.more_certain_than_held(state.position)
+        if older is None or matcher.is_young or matcher.driving:
+            self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
+            self._meetings.clear()
+            return None
+        if self._certain_at is None:
+            self._certain_at = stamp
+        pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
+        self._next_search = stamp + max(tuning.EARLIER_PAUSE_NS, pause)
+        return matcher.part_of(older)
+
+    def search(
+        self, source: Source, part: SweepMatcher, motion: SweepMotion, jump: FrameJump
+    ) -> Return | None:
+        """Return the way back into the older part of the map if two sweeps meet it.
+
+        What drifted away since is not in that part. A wrong velocity moved the pose, so the
+        velocity is as uncertain as that makes it.
+
+        Parameters
+        ----------
+        source : Source
+            Deskewed by the motion.
+        part : SweepMatcher
+            As :meth:`part_due` returns it.
+        motion : SweepMotion
+        jump : FrameJump
+            Of the map in use.
+        """
+        stamp, place = int(motion.state.stamp), motion.state.position
+        uncertain = FrameJump(place, part.drift.at(place))
+        found = _met_in(EarlierMap(part, FrameJump()), source, motion, uncertain)
+        if found is None or not _is_elsewhere(found, motion, len(source.points)):
+            if stamp < self._met_until:
+                self._next_search = stamp + 1
+            else:
+                self._meetings.clear()
+            return None
+        if not self._meetings.confirm(None, _moves(motion.state, found.state)):
+            self._met_until = stamp + tuning.REVISIT_MET_NS
+            self._next_search = stamp + 1
+            return None
+        covariance = found.covariance.copy()
+        speed = float(np.linalg.norm(found.state.position - place)) / tuning.REVISIT_DRIFT_S
+        covariance[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
+        return Return(EarlierMap(part, jump), dataclasses.replace(found, covariance=covariance))
+
+
+def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int) -> bool:
+    """Return whether a sweep is explained by a map, at another place than that of its motion.
+
+    Where the two agree the younger part of the map is not wrong, and worth more than a jump.
+    """
+    way = float(np.linalg.norm(found.state.position - motion.state.position))
+    return (
+        way > tuning.REVISIT_LEAST_M
+        and found.matched > tuning.REVISIT_MATCHED * points
+        and found.inlier_ratio > tuning.REVISIT_INLIERS
+    )
+
+
+class _Meetings:
+    """Meetings with maps: one counts if the next says the same."""
+
+    def __init__(self) -> None:
+        self._last: tuple[EarlierMap | None, F64] | None = None
+
+    def clear(self) -> None:
+        """Forget the last one, as after a search that found nothing."""
+        self._last = None
+
+    def confirm(self, met: EarlierMap | None, moves: F64) -> bool:
+        """Take a meeting that moves the poses by a transform (4, 4); return whether it counts."""
+        last, self._last = self._last, (met, moves)
+        if last is None or last[0] is not met or not _are_one(last[1], moves):
+            return False
+        self._last = None
+        return True
+
+
+def _moves(state: InertialState, found: InertialState) -> F64:
+    """Return how a state found for another moves the map's poses (4, 4)."""
+    return np.asarray(_pose(found) @ np.linalg.inv(_pose(state)))
 
 
 def _met_in(
@@ -136,7 +256,7 @@ def _met_in(
     if rough is None:
         return None
     # velocity and gravity turn with the pose, which the search alone does not know
-    there = moved(state, _pose(rough.state) @ np.linalg.inv(_pose(state)))
+    there = moved(state, _moves(state, rough.state))
     turn = there.rotation @ state.rotation.T
     axes = np.eye(len(motion.covariance))
     for block in (POSITION, VELOCITY, GRAVITY):

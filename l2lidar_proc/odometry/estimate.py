@@ -34,7 +34,7 @@ class Status(Enum):
     GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"
     RESTARTED = "time jumped: the motion is unknown, pose and map are kept"
     LOST = "too long without a match: a new map begins at the predicted pose"
-    RETURNED = "an earlier map was matched again: the pose jumped back into it"
+    RETURNED = "an earlier map, or part of it, was matched again: the pose jumped back into it"
     REFUSED = "not later than the previous sweep: ignored"
 
 

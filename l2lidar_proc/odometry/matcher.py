@@ -5,6 +5,7 @@ Relocalization searches poses at which a sweep fits the map around a loose predi
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections import deque
 from typing import NamedTuple
@@ -287,6 +288,15 @@ class SweepMatcher:
         left = float(np.exp(-seconds / tuning.HEIGHT_MEMORY_S))
         fixed, total = self._height_fixed_s
         self._height_fixed_s = left * fixed + seconds * fixes, left * total + seconds
+
+    def part_of(self, sweeps: NDArray[np.bool_]) -> SweepMatcher:
+        """Return this with only the surfaces that some of the sweeps (S,) were the first to see.
+
+        All else is shared; one of the two may go on.
+        """
+        part = copy.copy(self)
+        part.surfaces = self.surfaces.part_of(sweeps)
+        return part
 
     def quality(self, points: int, found: Alignment | None) -> AlignmentQuality:
         """Return how well a sweep with so many points to align could be matched."""

@@ -19,7 +19,7 @@ from l2lidar_proc.odometry import kiss
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, Return
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return
 from l2lidar_proc.odometry.estimate import (
     AlignmentQuality,
     OdometryEstimate,
@@ -103,6 +103,7 @@ class Odometry:
         self._unmatched_ns = 0
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
+        self._revisit = MapRevisit()
         self._last: OdometryEstimate | None = None
 
     def _new_initializer(self) -> MapInitializer:
@@ -354,10 +355,17 @@ class Odometry:
     # ---- returning
 
     def _way_back(self, sweep: Sweep, motion: SweepMotion) -> Return | None:
-        """Search the earlier maps, if there are any and it is time to."""
-        if not self._earlier.is_due(motion.state.stamp):
+        """Search the earlier maps and the older part of this one, where it is time to."""
+        if self._earlier.is_due(motion.state.stamp):
+            source = self.matcher.source(sweep, motion)
+            back = self._earlier.search(source, motion, self._jump)
+            if back is not None:
+                return back
+        part = self._revisit.part_due(self.matcher, motion.state)
+        if part is None:
             return None
-        return self._earlier.search(self.matcher.source(sweep, motion), motion, self._jump)
+        source = self.matcher.source(sweep, motion)
+        return self._revisit.search(source, part, motion, self._jump)
 
     def _return(self, back: Return, motion: SweepMotion) -> SweepMotion:
         """Go on in an earlier map; return the motion of the sweep that met it."""
@@ -487,6 +495,8 @@ class Odometry:
         self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
         self._zero_velocity.clear()
         self._innovations.clear()
+        self._earlier.restart(reference)
+        self._revisit.restart(reference)
         if self.phase is Phase.STATIONARY:
             self._leave_rest()
 

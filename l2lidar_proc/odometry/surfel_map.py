@@ -455,12 +455,28 @@ class SurfelMap:
         cells = self._cells[1 : len(self) + 1]
         kept = ((self._middles(cells["key"]) - origin) ** 2).sum(axis=1) <= distance * distance
         kept &= cells["seen"] >= since
-        if kept.all():
-            return
+        if not kept.all():
+            self._index.clear()
+            self._take(self, kept)
+
+    def part_of(self, sweeps: NDArray[np.bool_]) -> SurfelMap:
+        """Return a map with the cells of the places that some of the sweeps (S,) saw first."""
+        part = SurfelMap(
+            self._sizes.tolist(),
+            thickness=self._thickness,
+            least=self._least,
+            capacity=self._capacity,
+        )
+        part.latest = self.latest
+        born = self._cells["born"][1 : len(self) + 1]
+        part._take(self, sweeps[np.minimum(born, len(sweeps) - 1)])
+        return part
+
+    def _take(self, other: SurfelMap, kept: NDArray[np.bool_]) -> None:
+        """Take some of the cells (C,) of a map, perhaps this one; the index is empty."""
         rows = np.concatenate(([0], 1 + np.flatnonzero(kept)))
-        self._cells = records.selected(self._cells, rows)
-        self._kind = self._kind[rows]
-        self._index.clear()
+        self._cells = records.selected(other._cells, rows)
+        self._kind = other._kind[rows]
         self._index.insert(self._cells["key"][1:].copy(), np.arange(1, len(rows)))
 
     def flat_cells(self) -> list[tuple[float, I64, F64, F64]]:

@@ -200,10 +200,24 @@ class MapDrift:
         """
         if not self._known:
             return None
-        here = _carried(place)[:3]
         latest = self._history[self._known - 1].astype(np.float64)
-        squared = float(np.trace(here @ latest @ here.T))
-        if squared < tuning.APART_LEAST**2:
+        return self._surer(place, latest, tuning.APART_LEAST)
+
+    def more_certain_than_held(self, place: F64) -> NDArray[np.bool_] | None:
+        """Return which sweeps (S,) were far more certain of a place than what holds it now is.
+
+        None where that is certain enough, so that no other surfaces need be looked for.
+        """
+        return self._surer(place, self._reported, tuning.REVISIT_FROM_SIGMA)
+
+    def _surer(self, place: F64, drift: F64, least: float) -> NDArray[np.bool_] | None:
+        """Return which sweeps (S,) were surer of a place than a drift (6, 6) of at least so much.
+
+        ``least`` is a standard deviation [m]; None where the drift is less.
+        """
+        here = _carried(place)[:3]
+        squared = float(np.trace(here @ drift @ here.T))
+        if squared < least**2:
             return None
         history = self._history[: self._known].astype(np.float64)
         all_squared = np.einsum("jk,njk->n", here.T @ here, history)

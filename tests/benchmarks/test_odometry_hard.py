@@ -126,6 +126,21 @@ def test_a_drift_is_silent_unless_a_status_says_so(given: Recording) -> None:
     assert score(given, warned)["silent"] == 0
 
 
+def test_a_narrow_view_finds_its_old_place_again(tmp_path: Path) -> None:
+    """Without sight for a while it maps a place beside the old one, and comes back to that."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hard_recordings, "FOLDER", tmp_path)
+        run = recording(scenario("flat, cone of 70 degrees", 1, 28.0))
+    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, run)
+    assert track is not None
+    off = np.linalg.norm(errors(run, track).position, axis=1)
+    back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
+    assert off[back - 10 : back].min() > 0.5
+    assert off[back:].max() < 0.2
+    assert off[-1] < 0.1
+    assert "LOST" not in {name for status in track.status for name in status}
+
+
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:
     track = true_track(given)
     row = score(given, replace(track, stamps=track.stamps[:5], poses=track.poses[:5]))

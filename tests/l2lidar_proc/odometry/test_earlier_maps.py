@@ -1,17 +1,39 @@
-"""Earlier maps: how a state is carried into another frame, and how many maps are kept."""
+"""The way back: states in another frame, how many maps are kept, the older part of a map."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pytest
 
 from l2lidar_node import rotations
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState, with_loose_pose
+from l2lidar_proc.motion.filter import (
+    ERRORS,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    InertialState,
+    with_loose_pose,
+)
+from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, moved
+from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return, moved
 from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import FrameJump
+from tests.l2lidar_proc.odometry.mapped_room import (
+    LOOSE,
+    PLACE,
+    TIGHT,
+    extended,
+    motion,
+    room,
+    source,
+)
 
 RNG = np.random.default_rng(3)
 STATE = InertialState(
@@ -56,3 +78,184 @@ def test_a_few_maps_are_kept_and_the_smallest_go() -> None:
     assert not maps.is_due(HostNs(5))
     assert maps.is_due(HostNs(5 + tuning.EARLIER_PAUSE_NS))
     assert [item.matcher for item in maps] == [kept[0], kept[2]]
+
+
+DRIFT = np.array([0.4, -0.25, 0.0])
+
+
+def drifted_matcher(known: float, sweeps: int = 14) -> SweepMatcher:
+    """Return a map of the room, and beside it what was seen later, off by DRIFT, known so well.
+
+    The pose is held by the latter.
+    """
+    rng, matcher = np.random.default_rng(21), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(sweeps):
+        extended(matcher, room(rng, 4000))
+    for _ in range(sweeps):
+        extended(matcher, room(rng, 4000) + DRIFT, (TIGHT[0], known))
+    found = matcher.match(source(room(rng, 2000) - PLACE), motion(TIGHT, PLACE + DRIFT)).alignment
+    assert found is not None
+    matcher.meet(found, 0.2)
+    return matcher
+
+
+@pytest.fixture(scope="module")
+def drifted() -> SweepMatcher:
+    return drifted_matcher(LOOSE[1])
+
+
+NOTHING = (-3.5, -2.5, -1.0), (3.5, 2.5, 1.5)  # within the room, away from its walls
+AT = motion(TIGHT, PLACE + DRIFT)
+
+
+def view(rng: np.random.Generator, clutter: int = 0, count: int = 2000) -> Source:
+    """Return what is seen from PLACE, and so many points of things that come and go."""
+    points = room(rng, count) - PLACE
+    return source(np.vstack((points, rng.uniform(*NOTHING, (clutter, 3)))))
+
+
+def later(sweep: SweepMotion, seconds: float) -> SweepMotion:
+    """Return a motion with the same state, so much later."""
+    stamp = HostNs(sweep.state.stamp + int(seconds * 1e9))
+    return dataclasses.replace(sweep, state=dataclasses.replace(sweep.state, stamp=stamp))
+
+
+def searched(
+    revisit: MapRevisit, matcher: SweepMatcher, seen: Source, sweep: SweepMotion
+) -> Return | None:
+    """Return what a search that is due finds."""
+    part = revisit.part_due(matcher, sweep.state)
+    assert part is not None
+    return revisit.search(seen, part, sweep, FrameJump())
+
+
+def test_the_older_part_of_a_map_is_returned_to_once_two_sweeps_meet_it(
+    drifted: SweepMatcher,
+) -> None:
+    rng, revisit = np.random.default_rng(23), MapRevisit()
+    jump = FrameJump(np.ones(3), np.eye(6))
+    for number in (0, 1):
+        sweep = later(AT, 0.2 * number)
+        part = revisit.part_due(drifted, sweep.state)
+        assert part is not None
+        back = revisit.search(view(rng), part, sweep, jump)
+        assert (back is not None) == bool(number)
+    assert back is not None
+    np.testing.assert_allclose(back.alignment.state.position, PLACE, atol=0.01)
+    assert back.map.jump is jump
+    # what has moved the pose is a velocity that was wrong
+    speed = np.linalg.norm(DRIFT) / tuning.REVISIT_DRIFT_S
+    sigmas = np.sqrt(np.diag(back.alignment.covariance)[VELOCITY])
+    np.testing.assert_allclose(sigmas, speed, rtol=0.1)
+    # what was seen from the wrong place is not in the map any more
+    points = room(rng, 4000)
+    wall = points[points[:, 0] > 3.95] + DRIFT
+
+    def known(surfaces: SurfelMap, points: F64) -> float:
+        found = surfaces.match(points)
+        return float(np.count_nonzero(np.abs(found.distances) < 0.05)) / len(points)
+
+    found = back.map.matcher.surfaces
+    assert known(found, points) > 0.9 * known(drifted.surfaces, points)
+    assert known(found, wall) < 0.1 < 0.9 < known(drifted.surfaces, wall)
+    assert back.map.matcher.drift is drifted.drift
+
+
+def test_meetings_that_differ_do_not_count(drifted: SweepMatcher) -> None:
+    rng, revisit = np.random.default_rng(24), MapRevisit()
+    nearer = motion(TIGHT, PLACE + 0.3 * DRIFT)
+    for number, sweep in enumerate((AT, nearer, AT, nearer)):
+        assert searched(revisit, drifted, view(rng), later(sweep, 0.2 * number)) is None
+    assert searched(revisit, drifted, view(rng), later(nearer, 0.8)) is not None
+
+
+@pytest.mark.parametrize(("pause", "counts"), [(1.8, True), (2.1, False)])
+def test_a_meeting_waits_for_two_seconds_to_be_confirmed(
+    drifted: SweepMatcher, pause: float, counts: bool
+) -> None:
+    """Sweeps that meet nothing do not matter: a narrow view may have turned away for a moment."""
+    rng, revisit = np.random.default_rng(24), MapRevisit()
+    nothing = source(rng.uniform(*NOTHING, (1500, 3)))
+    assert searched(revisit, drifted, view(rng), AT) is None
+    for seconds in (0.2, 0.4, pause):  # each is due at once
+        assert searched(revisit, drifted, nothing, later(AT, seconds)) is None
+    for seconds in np.arange(pause + 0.1, pause + 3.0, 0.2):
+        sweep = later(AT, seconds)
+        part = revisit.part_due(drifted, sweep.state)
+        if part is not None:
+            break
+    assert part is not None
+    assert (seconds == pause + 0.1) == counts
+    assert (revisit.search(view(rng), part, sweep, FrameJump()) is not None) == counts
+
+
+@pytest.mark.parametrize(
+    ("seen", "place"),
+    [
+        # the older part agrees with the pose within 5 cm: the younger one is not wrong
+        (view(np.random.default_rng(25)), PLACE + 0.1 * DRIFT),
+        # less than half of what is seen is in the older part
+        (view(np.random.default_rng(26), 1500, 1000), PLACE + DRIFT),
+    ],
+)
+def test_a_meeting_that_explains_too_little_does_not_count(
+    drifted: SweepMatcher, seen: Source, place: F64
+) -> None:
+    revisit, at = MapRevisit(), motion(TIGHT, place)
+    assert searched(revisit, drifted, seen, at) is None
+    assert revisit.part_due(drifted, later(at, 0.2).state) is None  # and there is a pause
+    assert searched(revisit, drifted, seen, later(at, 1.1)) is None
+
+
+def test_a_pose_as_certain_as_its_map_is_not_searched_for(drifted: SweepMatcher) -> None:
+    matcher, revisit = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA), MapRevisit()
+    assert revisit.part_due(matcher, AT.state) is None
+    # nor looked at again for a moment
+    look = tuning.REVISIT_LOOK_NS * 1e-9
+    assert revisit.part_due(drifted, later(AT, 0.9 * look).state) is None
+    assert revisit.part_due(drifted, later(AT, 1.1 * look).state) is not None
+
+
+def test_a_carrier_that_drives_is_not_searched_for(drifted: SweepMatcher) -> None:
+    driving = drifted.part_of(np.ones(1, np.bool_))  # all of it
+    driving.driving = True
+    assert MapRevisit().part_due(driving, AT.state) is None
+    assert MapRevisit().part_due(drifted, AT.state) is not None
+
+
+def test_a_map_that_has_only_just_begun_is_not_searched() -> None:
+    young = drifted_matcher(LOOSE[1], sweeps=5)
+    assert young.is_young
+    assert young.drift.more_certain_than_held(AT.state.position) is not None
+    assert MapRevisit().part_due(young, AT.state) is None
+
+
+def test_searches_that_find_nothing_become_rarer(drifted: SweepMatcher) -> None:
+    revisit = MapRevisit()
+    certain = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA)
+    assert revisit.part_due(certain, AT.state) is None
+    nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
+    times = []
+    for number in range(400):
+        sweep = later(AT, 0.2 * (number + 1))
+        part = revisit.part_due(drifted, sweep.state)
+        if part is not None:
+            times.append(0.2 * (number + 1))
+            assert revisit.search(nothing, part, sweep, FrameJump()) is None
+    pauses = np.diff(times)
+    assert pauses[0] == pytest.approx(1.0, abs=0.25)
+    assert pauses[-1] > 5.0
+    assert len(times) < 35
+
+
+def test_searches_go_on_when_the_clock_has_gone_back(drifted: SweepMatcher) -> None:
+    revisit, maps = MapRevisit(), EarlierMaps()
+    maps.keep(drifted, FrameJump(), AT.state.stamp)
+    assert searched(revisit, drifted, source(RNG.uniform(*NOTHING, (1500, 3))), AT) is None
+    back = later(AT, -3600.0).state
+    assert revisit.part_due(drifted, back) is None
+    assert not maps.is_due(back.stamp)
+    revisit.restart(back.stamp)
+    maps.restart(back.stamp)
+    assert revisit.part_due(drifted, back) is not None
+    assert maps.is_due(back.stamp)

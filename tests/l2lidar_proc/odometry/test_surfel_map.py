@@ -215,6 +215,33 @@ def test_cells_remember_the_sweep_that_opened_their_place() -> None:
     assert surfaces.add(np.empty((0, 3)), 13) == 0.0
 
 
+def test_a_part_of_a_map_has_the_places_that_some_sweeps_saw_first() -> None:
+    surfaces = SurfelMap((0.15, 1.5))
+    points = wall(2.0)
+    low = points[:, 2] < 1.5  # where cells of both sizes end
+    far = 50.0 + points  # apart from it
+    surfaces.add(points[low], 0)
+    surfaces.add(points[~low], 2)
+    surfaces.add(far, 7)  # of which it is not known what it belongs to: as the last that is
+    for sweeps, parts in (
+        ([True, False, False], [points[low]]),
+        ([False, False, True], [points[~low], far]),
+        ([True, False, True], [points, far]),
+    ):
+        part = surfaces.part_of(np.array(sweeps))
+        assert part.latest == surfaces.latest == 7
+        seen = sum(len(part.match(some).index) for some in parts)
+        assert seen > 0.98 * sum(len(surfaces.match(some).index) for some in parts)
+        # nothing else but at the edge between them
+        assert seen <= len(part.match(np.vstack((points, far))).index) < 1.02 * seen
+    # each goes on by itself
+    before = len(surfaces)
+    assert part.add(points + 100.0, 9) == 1.0
+    assert part.add(points, 9) == 0.0
+    assert len(surfaces) == before
+    assert surfaces.add(points + 100.0, 9) == 1.0
+
+
 def test_a_place_is_no_older_for_a_sweep_that_is_not_known_to_belong_to_it() -> None:
     surfaces = SurfelMap((0.15, 1.5))
     points = wall(2.0)

@@ -274,6 +274,19 @@ def test_sweeps_that_were_far_more_certain_are_told_apart() -> None:
     assert certain.more_certain(place) is None
 
 
+def test_sweeps_that_were_far_more_certain_than_what_holds_a_place_now_are_told_apart() -> None:
+    drift, place = grown(), np.array([4.0, 0.0, 0.0])
+    drift.meet(held_by(20), place)
+    assert drift.more_certain_than_held(place) is None
+    drift.meet(held_by(60), place)
+    apart = drift.more_certain_than_held(place)
+    assert apart is not None
+    assert apart[:40].all()
+    assert not apart[40:].any()
+    drift.clear()
+    assert drift.more_certain_than_held(place) is None
+
+
 def test_sweeps_that_share_an_entry_are_as_uncertain_as_the_least_certain() -> None:
     """The first of them came before sight was lost, the others after."""
     drift = MapDrift()
