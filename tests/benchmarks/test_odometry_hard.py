@@ -17,6 +17,9 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
+from l2lidar_node.types import HostNs
+from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.odometry import Odometry
 from tests.support.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
@@ -126,19 +129,44 @@ def test_a_drift_is_silent_unless_a_status_says_so(given: Recording) -> None:
     assert score(given, warned)["silent"] == 0
 
 
-def test_a_narrow_view_finds_its_old_place_again(tmp_path: Path) -> None:
-    """Without sight for a while it maps a place beside the old one, and comes back to that."""
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Return a narrow view that is without sight for a while, and comes back to its old place."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hard_recordings, "FOLDER", tmp_path)
-        run = recording(scenario("flat, cone of 70 degrees", 1, 28.0))
-    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, run)
+        patch.setattr(hard_recordings, "FOLDER", tmp_path_factory.mktemp("recordings"))
+        return recording(scenario("flat, cone of 70 degrees", 1, 28.0))
+
+
+def test_a_narrow_view_finds_its_old_place_again(narrow: Recording) -> None:
+    """It had mapped another one beside it."""
+    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, narrow)
     assert track is not None
-    off = np.linalg.norm(errors(run, track).position, axis=1)
+    off = np.linalg.norm(errors(narrow, track).position, axis=1)
     back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
     assert off[back - 10 : back].min() > 0.5
     assert off[back:].max() < 0.2
     assert off[-1] < 0.1
     assert "LOST" not in {name for status in track.status for name in status}
+
+
+def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
+    narrow: Recording,
+) -> None:
+    hour, jump = 3_600_000_000_000, EPOCH + 14_000_000_000
+    odometry = Odometry(OdometryConfig(), narrow.T_cloud_imu)
+    names: list[set[str]] = []
+    first = 0
+    for sweep in narrow.sweeps():
+        last = int(np.searchsorted(narrow.imu["stamp"], sweep.end)) + 1
+        imu, one = narrow.imu[first:last].copy(), sweep
+        if sweep.start >= jump:
+            imu["stamp"] -= hour
+            one = replace(sweep, start=HostNs(sweep.start - hour), end=HostNs(sweep.end - hour))
+        odometry.imu(imu)
+        first = last
+        names += [{status.name for status in item.status} for item in odometry.register(one)]
+    restarted = next(k for k, status in enumerate(names) if "RESTARTED" in status)
+    assert "RETURNED" in set().union(*names[restarted:])
 
 
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -108,10 +109,9 @@ NOTHING = (-3.5, -2.5, -1.0), (3.5, 2.5, 1.5)  # within the room, away from its 
 AT = motion(TIGHT, PLACE + DRIFT)
 
 
-def view(rng: np.random.Generator, clutter: int = 0, count: int = 2000) -> Source:
-    """Return what is seen from PLACE, and so many points of things that come and go."""
-    points = room(rng, count) - PLACE
-    return source(np.vstack((points, rng.uniform(*NOTHING, (clutter, 3)))))
+def view(rng: np.random.Generator) -> Source:
+    """Return what is seen from PLACE."""
+    return source(room(rng, 2000) - PLACE)
 
 
 def later(sweep: SweepMotion, seconds: float) -> SweepMotion:
@@ -189,22 +189,67 @@ def test_a_meeting_waits_for_two_seconds_to_be_confirmed(
     assert (revisit.search(view(rng), part, sweep, FrameJump()) is not None) == counts
 
 
+def far_view(rng: np.random.Generator) -> Source:
+    """Return a view of which more than half lies behind the walls, where there is no map."""
+    beyond = rng.uniform((6.0, -3.0, -1.0), (12.0, 3.0, 2.0), (1500, 3))
+    return source(np.vstack((room(rng, 1000), beyond)) - PLACE)
+
+
+def furnished_view(rng: np.random.Generator) -> Source:
+    """Return a view of the room with things that stand 20 cm in front of its walls."""
+    points = room(rng, 2000)
+    for axis, side in ((0, 3.9), (1, 2.9)):
+        before = (np.abs(points[:, axis]) > side) & (rng.random(len(points)) < 0.5)
+        points[before, axis] -= 0.2 * np.sign(points[before, axis])
+    return source(points - PLACE)
+
+
 @pytest.mark.parametrize(
     ("seen", "place"),
     [
         # the older part agrees with the pose within 5 cm: the younger one is not wrong
-        (view(np.random.default_rng(25)), PLACE + 0.1 * DRIFT),
+        (view, PLACE + 0.1 * DRIFT),
         # less than half of what is seen is in the older part
-        (view(np.random.default_rng(26), 1500, 1000), PLACE + DRIFT),
+        (far_view, PLACE + DRIFT),
     ],
 )
 def test_a_meeting_that_explains_too_little_does_not_count(
-    drifted: SweepMatcher, seen: Source, place: F64
+    drifted: SweepMatcher, seen: Callable[[np.random.Generator], Source], place: F64
 ) -> None:
     revisit, at = MapRevisit(), motion(TIGHT, place)
-    assert searched(revisit, drifted, seen, at) is None
+    rng = np.random.default_rng(26)
+    assert searched(revisit, drifted, seen(rng), at) is None
     assert revisit.part_due(drifted, later(at, 0.2).state) is None  # and there is a pause
-    assert searched(revisit, drifted, seen, later(at, 1.1)) is None
+    assert searched(revisit, drifted, seen(rng), later(at, 1.1)) is None
+
+
+def test_a_meeting_with_something_else_does_not_count_even_if_sweeps_match_no_better_of_late() -> (
+    None
+):
+    matcher, rng = drifted_matcher(LOOSE[1]), np.random.default_rng(26)
+    for _ in range(40):
+        found = matcher.match(furnished_view(rng), AT).alignment
+        assert found is not None
+        matcher.meet(found, 0.2)
+    for seen, counts in ((furnished_view, False), (view, True)):
+        revisit = MapRevisit()
+        backs = []
+        for number in range(16):
+            sweep = later(AT, 0.5 * number)
+            part = revisit.part_due(matcher, sweep.state)
+            if part is not None:
+                backs.append(revisit.search(seen(rng), part, sweep, FrameJump()))
+        assert len(backs) >= 8
+        assert any(back is not None for back in backs) == counts
+
+
+def test_a_meeting_before_the_pose_was_certain_again_does_not_count(drifted: SweepMatcher) -> None:
+    rng, revisit = np.random.default_rng(27), MapRevisit()
+    certain = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA)
+    assert searched(revisit, drifted, view(rng), AT) is None
+    assert revisit.part_due(certain, later(AT, 0.2).state) is None
+    assert searched(revisit, drifted, view(rng), later(AT, 0.5)) is None
+    assert searched(revisit, drifted, view(rng), later(AT, 0.7)) is not None
 
 
 def test_a_pose_as_certain_as_its_map_is_not_searched_for(drifted: SweepMatcher) -> None:

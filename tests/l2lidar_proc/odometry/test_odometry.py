@@ -347,6 +347,26 @@ def test_lost_elsewhere_it_begins_a_new_map_and_returns_into_the_old_one() -> No
     assert [item for item in estimates if Status.RETURNED in item.status] == [estimates[back]]
 
 
+def test_the_old_map_is_searched_again_after_the_clock_has_gone_back() -> None:
+    room, yard = recording("room", "walk", 10.5), recording("yard", "walk", 10.5)
+    epoch, hour = sweep_epoch(room), 3_600_000_000_000
+    away, home = epoch + 3_300_000_000, epoch + 9_000_000_000
+    some = [one for one in sweeps(room, "turn") if one.end < away]
+    some += [one for one in sweeps(yard, "turn") if away <= one.start < home]
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    assert any(Status.LOST in item.status for item in feed(odometry, room, some))
+    imu = room.imu[room.imu["stamp"] >= home].copy()
+    imu["stamp"] -= hour
+    back = [
+        dataclasses.replace(one, start=HostNs(one.start - hour), end=HostNs(one.end - hour))
+        for one in sweeps(room, "turn")
+        if one.start >= home
+    ]
+    estimates = feed(odometry, room, back, imu)
+    assert Status.RESTARTED in estimates[0].status
+    assert any(Status.RETURNED in item.status for item in estimates)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 9, 50])
 @pytest.mark.parametrize("mode", ["alone", "in the middle"])
 def test_thin_clouds_do_no_harm(count: int, mode: str) -> None:

@@ -283,6 +283,10 @@ def test_sweeps_that_were_far_more_certain_than_what_holds_a_place_now_are_told_
     assert apart is not None
     assert apart[:40].all()
     assert not apart[40:].any()
+    drift.meet(held_by(20), place)  # once may be by chance
+    assert drift.more_certain_than_held(place) is not None
+    settle(drift, held_by(20), place)
+    assert drift.more_certain_than_held(place) is None
     drift.clear()
     assert drift.more_certain_than_held(place) is None
 
