@@ -169,6 +169,40 @@ WALL_FLAT: Final = 0.1  # of the scatter's second eigenvalue: below it the first
 RANGE_NOISE_SLOPE: Final = 0.0011  # [m/m]
 RANGE_NOISE_FACTOR: Final = 2.0  # on the standard deviation: neighbors err together
 
+# ---- odometry: vertical lines. Tuned on: seeds 0 to 7 of the hard corridors, where 4 to 9 sweeps
+# see a reveal of a door, and each gives its place along the corridor to 2 or 3 mm.
+
+LINE_SLOPE: Final = 0.3  # sine of the direction against the horizontal
+LINE_RANGE: Final = 8.0  # [m] farther away they are few, and false ones prevail
+LINE_SCANNED: Final = 15_000  # points of a sweep. Bounds the time; a turn of an L2 has fewer
+LINE_WALL_SLOPE: Final = 0.2  # cosine: surfaces along the direction are walls
+LINE_WALL_REACH: Final = 0.02  # [m] points nearer to such a surface belong to it,
+LINE_WALL_THICKNESS: Final = 0.015  # [m] unless it is thicker: that may be wall and reveal
+LINE_RADIUS: Final = 0.03  # [m] in plan, 2.5 times the range noise
+LINE_ROUNDS: Final = 3  # of mean shift
+LINE_MOST: Final = 60  # of a sweep. Bounds the time
+LINE_POINTS: Final = 12  # of a line, at least
+LINE_HEIGHT: Final = 0.25  # [m] standard deviation of the heights, at least
+LINE_SPREAD: Final = 0.0135  # [m] standard deviation along the direction, at most
+LINE_NOISE: Final = (0.008, 0.004)  # [m] of one point at least, and common to all of a line
+LINE_KEPT_NS: Final = 6_000_000_000  # [ns] in which a door is passed
+LINE_KEPT: Final = 1000  # lines at most. Bounds memory and time
+LINE_PAUSE_S: Final = 0.1  # [s] between two sweeps, at least
+LINE_DEEPEST: Final = 0.15  # [m] across, between two lines of one reveal
+LINE_REACH: Final = 0.3  # [m] along, likewise: two reveals are farther apart
+LINE_SIGMAS: Final = 3.0  # of the velocity, likewise,
+LINE_BETWEEN: Final = 0.008  # [m] and of the places
+LINE_FIT_NOISE: Final = 0.003  # [m] of the places, besides their own
+LINE_WANDER: Final = 0.01  # [m/s^2/sqrt(Hz)] by which the error of the velocity changes meanwhile
+LINE_FACE: Final = 0.02  # [m] along: lines of a sweep that are nearer are one face
+LINE_OUTLIER: Final = 2.5  # sigma by which a pair may disagree
+# Votes needed: where the velocity may have moved the lines by less than the length below, or more.
+LINE_VOTES: Final = (0.8, 1.5)
+LINE_UNSURE: Final = 0.025  # [m] 1 sigma
+LINE_CHANCE: Final = 2.0  # times the votes that chance gives, besides
+LINE_RIVAL: Final = 0.6  # of the votes, that no other velocity may have
+LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ at least
+
 # ---- odometry: map of surfaces
 
 ELONGATED: Final = 9.0  # variance ratio: a surface is at least 3 times wider than it is thick

@@ -41,6 +41,7 @@ from l2lidar_proc.odometry.estimate import AlignmentQuality
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import MapDrift
+from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
 
 
 class Match(NamedTuple):
@@ -278,6 +279,44 @@ class SweepMatcher:
             np.sqrt(speeds) * seconds,
             found.strongly,
         )
+
+    def driving_direction(self, found: Alignment) -> F64 | None:
+        """Return the direction (3,) along which a carrier drives while its place is free.
+
+        None unless an alignment leaves exactly one direction of the place free, which is level,
+        and the carrier drives: by what it has shown before, or by its present velocity.
+        """
+        free = unobserved_directions(found.information[POSITION, POSITION])
+        if free.shape[1] != 1:
+            return None
+        along, gravity = free[:, 0], found.state.gravity
+        if abs(float(along @ gravity)) > tuning.LINE_SLOPE * float(np.linalg.norm(gravity)):
+            return None
+        sigma = float(np.sqrt(along @ found.covariance[VELOCITY, VELOCITY] @ along))
+        drives = abs(float(along @ found.state.velocity)) - sigma > tuning.DRIVING_SPEED
+        return along if self.driving or drives else None
+
+    def vertical_lines(self, sweep: Sweep, motion: SweepMotion, axes: F64) -> Lines:
+        """Return the vertical lines that a sweep sees away from known walls.
+
+        Parameters
+        ----------
+        sweep : Sweep
+        motion : SweepMotion
+            Places the points.
+        axes : ndarray, shape (3, 3)
+            As :func:`~l2lidar_proc.odometry.vertical_lines.level_axes` returns them, of the
+            direction along which the walls run.
+        """
+        seen = xyz(sweep.points)
+        near = np.flatnonzero((seen**2).sum(axis=1) < tuning.LINE_RANGE**2)
+        near = near[:: max(-(-len(near) // tuning.LINE_SCANNED), 1)]
+        some = dataclasses.replace(sweep, points=records.selected(sweep.points, near))
+        moved = self.deskewed(some, motion)
+        state = motion.state
+        placed = (xyz(moved) - self.lever) @ state.rotation.T + state.position
+        stamps = sweep.start + np.round(moved["time"] * 1e9).astype(np.int64)
+        return extract_lines(placed, stamps, self.surfaces.are_along(placed, axes[0]), axes)
 
     def _note_height(self, found: Alignment, seconds: float) -> None:
         """Note for how long the height has been fixed, of late."""

@@ -31,6 +31,7 @@ from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, crop
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.uncertainty import FrameJump, InnovationTest
+from l2lidar_proc.odometry.vertical_lines import VerticalLines, level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
 LIBRARIES: Final = (*kiss.LIBRARIES, eskf.LIBRARY, "scipy.spatial.transform")
@@ -101,6 +102,7 @@ class Odometry:
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0
+        self._lines = VerticalLines()
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
         self._revisit = MapRevisit()
@@ -225,10 +227,12 @@ class Odometry:
             self._note_unmatched(sweep, len(source.points), status)
             posterior = predicted.state, predicted.covariance
         else:
+            found = self._with_lines(sweep, predicted, found)
             self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
         motion = self._constrained(predicted, *posterior, status)
+        self._lines.correct(posterior[0], motion.state)
         if self._unmatched_ns >= tuning.LOST_NS:
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
@@ -246,6 +250,18 @@ class Odometry:
             fresh = self.matcher.extend(estimate.points, motion, guess)
             self._anchor_anew(fresh)
         return estimate
+
+    def _with_lines(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> Alignment:
+        """Return an alignment with what vertical lines tell where surfaces leave it free."""
+        self._lines.correct(predicted.state, found.state)
+        direction = self.matcher.driving_direction(found)
+        if direction is None:
+            return found
+        axes = level_axes(direction, found.state.gravity)
+        motion = predicted.with_state(found.state, found.covariance)
+        lines = self.matcher.vertical_lines(sweep, motion, axes)
+        state, covariance = self._lines.update(found.state, found.covariance, lines, axes)
+        return dataclasses.replace(found, state=state, covariance=covariance)
 
     def _constrained(
         self, predicted: SweepMotion, after: InertialState, covariance: F64, status: list[Status]
@@ -286,6 +302,7 @@ class Odometry:
             self._keep_at_rest(motion)
         else:
             motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
+            self._lines.correct(predicted.state, motion.state)
             self._keep(motion)
         quality = self._consistency(self.matcher.quality(len(sweep.points), None))
         return self._estimate(sweep, motion, status, quality)
@@ -334,6 +351,7 @@ class Odometry:
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
         if rests:
             self._innovations.clear()
+            self._lines.clear()
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map at the predicted pose; keep the one before, it may be seen again."""
@@ -347,6 +365,7 @@ class Odometry:
             self._earlier.keep(self.matcher, before, motion.state.stamp)
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
+        self._lines.clear()
         self._unmatched_ns = 0
         self._innovations.clear()
         self.phase = Phase.LOST
@@ -374,6 +393,7 @@ class Odometry:
         self._initializer = self._new_initializer()
         self.matcher.meet(back.alignment, 0.0)
         self._zero_velocity.clear()
+        self._lines.clear()
         self._innovations.clear()
         self._unmatched_ns = 0
         self.phase = Phase.TRACKING
@@ -494,6 +514,7 @@ class Odometry:
         self._jump = self._jump.unseen(self._belief[0])
         self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
         self._zero_velocity.clear()
+        self._lines.clear()
         self._innovations.clear()
         self._earlier.restart(reference)
         self._revisit.restart(reference)

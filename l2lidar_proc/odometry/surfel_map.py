@@ -419,6 +419,27 @@ class SurfelMap:
             self._kind[row],
         )
 
+    def are_along(self, points: F64, direction: F64) -> NDArray[np.bool_]:
+        """Return which points lie on thin flat surfaces that run along a direction.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            [m], map frame.
+        direction : ndarray, shape (3,)
+            Unit.
+        """
+        found = self.match(points)
+        thickness2 = self._cells["spread"][found.cells, 0]
+        on_wall = (
+            (np.abs(found.normals @ direction) < tuning.LINE_WALL_SLOPE)
+            & (np.abs(found.distances) < tuning.LINE_WALL_REACH)
+            & (thickness2 < tuning.LINE_WALL_THICKNESS**2)
+        )
+        along = np.zeros(len(points), np.bool_)
+        along[found.index[on_wall]] = True
+        return along
+
     def tilts(self, cells: I64, axis: I64) -> F64:
         """Return how far normals may be tilted towards each axis of their cells, 1 sigma.
 
