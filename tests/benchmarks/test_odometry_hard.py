@@ -20,6 +20,7 @@ from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.vertical_lines import VerticalLines
 from tests.support.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
@@ -167,6 +168,24 @@ def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
         names += [{status.name for status in item.status} for item in odometry.register(one)]
     restarted = next(k for k, status in enumerate(names) if "RESTARTED" in status)
     assert "RETURNED" in set().union(*names[restarted:])
+
+
+def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the surfaces alone the sensor ends more than a meter farther along it."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    corridor = recording(scenario("corridor, 80 degrees", 13, 24.0))
+    ends = []
+    for _ in range(2):
+        track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, corridor)
+        assert track is not None
+        ends.append(score(corridor, track)["end_m"])
+        monkeypatch.setattr(
+            VerticalLines, "update", lambda _, state, covariance, *others: (state, covariance)
+        )
+    assert ends[0] < 0.4
+    assert ends[1] > 1.0
 
 
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:
