@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.vertical_lines import VerticalLines
+from l2lidar_proc.odometry.vertical_lines import LINE, VerticalLines
 from tests.support.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
@@ -186,6 +187,25 @@ def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
         )
     assert ends[0] < 0.4
     assert ends[1] > 1.0
+
+
+def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
+    odometry = Odometry(OdometryConfig(), narrow.T_cloud_imu)
+    hour = 3_600_000_000_000
+    some = list(islice(narrow.sweeps(), 30))
+    odometry.imu(narrow.imu[narrow.imu["stamp"] < some[-1].end])
+    for sweep in some:
+        odometry.register(sweep)
+    line = np.zeros(1, LINE)
+    line["stamp"] = some[-1].start
+    state = odometry.motion.state if odometry.motion else None
+    assert state is not None
+    odometry._lines.update(state, np.eye(18), line, np.eye(3))
+    assert len(odometry._lines) == 1
+    odometry.register(
+        replace(some[-1], start=HostNs(some[-1].start - hour), end=HostNs(some[-1].end - hour))
+    )
+    assert len(odometry._lines) == 0
 
 
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:

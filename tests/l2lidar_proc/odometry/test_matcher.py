@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.matcher import Match, SweepMatcher
@@ -248,6 +251,46 @@ def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
     assert found.denser is not None
     both = np.vstack((found.points, found.denser().points))
     assert len(np.unique(both, axis=0)) == len(both) > len(found.points)
+
+
+@pytest.mark.parametrize(
+    ("free", "speed", "sigma", "driving", "found"),
+    [
+        ((0,), 0.2, 0.3, True, True),
+        ((0,), 0.2, 0.3, False, False),  # a sensor that is moved by hand
+        ((0,), -1.3, 0.3, False, True),  # too fast for that
+        ((0,), -1.3, 0.7, False, False),  # perhaps
+        ((), 1.3, 0.1, True, False),
+        ((0, 1), 1.3, 0.1, True, False),
+        ((2,), 1.3, 0.1, True, False),  # up
+    ],
+)
+def test_a_drive_along_one_free_level_direction(
+    free: tuple[int, ...], speed: float, sigma: float, driving: bool, found: bool
+) -> None:
+    """About the axes of a corridor that rises by 10 degrees."""
+    slope = np.deg2rad(10.0)
+    axes = np.array(
+        [
+            [np.cos(slope), 0.0, -np.sin(slope)],
+            [0.0, 1.0, 0.0],
+            [np.sin(slope), 0.0, np.cos(slope)],
+        ]
+    )
+    still = motion(TIGHT, np.zeros(3)).state
+    state = dataclasses.replace(still, velocity=speed * axes[:, 0])
+    covariance, information = np.zeros((2, eskf.ERRORS, eskf.ERRORS))
+    covariance[eskf.VELOCITY, eskf.VELOCITY] = sigma**2 * np.eye(3)
+    known = np.diag([0.0 if axis in free else 1e6 for axis in range(3)])
+    information[eskf.POSITION, eskf.POSITION] = axes @ known @ axes.T
+    nobody = np.empty(0, np.int64), np.empty(0)
+    aligned = Alignment(state, covariance, information, np.eye(3), 100, 1.0, 0.0, 1, nobody)
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    matcher.driving = driving
+    direction = matcher.driving_direction(aligned)
+    assert (direction is not None) == found
+    if direction is not None:
+        assert abs(float(direction @ axes[:, 0])) == pytest.approx(1.0)
 
 
 def test_a_height_that_was_not_fixed_for_long_is_not_observed() -> None:
