@@ -23,7 +23,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from l2lidar_node import records
 from l2lidar_node.types import F64, I64
@@ -99,6 +98,8 @@ def extract_lines(points: F64, stamps: I64, is_wall: NDArray[np.bool_], axes: F6
     -------
     ndarray, shape (M,), dtype LINE
     """
+    from scipy.spatial import cKDTree  # brings scipy.sparse along; a node starts without
+
     free = np.flatnonzero(~is_wall)
     if len(free) < tuning.LINE_POINTS:
         return np.zeros(0, LINE)
