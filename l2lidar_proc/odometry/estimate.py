@@ -73,8 +73,9 @@ class AlignmentQuality:
     velocity_nis : float
         Likewise of the sum of what they corrected of the velocity: large where accelerometer and
         alignments contradict each other for seconds.
-    excess : float
-        By how much the variances of pose and velocity were raised for that, at least 1.
+    variance_factor : float
+        Factor on the variances of pose and velocity for that: above 1 where predictions are worse
+        than their covariance says, below where they are better and no direction was left free.
     beam_correction : tuple of float
         What was added to the unit's ``xi_angle`` and ``beta_angle`` [rad].
     """
@@ -89,7 +90,7 @@ class AlignmentQuality:
     map_cells: int = 0
     nis: float = 0.0
     velocity_nis: float = 0.0
-    excess: float = 1.0
+    variance_factor: float = 1.0
     beam_correction: tuple[float, float] = (0.0, 0.0)
 
 
@@ -206,7 +207,7 @@ def estimate_of(
     drift : MapDrift
         What the map's own place, and its own error, add to the covariance.
     """
-    state, p = motion.state, quality.excess * motion.covariance
+    state, p = motion.state, quality.variance_factor * motion.covariance
     if quality.matched and quality.degeneracy_ratio < tuning.DEGENERATE_SHARE:
         status = (*status, Status.DEGENERATE)
     pose = np.zeros((6, 18))

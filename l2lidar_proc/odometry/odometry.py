@@ -12,11 +12,11 @@ import numpy as np
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
-from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.filter import POSITION, InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
-from l2lidar_proc.odometry.alignment import Alignment
+from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return
@@ -170,7 +170,7 @@ class Odometry:
             return None
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
         nothing, noise = self._last.points[:0], self.config.inertial.gyro_noise
-        quality = AlignmentQuality(excess=self._last.quality.excess)
+        quality = AlignmentQuality(variance_factor=self._last.quality.variance_factor)
         return estimate_of(
             motion,
             self._lever,
@@ -225,6 +225,7 @@ class Odometry:
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
+            self._innovations.leave_free(predicted.state.stamp)
             posterior = predicted.state, predicted.covariance
         else:
             found = self._with_lines(sweep, predicted, found)
@@ -304,6 +305,7 @@ class Odometry:
             motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
             self._lines.correct(predicted.state, motion.state)
             self._keep(motion)
+            self._innovations.leave_free(motion.state.stamp)
         quality = self._consistency(self.matcher.quality(len(sweep.points), None))
         return self._estimate(sweep, motion, status, quality)
 
@@ -318,7 +320,10 @@ class Odometry:
         """Return the quality of an alignment with what the innovations of late say."""
         found = self._innovations
         return dataclasses.replace(
-            quality, nis=found.nis, velocity_nis=found.velocity_nis, excess=found.excess
+            quality,
+            nis=found.nis,
+            velocity_nis=found.velocity_nis,
+            variance_factor=found.variance_factor,
         )
 
     def _anchor_anew(self, fresh: float) -> None:
@@ -345,6 +350,8 @@ class Odometry:
         """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
         state, covariance = found.state, found.covariance
         self._innovations.take(predicted.state, predicted.covariance, state, covariance)
+        if unobserved_directions(found.information[POSITION, POSITION]).size:
+            self._innovations.leave_free(state.stamp)
         self._unmatched_ns = 0
         samples = self._predictor.samples(sweep.end - tuning.STILL_TEST_NS, sweep.end)
         rests = self._zero_velocity.watch(state, covariance, samples)

@@ -14,7 +14,8 @@ some seconds show two things. Their size shows whether the noise is as assumed: 
 normalized innovation squared (NIS) is 1 for each degree of freedom (Bar-Shalom et al. 2001,
 section 5.4). Their sum shows whether the accelerometer, with biases and gravity as estimated,
 contradicts the alignments: corrections of the velocity that are all alike do not average out.
-Neither sees an error along a direction that nothing measures.
+Variances are reported as much larger or smaller as that shows them to be. Neither sees an error
+along a direction that nothing measures: while there is one, variances are never reported smaller.
 """
 
 from __future__ import annotations
@@ -331,11 +332,16 @@ class InnovationTest:
     """Compares the innovations of the last seconds with their covariances."""
 
     def __init__(self) -> None:
-        self._recent: deque[_Correction] = deque()
+        self.clear()
 
     def clear(self) -> None:
         """Forget everything, as after a rest or a loss."""
-        self._recent.clear()
+        self._recent: deque[_Correction] = deque()
+        self._free: int | None = None  # stamp of the latest sweep that left a direction free
+
+    def leave_free(self, stamp: int) -> None:
+        """Take a sweep [ns] that left a direction of the place free, or all: it met nothing."""
+        self._free = stamp
 
     def take(
         self,
@@ -400,14 +406,22 @@ class InnovationTest:
         return float(total @ np.linalg.solve(allowed, total)) / 3.0
 
     @property
-    def excess(self) -> float:
-        """By how much variances are too small, at least 1."""
+    def variance_factor(self) -> float:
+        """Factor by which variances are to be reported larger, or smaller where below 1.
+
+        Smaller only where every direction was measured throughout the window.
+        """
         if len(self._recent) < tuning.NIS_LEAST:
             return 1.0
-        worse = max(self.nis, self.velocity_nis / tuning.NIS_CHANCE, 1.0)
-        return min(worse, tuning.NIS_MOST)
+        found = max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
+        if found >= 1.0:
+            return min(found, tuning.NIS_MOST)
+        newest = self._recent[-1].stamp
+        if self._free is not None and newest - self._free <= tuning.NIS_WINDOW_NS:
+            return 1.0
+        return min(max(tuning.NIS_MARGIN * found, 1.0 / tuning.NIS_MOST), 1.0)
 
     @property
     def contradicts(self) -> bool:
         """Whether chance does not explain the corrections."""
-        return self.excess > tuning.NIS_SUSPECT
+        return self.variance_factor > tuning.NIS_SUSPECT

@@ -87,7 +87,7 @@ def odometry_status(
         "speed_sigma_m_s": f"{estimate.speed_sigma:.4f}",
         "nis": f"{quality.nis:.3f}",
         "velocity_nis": f"{quality.velocity_nis:.3f}",
-        "variance_excess": f"{quality.excess:.2f}",
+        "variance_factor": f"{quality.variance_factor:.2f}",
         "tilt_rad": f"{estimate.tilt:.5f}",
         "age_s": f"{(now - estimate.stamp) * 1e-9:.3f}",
     }

@@ -72,6 +72,23 @@ def test_covariance_and_twist_are_those_of_the_errors() -> None:
     assert np.abs(rate - moving.angular_velocity).max() < 0.1
 
 
+@pytest.mark.parametrize("scene", ["room", "yard"])
+def test_the_covariance_of_the_velocity_is_neither_too_small_nor_too_large(
+    scene: str,
+) -> None:
+    """Normalized squared errors (NEES); 3 is their mean if the covariance is right."""
+    run = recording(scene, "walk", 14.0)
+    moved = [item for item in drive(run, "half turn") if item.quality.nis > 0.0]
+    assert len(moved) > 60
+    seconds = (np.array([item.stamp for item in moved]) - sweep_epoch(run)) * 1e-9
+    found = np.array([item.velocity for item in moved])
+    found -= run.motion.kinematics(seconds).velocity_body
+    covariances = np.array([item.twist_covariance[:3, :3] for item in moved])
+    nees = np.einsum("ni,ni->n", found, np.linalg.solve(covariances, found[..., None])[..., 0])
+    assert 0.6 < nees.mean() < 6.0
+    assert np.mean(nees < 7.8147) > 0.85  # the bound of 95 %
+
+
 def sweep_epoch(run: Any) -> Any:
     return int(run.imu["stamp"][0])
 

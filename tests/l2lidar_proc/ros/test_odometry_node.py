@@ -376,7 +376,7 @@ def test_back_ends_get_deskewed_clouds_and_the_status_of_each_pose(bench: Any) -
     values = {item.key: item.value for item in statuses[-1].status[0].values}
     sigma = np.sqrt(np.asarray(bench.poses[-1].pose.covariance).reshape(6, 6).diagonal())
     assert float(values["position_sigma_m"]) == pytest.approx(sigma[:3].max(), abs=1e-4)
-    assert float(values["variance_excess"]) == 1.0
+    assert float(values["variance_factor"]) == 1.0
     assert 0.0 <= float(values["nis"]) < 2.0
     assert float(values["tilt_rad"]) < 0.02
     assert values["degenerate_direction"] == "0.000 0.000 0.000"
