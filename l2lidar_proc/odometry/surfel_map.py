@@ -34,16 +34,17 @@ class CellIndex:
     """
 
     def __init__(self) -> None:
-        self.clear()
+        self._used = 0
+        self._make_slots(_LEAST_BITS)
 
     def __len__(self) -> int:
         """Return the number of keys."""
         return self._used
 
     def clear(self) -> None:
-        """Forget all keys."""
+        """Forget all keys; the slots stay for the next ones."""
         self._used = 0
-        self._make_slots(_LEAST_BITS)
+        self._rows[:] = 0
 
     def find(self, keys: I64) -> I64:
         """Return the row of each key, 0 for those that are not known.
@@ -477,8 +478,23 @@ class SurfelMap:
         kept = ((self._middles(cells["key"]) - origin) ** 2).sum(axis=1) <= distance * distance
         kept &= cells["seen"] >= since
         if not kept.all():
-            self._index.clear()
-            self._take(self, kept)
+            self._drop(1 + np.flatnonzero(~kept))
+
+    def _drop(self, rows: I64) -> None:
+        """Drop the cells of some rows, ascending; the last ones of the others take their places.
+
+        The memory stays: what is freed and asked for again comes back in pieces.
+        """
+        end = len(self) + 1
+        left = end - len(rows)
+        holes = rows[: np.searchsorted(rows, left)]
+        last = np.setdiff1d(np.arange(left, end), rows, assume_unique=True)
+        records.assign(self._cells, holes, records.selected(self._cells, last))
+        self._kind[holes] = self._kind[last]
+        self._cells[left:end] = np.zeros(1, CELL)
+        self._kind[left:end] = 0
+        self._index.clear()
+        self._index.insert(self._cells["key"][1:left].copy(), np.arange(1, left))
 
     def part_of(self, sweeps: NDArray[np.bool_]) -> SurfelMap:
         """Return a map with the cells of the places that some of the sweeps (S,) saw first."""
@@ -494,7 +510,7 @@ class SurfelMap:
         return part
 
     def _take(self, other: SurfelMap, kept: NDArray[np.bool_]) -> None:
-        """Take some of the cells (C,) of a map, perhaps this one; the index is empty."""
+        """Take some of the cells (C,) of another map; this one is empty."""
         rows = np.concatenate(([0], 1 + np.flatnonzero(kept)))
         self._cells = records.selected(other._cells, rows)
         self._kind = other._kind[rows]

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, strategies as st
 
 from l2lidar_node.types import HostNs
@@ -165,6 +166,40 @@ def test_cells_out_of_sight_are_forgotten_and_full_ones_in_sight_stay() -> None:
     assert surfaces.match(places).index.tolist() == [0]
     surfaces.forget(np.zeros(3), 10.0, 8)
     assert not len(surfaces)
+
+
+@pytest.mark.parametrize("kept", ["first", "last", "every other", "none", "all"])
+def test_what_is_left_after_forgetting_is_as_it_was_and_the_rest_begins_anew(kept: str) -> None:
+    walls = [wall(2.12 + 3.0 * number) for number in range(8)]
+    keeps = [
+        {"first": k < 3, "last": k > 4, "every other": k % 2 == 1}.get(kept, kept == "all")
+        for k in range(len(walls))
+    ]
+    surfaces, never = SurfelMap((0.15, 0.6)), SurfelMap((0.15, 0.6))
+    for number, points in enumerate(walls):
+        surfaces.add(points, number)
+        if keeps[number]:
+            never.add(points, number)
+    for points, keep in zip(walls, keeps, strict=True):
+        if keep:
+            surfaces.add(points[: len(points) // 2], 20)
+            never.add(points[: len(points) // 2], 20)
+    # what was not seen again goes, of the walls that are kept as well
+    for map_ in (surfaces, never):
+        map_.forget(np.zeros(3), 1000.0, 20)
+    assert len(surfaces) == len(never)
+
+    def known(map_: SurfelMap) -> list[list[float]]:
+        """Return what a map knows of all places: numbers of rows do not count."""
+        found = map_.match(np.concatenate(walls))
+        parts = (found.index, found.distances, found.variances, found.born, found.opened)
+        return [*(part.tolist() for part in parts), found.normals.ravel().tolist()]
+
+    assert known(surfaces) == known(never)
+    for number, points in enumerate(walls):
+        assert surfaces.add(points, 21 + number) == never.add(points, 21 + number)
+    assert len(surfaces) == len(never)
+    assert known(surfaces) == known(never)
 
 
 def test_what_was_left_behind_a_long_way_ago_is_forgotten_however_near_it_is() -> None:
