@@ -12,6 +12,7 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_node.types import POINT, HostNs, Level, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry, Phase
@@ -87,6 +88,30 @@ def test_the_covariance_of_the_velocity_is_neither_too_small_nor_too_large(
     nees = np.einsum("ni,ni->n", found, np.linalg.solve(covariances, found[..., None])[..., 0])
     assert 0.6 < nees.mean() < 6.0
     assert np.mean(nees < 7.8147) > 0.85  # the bound of 95 %
+
+
+@pytest.mark.parametrize("what", ["covered", "skipped", "one wall"])
+def test_no_variance_is_lowered_around_a_sweep_that_left_a_direction_free(what: str) -> None:
+    run = recording("room", "walk", 14.0)
+    some = list(sweeps(run, "half turn"))
+    middle = len(some) // 2
+    points = some[middle].points
+    if what == "covered":
+        points = points[:5]
+    elif what == "one wall":
+        points = points[points["x"] > 0.9 * points["x"].max()]
+    some[middle] = dataclasses.replace(some[middle], points=points)
+    skips = middle if what == "skipped" else -1
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some, may_skip=lambda number: number == skips)
+    assert len(estimates) == len(some)
+    assert {Status.DEGENERATE, Status.PREDICTED} & set(estimates[middle].status)
+    factors = np.array([item.quality.variance_factor for item in estimates])
+    seconds = (np.array([item.stamp for item in estimates]) - estimates[middle].stamp) * 1e-9
+    since = 1e-9 * tuning.NIS_WINDOW_NS
+    assert (factors[(seconds > -2.0) & (seconds < 0.0)] < 0.5).all()
+    assert (factors[(seconds >= 0.0) & (seconds < since)] == 1.0).all()
+    assert (factors[seconds > since + 0.2] < 0.5).all()
 
 
 def sweep_epoch(run: Any) -> Any:

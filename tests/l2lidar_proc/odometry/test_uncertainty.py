@@ -183,13 +183,17 @@ def corrected(covariance: np.ndarray, measured: slice = slice(0, 9)) -> np.ndarr
 
 
 def run(
-    scale: float, seconds: float = 5.0, drift: float = 0.0, measured: slice = slice(0, 9)
+    scale: float,
+    seconds: float = 5.0,
+    drift: float = 0.0,
+    measured: slice = slice(0, 9),
+    test: InnovationTest | None = None,
 ) -> InnovationTest:
     """Return the test after corrections ``scale`` times as large as their covariance allows.
 
     ``drift`` [m/s] is added to each correction of the velocity along x.
     """
-    test = InnovationTest()
+    test = test or InnovationTest()
     rng = np.random.default_rng(3)
     after = corrected(BEFORE, measured)
     for number in range(round(seconds / 0.23)):
@@ -241,6 +245,10 @@ def test_variances_are_not_lowered_while_a_direction_was_free() -> None:
     found = run(2.0)
     found.leave_free(at(0.23 * last))
     assert found.variance_factor == pytest.approx(4.0, rel=0.3)  # raised all the same
+    forgotten = InnovationTest()
+    forgotten.leave_free(at(0.23 * last))
+    forgotten.clear()
+    assert run(0.3, test=forgotten).variance_factor < 1.0
 
 
 def test_small_ones_that_are_all_alike_contradict_the_accelerometer() -> None:
