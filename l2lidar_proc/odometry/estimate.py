@@ -75,7 +75,7 @@ class AlignmentQuality:
         alignments contradict each other for seconds.
     variance_factor : float
         Factor on the variances of pose and velocity for that: above 1 where predictions are worse
-        than their covariance says, below where they are better and no direction was left free.
+        than their covariance says, below where they are better and every direction was observed.
     beam_correction : tuple of float
         What was added to the unit's ``xi_angle`` and ``beta_angle`` [rad].
     """
@@ -92,6 +92,11 @@ class AlignmentQuality:
     velocity_nis: float = 0.0
     variance_factor: float = 1.0
     beam_correction: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def observes_all(self) -> bool:
+        """Whether points were matched, and constrain the position in every direction."""
+        return self.matched > 0 and self.degeneracy_ratio >= tuning.DEGENERATE_SHARE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,7 +213,7 @@ def estimate_of(
         What the map's own place, and its own error, add to the covariance.
     """
     state, p = motion.state, quality.variance_factor * motion.covariance
-    if quality.matched and quality.degeneracy_ratio < tuning.DEGENERATE_SHARE:
+    if quality.matched and not quality.observes_all:
         status = (*status, Status.DEGENERATE)
     pose = np.zeros((6, 18))
     pose[:3, POSITION] = np.eye(3)

@@ -12,11 +12,11 @@ import numpy as np
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
-from l2lidar_proc.motion.filter import POSITION, InertialState
+from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
-from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
+from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return
@@ -225,7 +225,6 @@ class Odometry:
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
-            self._innovations.leave_free(predicted.state.stamp)
             posterior = predicted.state, predicted.covariance
         else:
             found = self._with_lines(sweep, predicted, found)
@@ -243,7 +242,8 @@ class Odometry:
             found, motion, guess = back.alignment, self._return(back, motion), motion.state
             status.append(Status.RETURNED)
         self._keep(motion)
-        quality = self._consistency(self.matcher.quality(len(source.points), found))
+        quality = self.matcher.quality(len(source.points), found)
+        quality = self._consistency(quality, motion.state.stamp)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
@@ -305,8 +305,8 @@ class Odometry:
             motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
             self._lines.correct(predicted.state, motion.state)
             self._keep(motion)
-            self._innovations.leave_free(motion.state.stamp)
-        quality = self._consistency(self.matcher.quality(len(sweep.points), None))
+        quality = self.matcher.quality(len(sweep.points), None)
+        quality = self._consistency(quality, motion.state.stamp)
         return self._estimate(sweep, motion, status, quality)
 
     def _is_suspect(self, motion: SweepMotion) -> bool:
@@ -316,9 +316,11 @@ class Odometry:
         # without a gyro its bias stands for the change of the rate
         return not (motion.imu.missing.all() or eskf.biases_are_plausible(motion.state))
 
-    def _consistency(self, quality: AlignmentQuality) -> AlignmentQuality:
-        """Return the quality of an alignment with what the innovations of late say."""
+    def _consistency(self, quality: AlignmentQuality, stamp: HostNs) -> AlignmentQuality:
+        """Return the quality of the alignment at an instant with what the innovations say."""
         found = self._innovations
+        if not quality.observes_all:
+            found.note_unobserved(stamp)
         return dataclasses.replace(
             quality,
             nis=found.nis,
@@ -350,8 +352,6 @@ class Odometry:
         """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
         state, covariance = found.state, found.covariance
         self._innovations.take(predicted.state, predicted.covariance, state, covariance)
-        if unobserved_directions(found.information[POSITION, POSITION]).size:
-            self._innovations.leave_free(state.stamp)
         self._unmatched_ns = 0
         samples = self._predictor.samples(sweep.end - tuning.STILL_TEST_NS, sweep.end)
         rests = self._zero_velocity.watch(state, covariance, samples)

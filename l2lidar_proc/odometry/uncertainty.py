@@ -14,8 +14,8 @@ some seconds show two things. Their size shows whether the noise is as assumed: 
 normalized innovation squared (NIS) is 1 for each degree of freedom (Bar-Shalom et al. 2001,
 section 5.4). Their sum shows whether the accelerometer, with biases and gravity as estimated,
 contradicts the alignments: corrections of the velocity that are all alike do not average out.
-Variances are reported as much larger or smaller as that shows them to be. Neither sees an error
-along a direction that nothing measures: while there is one, variances are never reported smaller.
+The reported variances are scaled accordingly, up or down. Neither sees an error along a direction
+that nothing measures: as long as there is one, the variances are not scaled down.
 """
 
 from __future__ import annotations
@@ -337,11 +337,11 @@ class InnovationTest:
     def clear(self) -> None:
         """Forget everything, as after a rest or a loss."""
         self._recent: deque[_Correction] = deque()
-        self._free: int | None = None  # stamp of the latest sweep that left a direction free
+        self._unobserved: int | None = None  # stamp of the latest sweep without some direction
 
-    def leave_free(self, stamp: int) -> None:
-        """Take a sweep [ns] that left a direction of the place free, or all: it met nothing."""
-        self._free = stamp
+    def note_unobserved(self, stamp: int) -> None:
+        """Note that the sweep of a stamp [ns] did not observe the position in every direction."""
+        self._unobserved = stamp
 
     def take(
         self,
@@ -416,8 +416,8 @@ class InnovationTest:
         found = max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
         if found >= 1.0:
             return min(found, tuning.NIS_MOST)
-        newest = self._recent[-1].stamp
-        if self._free is not None and newest - self._free <= tuning.NIS_WINDOW_NS:
+        newest, unobserved = self._recent[-1].stamp, self._unobserved
+        if unobserved is not None and newest - unobserved <= tuning.NIS_WINDOW_NS:
             return 1.0
         return min(max(tuning.NIS_MARGIN * found, 1.0 / tuning.NIS_MOST), 1.0)
 

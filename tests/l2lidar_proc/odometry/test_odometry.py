@@ -91,7 +91,9 @@ def test_the_covariance_of_the_velocity_is_neither_too_small_nor_too_large(
 
 
 @pytest.mark.parametrize("what", ["covered", "skipped", "one wall"])
-def test_no_variance_is_lowered_around_a_sweep_that_left_a_direction_free(what: str) -> None:
+def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
+    what: str,
+) -> None:
     run = recording("room", "walk", 14.0)
     some = list(sweeps(run, "half turn"))
     middle = len(some) // 2

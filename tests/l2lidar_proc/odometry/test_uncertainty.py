@@ -229,24 +229,24 @@ def test_small_ones_tell_that_variances_are_too_large() -> None:
     assert run(0.9).variance_factor <= 1.0  # the margin raises none
     assert run(0.01).variance_factor == 1.0 / tuning.NIS_MOST
     assert run(0.3, seconds=0.7).variance_factor == 1.0  # too few to say so
-    # what the sum shows to be 1.4 times the covariance is not lowered for what the sizes show
+    # small ones that add up: their sum decides
     alike = run(0.3, drift=0.01)
     assert alike.nis < 0.5 * alike.velocity_nis / tuning.NIS_CHANCE < 1.0
     expected = tuning.NIS_MARGIN * alike.velocity_nis / tuning.NIS_CHANCE
     assert alike.variance_factor == pytest.approx(min(expected, 1.0))
 
 
-def test_variances_are_not_lowered_while_a_direction_was_free() -> None:
+def test_variances_are_not_lowered_while_a_direction_was_unobserved() -> None:
     last = round(5.0 / 0.23) - 1
     for before, lowered in ((0.0, False), (2.9, False), (3.1, True)):
         found = run(0.3)
-        found.leave_free(at(0.23 * last - before))
+        found.note_unobserved(at(0.23 * last - before))
         assert (found.variance_factor < 1.0) == lowered, before
     found = run(2.0)
-    found.leave_free(at(0.23 * last))
+    found.note_unobserved(at(0.23 * last))
     assert found.variance_factor == pytest.approx(4.0, rel=0.3)  # raised all the same
     forgotten = InnovationTest()
-    forgotten.leave_free(at(0.23 * last))
+    forgotten.note_unobserved(at(0.23 * last))
     forgotten.clear()
     assert run(0.3, test=forgotten).variance_factor < 1.0
 
