@@ -40,7 +40,7 @@ FULL_RUNS: Final = 200
 CONSISTENT: Final = (0.85, 0.99)  # share of poses within their 95 % bound
 ATE_BOUNDS: Final = {"room, imperfect": 0.005, "hall, imperfect": 0.025, "wood, imperfect": 0.015}
 HALL_SPEED: Final = 8.0
-TUNED: Final = 8  # seeds below this one have chosen tuning constants; the others only judge
+FIRST_UNSEEN: Final = 8  # seeds below this one have chosen tuning constants; the others only judge
 PAGE: Final = Path("docs") / "results" / "odometry_hard.md"
 UNSEEN_PAGE: Final = PAGE.with_stem("odometry_hard_unseen")
 
@@ -233,7 +233,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fresh", action="store_true", help="make the recordings anew")
     parser.add_argument("--install-referees", action="store_true")
     parser.add_argument(
-        "--page", action="store_true", help=f"write {PAGE}, or {UNSEEN_PAGE} from seed {TUNED} on"
+        "--page",
+        action="store_true",
+        help=f"write {PAGE}, or {UNSEEN_PAGE} from seed {FIRST_UNSEEN} on",
     )
     given = parser.parse_args(arguments)
     if given.install_referees:
@@ -296,22 +298,24 @@ def main(arguments: list[str] | None = None) -> int:
 _OURS: Final = "ours"
 _HEAD: Final = """# Hard runs of the odometry
 
-Written by `make bench-odometry-hard BENCH_ARGS="--page"`; [odometry](../odometry.md) explains the
-estimator, and `benchmarks/hard_scenarios.py` the scenes. A run *failed* if its last pose is off by
-more than 1 % of the distance and more than 0.3 m. It was *silent* if a pose without any status was
-off by more than 3 sigma and 0.1 m. NEES is the share of poses (position and attitude, 6) and of
-velocities (3) whose normalized squared error is within the bound that 95 % should keep. ATE is
-after an SE(3) alignment; ends and NEES are relative to the first pose. A unit called *imperfect*
-has beam angles 0.4 degrees off, ranges 0.2 % off, an IMU rotated by 0.5 degrees and 2 ms late,
-vibration, lost packets and gaps in its IMU samples.
+Written by `make bench-odometry-hard BENCH_ARGS="{arguments}"`; [odometry](../odometry.md)
+explains the estimator, and `benchmarks/hard_scenarios.py` the scenes. A run *failed* if its last
+pose is off by more than 1 % of the distance and more than 0.3 m. It was *silent* if a pose
+without any status was off by more than 3 sigma and 0.1 m. NEES is the share of poses (position
+and attitude, 6) and of velocities (3) whose normalized squared error is within the bound that 95
+% should keep. ATE is after an SE(3) alignment; ends and NEES are relative to the first pose. A
+unit called *imperfect* has beam angles 0.4 degrees off, ranges 0.2 % off, an IMU rotated by 0.5
+degrees and 2 ms late, vibration, lost packets and gaps in its IMU samples.
 """
 
 
 def write(rows: list[Row], targets: list[Target]) -> Path:
     """Write the page, or that of the seeds that were not used for tuning; return its path."""
-    path = UNSEEN_PAGE if _are_unseen(rows) else PAGE
+    path, arguments = PAGE, "--full --page"
+    if _are_unseen(rows):
+        path, arguments = UNSEEN_PAGE, f"--full --first-seed {FIRST_UNSEEN} --page"
     parts = [
-        _HEAD,
+        _HEAD.format(arguments=arguments),
         _setting(rows),
         _accuracy(rows),
         _consistency(rows),
@@ -326,7 +330,7 @@ def write(rows: list[Row], targets: list[Target]) -> Path:
 
 
 def _are_unseen(rows: list[Row]) -> bool:
-    return all(row["seed"] >= TUNED for row in rows)
+    return all(row["seed"] >= FIRST_UNSEEN for row in rows)
 
 
 def _setting(rows: list[Row]) -> str:
@@ -335,10 +339,10 @@ def _setting(rows: list[Row]) -> str:
     spans = " and ".join(f"{length:g} s" for length in lengths)
     seeds = sorted({row["seed"] for row in ours})
     use = "which were not used for tuning" if _are_unseen(rows) else "some used for tuning"
+    others = " The other methods ran on the number of recordings in their column."
     return (
         f"{len(ours)} runs of {spans}, {sum(row['way_m'] for row in ours):.0f} m in all, seeds "
-        f"{seeds[0]} to {seeds[-1]}, {use}. The other methods ran on the number of recordings in "
-        "their column."
+        f"{seeds[0]} to {seeds[-1]}, {use}." + others * (len(ours) < len(rows))
     )
 
 

@@ -259,7 +259,8 @@ def test_the_page_tells_of_every_scene_and_failure(
     assert "| hard, 0 |" in text
     assert "gave up, 1 of 1" in text
     assert "**not met**" in text
-    assert "seeds 0 to 0, some used for tuning" in text
+    assert "seeds 0 to 0, some used for tuning. The other methods" in text
+    assert 'BENCH_ARGS="--full --page"' in text
 
 
 def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
@@ -269,7 +270,7 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
     monkeypatch.setattr(bench_odometry_hard, "PAGE", pages[0])
     monkeypatch.setattr(bench_odometry_hard, "UNSEEN_PAGE", pages[1])
     figures = score(given, true_track(given))
-    last = bench_odometry_hard.TUNED - 1
+    last = bench_odometry_hard.FIRST_UNSEEN - 1
     for first, page in ((last, pages[0]), (last + 1, pages[1])):
         rows = [
             {"family": "calm", "method": "ours", "seed": seed, "seconds": 4.0, **figures}
@@ -278,4 +279,7 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
         reached = list(bench_odometry_hard.targets(rows))
         assert bench_odometry_hard.write(rows, reached) == page
     assert "seeds 7 to 8, some used for tuning" in pages[0].read_text()
-    assert "seeds 8 to 9, which were not used for tuning" in pages[1].read_text()
+    unseen = pages[1].read_text()
+    assert "seeds 8 to 9, which were not used for tuning" in unseen
+    assert 'BENCH_ARGS="--full --first-seed 8 --page"' in unseen
+    assert "other methods" not in unseen
