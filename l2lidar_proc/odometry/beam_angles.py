@@ -177,6 +177,20 @@ class BeamAngles:
         self._weighted = self._weighted + gradient
         self.correction = self._known()
 
+    @property
+    def sigmas(self) -> tuple[float, float] | None:
+        """What the angles of corrected clouds may be wrong by, 1 sigma [rad].
+
+        Along the direction that is known best, and the other. What the estimate says but is not
+        sure enough of to correct it counts as well. None for clouds without the pattern of an L2.
+        """
+        if self._failures >= _GIVE_UP:
+            return None
+        left = self._estimate - self.correction
+        squared = np.linalg.inv(self._information) + np.outer(left, left)
+        best, worst = np.sqrt(np.linalg.eigvalsh(squared)).tolist()
+        return best, worst
+
     def _teaches(self) -> bool:
         """Return whether the present sweep is worth the time that its gaps take."""
         first, most = tuning.BEAM_OFTEN

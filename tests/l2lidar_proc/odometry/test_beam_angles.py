@@ -13,6 +13,7 @@ from l2lidar_node.calibration import model
 from l2lidar_node.calibration.model import BETA, NAMES, RETURN, XI, Block
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.odometry.beam_angles import BeamAngles, between_halves, halves
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.odometry import Odometry, Phase
@@ -100,6 +101,18 @@ def test_a_unit_that_is_right_is_left_alone() -> None:
     assert beams.corrected(sweep) is sweep
 
 
+def test_how_wrong_the_angles_may_still_be_is_told() -> None:
+    """What is found but not sure enough to be corrected is an error that stays."""
+    assert BeamAngles().sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
+    right, across, along = (learned(unit).sigmas for unit in ((0.0, 0.0), (0.5, -0.2), (0.4, 0.8)))
+    assert right is not None
+    assert across is not None
+    assert along is not None
+    assert right[0] < 0.2 * tuning.BEAM_SIGMA < 0.5 * tuning.BEAM_SIGMA < right[1]
+    assert across == pytest.approx(right, rel=0.3)  # it is corrected
+    assert along[1] > 1.3 * right[1]  # it is not
+
+
 @pytest.mark.parametrize("drift", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (-0.1, 0.1, 0.0)])
 def test_a_velocity_that_is_off_does_not_pass_for_beam_angles(drift: Any) -> None:
     """10 cm/s move the halves apart by 12 mm where they see the same surface half a turn later."""
@@ -162,6 +175,7 @@ def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
         assert beams.corrected(sweep) is sweep
         beams.learn(sweep, sweep.points, at_rest=True)
     np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+    assert beams.sigmas is None
     # it has given up: an L2 later is not looked at
     sweep, _ = turn(UNIT, 0)
     beams.corrected(sweep)
