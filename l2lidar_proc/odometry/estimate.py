@@ -223,11 +223,13 @@ def estimate_of(
     twist[3:, GYRO_BIAS] = np.eye(3)
     twist_covariance = twist @ p @ twist.T
     twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)
+    # only where every direction was observed of late is the unit as good as its clouds show
+    of_map = (drift.reported_at if quality.variance_factor < 1.0 else drift.at)(state.position)
     rate = motion.rate
     return OdometryEstimate(
         stamp=state.stamp,
         T_map_lidar=cloud_pose(state, lever),
-        covariance=pose @ p @ pose.T + jump.at(state.position) + drift.at(state.position),
+        covariance=pose @ p @ pose.T + jump.at(state.position) + of_map,
         velocity=state.rotation.T @ state.velocity - rotations.cross(rate, lever),
         angular_velocity=rate,
         twist_covariance=twist_covariance,

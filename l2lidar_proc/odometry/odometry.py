@@ -539,6 +539,7 @@ class Odometry:
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
         xi, beta = self._beams.correction.tolist()
+        self.matcher.drift.beam_sigmas = self._beams.sigmas
         self._last = estimate_of(
             motion,
             self._lever,

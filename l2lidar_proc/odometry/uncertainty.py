@@ -47,11 +47,16 @@ class MapDrift:
     begun_in_motion : bool
         The first sweeps were deskewed with a velocity and a gyro bias that were hardly known, so
         the first pose is shifted and turned against the map that followed.
+    beam_sigmas : tuple of float, optional
+        What the beam angles of the sweeps to come may be wrong by, 1 sigma [rad], along their
+        best known direction and the other; None where nothing estimates them.
     """
 
     def __init__(self) -> None:
         self._history = np.zeros((64, 6, 6), np.float32)
         self._ways = np.zeros(64)  # on which they were [m]
+        self._swings = np.zeros(64)  # the worse of the beam angles, added up along it [rad m]
+        self.beam_sigmas: tuple[float, float] | None = (tuning.BEAM_SIGMA, tuning.BEAM_SIGMA)
         self.clear()
 
     def clear(self) -> None:
@@ -61,9 +66,13 @@ class MapDrift:
         self._current = np.zeros((6, 6))
         self._reported = np.zeros((6, 6))  # the same, but falling over some sweeps
         self._way, self._before = 0.0, np.zeros(3)
+        self._swing = 0.0
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
+        self._swung = 0.0  # the worse of the beam angles, added up until then [rad m]
+        self._began = 0.0  # the better of them, when the surroundings of the origin were mapped
         self._vertical: F64 | None = None  # gravity when it was first known [m/s^2]
         self._lean: F64 = np.zeros(3)  # by which the map has bent since, as gravity shows [rad]
+        self._up: F64 | None = None  # as gravity shows it now, unit; None while it does not
 
     def meet(
         self,
@@ -92,6 +101,7 @@ class MapDrift:
         rows = self._rows(sweeps)
         self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
         self._behind = float(shares @ self._ways[rows])
+        self._swung = float(shares @ self._swings[rows])
         if place is not None:
             for direction, (sweeps, shares) in (*strongly, *([weakly] if weakly else [])):
                 rows = self._rows(sweeps)
@@ -179,12 +189,20 @@ class MapDrift:
         if row >= len(self._history):
             grown = np.zeros((2 * row, 6, 6), np.float32)
             grown[: len(self._history)] = self._history
-            self._ways = np.concatenate((self._ways, np.zeros(2 * row - len(self._ways))))
+            more = np.zeros(2 * row - len(self._ways))
+            self._ways = np.concatenate((self._ways, more))
+            self._swings = np.concatenate((self._swings, more))
             self._history = grown
+        better, worse = self.beam_sigmas or (0.0, 0.0)
         if self._known:
-            self._way += float(np.linalg.norm(place - self._before))
+            step = float(np.linalg.norm(place - self._before))
+            self._way += step
+            self._swing += step * worse
+        if self._way < tuning.UNIT_FROM_M:
+            self._began = better
         self._before = place
         self._ways[self._known : row + 1] = self._way
+        self._swings[self._known : row + 1] = self._swing
         moved = _carried(-place)
         found = self._current + moved @ covariance @ moved.T
         here = _carried(place)[:3]
@@ -238,31 +256,69 @@ class MapDrift:
         """
         squared = float(gravity @ gravity)
         if squared == 0.0:
+            self._up = None
             return
         if self._vertical is None:
             if np.linalg.eigvalsh(covariance)[-1] < tuning.LEAN_KNOWN**2 * squared:
                 self._vertical = gravity
             return
+        self._up = -gravity / np.sqrt(squared)
         turn = rotations.cross(self._vertical, gravity) / squared
         angle = float(np.linalg.norm(turn))
         self._lean = turn * max(1.0 - tuning.LEAN_FROM / max(angle, 1e-12), 0.0)
 
     def at(self, place: F64) -> F64:
-        """Return what the map adds to the covariance (6, 6) of a pose at a place (3,) [m].
+        """Return what the map may add to the covariance (6, 6) of a pose at a place (3,) [m].
 
+        It has room for a unit that is as wrong as units are, for searches and for decisions.
         What a unit's calibration is wrong by adds up with the distance; and with the way, where
         the map of the place that was there first is forgotten. The map bends where it grows: the
         attitude errs with the way as the vertical does.
         """
-        moved = _carried(place)
         away = float(np.linalg.norm(place))
         left = 1.0 - np.exp(-max(away, self._behind) / tuning.UNIT_FROM_M)  # 0 defines the frame
         share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self._behind)
         shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
         bend = tuning.MAP_BEND**2 * max(away, self._behind)
-        unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
-        unit[3:, 3:] += np.outer(self._lean, self._lean)
+        return self._with(
+            place, np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
+        )
+
+    def reported_at(self, place: F64) -> F64:
+        """Return what the map is expected to add to the covariance (6, 6) of a pose, to report it.
+
+        As :meth:`at`, but for a unit as good as its clouds show it to be. Beam angles that move
+        the halves of the fan apart turn the map against its first pose at once. Those that do not,
+        and hence are hardly known, turn it about the vertical as it grows, and bend the way by
+        that; gravity and the ground do not let it lean. What a scale of the ranges is wrong by
+        moves places along the line from the origin, and nothing else. Where nothing estimates the
+        beam angles it is as in :meth:`at`.
+
+        That holds where surfaces fix every direction. What only the IMU holds errs as that does.
+        """
+        if self.beam_sigmas is None:
+            return self.at(place)
+        better, worse = self.beam_sigmas
+        away = float(np.linalg.norm(place))
+        way = max(away, self._behind)
+        left = 1.0 - np.exp(-way / tuning.UNIT_FROM_M)
+        turn = (tuning.MAP_TURN * left) ** 2 + tuning.MAP_TURN_BEND**2 * way
+        turn += (tuning.BEAM_TURN * max(better, self._began) * left) ** 2
+        shift = (tuning.MAP_SHIFT * left) ** 2 + (tuning.MAP_SHARE * way) ** 2
+        swing = (tuning.BEAM_SWING * max(self._swung, worse * away)) ** 2
+        up = np.eye(3) if self._up is None else np.outer(self._up, self._up)
+        level = np.eye(3) if self._up is None else np.eye(3) - up
+        unit = np.diag([shift] * 3 + [turn] * 3)
+        unit[:3, :3] += swing * way**2 * level  # as if all of it had come about at the beginning
+        unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
+        unit[3:, 3:] += swing * up
+        return self._with(place, unit)
+
+    def _with(self, place: F64, unit: F64) -> F64:
+        """Return the covariance (6, 6) of the map at a place with that of a unit's faults."""
+        moved = _carried(place)
         begun = np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3) * self.begun_in_motion
+        unit[3:, 3:] += np.outer(self._lean, self._lean)
         return np.asarray(moved @ (self._reported + np.diag(begun)) @ moved.T + unit)
 
 

@@ -90,6 +90,43 @@ def test_the_covariance_of_the_velocity_is_neither_too_small_nor_too_large(
     assert np.mean(nees < 7.8147) > 0.85  # the bound of 95 %
 
 
+@pytest.mark.parametrize(
+    ("scene", "unit"), [("room", "perfect"), ("yard", "perfect"), ("yard", "typical")]
+)
+def test_the_covariance_of_the_pose_is_neither_too_small_nor_too_large(
+    scene: str, unit: str
+) -> None:
+    """NEES of errors relative to the first pose; 6 is their mean if the covariance is right.
+
+    In half turns hardly anything shows whether the unit is a good one: then it is less.
+    """
+    run = record(scene, "walk", 1, 14.0, unit=unit)
+    estimates = drive(run, "half turn")
+    places, quaternions = truth(run, np.array([item.stamp for item in estimates]))
+    turns = rotations.matrices(quaternions)
+    nees = []
+    for item, place, turn in zip(estimates, places, turns, strict=True):
+        if item.quality.nis == 0.0:
+            continue
+        aligned = estimates[0].T_map_lidar[:3, :3] @ turns[0].T
+        off = item.T_map_lidar[:3, :3] @ (aligned @ turn).T
+        shift = item.T_map_lidar[:3, 3] - estimates[0].T_map_lidar[:3, 3]
+        shift = shift - aligned @ (place - places[0])
+        error = np.r_[shift, rotations.log(rotations.from_matrix(off))]
+        nees.append(float(error @ np.linalg.solve(item.covariance, error)))
+    assert len(nees) > 60
+    assert 0.5 < np.mean(nees) < 9.0
+    assert np.mean(np.array(nees) < 12.5916) > 0.85  # the bound of 95 %
+
+
+def test_a_unit_that_shows_its_beam_angles_is_more_certain_of_its_pose() -> None:
+    run = recording("room", "walk")
+    seen = driven("room", "walk")[-1]
+    unseen = drive(run, config=OdometryConfig(correct_beams=False))[-1]
+    np.testing.assert_array_equal(seen.T_map_lidar, unseen.T_map_lidar)
+    assert (np.diag(seen.covariance)[3:] < 0.3 * np.diag(unseen.covariance)[3:]).all()
+
+
 @pytest.mark.parametrize("what", ["covered", "skipped", "one wall"])
 def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
     what: str,
@@ -114,6 +151,11 @@ def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
     assert (factors[(seconds > -2.0) & (seconds < 0.0)] < 0.5).all()
     assert (factors[(seconds >= 0.0) & (seconds < since)] == 1.0).all()
     assert (factors[seconds > since + 0.2] < 0.5).all()
+    # nor is anything less allowed for the unit
+    turns = np.array([item.covariance[5, 5] for item in estimates]) / tuning.UNIT_TURN**2
+    assert (turns[(seconds > -2.0) & (seconds < 0.0)] < 0.3).all()
+    assert (turns[(seconds >= 0.0) & (seconds < since)] > 0.9).all()
+    assert (turns[seconds > since + 0.2] < 0.3).all()
 
 
 def sweep_epoch(run: Any) -> Any:

@@ -120,6 +120,105 @@ def test_what_gravity_has_turned_in_the_map_the_attitude_may_be_wrong_by() -> No
     np.testing.assert_array_equal(drift.at(ZERO), np.zeros((6, 6)))
 
 
+def upright(better: float = 0.0, worse: float = 0.0) -> MapDrift:
+    """Return a map that knows its vertical, of a unit with beam angles known so well."""
+    drift = MapDrift()
+    drift.beam_sigmas = better, worse
+    for _ in range(2):
+        drift.lean(np.array([0.0, 0.0, -9.8]), 0.01 * np.eye(3))
+    return drift
+
+
+def test_what_is_reported_of_the_first_pose_has_no_error_by_definition() -> None:
+    np.testing.assert_array_equal(upright(0.009, 0.009).reported_at(ZERO), np.zeros((6, 6)))
+
+
+def test_what_ranges_are_wrong_by_moves_places_along_the_line_from_the_origin() -> None:
+    place = np.array([40.0, 0.0, 30.0])
+    told = upright().reported_at(place)
+    along, across = place / 50.0, np.array([-0.6, 0.0, 0.8])
+    least = (50.0 * tuning.MAP_SHARE) ** 2 + tuning.MAP_SHIFT**2
+    assert along @ told[:3, :3] @ along == pytest.approx(0.1**2 + least, rel=1e-6)
+    assert across @ told[:3, :3] @ across == pytest.approx(least, rel=1e-6)
+    # far less than what has to be allowed for a unit that nobody has looked at
+    assert np.trace(told) < 0.1 * np.trace(unit_alone(place))
+
+
+def test_a_map_turns_about_the_vertical_as_it_grows_with_wrong_beam_angles() -> None:
+    sigma, place = 0.005, np.array([20.0, 0.0, 0.0])
+    added = upright(0.0, sigma).reported_at(place) - upright().reported_at(place)
+    swing = (tuning.BEAM_SWING * sigma * 20.0) ** 2
+    expected = [400.0 * swing, 400.0 * swing, 0.0, 0.0, 0.0, swing]
+    np.testing.assert_allclose(added, np.diag(expected), rtol=1e-6, atol=1e-15)
+    # where gravity does not show the vertical it may be any axis
+    drift = upright(0.0, sigma)
+    drift.lean(ZERO, 0.01 * np.eye(3))
+    added = drift.reported_at(place) - upright().reported_at(place)
+    expected = [400.0 * swing] * 3 + [swing] * 3
+    np.testing.assert_allclose(added, np.diag(expected), rtol=1e-6, atol=1e-15)
+
+
+def test_what_was_mapped_with_wrong_beam_angles_stays_turned() -> None:
+    """Known later, they no longer turn what is added; back at the origin the turn is undone."""
+    drift, way, nothing = upright(0.0, 0.005), np.array([1.0, 0.0, 0.0]), np.zeros((6, 6))
+    drift.record(0, ZERO, nothing)
+    drift.record(10 * tuning.DRIFT_GROUP, 10.0 * way, nothing)
+    drift.beam_sigmas = 0.0, 0.0
+    drift.record(150 * tuning.DRIFT_GROUP, 20.0 * way, nothing)  # in a longer history
+    swing = (tuning.BEAM_SWING * 0.005 * 10.0) ** 2
+    others = upright().reported_at(20.0 * way)[5, 5]
+    for sweep, expected in ((150, swing), (10, swing), (0, 0.0)):
+        drift.meet(held_by(sweep * tuning.DRIFT_GROUP))
+        assert drift.reported_at(20.0 * way)[5, 5] == pytest.approx(others + expected, rel=1e-3)
+    drift.clear()
+    drift.record(0, ZERO, nothing)
+    drift.record(tuning.DRIFT_GROUP, 20.0 * way, nothing)
+    drift.meet(held_by(tuning.DRIFT_GROUP))
+    assert drift.reported_at(20.0 * way)[5, 5] == pytest.approx(others, rel=1e-3)
+
+
+@pytest.mark.parametrize("first", [0.001, 0.005])
+@pytest.mark.parametrize("now", [0.001, 0.005])
+def test_a_map_is_turned_by_beam_angles_that_its_first_pose_did_not_know(
+    first: float, now: float
+) -> None:
+    drift, way = upright(first), np.array([1.0, 0.0, 0.0])
+    drift.record(0, ZERO, np.zeros((6, 6)))
+    drift.beam_sigmas = now, 0.0
+    drift.record(1, 5.0 * way, np.zeros((6, 6)))
+    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
+    turn = (tuning.BEAM_TURN * max(first, now)) ** 2
+    np.testing.assert_allclose(added, np.diag([0.0] * 3 + [turn] * 3), rtol=1e-6, atol=1e-15)
+    drift.clear()
+    drift.record(0, ZERO, np.zeros((6, 6)))
+    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
+    assert added[3, 3] == pytest.approx((tuning.BEAM_TURN * now) ** 2)
+
+
+def test_nothing_less_than_for_any_unit_is_reported_where_nothing_shows_the_beams() -> None:
+    drift, place = upright(0.001, 0.001), np.array([20.0, -3.0, 1.0])
+    drift.record(0, ZERO, SURE)
+    drift.meet(held_by(0))
+    assert np.linalg.eigvalsh(drift.at(place) - drift.reported_at(place)).min() > 0.0
+    drift.beam_sigmas = None
+    drift.record(1, place, SURE)  # does no harm
+    np.testing.assert_array_equal(drift.reported_at(place), drift.at(place))
+
+
+def test_what_is_reported_drifts_and_leans_like_the_map() -> None:
+    drift = MapDrift()
+    alone = drift.reported_at(ZERO)
+    drift.begun_in_motion = True
+    drift.record(0, ZERO, np.diag([0.04, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    drift.meet(held_by(0))
+    for lean in (0.0, 0.1):
+        drift.lean(9.8 * np.array([0.0, np.sin(lean), -np.cos(lean)]), 0.01 * np.eye(3))
+    shift, turn = np.square(tuning.BEGUN_IN_MOTION)
+    lean = (0.1 - tuning.LEAN_FROM) ** 2
+    expected = [0.04 + shift, shift, shift, lean + turn, turn, turn]
+    np.testing.assert_allclose(drift.reported_at(ZERO) - alone, np.diag(expected), rtol=0.01)
+
+
 def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
     drift = MapDrift()
     step = np.diag([1e-4] * 3 + [0.0] * 3)
