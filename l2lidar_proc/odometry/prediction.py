@@ -285,7 +285,8 @@ def _grown(anchor: OdometryEstimate, rotation: F64, seconds: float) -> F64:
 
     How far the errors of place and speed go together is not known here, so the bound for any
     correlation counts: (1 + a) P + (1 + 1/a) Q with the ratio a of the two (covariance
-    intersection; Julier and Uhlmann 1997). Errors of the rate are those of single samples, white.
+    intersection; Julier and Uhlmann 1997). Errors of the rate are those of single samples, white,
+    and what they add up to is as much less than assumed as the innovations show of all else.
     """
     found = anchor.covariance.copy()
     place = found[:3, :3]
@@ -294,5 +295,5 @@ def _grown(anchor: OdometryEstimate, rotation: F64, seconds: float) -> F64:
     if ratio > 0.0:
         found[:3, :3] = (1.0 + ratio) * place + (1.0 + 1.0 / ratio) * speed
     rate = rotation @ anchor.twist_covariance[3:, 3:] @ rotation.T
-    found[3:, 3:] += rate * (_PERIOD_S * seconds)
+    found[3:, 3:] += rate * (anchor.quality.variance_factor * _PERIOD_S * seconds)
     return found
