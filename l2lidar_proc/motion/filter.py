@@ -133,12 +133,16 @@ class Noise:
         [rad/s^2/sqrt(Hz)]
     accel_walk : float
         [m/s^3/sqrt(Hz)]
+    gyro_share : float
+        Of the angular velocity that counts as noise besides, for errors of scale and axes
+        [sqrt(s)].
     """
 
     gyro: float
     accel: float
     gyro_walk: float
     accel_walk: float
+    gyro_share: float = 0.0
 
 
 class Update(NamedTuple):
@@ -198,11 +202,15 @@ def predict(
     forces = (back @ (gained / dt[:, None])[..., None])[..., 0]
     f = transition(state.rotation @ turns[:-1], back @ turns[1:], forces, dt)
     spans = np.diff(imu.stamps[: knot + 1])
-    blind = np.add.reduceat(spans * imu.missing[:knot], first) / np.add.reduceat(spans, first)
+    lasted = np.add.reduceat(spans, first)
+    blind = np.add.reduceat(spans * imu.missing[:knot], first) / lasted
     rates = np.abs(preintegrated.rates[: knot + 1]).max(axis=1)
     held = np.maximum(np.maximum.reduceat(rates[:-1], first), rates[last])
     unmeasured = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
-    gyro2 = (1.0 - blind) * noise.gyro**2 + blind * unmeasured
+    ways = np.add.reduceat(spans[:, None] * preintegrated.rates[:knot], first, axis=0)
+    turning = np.abs(ways / lasted[:, None]).max(axis=1)  # a vibration turns nothing
+    measured = noise.gyro**2 + (noise.gyro_share * turning) ** 2
+    gyro2 = (1.0 - blind) * measured + blind * unmeasured
     blind = np.ones_like(blind) if blind_forces else blind
     accel2 = (1.0 - blind) * noise.accel**2 + blind * tuning.BLIND_ACCEL**2
     q = process_noise(gyro2, accel2, noise, dt)

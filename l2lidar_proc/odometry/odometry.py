@@ -169,7 +169,7 @@ class Odometry:
         if not 0 < stamp - state.stamp <= tuning.TIME_JUMP_NS:
             return None
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
-        nothing, noise = self._last.points[:0], self.config.inertial.gyro_noise
+        nothing, noise = self._last.points[:0], self._predictor.gyro_noise
         quality = AlignmentQuality(variance_factor=self._last.quality.variance_factor)
         return estimate_of(
             motion,
@@ -546,7 +546,7 @@ class Odometry:
             self.matcher.deskewed(sweep, motion),
             tuple(status),
             dataclasses.replace(quality, beam_correction=(xi, beta)),
-            self.config.inertial.gyro_noise,
+            self._predictor.gyro_noise,
             self._jump,
             self.matcher.drift,
         )

@@ -52,6 +52,8 @@ class Predictor:
         Whether the accelerometer is sound.
     steady_rate : ndarray, shape (3,)
         Rate without bias where there is no gyro [rad/s], cloud axes.
+    gyro_noise : float
+        Of the samples that were used last [rad/s], each axis.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
@@ -64,6 +66,8 @@ class Predictor:
         """Forget what was found out about the motion; the samples stay."""
         self.trusts_gravity = False
         self.steady_rate: F64 = np.zeros(3)
+        self.gyro_noise = self.config.inertial.gyro_noise
+        self._rest: tuple[F64, int] = np.zeros(3), 0  # mean squares of the gyro at rest, samples
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
@@ -130,6 +134,7 @@ class Predictor:
     ) -> tuple[InertialState, F64]:
         """Return state and covariance of a sensor at rest since, up to an instant."""
         samples = self.samples(state.stamp, until)
+        self._note_rest(samples, state.gyro_bias)
         noise = self._noise(samples)
         return eskf.update_static(state, covariance, samples, noise, self._use_forces)
 
@@ -137,15 +142,40 @@ class Predictor:
     def _use_forces(self) -> bool:
         return self.trusts_gravity and self.config.inertial.use_accelerometer
 
+    def _note_rest(self, samples: Samples, bias: F64) -> None:
+        """Take samples of a sensor at rest, which show all of the gyro's noise.
+
+        The lines of the head are in it, which differ tenfold between units and do not show while
+        the sensor moves.
+        """
+        if not len(samples):
+            return
+        known, count = self._rest
+        squared = np.square(samples["angular_velocity"] - bias).mean(axis=0)
+        count = min(count + len(samples), tuning.GYRO_REST_MEMORY)
+        known = known + min(len(samples) / count, 1.0) * (squared - known)
+        self._rest = known, count
+
+    @property
+    def _least_gyro_noise(self) -> float:
+        """The gyro's noise as measured at rest [rad/s], the parameter before that."""
+        known, count = self._rest
+        if count < tuning.GYRO_REST_SAMPLES:
+            return self.config.inertial.gyro_noise
+        return max(float(np.sqrt(known.max())), tuning.LEAST_GYRO_NOISE)
+
     def _noise(self, samples: Samples) -> Noise:
-        """Return the noise of samples: the parameter, or more where more shows."""
+        """Return the noise of samples: as known, or more where more shows."""
         settings = self.config.inertial
         scale = float(np.sqrt(tuning.IMU_PERIOD_S))
+        shown = tuning.GYRO_NOISE_FACTOR * white_noise(samples["angular_velocity"])
+        self.gyro_noise = max(self._least_gyro_noise, shown)
         return Noise(
-            max(settings.gyro_noise, white_noise(samples["angular_velocity"])) * scale,
+            self.gyro_noise * scale,
             max(settings.accel_noise, white_noise(samples["linear_acceleration"])) * scale,
             settings.gyro_bias_walk,
             settings.accel_bias_walk,
+            tuning.GYRO_SHARE,
         )
 
 
@@ -239,7 +269,9 @@ class DeadReckoning:
             self._anchor,
             stamp=self.stamp,
             T_map_lidar=self._pose(),
-            covariance=_grown(self._anchor, rotation, (self.stamp - self._anchor.stamp) * 1e-9),
+            covariance=_grown(
+                self._anchor, rotation, self._rate, (self.stamp - self._anchor.stamp) * 1e-9
+            ),
             velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
             angular_velocity=self._rate,
         )
@@ -280,13 +312,14 @@ class DeadReckoning:
         self.stamp, self._rate = stamp, rate
 
 
-def _grown(anchor: OdometryEstimate, rotation: F64, seconds: float) -> F64:
+def _grown(anchor: OdometryEstimate, rotation: F64, rate: F64, seconds: float) -> F64:
     """Return the covariance (6, 6) of a pose so long after an estimate.
 
     How far the errors of place and speed go together is not known here, so the bound for any
     correlation counts: (1 + a) P + (1 + 1/a) Q with the ratio a of the two (covariance
     intersection; Julier and Uhlmann 1997). Errors of the rate are those of single samples, white,
-    and what they add up to is as much less than assumed as the innovations show of all else.
+    and a share of the rate itself, as in the filter. What they add up to is as much less than
+    assumed as the innovations show of all else.
     """
     found = anchor.covariance.copy()
     place = found[:3, :3]
@@ -294,6 +327,8 @@ def _grown(anchor: OdometryEstimate, rotation: F64, seconds: float) -> F64:
     ratio = float(np.sqrt(np.trace(speed) / max(float(np.trace(place)), 1e-12)))
     if ratio > 0.0:
         found[:3, :3] = (1.0 + ratio) * place + (1.0 + 1.0 / ratio) * speed
-    rate = rotation @ anchor.twist_covariance[3:, 3:] @ rotation.T
-    found[3:, 3:] += rate * (anchor.quality.variance_factor * _PERIOD_S * seconds)
+    white = _PERIOD_S * rotation @ anchor.twist_covariance[3:, 3:] @ rotation.T
+    share = tuning.GYRO_SHARE * float(np.abs(rate).max())
+    grown = (white + share**2 * np.eye(3)) * seconds
+    found[3:, 3:] += anchor.quality.variance_factor * grown
     return found

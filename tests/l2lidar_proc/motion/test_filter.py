@@ -110,6 +110,31 @@ def test_the_covariance_is_that_of_one_step_after_the_other() -> None:
     np.testing.assert_allclose(found, p, rtol=1e-9, atol=1e-12)
 
 
+def test_a_share_of_the_rate_counts_as_noise_of_the_gyro() -> None:
+    """Errors of scale and axes; where the sensor hardly turns they are nothing."""
+    state, p = some_state(), 1e-6 * np.eye(eskf.ERRORS)
+    for turn in (0.0, 2.0):
+        imu = segment(
+            Motion(turn=turn).imu(0.0, 0.21), [at(0.0), at(0.2)], 50_000_000, np.zeros(3)
+        )
+        sums = integrate(
+            imu,
+            0,
+            gyro_bias=np.zeros(3),
+            accel_bias=state.accel_bias,
+            rest_force=state.rest_force,
+        )
+        knot = len(imu.stamps) - 1
+        found, expected = (
+            eskf.predict(state, p, imu, sums, knot, noise)[1]
+            for noise in (
+                Noise(0.003, 0.02, 1e-4, 1e-3, 0.002),
+                Noise(float(np.hypot(0.003, 0.002 * turn)), 0.02, 1e-4, 1e-3),
+            )
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-15)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_twist_jacobian_is_the_derivative_of_the_velocity(seed: int) -> None:
     state, rate = some_state(seed), np.array([0.3, -0.5, 1.0])

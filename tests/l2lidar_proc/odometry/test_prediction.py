@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_proc import tuning
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, Predictor
-from tests.l2lidar_proc.motion.analytic import Motion
+from tests.l2lidar_proc.motion.analytic import EPOCH, Motion
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording
 from tests.support.odometry_runs import sweeps
 
@@ -68,7 +71,7 @@ def test_it_is_as_good_as_every_sample_by_itself(world: str, motion: str) -> Non
         assert turned_by(carried, full) < 1e-3
         np.testing.assert_allclose(carried.velocity, full.velocity, atol=0.05)
         sigmas = np.sqrt(np.diag(carried.covariance) / np.diag(full.covariance))
-        assert sigmas.min() > 0.6
+        assert sigmas.min() > 0.55
         assert sigmas.max() < 1.5
 
 
@@ -160,12 +163,15 @@ def test_the_covariance_grows_by_what_speed_and_rate_are_uncertain_by(estimate: 
     assert carried.stamp == known.stamp + 200_000_000
     sigma = np.sqrt(np.diag(carried.covariance))
     np.testing.assert_allclose(sigma[:3], place + speed * 0.2, rtol=1e-6)
-    np.testing.assert_allclose(sigma[3:], np.sqrt(turned**2 + rate**2 * 0.004 * 0.2), rtol=1e-6)
+    share = tuning.GYRO_SHARE * np.abs(carried.angular_velocity).max()
+    expected = np.sqrt(turned**2 + (rate**2 * 0.004 + share**2) * 0.2)
+    np.testing.assert_allclose(sigma[3:], expected, rtol=1e-6)
 
     still = dataclasses.replace(known, twist_covariance=np.zeros((6, 6)))
     reckoning.reset(still)
     carried = carry(reckoning, samples(known.stamp, 5))
-    np.testing.assert_allclose(carried.covariance, known.covariance, atol=1e-12)
+    grown = known.covariance + np.diag([0.0] * 3 + [share**2 * 0.02] * 3)
+    np.testing.assert_allclose(carried.covariance, grown, atol=1e-12)
 
 
 def test_untrusted_gravity_holds_the_speed(estimate: Any) -> None:
@@ -188,5 +194,64 @@ def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> No
     samples["angular_velocity"] += rng.normal(0.0, 0.3, (len(samples), 3))
     samples["linear_acceleration"] += rng.normal(0.0, 0.7, (len(samples), 3))
     loud = predictor._noise(samples)
-    assert loud.gyro == pytest.approx(0.3 * np.sqrt(0.004), rel=0.05)
+    assert loud.gyro == pytest.approx(tuning.GYRO_NOISE_FACTOR * 0.3 * np.sqrt(0.004), rel=0.05)
+    assert predictor.gyro_noise == pytest.approx(loud.gyro / np.sqrt(0.004))
     assert loud.accel == pytest.approx(0.7 * np.sqrt(0.004), rel=0.05)
+
+
+def at_rest(line: float, noise: float, seconds: float) -> Any:
+    """Return samples of a sensor at rest, with white noise and a line of the head [rad/s]."""
+    count = round(250 * seconds)
+    found = np.zeros(count, IMU_SAMPLE)
+    found["stamp"] = EPOCH + 4_000_000 * np.arange(count)
+    found["angular_velocity"] = np.random.default_rng(4).normal(0.01, noise, (count, 3))
+    found["angular_velocity"][:, 1] += line * np.sin(2.0 * np.pi * 4.33 * 0.004 * np.arange(count))
+    found["linear_acceleration"][:, 2] = 9.80665
+    return found
+
+
+def rested(line: float, noise: float, seconds: float) -> Predictor:
+    """Return a predictor that was at rest for so long, a turn of the head at a time."""
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    predictor.imu(at_rest(line, noise, seconds))
+    zero = np.zeros(3)
+    down = np.array([0.0, 0.0, -9.80665])
+    state = InertialState(EPOCH, np.eye(3), zero, zero, np.full(3, 0.01), zero, down)
+    covariance = 1e-4 * np.eye(eskf.ERRORS)
+    for turn in range(1, int(seconds / 0.231) + 1):
+        until = HostNs(EPOCH + 231_000_000 * turn)
+        state, covariance = predictor.static_update(state, covariance, until)
+        state = dataclasses.replace(state, stamp=until)
+    return predictor
+
+
+@pytest.mark.parametrize(("line", "noise"), [(0.3, 0.03), (0.0, 0.06), (0.03, 0.0)])
+def test_at_rest_the_gyro_shows_its_noise_with_the_lines_of_the_head(
+    line: float, noise: float
+) -> None:
+    predictor = rested(line, noise, 3.0)
+    moving = Motion().imu(0, 40)
+    expected = np.sqrt(noise**2 + 0.5 * line**2)
+    assert predictor._noise(moving).gyro == pytest.approx(expected * np.sqrt(0.004), rel=0.1)
+    predictor.reset()
+    predictor._noise(moving)
+    assert predictor.gyro_noise == OdometryConfig().inertial.gyro_noise
+
+
+def test_a_short_rest_shows_no_noise_and_no_gyro_is_perfect() -> None:
+    moving = Motion().imu(0, 40)
+    short, still = rested(0.0, 0.03, 0.3), rested(0.0, 0.001, 3.0)
+    short._noise(moving)
+    assert short.gyro_noise == OdometryConfig().inertial.gyro_noise
+    still._noise(moving)
+    assert still.gyro_noise == tuning.LEAST_GYRO_NOISE
+
+
+def test_the_noise_at_rest_follows_the_unit() -> None:
+    """What the sensor showed minutes ago counts no more."""
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    for noise in (0.3, 0.03):
+        for _ in range(40):
+            predictor._note_rest(at_rest(0.0, noise, 1.0), np.full(3, 0.01))
+    predictor._noise(Motion().imu(0, 40))
+    assert predictor.gyro_noise == pytest.approx(0.03, rel=0.15)
