@@ -219,6 +219,8 @@ ELONGATED: Final = 9.0  # variance ratio: a surface is at least 3 times wider th
 FLAT_WIDTH: Final = 0.08  # of its cell (1 sigma) in its shorter direction
 NARROW: Final = 0.16  # of the cell's edge: largest scatter that fixes a place; evenly filled: 0.29
 NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is narrow as well
+# Sine of the angle by which a surface may be seen from behind: the normals of small ones are off
+SIDE_SLACK: Final = 0.1
 EDGE_SHARE: Final = 0.4  # of the points that may lack a flat surface where flat ones abound
 REFIT_GROWTH: Final = 1.2  # growth of the count before a cell is fitted again. Speed only
 

@@ -248,7 +248,10 @@ def correspondences_of(
         for points, (state, _) in zip(deskewed, views, strict=True)
     ]
     sizes = [len(points) for points in seen]
-    matches = surfaces.match(_joined(seen), narrow=True, sizes=sizes)
+    # a wall between rooms is thinner than the first step reaches, and what comes into sight
+    # through a door is mostly another side of a wall: it would pull the sweep by the thickness
+    origins = np.repeat([state.position for state, _ in views], sizes, axis=0)
+    matches = surfaces.match(_joined(seen), narrow=True, sizes=sizes, origins=origins)
     points, times, ranges = (
         _joined(items)
         for items in (

@@ -228,7 +228,7 @@ class SweepMatcher:
         placed = (state.rotation @ points.T + state.position[:, None]).T
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
         apart = self.drift.more_certain(state.position)
-        fresh = self.surfaces.add(placed, self._sweeps, apart)
+        fresh = self.surfaces.add(placed, self._sweeps, apart, state.position)
         self.kiss.update(points, _pose(state), _pose(guess))
         self._walk(state.position)
         self._sweeps += 1
@@ -544,9 +544,11 @@ def _scores(
     """Return how many of some points lie on surfaces for each error (N, 18) of the state."""
     points = source.points[:: max(len(source.points) // count, 1)]
     turns = state.rotation @ rotations.matrices(rotations.exp(errors[:, ROTATION]))
+    origins = state.position + errors[:, POSITION]
     seen = np.einsum("kij,nj->kni", turns, points)
-    seen += (state.position + errors[:, POSITION])[:, None]
-    found = surfaces.match(seen.reshape(-1, 3))
+    seen += origins[:, None]
+    origins = np.repeat(origins, len(points), axis=0)
+    found = surfaces.match(seen.reshape(-1, 3), origins=origins)
     near = np.abs(found.distances) < tuning.SEARCH_NEAR_M
     return np.bincount(found.index[near] // len(points), minlength=len(errors))
 

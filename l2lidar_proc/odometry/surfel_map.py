@@ -114,9 +114,14 @@ CELL: Final = np.dtype(
         ("opened", "<i8"),  # number of the sweep whose points opened it
         ("seen", "<i8"),  # number of the latest sweep with points in it
         ("fitted", "<f8"),  # count when mean, axes and spread were computed
+        ("sided", "<i8"),  # from which sides its points were seen, as _NO_SIDE and others
     ],
 )
 """What is known about a cell."""
+
+# Sides from which the points of a cell were seen: nobody said; the one that the normal points to;
+# both. A flat cell with points from both is a board. A wall is thicker, and has two surfaces.
+_NO_SIDE, _ONE_SIDE, _BOTH_SIDES = 0, 1, 2
 
 _FLAT: Final = 3
 """Kind of a flat cell; that of others is the number of axes along which their points lie close."""
@@ -256,7 +261,13 @@ class SurfelMap:
         self._cells[:used] = np.zeros(1, CELL)
         self._kind[:used] = 0
 
-    def add(self, points: F64, sweep: int = 0, apart: NDArray[np.bool_] | None = None) -> float:
+    def add(
+        self,
+        points: F64,
+        sweep: int = 0,
+        apart: NDArray[np.bool_] | None = None,
+        origin: F64 | None = None,
+    ) -> float:
         """Add points, and return the share of them in places where there were none before.
 
         Parameters
@@ -267,6 +278,8 @@ class SurfelMap:
             Number of the sweep that they come from.
         apart : ndarray, shape (S,), optional
             Sweeps whose places these points are not known to belong to: they are the first there.
+        origin : ndarray, shape (3,), optional
+            Where they were seen from [m], map frame.
         """
         if not len(points):
             return 0.0
@@ -277,7 +290,7 @@ class SurfelMap:
         new = rows == 0
         rows[new] = self._open(distinct[new])
         fresh = self._note_sweep(rows, new, cell, groups.counts, sweep, apart)
-        self._extend(points, groups, rows, distinct, cell)
+        self._extend(points, groups, rows, distinct, cell, origin)
         return fresh
 
     def _groups(self, points: F64) -> _Groups:
@@ -344,7 +357,15 @@ class SurfelMap:
             self._cells["born"][rows[new]] = born
         return fresh
 
-    def _extend(self, points: F64, groups: _Groups, rows: I64, keys: I64, cell: I64) -> None:
+    def _extend(
+        self,
+        points: F64,
+        groups: _Groups,
+        rows: I64,
+        keys: I64,
+        cell: I64,
+        origin: F64 | None,
+    ) -> None:
         """Add points (N, 3) to the sums of their cells (C,), as far as these still change.
 
         The sums of a coarser cell are those of its groups, moved to its middle (parallel axis
@@ -376,10 +397,17 @@ class SurfelMap:
             & (grown["count"] >= tuning.REFIT_GROWTH * grown["fitted"])
         )
         if len(fitted):
-            self._kind[rows[fitted]] = self._fit(grown, fitted, middles[changing][fitted])
+            self._kind[rows[fitted]] = self._fit(grown, fitted, middles[changing][fitted], origin)
         records.assign(cells, rows, grown)
 
-    def match(self, points: F64, *, narrow: bool = False, sizes: Sequence[int] = ()) -> Matches:
+    def match(
+        self,
+        points: F64,
+        *,
+        narrow: bool = False,
+        sizes: Sequence[int] = (),
+        origins: F64 | None = None,
+    ) -> Matches:
         """Return the surface of every point that has one: the finest at its place.
 
         Parameters
@@ -393,6 +421,9 @@ class SurfelMap:
         sizes : sequence of int
             Points of each of several sweeps that lie one after the other; what most points have
             is asked for each by itself.
+        origins : ndarray, shape (N, 3), optional
+            Where each point is seen from [m]. A surface that would be seen from behind is not the
+            point's: it is the other side of a wall.
         """
         # nearly all points have a surface in the finest level
         finest = self._rows(points, slice(1))
@@ -410,12 +441,20 @@ class SurfelMap:
                 found += [(row, index, 0), (row[both], index[both], 1)]
         rows_found, indices, axes = zip(*found, strict=True)
         axis = np.repeat(axes, [len(some) for some in indices])
-        row = np.concatenate(rows_found)
+        row, index = np.concatenate(rows_found), np.concatenate(indices)
+        cells = records.selected(self._cells, row)
+        if origins is not None:
+            behind = _are_behind(points[index], origins[index], cells)
+            behind &= self._kind[row] == _FLAT
+            if behind.any():
+                seen = np.flatnonzero(~behind)
+                row, index, axis = row[seen], index[seen], axis[seen]
+                cells = records.selected(cells, seen)
         return _matches(
             points,
-            np.concatenate(indices),
+            index,
             row,
-            records.selected(self._cells, row),
+            cells,
             axis,
             self._kind[row],
         )
@@ -543,8 +582,13 @@ class SurfelMap:
         self._cells["key"][rows] = keys
         return rows
 
-    def _fit(self, cells: NDArray[np.void], rows: I64, middles: F64) -> NDArray[np.int8]:
-        """Fit planes to some (M,) of the cells, their middles (M, 3) given; return their kinds."""
+    def _fit(
+        self, cells: NDArray[np.void], rows: I64, middles: F64, origin: F64 | None
+    ) -> NDArray[np.int8]:
+        """Fit planes to some (M,) of the cells, their middles (M, 3) given; return their kinds.
+
+        Normals point to an origin (3,) of the latest points, if there is one.
+        """
         count = cells["count"][rows]
         mean = cells["sum"][rows] / count[:, None]
         covariance = cells["products"][rows].T / count
@@ -555,7 +599,17 @@ class SurfelMap:
         size = self._sizes[cells["key"][rows] >> 3 * _BITS]
         wide = np.maximum(tuning.ELONGATED * spread[:, 0], (tuning.FLAT_WIDTH * size) ** 2)
         flat = (spread[:, 0] < self._thickness**2) & (spread[:, 1] > wide)
-        cells["mean"][rows] = mean + middles
+        mean += middles
+        if origin is not None:
+            ways = origin - mean
+            behind = np.einsum("ni,ni->n", axes[:, 0], ways) < 0.0
+            axes[behind, 0] *= -1.0
+            least = tuning.SIDE_SLACK * np.sqrt(np.einsum("ni,ni->n", ways, ways))
+            is_other = np.einsum("ni,ni->n", cells["axes"][rows, 0], ways) < -least
+            both = is_other & (cells["sided"][rows] == _ONE_SIDE)
+            both |= cells["sided"][rows] == _BOTH_SIDES
+            cells["sided"][rows] = np.where(both, _BOTH_SIDES, _ONE_SIDE)
+        cells["mean"][rows] = mean
         cells["axes"][rows] = axes
         cells["spread"][rows] = spread
         cells["fitted"][rows] = count
@@ -670,6 +724,14 @@ def _matches(
         rows,
         axis,
     )
+
+
+def _are_behind(points: F64, origins: F64, cells: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return which points (M, 3) are seen from the other side than the surfaces of their cells."""
+    ways = origins - points
+    along = np.einsum("ni,ni->n", cells["axes"][:, 0], ways)
+    least = tuning.SIDE_SLACK * np.sqrt(np.einsum("ni,ni->n", ways, ways))
+    return np.asarray((cells["sided"] == _ONE_SIDE) & (along < -least))
 
 
 def _grown(rows: NDArray[Any], size: int) -> NDArray[Any]:

@@ -90,6 +90,28 @@ def test_a_few_points_do_not_move_a_loose_prediction_far(grown: SweepMatcher, co
         assert place is None or place == pytest.approx(-0.2, abs=0.01)
 
 
+def test_the_other_side_of_a_wall_does_not_pull() -> None:
+    """A wall of 12 cm, of which one side is mapped and the other comes into sight."""
+    rng, matcher = np.random.default_rng(22), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def side(x: float, count: int, low: float, high: float) -> F64:
+        return np.asarray(rng.uniform((x, low, -1.0), (x, high, 1.0), (count, 3)))
+
+    def ground(count: int) -> F64:
+        return np.asarray(rng.uniform((0.0, -3.0, -1.2), (4.0, 3.0, -1.2), (count, 3)))
+
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        points = np.vstack((ground(3000), side(2.0, 3000, -2.0, 2.0)))
+        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
+    place = np.array([4.0, 0.0, 0.0])  # in the other room
+    beyond = ground(100) * (0.4, 1.0, 1.0) + np.array((2.2, 0.0, 0.0))
+    seen = np.vstack((beyond, side(2.12, 300, -1.5, 1.5))) - place
+    found = matcher.match(source(seen), motion((0.005, 0.05), place)).alignment
+    assert found is not None
+    assert found.matched < 150
+    np.testing.assert_allclose(found.state.position, place, atol=0.01)
+
+
 def test_a_room_that_comes_into_sight_does_not_contradict_what_is_known_beside_it() -> None:
     """The coarse cells of a wall reach into the room behind its door."""
     rng, matcher = np.random.default_rng(20), SweepMatcher(OdometryConfig(), np.zeros(3))

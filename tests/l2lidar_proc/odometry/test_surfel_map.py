@@ -67,6 +67,79 @@ def test_a_wall_becomes_surfaces_and_gives_distances() -> None:
     assert (found.variances < 0.01**2).all()
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_surface_that_is_seen_from_behind_is_not_met(side: float) -> None:
+    """A wall between two rooms is 12 cm thick, less than a first step reaches."""
+    surfaces = SurfelMap((0.25, 0.6))
+    surfaces.add(wall(2.12), origin=np.array([2.12 - 3.0 * side, 0.0, 1.0]))
+    probe = np.array([[2.12 + 0.12 * side, 0.1, 1.1], [2.12 + 0.06 * side, -0.6, 0.4]])
+
+    def met(*origin: float) -> int:
+        return len(surfaces.match(probe, origins=np.tile(origin, (2, 1))).index)
+
+    assert met(2.12 - 5.0 * side, 1.0, 1.0) == 2
+    assert met(2.12 + 5.0 * side, 1.0, 1.0) == 0
+    assert met(2.12 + 0.15 * side, 7.0, 1.0) == 2  # along the wall: normals are off by more
+    unknown = SurfelMap((0.25, 0.6))
+    unknown.add(wall(2.12))
+    origins = np.tile([2.12 + 5.0 * side, 1.0, 1.0], (2, 1))
+    assert len(unknown.match(probe, origins=origins).index) == 2
+
+
+def test_a_board_is_met_from_both_sides_and_a_wall_from_its_own() -> None:
+    front, back = np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 1.0])
+    board, thick = SurfelMap((0.25, 0.6)), SurfelMap((0.25, 0.6))
+    for surfaces, x in ((board, 2.12), (thick, 2.27)):
+        surfaces.add(wall(2.12)[:2000], 0, origin=front)
+        surfaces.add(wall(x), 1, origin=back)
+        surfaces.add(wall(x)[2000:], 2, origin=back)
+    probe = np.array([[2.12, 0.1, 1.1], [2.12, -0.6, 0.4]])
+    for surfaces, count in ((board, 2), (thick, 0)):
+        assert len(surfaces.match(probe, origins=np.tile(front, (2, 1))).index) == 2
+        assert len(surfaces.match(probe, origins=np.tile(back, (2, 1))).index) == count
+
+
+def test_what_is_no_surface_has_no_side() -> None:
+    surfaces = SurfelMap((0.3,))
+    rng = np.random.default_rng(RNG_SEED)
+    for number in range(5):
+        pole = rng.uniform((2.1, 0.1, 0.0), (2.1, 0.1, 2.0), (400, 3))
+        pole[:, :2] += 0.01 * rng.standard_normal((400, 2))
+        surfaces.add(pole, number, origin=np.zeros(3))
+    probe = np.array([[2.1, 0.1, 1.0]])
+    here, there = (
+        surfaces.match(probe, narrow=True, origins=np.array([[x, 0.0, 1.0]])) for x in (0.0, 5.0)
+    )
+    assert len(here.index) == len(there.index) > 0
+
+
+def test_rays_pass_through_surfaces_only_where_these_are() -> None:
+    surfaces, origin = SurfelMap((0.15, 0.3, 0.6)), np.array([0.0, 0.0, 1.0])
+    rng = np.random.default_rng(RNG_SEED)
+
+    def ends(x: float, y: float, count: int = 400) -> Any:
+        """Return points on a wall across x, about y, a meter high."""
+        return rng.uniform((x, y - 0.4, 0.5), (x, y + 0.4, 1.5), (count, 3))
+
+    for number in range(4):
+        surfaces.add(wall(2.0), number, origin=origin)
+        if number < 2:
+            assert surfaces.rays_through(origin, ends(4.0, 0.0)) == 0.0  # from too few sweeps
+    through, beside = ends(4.0, 0.0), ends(4.0, 3.5)
+    share = surfaces.rays_through(origin, through)  # near the edges of cells none are counted
+    assert share > 0.5
+    assert surfaces.rays_through(origin, beside) == 0.0
+    # two in three, which no step through the points meets by chance
+    mixed = np.stack((through, through, beside), axis=1).reshape(-1, 3)
+    both = surfaces.rays_through(origin, mixed)
+    assert both == pytest.approx(share * 2 / 3, abs=0.07)
+    # on it, in front of it, and behind it by less than such surfaces may be off
+    for x in (1.0, 2.0, 2.2):
+        assert surfaces.rays_through(origin, ends(x, 0.0)) == 0.0
+    assert surfaces.rays_through(origin, origin[None]) == 0.0
+    assert surfaces.rays_through(origin, np.empty((0, 3))) == 0.0
+
+
 def test_points_of_one_line_are_no_surface() -> None:
     surfaces = SurfelMap((0.25,))
     line = np.linspace(0.0, 0.24, 200)[:, None] * [0.6, 0.8, 0.0]
