@@ -349,6 +349,21 @@ MAP_WAY: Final = 30.0  # [m]
 MAP_WAY_STEP: Final = 2.0  # [m] between the times that this is looked after
 PRUNE_SHARE: Final = 0.2  # of the map's radius traveled before far cells are dropped
 
+# ---- odometry: free space. Tuned on: narrow views; 0 to 3 % of the rays pass through surfaces at
+# right poses, 10 to 20 % at wrong ones that fit
+
+RAYS_THROUGH: Final = 0.06  # share of the rays that pass through known surfaces, at most
+RAYS: Final = 250  # of a sweep. Bounds the time
+RAY_LONGEST: Final = 10.0  # [m] likewise
+RAY_FROM: Final = 0.3  # [m] from the sensor
+RAY_MARGIN: Final = 0.35  # [m] before the point, where the surface itself may be
+RAY_STEP: Final = 0.08  # [m]
+RAY_NEAR: Final = 0.06  # [m] to the surface; more than half of a step
+RAY_FACING: Final = 0.5  # cosine of the angle between ray and normal
+RAY_EXTENT: Final = 1.5  # standard deviations of a surface's points within which it is known
+RAY_POINTS: Final = 30.0  # of a surface,
+RAY_SWEEPS: Final = 3.0  # from so many sweeps
+
 # ---- odometry: relocalization
 
 SEARCH_STEP_M: Final = 0.3  # [m] between places that are tried

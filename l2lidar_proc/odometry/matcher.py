@@ -361,7 +361,19 @@ class SweepMatcher:
             return False
         if strict and self._is_far_fetched(found, motion):
             return False
-        return found.inlier_ratio >= self._needed_inliers(strict)
+        if found.inlier_ratio < self._needed_inliers(strict):
+            return False
+        return not (strict and is_far(found, motion) and self._sees_through(found, source))
+
+    def _sees_through(self, found: Alignment, source: Source) -> bool:
+        """Return whether the sweep would see through known surfaces where an alignment puts it."""
+        state = found.state
+        placed = source.points @ state.rotation.T + state.position
+        return self.surfaces.rays_through(state.position, placed) > tuning.RAYS_THROUGH
+
+    def fits_badly(self, found: Alignment) -> bool:
+        """Return whether an alignment fits the map as wrong ones do, or as new places."""
+        return not self.is_young and found.inlier_ratio < self._needed_inliers(True)
 
     def _is_confirmed(self, found: Alignment | None, source: Source, motion: SweepMotion) -> bool:
         """Return whether the finest cells confirm a loose prediction.

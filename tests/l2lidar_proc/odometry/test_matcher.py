@@ -157,11 +157,35 @@ def test_a_place_far_from_the_prediction_is_the_only_one_that_fits(
     for _ in range(tuning.YOUNG_SWEEPS + 1):
         points = np.vstack((floor(3000), *(plate(x, 1500) for x in plates)))
         extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
-    cloud = source(np.vstack((floor(90), plate(2.0, 90))))
+    cloud = source(np.vstack((floor(90) * (0.4, 1.0, 1.0), plate(2.0, 90))))
     match = matcher.match(cloud, motion(LOOSE, np.array([0.4, 0.0, 0.0])))
     assert (match.alignment is not None) == believed
     if match.alignment is not None:
         assert match.alignment.state.position[0] == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("is_in_the_way", [False, True])
+def test_a_place_from_which_a_known_wall_is_seen_through_is_not_believed(
+    is_in_the_way: bool,
+) -> None:
+    """A floor and a wall fit 0.4 m from the prediction, where a narrow wall stands in between."""
+    rng, matcher = np.random.default_rng(21), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def plate(x: float, half: float, count: int) -> F64:
+        return np.asarray(rng.uniform((x, -half, -1.2), (x, half, 1.0), (count, 3)))
+
+    def floor(count: int) -> F64:
+        return np.asarray(rng.uniform((-1.0, -2.0, -1.2), (4.0, 2.0, -1.2), (count, 3)))
+
+    walls = ((2.8, 1.5), (1.6, 0.4)) if is_in_the_way else ((2.8, 1.5),)
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        points = np.vstack((floor(3000), *(plate(x, half, 2000) for x, half in walls)))
+        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
+    cloud = source(np.vstack((floor(90) * (0.4, 1.0, 1.0), plate(2.0, 1.5, 110))))
+    found = matcher.match(cloud, motion(LOOSE, np.array([0.4, 0.0, 0.0]))).alignment
+    assert (found is not None) != is_in_the_way
+    if found is not None:
+        assert found.state.position[0] == pytest.approx(0.8, abs=0.01)
 
 
 def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
