@@ -304,6 +304,20 @@ NIS_SEEN: Final = (
 NIS_SUSPECT: Final = 2.0
 NIS_CHANCE: Final = 3.8  # mean of 3 components that chance exceeds in one of 100 windows
 NIS_SPEED_FLOOR: Final = 0.03  # [m/s] of corrections in a window that never count
+# Of a single alignment, for each degree of freedom. Observed: at most 3.1 in the hard runs as
+# long as poses are right; 8 to 59 where it met wrong surfaces, or the prediction was wrong
+NIS_GATE: Final = 5.0
+# A sweep that fits the map badly is also aligned as if the prediction might be wrong by so much
+# [m, m/s], once in a while, and believed there if so many more of its points fit. Derived: blows
+# of 3 to 12 m/s^2 for 0.2 s that only the accelerometer felt; maps that drifted by 0.1 to 0.5 m
+DOUBT_SIGMA: Final = (0.3, 1.0)
+DOUBT_BETTER: Final = 0.05  # share of the points
+# Of the points that are at known surfaces, at least, where these fix the place, or do not
+DOUBT_MATCHED: Final = (0.5, 0.9)
+DOUBT_MANY: Final = (
+    300  # points, in the latter case. Tuned on: a cone, 134 points at a wrong place
+)
+DOUBT_PAUSE_NS: Final = 1_000_000_000  # [ns]
 NIS_MOST: Final = 25.0  # by which variances are raised at most, or lowered
 # Variances are lowered to so many times what the window shows. Tuned on: velocities of the hard
 # runs, seeds 0 to 3; from 1.25 to 1.5, 85 to 99 % of them are within their 95 % bound.

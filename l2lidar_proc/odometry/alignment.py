@@ -94,6 +94,19 @@ class Alignment:
     fine_ratio: float = 0.0
     scatter: F64 | None = None
 
+    def refutes(self, other: Alignment, points: int) -> bool:
+        """Return whether another alignment of the same sweep, of so many points, is wrong.
+
+        More points fit here, and they are most of the sweep and fix the place, or they are many
+        and nearly all.
+        """
+        some, nearly_all = tuning.DOUBT_MATCHED
+        if self.inlier_ratio < other.inlier_ratio + tuning.DOUBT_BETTER:
+            return False
+        if unobserved_directions(self.information[POSITION, POSITION]).size:
+            return self.matched >= max(nearly_all * points, tuning.DOUBT_MANY)
+        return self.matched >= some * points
+
 
 def align(
     prior: InertialState,

@@ -19,6 +19,7 @@ from l2lidar_proc.odometry import kiss
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return
 from l2lidar_proc.odometry.estimate import (
     AlignmentQuality,
@@ -30,7 +31,7 @@ from l2lidar_proc.odometry.estimate import (
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
-from l2lidar_proc.odometry.uncertainty import FrameJump, InnovationTest
+from l2lidar_proc.odometry.uncertainty import FrameJump, InnovationTest, doubted, inflated_prior
 from l2lidar_proc.odometry.vertical_lines import VerticalLines, level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
@@ -102,6 +103,7 @@ class Odometry:
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0
+        self._next_check = 0  # stamp from which on a sweep that fits badly is searched for
         self._lines = VerticalLines()
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
@@ -222,6 +224,8 @@ class Odometry:
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         source = self.matcher.source(sweep, predicted)
         found, uncharted = self.matcher.match(source, predicted)
+        if found is not None:
+            predicted, found = self._checked(source, predicted, found, status)
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
@@ -251,6 +255,32 @@ class Odometry:
             fresh = self.matcher.extend(estimate.points, motion, guess)
             self._anchor_anew(fresh)
         return estimate
+
+    def _checked(
+        self, source: Source, predicted: SweepMotion, found: Alignment, status: list[Status]
+    ) -> tuple[SweepMotion, Alignment | None]:
+        """Return prediction and alignment, found anew if the two contradict each other.
+
+        A prediction that is too sure of itself makes a compromise of both, at which neither fits.
+        The sweep is then aligned as after a prediction that may be wrong by as much.
+        """
+        prior = predicted.state
+        wide = inflated_prior(prior, predicted.covariance, found.state, found.covariance)
+        is_due = prior.stamp >= self._next_check and self.matcher.fits_badly(found)
+        if wide is None and not is_due:
+            return predicted, found
+        self._next_check = prior.stamp + tuning.DOUBT_PAUSE_NS
+        covariance = doubted(predicted.covariance if wide is None else wide)
+        loose = dataclasses.replace(predicted, covariance=covariance)
+        other = self.matcher.match(source, loose).alignment
+        if other is not None and other.refutes(found, len(source.points)):
+            status.append(Status.SUSPECT)
+            return loose, other
+        if wide is None:
+            return predicted, found
+        status.append(Status.SUSPECT)
+        loose = dataclasses.replace(predicted, covariance=wide)
+        return loose, self.matcher.match(source, loose).alignment
 
     def _with_lines(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> Alignment:
         """Return an alignment with what vertical lines tell where surfaces leave it free."""
@@ -285,7 +315,8 @@ class Odometry:
         gravity = posterior[1][eskf.GRAVITY, eskf.GRAVITY]
         self.matcher.drift.lean(posterior[0].gravity, gravity)
         bounded = eskf.bound_speed(*posterior, self.config.max_speed)
-        if bounded[0] is not posterior[0] or self._is_suspect(predicted):
+        is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)
+        if is_suspect and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
         return predicted.with_state(*bounded)
 
@@ -523,6 +554,7 @@ class Odometry:
         self._zero_velocity.clear()
         self._lines.clear()
         self._innovations.clear()
+        self._next_check = int(reference)
         self._earlier.restart(reference)
         self._revisit.restart(reference)
         if self.phase is Phase.STATIONARY:

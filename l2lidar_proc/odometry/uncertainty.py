@@ -384,6 +384,69 @@ class _Correction(NamedTuple):
     allowed: F64  # its covariance, shape (3, 3)
 
 
+def _correction(
+    prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
+) -> _Correction:
+    """Return how a prior was corrected, with its covariance (18, 18) before and after."""
+    before = covariance[_MOTION, _MOTION]
+    allowed = before - corrected[_MOTION, _MOTION]
+    change = posterior.boxminus(prior)[_MOTION]
+    unit = np.sqrt(np.maximum(np.diag(before), 1e-18))
+    # only directions that were measured: elsewhere nothing was corrected, nor could be
+    share, axes = np.linalg.eigh(allowed / np.outer(unit, unit))
+    seen = share > tuning.NIS_SEEN
+    normalized = (axes[:, seen].T @ (change / unit)) ** 2 / share[seen]
+    return _Correction(
+        posterior.stamp,
+        float(normalized.sum()),
+        int(seen.sum()),
+        change[_VELOCITY],
+        allowed[_VELOCITY, _VELOCITY],
+    )
+
+
+def inflated_prior(
+    prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
+) -> F64 | None:
+    """Return the covariance that a prior must have had, if a correction contradicts it.
+
+    A single correction far beyond what the covariances allow (an innovation gate) means that one
+    of the two is wrong. A prior that is too sure of itself would make a compromise of both, at
+    which neither fits.
+
+    Parameters
+    ----------
+    prior : InertialState
+        As predicted.
+    covariance : ndarray, shape (18, 18)
+        Of the prior.
+    posterior : InertialState
+        As aligned.
+    corrected : ndarray, shape (18, 18)
+        Covariance of the posterior.
+
+    Returns
+    -------
+    ndarray, shape (18, 18), or None
+        Pose and velocity are as uncertain as the correction shows. None within the gate.
+    """
+    item = _correction(prior, covariance, posterior, corrected)
+    nis = item.squared / max(item.freedoms, 1)
+    if nis < tuning.NIS_GATE:
+        return None
+    scale = np.ones(len(covariance))
+    scale[_MOTION] = np.sqrt(nis)
+    return np.asarray(covariance * np.outer(scale, scale))
+
+
+def doubted(covariance: F64) -> F64:
+    """Return the covariance (18, 18) of a prior whose place and velocity are in doubt."""
+    found = covariance.copy()
+    found[POSITION, POSITION] += tuning.DOUBT_SIGMA[0] ** 2 * np.eye(3)
+    found[VELOCITY, VELOCITY] += tuning.DOUBT_SIGMA[1] ** 2 * np.eye(3)
+    return found
+
+
 class InnovationTest:
     """Compares the innovations of the last seconds with their covariances."""
 
@@ -419,26 +482,11 @@ class InnovationTest:
         corrected : ndarray, shape (18, 18)
             Covariance of the posterior.
         """
-        before = covariance[_MOTION, _MOTION]
-        allowed = before - corrected[_MOTION, _MOTION]
-        change = posterior.boxminus(prior)[_MOTION]
-        unit = np.sqrt(np.maximum(np.diag(before), 1e-18))
-        # only directions that were measured: elsewhere nothing was corrected, nor could be
-        share, axes = np.linalg.eigh(allowed / np.outer(unit, unit))
-        seen = share > tuning.NIS_SEEN
-        if not seen.any():
+        item = _correction(prior, covariance, posterior, corrected)
+        if not item.freedoms:
             return
-        normalized = (axes[:, seen].T @ (change / unit)) ** 2 / share[seen]
         recent = self._recent
-        recent.append(
-            _Correction(
-                posterior.stamp,
-                float(normalized.sum()),
-                int(seen.sum()),
-                change[_VELOCITY],
-                allowed[_VELOCITY, _VELOCITY],
-            )
-        )
+        recent.append(item)
         while recent[-1].stamp - recent[0].stamp > tuning.NIS_WINDOW_NS:
             recent.popleft()
 

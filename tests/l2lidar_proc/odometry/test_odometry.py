@@ -158,6 +158,29 @@ def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
     assert (turns[seconds > since + 0.2] < 0.3).all()
 
 
+@pytest.mark.parametrize("blow", [3.0, 12.0])
+@pytest.mark.parametrize(("scene", "axis"), [("room", 0), ("room", 1), ("yard", 0)])
+def test_a_sweep_that_contradicts_the_prediction_is_aligned_without_it(
+    scene: str, axis: int, blow: float
+) -> None:
+    """For a fifth of a second the accelerometer reports a blow that did not move the sensor."""
+    run = recording(scene, "walk")
+    some = list(sweeps(run, "turn"))
+    middle = some[len(some) // 2].start
+    imu = run.imu.copy()
+    during = (imu["stamp"] >= middle) & (imu["stamp"] < middle + 200_000_000)
+    imu["linear_acceleration"][during, axis] += blow
+    estimates = drive(run, imu=imu)
+    stamps = np.array([item.stamp for item in estimates])
+    suspect = np.array([Status.SUSPECT in item.status for item in estimates])
+    assert suspect.any()
+    assert not suspect[stamps < middle].any()
+    later = stamps > middle + 1_000_000_000
+    assert later.sum() > 5
+    assert errors(run, estimates)[later].max() < 0.05
+    assert not suspect[later].any()
+
+
 def sweep_epoch(run: Any) -> Any:
     return int(run.imu["stamp"][0])
 
