@@ -443,9 +443,11 @@ EARLIER_SAME: Final = (0.05, 0.25)  # [rad, m] within which two meetings agree
 # The older part of the map in use is searched likewise while the pose is less certain than that.
 # Tuned on: narrow views in rooms and flats.
 REVISIT_FROM_SIGMA: Final = 0.12  # [m] 1 sigma of the place
+# Not ever more rarely, as after losses: an old place is in view for a second or two only
+REVISIT_PAUSE_NS: Final = 1_000_000_000  # [ns] between searches
 REVISIT_LOOK_NS: Final = 200_000_000  # [ns] between looks whether it is
 REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
-REVISIT_MATCHED: Final = 0.5  # least share of the sweep's points that meet the older part
+REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part
 REVISIT_INLIERS: Final = 0.85  # least share of those that are near its surfaces
 REVISIT_MET_NS: Final = 2_000_000_000  # [ns] within which a meeting must be confirmed
 # Time in which the place may have moved by the jump. Observed: a view lacks for 3 to 10 s.

@@ -135,7 +135,6 @@ class MapRevisit:
     """Search of the older part of the map in use while the pose is less certain than that."""
 
     def __init__(self) -> None:
-        self._certain_at: int | None = None  # stamp until which the pose was certain enough
         self._meetings = _Meetings()
         self.restart(HostNs(0))
 
@@ -143,11 +142,10 @@ class MapRevisit:
         """Begin anew at an instant of another time line."""
         self._next_search = int(stamp)
         self._met_until = int(stamp)  # until then a meeting may be confirmed
-        self._certain_at = None
         self._meetings.clear()
 
     def part_due(self, matcher: SweepMatcher, state: InertialState) -> SweepMatcher | None:
-        """Return the older part of the map if it should be searched now: ever more rarely.
+        """Return the older part of the map if it should be searched now.
 
         Parameters
         ----------
@@ -160,13 +158,10 @@ class MapRevisit:
             return None
         older = matcher.drift.more_certain_than_held(state.position)
         if older is None or matcher.is_young or matcher.driving:
-            self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
+            self._next_search = stamp + tuning.REVISIT_LOOK_NS
             self._meetings.clear()
             return None
-        if self._certain_at is None:
-            self._certain_at = stamp
-        pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
-        self._next_search = stamp + max(tuning.EARLIER_PAUSE_NS, pause)
+        self._next_search = stamp + tuning.REVISIT_PAUSE_NS
         return matcher.part_of(older)
 
     def search(
