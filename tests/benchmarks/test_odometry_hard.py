@@ -20,6 +20,7 @@ from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.vertical_lines import LINE, VerticalLines
 from tests.support.other_sensors import SENSORS
@@ -151,30 +152,41 @@ def test_a_narrow_view_finds_its_old_place_again(narrow: Recording) -> None:
     assert "LOST" not in {name for status in track.status for name in status}
 
 
+@pytest.mark.parametrize(("seconds", "how"), [(14, "SUSPECT"), (18, "RETURNED")])
 def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
-    narrow: Recording,
+    narrow: Recording, seconds: int, how: str
 ) -> None:
-    hour, jump = 3_600_000_000_000, EPOCH + 14_000_000_000
+    """By a sweep that fits the map badly where it is, or by a search of the map's older part."""
+    hour, jump = 3_600_000_000_000, EPOCH + seconds * 1_000_000_000
     odometry = Odometry(OdometryConfig(), narrow.T_cloud_imu)
-    names: list[set[str]] = []
+    found: list[OdometryEstimate] = []
+    stamps = []
     first = 0
     for sweep in narrow.sweeps():
         last = int(np.searchsorted(narrow.imu["stamp"], sweep.end)) + 1
-        imu, one = narrow.imu[first:last].copy(), sweep
+        imu, one, back = narrow.imu[first:last].copy(), sweep, 0
         if sweep.start >= jump:
+            back = hour
             imu["stamp"] -= hour
             one = replace(sweep, start=HostNs(sweep.start - hour), end=HostNs(sweep.end - hour))
         odometry.imu(imu)
         first = last
-        names += [{status.name for status in item.status} for item in odometry.register(one)]
+        some = odometry.register(one)
+        found += some
+        stamps += [item.stamp + back for item in some]
+    names = [{status.name for status in item.status} for item in found]
     restarted = next(k for k, status in enumerate(names) if "RESTARTED" in status)
-    assert "RETURNED" in set().union(*names[restarted:])
+    poses = np.array([item.T_map_lidar for item in found])
+    off = np.linalg.norm(errors(narrow, Track(np.array(stamps), poses, 1.0)).position, axis=1)
+    assert off[restarted:].max() > 1.0
+    assert off[-1] < 0.1
+    assert how in set().union(*names[restarted:])
 
 
 def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the surfaces alone the sensor ends more than a meter farther along it."""
+    """With the surfaces alone the sensor ends half a meter farther along it."""
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     corridor = recording(scenario("corridor, 80 degrees", 13, 24.0))
     ends = []
@@ -185,8 +197,8 @@ def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
         monkeypatch.setattr(
             VerticalLines, "update", lambda _, state, covariance, *others: (state, covariance)
         )
-    assert ends[0] < 0.4
-    assert ends[1] > 1.0
+    assert ends[0] < 0.2
+    assert ends[1] > 0.4
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
@@ -278,8 +290,8 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
         ]
         reached = list(bench_odometry_hard.targets(rows))
         assert bench_odometry_hard.write(rows, reached) == page
-    assert "seeds 7 to 8, some used for tuning" in pages[0].read_text()
+    assert "seeds 15 to 16, some used for tuning" in pages[0].read_text()
     unseen = pages[1].read_text()
-    assert "seeds 8 to 9, which were not used for tuning" in unseen
-    assert 'BENCH_ARGS="--full --first-seed 8 --page"' in unseen
+    assert "seeds 16 to 17, which were not used for tuning" in unseen
+    assert 'BENCH_ARGS="--full --first-seed 16 --page"' in unseen
     assert "other methods" not in unseen
