@@ -443,8 +443,8 @@ EARLIER_SAME: Final = (0.05, 0.25)  # [rad, m] within which two meetings agree
 # The older part of the map in use is searched likewise while the pose is less certain than that.
 # Tuned on: narrow views in rooms and flats.
 REVISIT_FROM_SIGMA: Final = 0.12  # [m] 1 sigma of the place
-# Not ever more rarely, as after losses: an old place is in view for a second or two only
-REVISIT_PAUSE_NS: Final = 1_000_000_000  # [ns] between searches
+# Not ever more rarely, as after losses: an old place is in view for a few seconds only
+REVISIT_PAUSE_NS: Final = 3_000_000_000  # [ns] between searches, at most
 REVISIT_LOOK_NS: Final = 200_000_000  # [ns] between looks whether it is
 REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
 REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part

@@ -135,17 +135,19 @@ class MapRevisit:
     """Search of the older part of the map in use while the pose is less certain than that."""
 
     def __init__(self) -> None:
+        self._certain_at: int | None = None  # stamp until which the pose was certain enough
         self._meetings = _Meetings()
         self.restart(HostNs(0))
 
     def restart(self, stamp: HostNs) -> None:
         """Begin anew at an instant of another time line."""
         self._next_search = int(stamp)
+        self._certain_at = None
         self._met_until = int(stamp)  # until then a meeting may be confirmed
         self._meetings.clear()
 
     def part_due(self, matcher: SweepMatcher, state: InertialState) -> SweepMatcher | None:
-        """Return the older part of the map if it should be searched now.
+        """Return the older part of the map if it should be searched now: more rarely, to a limit.
 
         Parameters
         ----------
@@ -158,10 +160,14 @@ class MapRevisit:
             return None
         older = matcher.drift.more_certain_than_held(state.position)
         if older is None or matcher.is_young or matcher.driving:
-            self._next_search = stamp + tuning.REVISIT_LOOK_NS
+            self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
             self._meetings.clear()
             return None
-        self._next_search = stamp + tuning.REVISIT_PAUSE_NS
+        if self._certain_at is None:
+            self._certain_at = stamp
+        pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
+        pause = min(max(tuning.EARLIER_PAUSE_NS, pause), tuning.REVISIT_PAUSE_NS)
+        self._next_search = stamp + pause
         return matcher.part_of(older)
 
     def search(
