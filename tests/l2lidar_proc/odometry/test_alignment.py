@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -235,3 +237,30 @@ def test_derivatives_by_all_errors_are_those_of_the_residuals() -> None:
         error[column] = STEP
         moved = residuals(error)
         np.testing.assert_allclose(h[:, column], (moved - base.distances) / STEP, atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("better", "matched", "fixes", "refutes"),
+    [
+        (0.06, 260, True, True),
+        (0.04, 500, True, False),
+        (0.06, 240, True, False),
+        (0.06, 460, False, True),
+        (0.06, 440, False, False),
+    ],
+    ids=["fixed", "no better", "few", "nearly all", "not fixed"],
+)
+def test_an_alignment_refutes_another_that_fits_worse(
+    better: float, matched: int, fixes: bool, refutes: bool
+) -> None:
+    found, _ = aligned(posts=True, off=np.array([0.01, 0.0, 0.0]))
+    information = np.eye(eskf.ERRORS)
+    information[3, 3] = 1.0 if fixes else 0.0
+    worse = dataclasses.replace(found, inlier_ratio=0.9)
+    one = dataclasses.replace(
+        found, inlier_ratio=0.9 + better, matched=matched, information=information
+    )
+    assert one.refutes(worse, 500) == refutes
+    assert not worse.refutes(one, 500)
+    few = dataclasses.replace(one, matched=matched // 5)
+    assert few.refutes(worse, 100) == (refutes and fixes)

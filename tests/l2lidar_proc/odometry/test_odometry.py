@@ -158,7 +158,7 @@ def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
     assert (turns[seconds > since + 0.2] < 0.3).all()
 
 
-@pytest.mark.parametrize("blow", [3.0, 12.0])
+@pytest.mark.parametrize("blow", [1.0, 3.0, 12.0])
 @pytest.mark.parametrize(("scene", "axis"), [("room", 0), ("room", 1), ("yard", 0)])
 def test_a_sweep_that_contradicts_the_prediction_is_aligned_without_it(
     scene: str, axis: int, blow: float
@@ -174,6 +174,7 @@ def test_a_sweep_that_contradicts_the_prediction_is_aligned_without_it(
     stamps = np.array([item.stamp for item in estimates])
     suspect = np.array([Status.SUSPECT in item.status for item in estimates])
     assert suspect.any()
+    assert all(item.is_aligned for item in estimates)
     assert not suspect[stamps < middle].any()
     later = stamps > middle + 1_000_000_000
     assert later.sum() > 5
