@@ -182,6 +182,36 @@ def test_a_sweep_that_contradicts_the_prediction_is_aligned_without_it(
     assert not suspect[later].any()
 
 
+def test_a_sweep_is_aligned_again_after_the_clock_has_gone_back() -> None:
+    """The sweeps that fit badly are counted by a clock."""
+    run, hour = recording("room", "walk", 14.0), 3_600_000_000_000
+    some = list(sweeps(run, "turn"))
+    imu = run.imu.copy()
+    for at in (len(some) // 3, 3 * len(some) // 4):
+        begin = some[at].start
+        during = (imu["stamp"] >= begin) & (imu["stamp"] < begin + 200_000_000)
+        imu["linear_acceleration"][during, 1] += 4.0
+    jump = some[len(some) // 2].start
+    imu["stamp"][imu["stamp"] >= jump] -= hour
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates, first = [], 0
+    for sweep in some:
+        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+        odometry.imu(imu[first:last])
+        first = last
+        back = hour * (sweep.start >= jump)
+        moved = dataclasses.replace(
+            sweep, start=HostNs(sweep.start - back), end=HostNs(sweep.end - back)
+        )
+        found = odometry.register(moved)
+        estimates += [dataclasses.replace(one, stamp=HostNs(one.stamp + back)) for one in found]
+    suspect = [Status.SUSPECT in item.status for item in estimates]
+    half = len(suspect) // 2
+    assert any(suspect[:half])
+    assert any(suspect[half:])
+    assert errors(run, estimates)[-8:].max() < 0.05
+
+
 def sweep_epoch(run: Any) -> Any:
     return int(run.imu["stamp"][0])
 
