@@ -314,9 +314,7 @@ DOUBT_SIGMA: Final = (0.3, 1.0)
 DOUBT_BETTER: Final = 0.05  # share of the points
 # Of the points that are at known surfaces, at least, where these fix the place, or do not
 DOUBT_MATCHED: Final = (0.5, 0.9)
-DOUBT_MANY: Final = (
-    300  # points, in the latter case. Tuned on: a cone, 134 points at a wrong place
-)
+DOUBT_MANY: Final = 300  # points, where not. Tuned on: a cone, 134 at a wrong place
 DOUBT_PAUSE_NS: Final = 1_000_000_000  # [ns]
 NIS_MOST: Final = 25.0  # by which variances are raised at most, or lowered
 # Variances are lowered to so many times what the window shows. Tuned on: velocities of the hard

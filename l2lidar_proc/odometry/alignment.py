@@ -94,8 +94,8 @@ class Alignment:
     fine_ratio: float = 0.0
     scatter: F64 | None = None
 
-    def refutes(self, other: Alignment, points: int) -> bool:
-        """Return whether another alignment of the same sweep, of so many points, is wrong.
+    def fits_better_than(self, other: Alignment, points: int) -> bool:
+        """Return whether this is right and another alignment of the sweep's points is wrong.
 
         More points fit here, and they are most of the sweep and fix the place, or they are many
         and nearly all.

@@ -142,8 +142,8 @@ class MapRevisit:
     def restart(self, stamp: HostNs) -> None:
         """Begin anew at an instant of another time line."""
         self._next_search = int(stamp)
-        self._certain_at = None
         self._met_until = int(stamp)  # until then a meeting may be confirmed
+        self._certain_at = None
         self._meetings.clear()
 
     def part_due(self, matcher: SweepMatcher, state: InertialState) -> SweepMatcher | None:

@@ -31,7 +31,12 @@ from l2lidar_proc.odometry.estimate import (
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
-from l2lidar_proc.odometry.uncertainty import FrameJump, InnovationTest, doubted, inflated_prior
+from l2lidar_proc.odometry.uncertainty import (
+    FrameJump,
+    InnovationTest,
+    inflated_prior,
+    with_loose_motion,
+)
 from l2lidar_proc.odometry.vertical_lines import VerticalLines, level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
@@ -103,7 +108,7 @@ class Odometry:
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0
-        self._next_check = 0  # stamp from which on a sweep that fits badly is searched for
+        self._next_check = 0  # stamp from which on a sweep that fits badly is aligned again
         self._lines = VerticalLines()
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
@@ -270,10 +275,10 @@ class Odometry:
         if wide is None and not is_due:
             return predicted, found
         self._next_check = prior.stamp + tuning.DOUBT_PAUSE_NS
-        covariance = doubted(predicted.covariance if wide is None else wide)
+        covariance = with_loose_motion(predicted.covariance if wide is None else wide)
         loose = dataclasses.replace(predicted, covariance=covariance)
         other = self.matcher.match(source, loose).alignment
-        if other is not None and other.refutes(found, len(source.points)):
+        if other is not None and other.fits_better_than(found, len(source.points)):
             status.append(Status.SUSPECT)
             return loose, other
         if wide is None:

@@ -439,8 +439,8 @@ def inflated_prior(
     return np.asarray(covariance * np.outer(scale, scale))
 
 
-def doubted(covariance: F64) -> F64:
-    """Return the covariance (18, 18) of a prior whose place and velocity are in doubt."""
+def with_loose_motion(covariance: F64) -> F64:
+    """Return the covariance (18, 18) of a prior whose position and velocity may be wrong."""
     found = covariance.copy()
     found[POSITION, POSITION] += tuning.DOUBT_SIGMA[0] ** 2 * np.eye(3)
     found[VELOCITY, VELOCITY] += tuning.DOUBT_SIGMA[1] ** 2 * np.eye(3)
@@ -469,19 +469,7 @@ class InnovationTest:
         posterior: InertialState,
         corrected: F64,
     ) -> None:
-        """Take an alignment.
-
-        Parameters
-        ----------
-        prior : InertialState
-            As predicted.
-        covariance : ndarray, shape (18, 18)
-            Of the prior.
-        posterior : InertialState
-            As aligned.
-        corrected : ndarray, shape (18, 18)
-            Covariance of the posterior.
-        """
+        """Take an alignment, given as to :func:`inflated_prior`."""
         item = _correction(prior, covariance, posterior, corrected)
         if not item.freedoms:
             return

@@ -260,7 +260,7 @@ def test_an_alignment_refutes_another_that_fits_worse(
     one = dataclasses.replace(
         found, inlier_ratio=0.9 + better, matched=matched, information=information
     )
-    assert one.refutes(worse, 500) == refutes
-    assert not worse.refutes(one, 500)
+    assert one.fits_better_than(worse, 500) == refutes
+    assert not worse.fits_better_than(one, 500)
     few = dataclasses.replace(one, matched=matched // 5)
-    assert few.refutes(worse, 100) == (refutes and fixes)
+    assert few.fits_better_than(worse, 100) == (refutes and fixes)

@@ -183,7 +183,7 @@ def test_a_sweep_that_contradicts_the_prediction_is_aligned_without_it(
 
 
 def test_a_sweep_is_aligned_again_after_the_clock_has_gone_back() -> None:
-    """The sweeps that fit badly are counted by a clock."""
+    """Sweeps that fit badly are aligned again once a second at most."""
     run, hour = recording("room", "walk", 14.0), 3_600_000_000_000
     some = list(sweeps(run, "turn"))
     imu = run.imu.copy()
