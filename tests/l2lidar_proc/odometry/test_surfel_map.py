@@ -11,11 +11,12 @@ from hypothesis import given, strategies as st
 
 from l2lidar_node.types import HostNs
 from l2lidar_proc.motion.filter import ERRORS, InertialState
+from l2lidar_proc.odometry.cell_index import CellIndex
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.principal_axes import principal_axes
-from l2lidar_proc.odometry.surfel_map import CellIndex, SurfelMap
+from l2lidar_proc.odometry.surfel_map import SurfelMap
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion
 
 KEYS = st.one_of(
