@@ -228,7 +228,10 @@ class SweepMatcher:
         placed = (state.rotation @ points.T + state.position[:, None]).T
         self.drift.record(self._sweeps, state.position, pose_covariance(motion))
         apart = self.drift.more_certain(state.position)
-        fresh = self.surfaces.add(placed, self._sweeps, apart, state.position)
+        # what is ahead of a carrier that drives was seen from afar first, and tells its way:
+        # points from nearby, which the errors of that way have moved, must not take its place
+        weighted = not self.driving
+        fresh = self.surfaces.add(placed, self._sweeps, apart, state.position, weighted=weighted)
         self.kiss.update(points, _pose(state), _pose(guess))
         self._walk(state.position)
         self._sweeps += 1

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from l2lidar_node.types import HostNs
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, InertialState
 from l2lidar_proc.odometry.cell_index import CellIndex
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -374,3 +375,55 @@ def test_a_place_is_no_older_for_a_sweep_that_is_not_known_to_belong_to_it() -> 
     surfaces.add(points[~left], 2, np.array([True, False]))
     for part, born in ((left, 0), (~left, 2)):
         assert np.median(surfaces.match(points[part]).born) == born
+
+
+def test_near_points_take_the_place_of_far_ones_that_fill_a_cell() -> None:
+    """A wall at the face of two cells, its noise larger from afar."""
+    rng = np.random.default_rng(2)
+    eye = np.array([-1.0, 0.15, 0.15])
+
+    def seen(noise: float) -> Any:
+        points = rng.uniform((0.3, 0.02, 0.02), (0.3, 0.28, 0.28), (100, 3))
+        points[:, 0] += noise * rng.standard_normal(100)
+        return points
+
+    def off(surfaces: SurfelMap) -> float:
+        met = surfaces.match(seen(0.001))
+        return float(np.abs(met.distances).mean())
+
+    found = {}
+    for weighted in (False, True):
+        surfaces = SurfelMap((0.3,), capacity=400)
+        for number in range(12):
+            far = np.array([-5.0, 0.15, 0.15])
+            surfaces.add(seen(0.04), number, origin=far, weighted=weighted)
+        assert off(surfaces) > 0.015
+        for number in range(12, 24):
+            surfaces.add(seen(0.004), number, origin=eye, weighted=weighted)
+        found[weighted] = off(surfaces)
+    assert found[False] > 0.015
+    assert found[True] < 0.5 * found[False]
+
+
+def test_weighted_points_give_the_weighted_mean_and_count_for_less() -> None:
+    rng = np.random.default_rng(5)
+    surfaces = SurfelMap((0.25, 4.0), capacity=10**6)
+    eyes = np.array([[2.0, 2.0, 1.0], [2.0, 2.0, 9.0]])
+    clouds = []
+    for number, eye in enumerate(eyes):
+        points = rng.uniform((0.1, 0.1, 0.1 + number), (3.9, 3.9, 0.2 + number), (3000, 3))
+        clouds.append(points)
+        surfaces.add(points, number, origin=eye, weighted=True)
+    cell = np.floor(np.vstack(clouds) / 0.25)
+    owner = np.repeat([0, 1], 3000)
+    middles = (cell + 0.5) * 0.25
+    ways = middles - eyes[owner]
+    weights = 1.0 / (1.0 + (ways**2).sum(axis=1) / tuning.WEIGHT_RANGE**2)
+    whole = surfaces._cells[1 : len(surfaces) + 1]
+    coarse = whole[whole["key"] >> 57 == 1]
+    assert len(coarse) == 1
+    mean = (weights[:, None] * np.vstack(clouds)).sum(axis=0) / weights.sum()
+    np.testing.assert_allclose(coarse["sum"][0] / coarse["weight"][0] + 2.0, mean, atol=1e-9)
+    count = weights.sum() ** 2 / (weights**2).sum()
+    assert coarse["count"][0] == pytest.approx(count)
+    assert count < 5000
