@@ -12,6 +12,11 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
 
+Weak directions mix turns with ways. What little is known of a turn would then speak about the way
+along a wall as well: watched with a narrow view, that halved the uncertainty of a velocity which
+was wrong by more. So the directions of the place that nothing faces come first, by themselves, and
+no point says anything about them.
+
 A carrier that drives leaves the rims of its view behind, and what is wrong by its velocity adds up
 soon. There, three things are stricter, and in turn surfaces count sooner:
 
@@ -139,12 +144,40 @@ def weak_axes(
         return None
     axes = axes[:, weak]
     if scatter is None or not _is_way(axes[:, 0], state.gravity):
-        return WeakAxes(scale, axes, surfaces)
+        return WeakAxes(scale, _free_first(axes, found), surfaces)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
     axes = _along_walls(axes, levers, weights)
     axes, scatter = _steadied(axes, found.normals, weights, scatter)
     return WeakAxes(scale, axes, surfaces, scatter)
+
+
+def _free_first(axes: F64, found: Correspondences) -> F64:
+    """Return weak directions (6, K) with those of the place first that no surface faces.
+
+    Parameters
+    ----------
+    axes : ndarray, shape (6, K)
+        Orthonormal, weakest first.
+    found : Correspondences
+
+    Returns
+    -------
+    ndarray, shape (6, L)
+        Orthonormal. They span the given directions as far as those of the place leave them.
+    """
+    normals = found.normals
+    strength, places = np.linalg.eigh((normals * found.weights[:, None]).T @ normals)
+    places = places[:, strength < tuning.WEAK_SHARE * strength[-1]]
+    faces = np.abs(normals @ places) > tuning.WEAK_FACING
+    faces &= found.settled(tuning.WEAK_AGE)[:, None]
+    places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
+    if not places.shape[1]:
+        return axes
+    free = np.concatenate((np.zeros_like(places), places))
+    others, lengths, _ = np.linalg.svd(axes - free @ (free.T @ axes), full_matrices=False)
+    others = others[:, lengths > tuning.FREE_LEFT]
+    return np.column_stack((free, others[:, ::-1]))
 
 
 def _is_way(axis: F64, gravity: F64) -> bool:

@@ -183,8 +183,10 @@ def test_a_place_from_which_a_known_wall_is_seen_through_is_not_believed(
         extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
     cloud = source(np.vstack((floor(90) * (0.4, 1.0, 1.0), plate(2.0, 1.5, 110))))
     found = matcher.match(cloud, motion(LOOSE, np.array([0.4, 0.0, 0.0]))).alignment
-    assert (found is not None) != is_in_the_way
-    if found is not None:
+    if is_in_the_way:  # the floor alone may place the sweep where it was predicted
+        assert found is None or abs(found.state.position[0] - 0.4) < 0.01
+    else:
+        assert found is not None
         assert found.state.position[0] == pytest.approx(0.8, abs=0.01)
 
 

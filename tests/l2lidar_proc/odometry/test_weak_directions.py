@@ -248,3 +248,47 @@ def test_points_that_thinning_left_out_fix_the_place_if_they_face_the_way() -> N
     assert driven.covariance[3, 3] < 0.3 * by_hand.covariance[3, 3]
     # of the others, which say nothing new, none is added
     assert len(thin.points) < driven.matched < len(thin.points) + 2 * 90
+
+
+def test_a_way_that_nothing_faces_is_free_however_weak_turns_are() -> None:
+    """One wall and a strip of floor: the way along the wall is weak, and so are two turns."""
+    rng = np.random.default_rng(4)
+    surfaces = SurfelMap(SIZES)
+
+    def seen(count: int) -> F64:
+        wall = rng.uniform((-1.0, 1.5, -0.8), (1.0, 1.5, 0.8), (count, 3))
+        floor = rng.uniform((-1.0, 0.9, -0.8), (1.0, 1.5, -0.8), (count // 8, 3))
+        points = np.vstack((wall, floor))
+        return points + 0.01 * rng.standard_normal(points.shape)
+
+    for number in range(12):
+        surfaces.add(seen(3000), number)
+    points = seen(800)
+    weak = weak_in(surfaces, points, None)
+    np.testing.assert_allclose(weak.axes.T @ weak.axes, np.eye(weak.axes.shape[1]), atol=1e-9)
+    first, others = weak.axes[:, 0], weak.axes[:, 1:]
+    assert not first[:3].any()
+    assert abs(first[3]) > 0.999
+    np.testing.assert_allclose(others[3], 0.0, atol=0.05)
+    assert others.shape[1] >= 2
+    # nothing is learned of the way, though what is known of the turns is not perfect
+    prior = 0.2**2 * np.eye(eskf.ERRORS)
+    found = align(at(), prior, source(points), surfaces, SurfaceConfig(), 30)
+    assert found is not None
+    assert found.information[3, 3] < 1e-4 * found.information[4, 4]
+    assert found.covariance[3, 3] > 0.19**2
+
+
+@pytest.mark.parametrize("facing", [True, False])
+def test_a_few_points_that_face_a_way_do_not_tell_it(facing: bool) -> None:
+    rng = np.random.default_rng(6)
+    surfaces = SurfelMap(SIZES)
+    patch = rng.uniform((0.9, 1.05, 0.05), (0.9, 1.45, 0.4), (400, 3))
+    for number in range(12):
+        wall = rng.uniform((-1.0, 1.5, -0.8), (1.0, 1.5, 0.8), (3000, 3))
+        surfaces.add(np.vstack((wall, patch)) + rng.normal(0.0, 0.005, (3400, 3)), number)
+    wall = rng.uniform((-1.0, 1.5, -0.8), (1.0, 1.5, 0.8), (800, 3))
+    count = tuning.FREE_FACING + (40 if facing else 0)
+    weak = weak_in(surfaces, np.vstack((wall, patch[:count])), None)
+    is_free = np.abs(weak.axes[3]) > 0.999
+    assert is_free.any() is np.bool_(not facing)
