@@ -458,9 +458,10 @@ def apply_zero_velocity_prior(
     Carriers are slow: a velocity of zero is measured all the time, but so coarsely that it only
     counts where nothing else measures the velocity. A carrier that drives may keep its velocity
     for minutes; measuring zero again and again would brake it. So its velocity has to be known
-    worse than its peak speed, at which zero is as likely as any. That does not hold for the
-    vertical velocity: what walks or drives comes back to its height. Where nothing observes the
-    height for long, that is all that is known of it, and counts for more.
+    worse than its peak speed, at which zero is as likely as any. One that is moved by hand stops
+    and turns all the time, so zero counts for more, the more the slower it is. The vertical
+    velocity is drawn whatever the carrier: what walks or drives comes back to its height. Where
+    nothing observes the height for long, that is all that is known of it, and counts for more.
 
     Parameters
     ----------
@@ -470,7 +471,8 @@ def apply_zero_velocity_prior(
     seconds : float
         Time since this was done last.
     peak_speed : float
-        Of this carrier of late, as :func:`peak_speed_after` returns it [m/s].
+        Of this carrier of late, as :func:`peak_speed_after` returns it [m/s]; 0 if nothing is
+        known of it.
     height_observed : bool
         Whether sweeps have fixed the height of late.
     """
@@ -482,13 +484,15 @@ def apply_zero_velocity_prior(
     if not height_observed and rise_sigma >= tuning.RISE_FROM_SIGMA:
         variance = tuning.RISE_SPEED**2 / seconds
         state, covariance = _drawn_to_zero(state, covariance, vertical, variance)
-    drives = peak_speed > tuning.DRIVING_SPEED
-    least = peak_speed if drives else tuning.PRIOR_FROM_SIGMA
-    variance = tuning.PRIOR_SPEED**2 / seconds
+    least, speed = tuning.PRIOR_FROM_SIGMA, tuning.PRIOR_SPEED
+    if peak_speed > tuning.DRIVING_SPEED:
+        least = peak_speed
+    elif peak_speed > 0.0:
+        least, speed = tuning.HAND_FROM_SIGMA, max(peak_speed, tuning.HAND_SPEED)
     if np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1] >= least**2:
-        return _drawn_to_zero(state, covariance, np.eye(3), variance)
+        return _drawn_to_zero(state, covariance, np.eye(3), speed**2 / seconds)
     if rise_sigma >= tuning.PRIOR_FROM_SIGMA:
-        return _drawn_to_zero(state, covariance, vertical, variance)
+        return _drawn_to_zero(state, covariance, vertical, tuning.PRIOR_SPEED**2 / seconds)
     return state, covariance
 
 
@@ -519,15 +523,16 @@ def peak_speed_after(
         The peak so far [m/s].
     state : InertialState
     covariance : ndarray, shape (18, 18)
-        A velocity that is hardly known says nothing, nor is anything forgotten meanwhile.
+        While the velocity is hardly known, nothing is forgotten, and only the speed counts that it
+        has at least.
     seconds : float
         Time since this was done last.
     """
-    variance = np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1]
-    if variance > tuning.PRIOR_LEARN_SIGMA**2:
-        return before
-    left = before * float(np.exp(-seconds / tuning.PRIOR_MEMORY_S))
-    return max(left, float(np.linalg.norm(state.velocity)))
+    speed = float(np.linalg.norm(state.velocity))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1]))
+    if sigma > tuning.PRIOR_LEARN_SIGMA:
+        return max(before, speed - tuning.PRIOR_LEARN_SIGMAS * sigma)
+    return max(before * float(np.exp(-seconds / tuning.PRIOR_MEMORY_S)), speed)
 
 
 def bound_speed(

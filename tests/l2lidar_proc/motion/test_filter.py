@@ -249,7 +249,7 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
     )
     # in all directions a velocity that is hardly known at all is drawn as before
     lost, _ = eskf.apply_zero_velocity_prior(
-        start, np.eye(eskf.ERRORS), 1.0, 0.3, height_observed=False
+        start, np.eye(eskf.ERRORS), 1.0, 0.0, height_observed=False
     )
     assert ahead @ lost.velocity == pytest.approx(0.25)
     assert up @ lost.velocity < 0.001
@@ -258,16 +258,42 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
 def test_the_peak_speed_is_the_highest_that_was_known_of_late() -> None:
     state = dataclasses.replace(some_state(), velocity=np.array([0.0, 1.2, 0.0]))
     known = np.eye(eskf.ERRORS) * (0.9 * tuning.PRIOR_LEARN_SIGMA) ** 2
-    unknown = known.copy()
-    unknown[7, 7] = (1.1 * tuning.PRIOR_LEARN_SIGMA) ** 2
     assert eskf.peak_speed_after(0.3, state, known, 0.1) == pytest.approx(1.2)
-    assert eskf.peak_speed_after(0.3, state, unknown, 0.1) == 0.3
     # one that stands is slow after some minutes
     left = eskf.peak_speed_after(2.4, state, known, tuning.PRIOR_MEMORY_S / 2.0)
     assert left == pytest.approx(2.4 * np.exp(-0.5))
     assert eskf.peak_speed_after(2.4, state, known, 3.0 * tuning.PRIOR_MEMORY_S) == pytest.approx(
         1.2
     )
+
+
+def test_of_a_velocity_that_is_hardly_known_only_the_least_speed_counts() -> None:
+    state = dataclasses.replace(some_state(), velocity=np.array([0.0, 1.3, 0.0]))
+    loose = np.eye(eskf.ERRORS) * 1e-4
+    for sigma in (1.1 * tuning.PRIOR_LEARN_SIGMA, 0.2):
+        loose[8, 8] = sigma**2
+        expected = 1.3 - tuning.PRIOR_LEARN_SIGMAS * sigma
+        assert eskf.peak_speed_after(0.3, state, loose, 0.1) == pytest.approx(expected)
+    # nothing is forgotten meanwhile
+    loose[8, 8] = 1.0
+    assert eskf.peak_speed_after(0.3, state, loose, 60.0) == 0.3
+
+
+def test_what_is_moved_by_hand_is_drawn_to_zero_by_its_own_speed() -> None:
+    level = dataclasses.replace(
+        some_state(), velocity=np.array([0.0, 0.4, 0.0]), gravity=np.zeros(3)
+    )
+    known = np.eye(eskf.ERRORS) * (0.9 * tuning.HAND_FROM_SIGMA) ** 2
+    loose = np.eye(eskf.ERRORS) * (1.1 * tuning.HAND_FROM_SIGMA) ** 2
+    assert eskf.apply_zero_velocity_prior(level, known, 1.0, 0.5)[0] is level
+    # of a carrier of which nothing is known, it has to be less certain
+    assert eskf.apply_zero_velocity_prior(level, loose, 1.0, 0.0)[0] is level
+    for peak in (0.5, 0.01):  # a very slow one does not say that it stands
+        noise = max(peak, tuning.HAND_SPEED) ** 2 / 0.5
+        left = noise / (noise + loose[7, 7])
+        slowed, covariance = eskf.apply_zero_velocity_prior(level, loose, 0.5, peak)
+        assert slowed.velocity[1] == pytest.approx(0.4 * left)
+        assert covariance[7, 7] == pytest.approx(loose[7, 7] * left)
 
 
 def test_the_size_of_gravity_comes_back_and_the_bias_with_it() -> None:
