@@ -285,7 +285,10 @@ class Odometry:
             return predicted, found
         status.append(Status.SUSPECT)
         loose = dataclasses.replace(predicted, covariance=wide)
-        return loose, self.matcher.match(source, loose).alignment
+        other = self.matcher.match(source, loose).alignment
+        if other is not None and found.fits_better_than(other, len(source.points)):
+            return predicted, found
+        return loose, other
 
     def _with_lines(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> Alignment:
         """Return an alignment with what vertical lines tell where surfaces leave it free."""
@@ -306,13 +309,12 @@ class Odometry:
         assert self._belief is not None
         before = self._belief[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
-        peak = eskf.peak_speed_after(self._peak_speed, after, covariance, lasted)
+        self._peak_speed = eskf.peak_speed_after(self._peak_speed, after, covariance, lasted)
         height = self.matcher.observes_height
         posterior = eskf.apply_zero_velocity_prior(
-            after, covariance, lasted, peak, height_observed=height
+            after, covariance, lasted, self._peak_speed, height_observed=height
         )
-        self._peak_speed = peak
-        self.matcher.driving = peak > tuning.DRIVING_SPEED
+        self.matcher.driving = self._peak_speed > tuning.DRIVING_SPEED
         posterior = eskf.with_gravity_of_known_size(*posterior)
         way = float(np.linalg.norm(posterior[0].position - before.position))
         lean = way * tuning.MAP_BEND**2
