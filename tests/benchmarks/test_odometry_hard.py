@@ -146,17 +146,17 @@ def test_a_narrow_view_finds_its_old_place_again(narrow: Recording) -> None:
     assert track is not None
     off = np.linalg.norm(errors(narrow, track).position, axis=1)
     back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
-    assert off[back - 10 : back].min() > 0.5
+    assert off[back - 4 : back].min() > 0.4
     assert off[back:].max() < 0.2
     assert off[-1] < 0.1
     assert "LOST" not in {name for status in track.status for name in status}
 
 
-@pytest.mark.parametrize(("seconds", "how"), [(14, "SUSPECT"), (18, "RETURNED")])
+@pytest.mark.parametrize("seconds", [12, 16])
 def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
-    narrow: Recording, seconds: int, how: str
+    narrow: Recording, seconds: int
 ) -> None:
-    """By a sweep that fits the map badly where it is, or by a search of the map's older part."""
+    """By a search of the map's older part, whose next time was told by the clock before."""
     hour, jump = 3_600_000_000_000, EPOCH + seconds * 1_000_000_000
     odometry = Odometry(OdometryConfig(), narrow.T_cloud_imu)
     found: list[OdometryEstimate] = []
@@ -178,17 +178,17 @@ def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
     restarted = next(k for k, status in enumerate(names) if "RESTARTED" in status)
     poses = np.array([item.T_map_lidar for item in found])
     off = np.linalg.norm(errors(narrow, Track(np.array(stamps), poses, 1.0)).position, axis=1)
-    assert off[restarted:].max() > 1.0
+    assert off[restarted:].max() > 0.3
     assert off[-1] < 0.1
-    assert how in set().union(*names[restarted:])
+    assert "RETURNED" in set().union(*names[restarted:])
 
 
 def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the surfaces alone the sensor ends half a meter farther along it."""
+    """With the surfaces alone the sensor ends over a meter off along it."""
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
-    corridor = recording(scenario("corridor, 80 degrees", 13, 24.0))
+    corridor = recording(scenario("corridor, 80 degrees", 12, 24.0))
     ends = []
     for _ in range(2):
         track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, corridor)
@@ -198,7 +198,7 @@ def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
             VerticalLines, "update", lambda _, state, covariance, *others: (state, covariance)
         )
     assert ends[0] < 0.2
-    assert ends[1] > 0.4
+    assert ends[1] > 1.0
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
