@@ -373,3 +373,13 @@ def test_a_height_that_was_not_fixed_for_long_is_not_observed() -> None:
     assert seen(20.0, 0.2)
     assert not seen(60.0, 0.0)
     assert seen(5.0, 1.0)
+
+
+@pytest.mark.parametrize("driving", [False, True])
+def test_points_count_by_their_range_unless_the_carrier_drives(driving: bool) -> None:
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    matcher.driving = driving
+    points = room(np.random.default_rng(13), 4000)
+    extended(matcher, points)
+    cells = matcher.surfaces._cells[1 : len(matcher.surfaces) + 1]
+    assert (cells["weight"].sum() < 0.9 * cells["count"].sum()) != driving

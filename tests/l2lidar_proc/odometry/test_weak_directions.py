@@ -291,4 +291,4 @@ def test_a_few_points_that_face_a_way_do_not_tell_it(facing: bool) -> None:
     count = tuning.FREE_FACING + (40 if facing else 0)
     weak = weak_in(surfaces, np.vstack((wall, patch[:count])), None)
     is_free = np.abs(weak.axes[3]) > 0.999
-    assert is_free.any() is np.bool_(not facing)
+    assert bool(is_free.any()) != facing
