@@ -485,7 +485,7 @@ def apply_zero_velocity_prior(
         variance = tuning.RISE_SPEED**2 / seconds
         state, covariance = _drawn_to_zero(state, covariance, vertical, variance)
     least, speed = tuning.PRIOR_FROM_SIGMA, tuning.PRIOR_SPEED
-    if peak_speed > tuning.DRIVING_SPEED:
+    if is_driving_speed(peak_speed):
         least = peak_speed
     elif peak_speed > 0.0:
         least, speed = tuning.HAND_FROM_SIGMA, max(peak_speed, tuning.HAND_SPEED)
@@ -508,6 +508,11 @@ def _drawn_to_zero(
     noise = variance * np.eye(len(axes))
     found = update(state, covariance, -axes @ state.velocity, jacobian, noise)
     return found.state, found.covariance
+
+
+def is_driving_speed(speed: float) -> bool:
+    """Return whether a carrier that has been so fast [m/s] drives, and is not moved by hand."""
+    return speed > tuning.DRIVING_SPEED
 
 
 def peak_speed_after(

@@ -24,6 +24,7 @@ from l2lidar_proc.motion.filter import (
     ROTATION,
     VELOCITY,
     InertialState,
+    is_driving_speed,
     square_root,
     update_with_information,
 )
@@ -296,8 +297,8 @@ class SweepMatcher:
         if abs(float(along @ gravity)) > tuning.LINE_SLOPE * float(np.linalg.norm(gravity)):
             return None
         sigma = float(np.sqrt(along @ found.covariance[VELOCITY, VELOCITY] @ along))
-        drives = abs(float(along @ found.state.velocity)) - sigma > tuning.DRIVING_SPEED
-        return along if self.driving or drives else None
+        least = abs(float(along @ found.state.velocity)) - sigma
+        return along if self.driving or is_driving_speed(least) else None
 
     def vertical_lines(self, sweep: Sweep, motion: SweepMotion, axes: F64) -> Lines:
         """Return the vertical lines that a sweep sees away from known walls.

@@ -314,7 +314,7 @@ class Odometry:
         posterior = eskf.apply_zero_velocity_prior(
             after, covariance, lasted, self._peak_speed, height_observed=height
         )
-        self.matcher.driving = self._peak_speed > tuning.DRIVING_SPEED
+        self.matcher.driving = eskf.is_driving_speed(self._peak_speed)
         posterior = eskf.with_gravity_of_known_size(*posterior)
         way = float(np.linalg.norm(posterior[0].position - before.position))
         lean = way * tuning.MAP_BEND**2
