@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -129,6 +129,9 @@ class OdometryEstimate:
         Cloud axes [rad/s, m/s^2].
     gravity : ndarray, shape (3,)
         Odometry axes [m/s^2]; zero when not trusted.
+    gyro_bias_covariance : ndarray, shape (9, 3)
+        Of the errors of ``covariance`` (6) and of the gyro bias (3), each with the gyro bias
+        [rad/s], cloud axes. What else the angular velocity is uncertain by is noise of samples.
     """
 
     stamp: HostNs
@@ -143,6 +146,7 @@ class OdometryEstimate:
     gyro_bias: F64
     accel_bias: F64
     gravity: F64
+    gyro_bias_covariance: F64 = field(default_factory=lambda: np.zeros((9, 3)))
 
     def refusing(self, points: NDArray[np.void]) -> OdometryEstimate:
         """Return the same again for a sweep with points (N,) that was refused."""
@@ -239,6 +243,7 @@ def estimate_of(
         gyro_bias=state.gyro_bias,
         accel_bias=state.accel_bias,
         gravity=state.gravity,
+        gyro_bias_covariance=np.vstack((pose @ p, p[GYRO_BIAS]))[:, GYRO_BIAS],
     )
 
 

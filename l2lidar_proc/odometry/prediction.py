@@ -202,6 +202,8 @@ class DeadReckoning:
         self._place: F64 = np.zeros(3)  # of the IMU, map axes
         self._velocity: F64 = np.zeros(3)  # of the IMU, map axes
         self._rate: F64 = np.zeros(3)  # cloud axes
+        # integral of the rotation over time since the estimate [s]: what a rate adds to turns
+        self._by_rate: F64 = np.zeros((3, 3))
         self._sample: tuple[HostNs, F64] | None = None  # that the state belongs to
 
     def reset(self, estimate: OdometryEstimate | None) -> None:
@@ -217,6 +219,7 @@ class DeadReckoning:
         swing = rotations.cross(estimate.angular_velocity, self._lever)
         self._velocity = self._rotation @ (estimate.velocity + swing)
         self._rate = estimate.angular_velocity
+        self._by_rate = np.zeros((3, 3))
 
     def carry(self, samples: Samples) -> F64 | None:
         """Return the pose of the cloud frame in the map, (4, 4), at the last of some samples.
@@ -264,16 +267,17 @@ class DeadReckoning:
         """
         if self._anchor is None:
             raise ValueError("no estimate to carry on from")
-        rotation = self._rotation
+        rotation, seconds = self._rotation, (self.stamp - self._anchor.stamp) * 1e-9
+        of_bias = self._anchor.gyro_bias_covariance.copy()
+        of_bias[3:6] -= self._by_rate @ of_bias[6:]
         return dataclasses.replace(
             self._anchor,
             stamp=self.stamp,
             T_map_lidar=self._pose(),
-            covariance=_grown(
-                self._anchor, rotation, self._rate, (self.stamp - self._anchor.stamp) * 1e-9
-            ),
+            covariance=_grown(self._anchor, rotation, self._rate, self._by_rate, seconds),
             velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
             angular_velocity=self._rate,
+            gyro_bias_covariance=of_bias,
         )
 
     def _pose(self) -> F64:
@@ -309,17 +313,34 @@ class DeadReckoning:
         self._place = self._place + dt * self._velocity + 0.5 * dt * dt * acceleration
         self._velocity = self._velocity + dt * acceleration
         self._rotation = middle @ half
+        self._by_rate = self._by_rate + dt * middle
         self.stamp, self._rate = stamp, rate
 
 
-def _grown(anchor: OdometryEstimate, rotation: F64, rate: F64, seconds: float) -> F64:
+def _grown(
+    anchor: OdometryEstimate, rotation: F64, rate: F64, by_rate: F64, seconds: float
+) -> F64:
     """Return the covariance (6, 6) of a pose so long after an estimate.
 
     How far the errors of place and speed go together is not known here, so the bound for any
     correlation counts: (1 + a) P + (1 + 1/a) Q with the ratio a of the two (covariance
-    intersection; Julier and Uhlmann 1997). Errors of the rate are those of single samples, white,
-    and a share of the rate itself, as in the filter. What they add up to is as much less than
-    assumed as the innovations show of all else.
+    intersection; Julier and Uhlmann 1997). The error of the gyro bias stays the same, so turns by
+    it grow with the time and their variance with its square, and goes together with that of the
+    attitude as the filter knows. The other errors of the rate are those of single samples, white,
+    and a share of the rate itself, as in the filter; their variance grows with the time. It is as
+    much less than assumed as the innovations show of all else.
+
+    Parameters
+    ----------
+    anchor : OdometryEstimate
+    rotation : ndarray, shape (3, 3)
+        Cloud axes to map axes now.
+    rate : ndarray, shape (3,)
+        Now, cloud axes [rad/s].
+    by_rate : ndarray, shape (3, 3)
+        Derivatives of turns about the map's axes by a constant rate about the cloud's [s].
+    seconds : float
+        Since the estimate.
     """
     found = anchor.covariance.copy()
     place = found[:3, :3]
@@ -327,7 +348,12 @@ def _grown(anchor: OdometryEstimate, rotation: F64, rate: F64, seconds: float) -
     ratio = float(np.sqrt(np.trace(speed) / max(float(np.trace(place)), 1e-12)))
     if ratio > 0.0:
         found[:3, :3] = (1.0 + ratio) * place + (1.0 + 1.0 / ratio) * speed
-    white = _PERIOD_S * rotation @ anchor.twist_covariance[3:, 3:] @ rotation.T
+    with_bias, bias = anchor.gyro_bias_covariance[:6], anchor.gyro_bias_covariance[6:]
+    by_bias = np.vstack((np.zeros((3, 3)), -by_rate))  # one that is too large turns too little
+    together = with_bias @ by_bias.T
+    found += by_bias @ bias @ by_bias.T + together + together.T
+    samples = anchor.twist_covariance[3:, 3:] - bias
+    white = _PERIOD_S * rotation @ samples @ rotation.T
     share = tuning.GYRO_SHARE * float(np.abs(rate).max())
     grown = (white + share**2 * np.eye(3)) * seconds
     found[3:, 3:] += anchor.quality.variance_factor * grown
