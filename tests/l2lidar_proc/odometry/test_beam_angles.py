@@ -223,13 +223,17 @@ def test_the_halves_of_a_real_unit_come_together_within_a_second(number: int) ->
 
 
 def test_the_odometry_of_an_uncalibrated_unit_is_better_for_it() -> None:
-    run = record("yard", "walk", 1, 8.0, unit="typical")
-    rms = []
-    for correct in (False, True):
-        odometry = Odometry(OdometryConfig(correct_beams=correct), T_CLOUD_IMU)
-        off = errors(run, feed(odometry, run, list(sweeps(run, "turn"))))
-        rms.append(np.sqrt(np.mean(off**2)))
-    assert rms[1] < 0.95 * rms[0]
+    """Of 8 s the errors differ twofold by chance, so they are taken over three recordings."""
+    squares = np.zeros((3, 2))
+    for number in range(3):
+        run = record("yard", "walk", number + 1, 8.0, unit="typical")
+        some = list(sweeps(run, "turn"))
+        for correct in (False, True):
+            odometry = Odometry(OdometryConfig(correct_beams=correct), T_CLOUD_IMU)
+            squares[number, int(correct)] = np.mean(errors(run, feed(odometry, run, some)) ** 2)
+    rms = np.sqrt(squares.mean(axis=0))
+    assert rms[1] < 0.75 * rms[0]
+    assert (squares[:, 1] < squares[:, 0]).all()
 
 
 def resting() -> Any:
