@@ -15,7 +15,7 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift
+from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift, MapError
 from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
 
 
@@ -132,6 +132,8 @@ class OdometryEstimate:
     gyro_bias_covariance : ndarray, shape (9, 3)
         Of the errors of ``covariance`` (6) and of the gyro bias (3), each with the gyro bias
         [rad/s], cloud axes. What else the angular velocity is uncertain by is noise of samples.
+    map_error : MapError, optional
+        What the map adds to ``covariance``; None where nothing is known of it.
     """
 
     stamp: HostNs
@@ -147,10 +149,21 @@ class OdometryEstimate:
     accel_bias: F64
     gravity: F64
     gyro_bias_covariance: F64 = field(default_factory=lambda: np.zeros((9, 3)))
+    map_error: MapError | None = None
 
     def refusing(self, points: NDArray[np.void]) -> OdometryEstimate:
         """Return the same again for a sweep with points (N,) that was refused."""
         return dataclasses.replace(self, points=points[:0], status=(Status.REFUSED,))
+
+    def map_covariance(self, place: F64) -> F64:
+        """Return what the map adds to the covariance (6, 6) at a place (3,) of the IMU [m].
+
+        Only where every direction was observed of late is the unit as good as its clouds show.
+        """
+        if self.map_error is None:
+            return np.zeros((6, 6))
+        is_observed = self.quality.variance_factor < 1.0
+        return (self.map_error.reported_at if is_observed else self.map_error.at)(place)
 
     @property
     def tilt(self) -> float:
@@ -227,13 +240,11 @@ def estimate_of(
     twist[3:, GYRO_BIAS] = np.eye(3)
     twist_covariance = twist @ p @ twist.T
     twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)
-    # only where every direction was observed of late is the unit as good as its clouds show
-    of_map = (drift.reported_at if quality.variance_factor < 1.0 else drift.at)(state.position)
     rate = motion.rate
-    return OdometryEstimate(
+    found = OdometryEstimate(
         stamp=state.stamp,
         T_map_lidar=cloud_pose(state, lever),
-        covariance=pose @ p @ pose.T + jump.at(state.position) + of_map,
+        covariance=pose @ p @ pose.T + jump.at(state.position),
         velocity=state.rotation.T @ state.velocity - rotations.cross(rate, lever),
         angular_velocity=rate,
         twist_covariance=twist_covariance,
@@ -244,7 +255,10 @@ def estimate_of(
         accel_bias=state.accel_bias,
         gravity=state.gravity,
         gyro_bias_covariance=np.vstack((pose @ p, p[GYRO_BIAS]))[:, GYRO_BIAS],
+        map_error=drift.error,
     )
+    of_map = found.map_covariance(state.position)
+    return dataclasses.replace(found, covariance=found.covariance + of_map)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

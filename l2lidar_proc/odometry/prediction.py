@@ -204,6 +204,7 @@ class DeadReckoning:
         self._rate: F64 = np.zeros(3)  # cloud axes
         # integral of the rotation over time since the estimate [s]: what a rate adds to turns
         self._by_rate: F64 = np.zeros((3, 3))
+        self._of_map: F64 = np.zeros((6, 6))  # what the map added to the estimate's covariance
         self._sample: tuple[HostNs, F64] | None = None  # that the state belongs to
 
     def reset(self, estimate: OdometryEstimate | None) -> None:
@@ -216,6 +217,7 @@ class DeadReckoning:
         self.stamp = estimate.stamp
         self._rotation = estimate.T_map_lidar[:3, :3]
         self._place = estimate.T_map_lidar[:3, 3] + self._rotation @ self._lever
+        self._of_map = estimate.map_covariance(self._place)
         swing = rotations.cross(estimate.angular_velocity, self._lever)
         self._velocity = self._rotation @ (estimate.velocity + swing)
         self._rate = estimate.angular_velocity
@@ -270,11 +272,13 @@ class DeadReckoning:
         rotation, seconds = self._rotation, (self.stamp - self._anchor.stamp) * 1e-9
         of_bias = self._anchor.gyro_bias_covariance.copy()
         of_bias[3:6] -= self._by_rate @ of_bias[6:]
+        # the map errs the more, the farther away from where it was begun
+        more = self._anchor.map_covariance(self._place) - self._of_map
         return dataclasses.replace(
             self._anchor,
             stamp=self.stamp,
             T_map_lidar=self._pose(),
-            covariance=_grown(self._anchor, rotation, self._rate, self._by_rate, seconds),
+            covariance=more + _grown(self._anchor, rotation, self._rate, self._by_rate, seconds),
             velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
             angular_velocity=self._rate,
             gyro_bias_covariance=of_bias,

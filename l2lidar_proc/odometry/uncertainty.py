@@ -37,6 +37,94 @@ _MOTION: Final = slice(POSE.start, VELOCITY.stop)  # turn, place and velocity
 _VELOCITY: Final = slice(VELOCITY.start - POSE.start, VELOCITY.stop - POSE.start)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MapError:
+    """What the map in use adds to the covariance of poses, as known at one instant.
+
+    Attributes
+    ----------
+    drift : ndarray, shape (6, 6)
+        Covariance of a shift and a turn of the map about its origin [m, rad], its axes.
+    behind : float
+        Way on which the surfaces were opened that hold the latest sweep [m].
+    beam_sigmas : tuple of float, optional
+        As of :class:`MapDrift`.
+    beam_began : float
+        The better of them when the surroundings of the origin were mapped [rad].
+    swung : float
+        The worse of them, added up along ``behind`` [rad m].
+    lean : ndarray, shape (3,)
+        By which the map has bent since it was begun, as gravity shows [rad].
+    up : ndarray, shape (3,), optional
+        Unit, map axes; None while gravity does not show it.
+    begun_in_motion : bool
+        As of :class:`MapDrift`.
+    """
+
+    drift: F64
+    behind: float
+    beam_sigmas: tuple[float, float] | None
+    beam_began: float
+    swung: float
+    lean: F64
+    up: F64 | None
+    begun_in_motion: bool
+
+    def at(self, place: F64) -> F64:
+        """Return what the map may add to the covariance (6, 6) of a pose at a place (3,) [m].
+
+        It has room for a unit that is as wrong as units are, for searches and for decisions.
+        What a unit's calibration is wrong by adds up with the distance; and with the way, where
+        the map of the place that was there first is forgotten. The map bends where it grows: the
+        attitude errs with the way as the vertical does.
+        """
+        away = float(np.linalg.norm(place))
+        left = 1.0 - np.exp(-max(away, self.behind) / tuning.UNIT_FROM_M)  # 0 defines the frame
+        share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self.behind)
+        shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
+        bend = tuning.MAP_BEND**2 * max(away, self.behind)
+        return self._with(
+            place, np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
+        )
+
+    def reported_at(self, place: F64) -> F64:
+        """Return what the map is expected to add to the covariance (6, 6) of a pose, to report it.
+
+        As :meth:`at`, but for a unit as good as its clouds show it to be. Beam angles that move
+        the halves of the fan apart turn the map against its first pose at once. Those that do not,
+        and hence are hardly known, turn it about the vertical as it grows, and bend the way by
+        that; gravity and the ground do not let it lean. What a scale of the ranges is wrong by
+        moves places along the line from the origin, and nothing else. Where nothing estimates the
+        beam angles it is as in :meth:`at`.
+
+        That holds where surfaces fix every direction. What only the IMU holds errs as that does.
+        """
+        if self.beam_sigmas is None:
+            return self.at(place)
+        better, worse = self.beam_sigmas
+        away = float(np.linalg.norm(place))
+        way = max(away, self.behind)
+        left = 1.0 - np.exp(-way / tuning.UNIT_FROM_M)
+        turn = (tuning.MAP_TURN * left) ** 2 + tuning.MAP_TURN_BEND**2 * way
+        turn += (tuning.BEAM_TURN * max(better, self.beam_began) * left) ** 2
+        shift = (tuning.MAP_SHIFT * left) ** 2 + (tuning.MAP_SHARE * way) ** 2
+        swing = (tuning.BEAM_SWING * max(self.swung, worse * away)) ** 2
+        up = np.eye(3) if self.up is None else np.outer(self.up, self.up)
+        level = np.eye(3) if self.up is None else np.eye(3) - up
+        unit = np.diag([shift] * 3 + [turn] * 3)
+        unit[:3, :3] += swing * way**2 * level  # as if all of it had come about at the beginning
+        unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
+        unit[3:, 3:] += swing * up
+        return self._with(place, unit)
+
+    def _with(self, place: F64, unit: F64) -> F64:
+        """Return the covariance (6, 6) of the map at a place with that of a unit's faults."""
+        moved = _carried(place)
+        begun = np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3) * self.begun_in_motion
+        unit[3:, 3:] += np.outer(self.lean, self.lean)
+        return np.asarray(moved @ (self.drift + np.diag(begun)) @ moved.T + unit)
+
+
 class MapDrift:
     """Uncertainty of the map in use, as a small motion of the whole map.
 
@@ -267,59 +355,27 @@ class MapDrift:
         angle = float(np.linalg.norm(turn))
         self._lean = turn * max(1.0 - tuning.LEAN_FROM / max(angle, 1e-12), 0.0)
 
-    def at(self, place: F64) -> F64:
-        """Return what the map may add to the covariance (6, 6) of a pose at a place (3,) [m].
-
-        It has room for a unit that is as wrong as units are, for searches and for decisions.
-        What a unit's calibration is wrong by adds up with the distance; and with the way, where
-        the map of the place that was there first is forgotten. The map bends where it grows: the
-        attitude errs with the way as the vertical does.
-        """
-        away = float(np.linalg.norm(place))
-        left = 1.0 - np.exp(-max(away, self._behind) / tuning.UNIT_FROM_M)  # 0 defines the frame
-        share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self._behind)
-        shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
-        bend = tuning.MAP_BEND**2 * max(away, self._behind)
-        return self._with(
-            place, np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
+    @property
+    def error(self) -> MapError:
+        """What it amounts to by now; it stays as it is when more sweeps come."""
+        return MapError(
+            drift=self._reported,
+            behind=self._behind,
+            beam_sigmas=self.beam_sigmas,
+            beam_began=self._began,
+            swung=self._swung,
+            lean=self._lean,
+            up=self._up,
+            begun_in_motion=self.begun_in_motion,
         )
 
+    def at(self, place: F64) -> F64:
+        """Return :meth:`MapError.at` a place (3,) [m] as of now."""
+        return self.error.at(place)
+
     def reported_at(self, place: F64) -> F64:
-        """Return what the map is expected to add to the covariance (6, 6) of a pose, to report it.
-
-        As :meth:`at`, but for a unit as good as its clouds show it to be. Beam angles that move
-        the halves of the fan apart turn the map against its first pose at once. Those that do not,
-        and hence are hardly known, turn it about the vertical as it grows, and bend the way by
-        that; gravity and the ground do not let it lean. What a scale of the ranges is wrong by
-        moves places along the line from the origin, and nothing else. Where nothing estimates the
-        beam angles it is as in :meth:`at`.
-
-        That holds where surfaces fix every direction. What only the IMU holds errs as that does.
-        """
-        if self.beam_sigmas is None:
-            return self.at(place)
-        better, worse = self.beam_sigmas
-        away = float(np.linalg.norm(place))
-        way = max(away, self._behind)
-        left = 1.0 - np.exp(-way / tuning.UNIT_FROM_M)
-        turn = (tuning.MAP_TURN * left) ** 2 + tuning.MAP_TURN_BEND**2 * way
-        turn += (tuning.BEAM_TURN * max(better, self._began) * left) ** 2
-        shift = (tuning.MAP_SHIFT * left) ** 2 + (tuning.MAP_SHARE * way) ** 2
-        swing = (tuning.BEAM_SWING * max(self._swung, worse * away)) ** 2
-        up = np.eye(3) if self._up is None else np.outer(self._up, self._up)
-        level = np.eye(3) if self._up is None else np.eye(3) - up
-        unit = np.diag([shift] * 3 + [turn] * 3)
-        unit[:3, :3] += swing * way**2 * level  # as if all of it had come about at the beginning
-        unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
-        unit[3:, 3:] += swing * up
-        return self._with(place, unit)
-
-    def _with(self, place: F64, unit: F64) -> F64:
-        """Return the covariance (6, 6) of the map at a place with that of a unit's faults."""
-        moved = _carried(place)
-        begun = np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3) * self.begun_in_motion
-        unit[3:, 3:] += np.outer(self._lean, self._lean)
-        return np.asarray(moved @ (self._reported + np.diag(begun)) @ moved.T + unit)
+        """Return :meth:`MapError.reported_at` a place (3,) [m] as of now."""
+        return self.error.reported_at(place)
 
 
 def _carried(place: F64) -> F64:
