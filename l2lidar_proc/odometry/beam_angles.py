@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import F64, I64, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.principal_axes import principal_axes
-from l2lidar_proc.odometry.surfel_map import products
+from l2lidar_proc.odometry.principal_axes import principal_axes, products
 
 _HEAD_HZ: Final = np.arange(3.0, 8.0, 0.05)  # units were measured from 4.3 to 5.6
 _RATE_NEAR: Final = 1.0 + np.arange(-0.02, 0.0201, 0.004)  # of a head whose rate is known

@@ -96,7 +96,7 @@ class Correspondences:
     is_fine : ndarray, shape (M,)
         Whether the surface is that of one of the finest cells.
     cells, axis : ndarray, shape (M,)
-        Of the surfaces, as in :class:`~l2lidar_proc.odometry.surfel_map.Matches`.
+        Of the surfaces, as in :class:`~l2lidar_proc.odometry.surfels.Matches`.
     met : int
         Points at known surfaces, near or not.
     met_fine : int

@@ -39,6 +39,7 @@ from l2lidar_proc.odometry.alignment import (
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import AlignmentQuality
+from l2lidar_proc.odometry.free_space import rays_through
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import MapDrift
@@ -373,7 +374,7 @@ class SweepMatcher:
         """Return whether the sweep would see through known surfaces where an alignment puts it."""
         state = found.state
         placed = source.points @ state.rotation.T + state.position
-        return self.surfaces.rays_through(state.position, placed) > tuning.RAYS_THROUGH
+        return rays_through(self.surfaces, state.position, placed) > tuning.RAYS_THROUGH
 
     def fits_badly(self, found: Alignment) -> bool:
         """Return whether an alignment fits the map as wrong ones do, or as new places."""

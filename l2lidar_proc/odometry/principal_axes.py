@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Final
+
 import numpy as np
 
 from l2lidar_node.types import F64
+
+PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Axes of the lines of a covariance: xx, xy, xz, yy, yz, zz."""
+
+
+def products(x: F64, y: F64, z: F64) -> Iterator[F64]:
+    """Yield the products of coordinates (N,), in the order of :func:`principal_axes`."""
+    axes = x, y, z
+    return (axes[i] * axes[j] for i, j in PAIRS)
 
 
 def principal_axes(covariance: F64) -> tuple[F64, F64]:

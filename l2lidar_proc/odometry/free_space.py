@@ -1,0 +1,46 @@
+"""Free space: what the rays to the points of a sweep pass through is not there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from l2lidar_node.types import F64
+from l2lidar_proc import tuning
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+
+
+def rays_through(surfaces: SurfelMap, origin: F64, points: F64) -> float:
+    """Return the share of the rays to some points that pass through known surfaces.
+
+    Many such rays mean a wrong pose, or a wrong map.
+
+    Parameters
+    ----------
+    surfaces : SurfelMap
+    origin : ndarray, shape (3,)
+        Where the rays begin [m], map frame.
+    points : ndarray, shape (N, 3)
+        Where they end.
+    """
+    points = points[:: max(len(points) // tuning.RAYS, 1)]
+    ways = points - origin
+    ranges = np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
+    ways = ways / ranges[:, None]
+    free = np.minimum(ranges, tuning.RAY_LONGEST) - tuning.RAY_MARGIN - tuning.RAY_FROM
+    counts = np.maximum(free / tuning.RAY_STEP, 0.0).astype(np.int64)
+    ray = np.repeat(np.arange(len(points)), counts)
+    number = np.arange(len(ray)) - np.repeat(np.cumsum(counts) - counts, counts)
+    places = origin + ways[ray] * (tuning.RAY_FROM + tuning.RAY_STEP * number)[:, None]
+    found = surfaces.match(places)
+    cells = surfaces.surfels(found.cells)
+    ray = ray[found.index]
+    offset = places[found.index] - cells["mean"]
+    beside = np.einsum("nij,nj->ni", cells["axes"][:, 1:], offset) ** 2
+    through = (
+        (np.abs(found.distances) < tuning.RAY_NEAR)
+        & (np.abs(np.einsum("ni,ni->n", found.normals, ways[ray])) > tuning.RAY_FACING)
+        & (beside < tuning.RAY_EXTENT**2 * cells["spread"][:, 1:]).all(axis=1)
+        & (cells["count"] >= tuning.RAY_POINTS)
+        & (cells["sweeps"] >= tuning.RAY_SWEEPS)
+    )
+    return len(np.unique(ray[through])) / max(len(points), 1)
