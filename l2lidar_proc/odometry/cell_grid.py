@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,21 +37,27 @@ class CellGrid:
 
     def keys(self, points: F64, levels: slice = slice(None)) -> I64:
         """Return the keys of the cells that points (N, 3) lie in, level by level, (L, N)."""
-        numbers = range(len(self.sizes))[levels]
-        keys = np.empty((len(numbers), len(points)), np.int64)
+        numbers = np.arange(len(self.sizes))[levels]
         axes = np.ascontiguousarray(points.T)
-        for level, key in zip(numbers, keys, strict=True):
-            x, y, z = (np.floor(axes * (1.0 / self.sizes[level])).astype(np.int64) + _HALF) & _MASK
-            np.left_shift(x, _BITS, out=key)
-            key |= y
-            key <<= _BITS
-            key |= z
-            key |= level << 3 * _BITS
+        scaled = axes * (1.0 / self.sizes[levels])[:, None, None]
+        places = np.floor(scaled, out=scaled).astype(np.int64)
+        places += _HALF
+        places &= _MASK
+        keys = places[:, 0] << _BITS
+        keys |= places[:, 1]
+        keys <<= _BITS
+        keys |= places[:, 2]
+        keys |= numbers[:, None] << 3 * _BITS
         return keys
 
     def middles(self, keys: I64) -> F64:
-        """Return the middles of cells [m], shape (C, 3)."""
-        return np.asarray((places_of(keys) + 0.5) * self.sizes[levels_of(keys)][:, None])
+        """Return the middles of cells [m], shape (3, C)."""
+        size = self.sizes[levels_of(keys)]
+        middles = np.empty((3, len(keys)))
+        for middle, place in zip(middles, _axes_of(keys), strict=True):
+            np.add(place, 0.5, out=middle)
+            middle *= size
+        return middles
 
     def groups(self, points: F64) -> Groups:
         """Return which points (N, 3) lie in the same cell of the finest level."""
@@ -59,26 +65,63 @@ class CellGrid:
         # neighbors in a scan line mostly share a cell: look up runs of equal keys
         begins = np.flatnonzero(np.diff(keys, prepend=-1))
         lengths = np.diff(begins, append=len(keys))
-        distinct, group = np.unique(keys[begins], return_inverse=True)
+        distinct, group = _distinct(keys[begins])
         counts = np.bincount(group, lengths, len(distinct)).astype(np.float64)
         return Groups(np.repeat(group, lengths), distinct, self.middles(distinct), counts)
 
-    def cells_of(self, groups: Groups) -> tuple[I64, I64]:
-        """Return the cells (C,) of all levels that groups (G,) lie in, and which is whose (L, G).
+    def cells_of(self, groups: Groups) -> Cells:
+        """Return the cells of all levels that groups lie in.
 
         A group belongs to the coarser cells around its middle, so the sizes need not be multiples.
         """
-        coarser = self.keys(groups.middles, slice(1, None))
+        coarser = self.keys(groups.middles.T, slice(1, None))
         found = [groups.keys]
         cell = np.empty((len(self.sizes), len(groups.keys)), np.int64)
         cell[0] = np.arange(len(groups.keys))
-        first = len(groups.keys)
+        edges = [0, len(groups.keys)]
         for keys, where in zip(coarser, cell[1:], strict=True):
-            distinct, number = np.unique(keys, return_inverse=True)
-            where[:] = first + number
+            distinct, number = _distinct(keys)
+            np.add(number, edges[-1], out=where)
             found.append(distinct)
-            first += len(distinct)
-        return np.concatenate(found), cell
+            edges.append(edges[-1] + len(distinct))
+        keys = np.concatenate(found)
+        return Cells(keys, self.middles(keys), cell, edges)
+
+
+class Cells(NamedTuple):
+    """Cells of all levels, level by level, and which of them groups of points lie in.
+
+    Attributes
+    ----------
+    keys : ndarray, shape (C,)
+        Of each level ascending.
+    middles : ndarray, shape (3, C)
+        [m]
+    of_groups : ndarray, shape (L, G)
+        The cells of each group.
+    edges : list of int
+        Of each level its first cell, and C.
+    """
+
+    keys: I64
+    middles: F64
+    of_groups: I64
+    edges: list[int]
+
+
+def _distinct(keys: I64) -> tuple[I64, I64]:
+    """Return the distinct keys, ascending, and the number (N,) of each; N > 0.
+
+    As ``numpy.unique`` with ``return_inverse``, in two thirds of the time.
+    """
+    order = np.argsort(keys)
+    ascending = keys[order]
+    begins = np.empty(len(keys), np.bool_)
+    begins[0] = True
+    np.not_equal(ascending[1:], ascending[:-1], out=begins[1:])
+    numbers = np.empty(len(keys), np.int64)
+    numbers[order] = np.cumsum(begins) - 1
+    return ascending[begins], numbers
 
 
 def levels_of(keys: I64) -> I64:
@@ -88,8 +131,12 @@ def levels_of(keys: I64) -> I64:
 
 def places_of(keys: I64) -> I64:
     """Return the places (N, 3) of cells, as multiples of their edge."""
-    cell = np.stack((keys >> 2 * _BITS, keys >> _BITS, keys), axis=1) & _MASK
-    return np.asarray(cell - _HALF)
+    return np.stack(list(_axes_of(keys)), axis=1)
+
+
+def _axes_of(keys: I64) -> Iterator[I64]:
+    """Yield the places (N,) of cells along x, y and z, as multiples of their edge."""
+    return (((keys >> shift) & _MASK) - _HALF for shift in (2 * _BITS, _BITS, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +149,7 @@ class Groups:
         Of each point.
     keys : ndarray, shape (G,)
         Ascending.
-    middles : ndarray, shape (G, 3)
+    middles : ndarray, shape (3, G)
         Of the cells [m].
     counts : ndarray, shape (G,)
         Points of each.
@@ -118,31 +165,34 @@ class Groups:
 
         Of groups that are not wanted (G,) they are 0.
         """
-        taken = np.flatnonzero(wanted[self.group])
-        group = self.group[taken]
-        middles = np.ascontiguousarray(self.middles.T)
-        x, y, z = (
-            axis[taken] - middle[group] for axis, middle in zip(points.T, middles, strict=True)
-        )
-        sums = [np.bincount(group, line, len(self.keys)) for line in (x, y, z, *products(x, y, z))]
-        return np.stack((np.where(wanted, self.counts, 0.0), *sums))
+        group, axes = self.group, points.T
+        if not wanted.all():
+            taken = np.flatnonzero(wanted[group])
+            group, axes = group[taken], axes[:, taken]
+        x, y, z = (axis - middle[group] for axis, middle in zip(axes, self.middles, strict=True))
+        moments = np.empty((10, len(self.keys)))
+        moments[0] = np.where(wanted, self.counts, 0.0)
+        for moment, line in zip(moments[1:], (x, y, z, *products(x, y, z)), strict=True):
+            moment[:] = np.bincount(group, line, len(moment))
+        return moments
 
 
-def shifted(moments: F64, offsets: F64) -> F64:
-    """Return the moments (10, G) of r + d from those of r, by the parallel axis theorem.
+def shifted(moments: F64, offsets: F64) -> Iterator[F64]:
+    """Yield the moments of r + d, ten lines (G,), from those of r, by the parallel axis theorem.
 
     Parameters
     ----------
     moments : ndarray, shape (10, G)
         Count, sum [m] and products [m^2] of some vectors r.
-    offsets : ndarray, shape (G, 3)
+    offsets : ndarray, shape (3, G)
         The same d for all vectors of a group [m].
     """
-    count, total, products = moments[0], moments[1:4], moments[4:]
-    d = np.ascontiguousarray(offsets.T)
-    moved = np.empty_like(moments)
-    moved[0] = count
-    moved[1:4] = total + count * d
-    for line, product, (i, j) in zip(moved[4:], products, PAIRS, strict=True):
-        np.add(product, d[i] * total[j] + moved[1 + i] * d[j], out=line)
-    return moved
+    count, sums, products = moments[0], moments[1:4], moments[4:]
+    yield count
+    moved = [total + count * offset for total, offset in zip(sums, offsets, strict=True)]
+    yield from moved
+    for product, (i, j) in zip(products, PAIRS, strict=True):
+        line = moved[i] * offsets[j]
+        line += offsets[i] * sums[j]
+        line += product
+        yield line

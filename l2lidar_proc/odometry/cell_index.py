@@ -10,6 +10,8 @@ from l2lidar_node.types import I64
 
 _ODD: Final = np.uint64(0x9E3779B97F4A7C15)  # 2^64 divided by the golden ratio (Knuth, 6.4)
 _LEAST_BITS: Final = 10
+# In place of a key and its row: the slot still passes on what was stored behind it.
+_GONE: Final = -1, np.iinfo(np.int64).max
 
 
 class CellIndex:
@@ -22,17 +24,20 @@ class CellIndex:
     """
 
     def __init__(self) -> None:
-        self._used = 0
+        self._known = 0
+        self._used = 0  # slots, those of removed keys included
         self._make_slots(_LEAST_BITS)
+        self._last_call: tuple[I64, I64] | None = None  # keys and rows of find_again
 
     def __len__(self) -> int:
         """Return the number of keys."""
-        return self._used
+        return self._known
 
     def clear(self) -> None:
         """Forget all keys; the slots stay for the next ones."""
-        self._used = 0
+        self._known = self._used = 0
         self._rows[:] = 0
+        self._last_call = None
 
     def find(self, keys: I64) -> I64:
         """Return the row of each key, 0 for those that are not known.
@@ -54,6 +59,26 @@ class CellIndex:
             left, slots, keys = left[others], slots[others], keys[others]
         return rows
 
+    def find_again(self, keys: I64) -> I64:
+        """Return what :meth:`find` does, sooner where most keys are those of the last call.
+
+        The steps of an alignment ask for the same points, which hardly move from step to step.
+
+        Parameters
+        ----------
+        keys : ndarray, shape (N,)
+            The caller must not change them later.
+        """
+        if self._last_call is None or self._last_call[0].shape != keys.shape:
+            rows = self.find(keys)
+        else:
+            before, rows = self._last_call
+            others = np.flatnonzero(keys != before)
+            rows = rows.copy()
+            rows[others] = self.find(keys[others])
+        self._last_call = keys, rows
+        return rows
+
     def insert(self, keys: I64, rows: I64) -> None:
         """Add keys that are not known yet.
 
@@ -64,12 +89,16 @@ class CellIndex:
         rows : ndarray, shape (N,)
             From 1 on.
         """
+        self._last_call = None
+        self._known += len(keys)
         self._used += len(keys)
         if 2 * self._used > len(self._rows):
-            taken = self._rows > 0
+            taken = (self._rows > 0) & (self._keys != _GONE[0])
             keys = np.concatenate((self._keys[taken], keys))
             rows = np.concatenate((self._rows[taken], rows))
-            self._make_slots((2 * self._used).bit_length())
+            # a third at most: room for as many as half of these before the next time
+            self._make_slots((3 * self._known).bit_length())
+            self._used = self._known
         slots = self._first_slots(keys)
         while len(keys):
             free = self._rows[slots] == 0
@@ -77,6 +106,41 @@ class CellIndex:
             lost = self._rows[slots] != rows  # taken before, or by another of these keys
             keys, rows = keys[lost], rows[lost]
             slots = (slots[lost] + 1) & self._last
+
+    def remove(self, keys: I64) -> None:
+        """Forget keys.
+
+        Parameters
+        ----------
+        keys : ndarray, shape (N,)
+            All known, all different.
+        """
+        self._last_call = None
+        self._known -= len(keys)
+        slots = self._slots_of(keys)
+        self._keys[slots], self._rows[slots] = _GONE
+
+    def move(self, keys: I64, rows: I64) -> None:
+        """Give keys other rows.
+
+        Parameters
+        ----------
+        keys : ndarray, shape (N,)
+            All known.
+        rows : ndarray, shape (N,)
+            From 1 on.
+        """
+        self._last_call = None
+        self._rows[self._slots_of(keys)] = rows
+
+    def _slots_of(self, keys: I64) -> I64:
+        """Return the slots of keys that are known."""
+        slots = self._first_slots(keys)
+        left = np.flatnonzero(self._keys[slots] != keys)
+        while len(left):
+            slots[left] = (slots[left] + 1) & self._last
+            left = left[self._keys[slots[left]] != keys[left]]
+        return slots
 
     def _make_slots(self, bits: int) -> None:
         self._keys: I64 = np.zeros(1 << bits, np.int64)

@@ -40,7 +40,8 @@ class Source:
     Attributes
     ----------
     points : ndarray, shape (N, 3)
-        Deskewed to the reference, from the IMU's origin, cloud axes [m].
+        Deskewed to the reference, from the IMU's origin, cloud axes [m]; best with each axis
+        contiguous.
     times : ndarray, shape (N,)
         Instant of each point after the reference [s], negative before it.
     ranges : ndarray, shape (N,)
@@ -243,15 +244,21 @@ def correspondences_of(
     deskewed = [
         _deskewed_again(source, state.boxminus(prior), prior.rotation) for state, source in views
     ]
+    # the transpose of products with the transpose: each axis stays contiguous
     seen = [
-        points @ state.rotation.T + state.position
+        (state.rotation @ points.T).T + state.position
         for points, (state, _) in zip(deskewed, views, strict=True)
     ]
     sizes = [len(points) for points in seen]
     # a wall between rooms is thinner than the first step reaches, and what comes into sight
     # through a door is mostly another side of a wall: it would pull the sweep by the thickness
-    origins = np.repeat([state.position for state, _ in views], sizes, axis=0)
-    matches = surfaces.match(_joined(seen), narrow=True, sizes=sizes, origins=origins)
+    origins = views[0][0].position
+    is_single = len(views) == 1
+    if not is_single:
+        origins = np.repeat([state.position for state, _ in views], sizes, axis=0)
+    matches = surfaces.match(
+        _joined(seen), narrow=True, sizes=sizes, origins=origins, again=is_single
+    )
     points, times, ranges = (
         _joined(items)
         for items in (
@@ -284,7 +291,7 @@ def correspondences_of(
         int(np.count_nonzero(matches.is_fine)),
         surfaces.latest,
     )
-    if len(views) == 1:
+    if is_single:
         return [found]
     edges = np.cumsum([0, *sizes])
     met, met_fine = (
@@ -349,5 +356,6 @@ def _deskewed_again(source: Source, error: F64, rotation: F64) -> F64:
     since = source.times[:, None]
     velocity = error[VELOCITY] @ rotation
     acceleration = error[GRAVITY] @ rotation - error[ACCEL_BIAS]
-    moved = source.points @ skew(-error[GYRO_BIAS]).T + velocity + (0.5 * since) * acceleration
+    turned = (skew(-error[GYRO_BIAS]) @ source.points.T).T
+    moved = turned + velocity + (0.5 * since) * acceleration
     return np.asarray(source.points + since * moved)

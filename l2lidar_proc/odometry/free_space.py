@@ -32,14 +32,14 @@ def rays_through(surfaces: SurfelMap, origin: F64, points: F64) -> float:
     number = np.arange(len(ray)) - np.repeat(np.cumsum(counts) - counts, counts)
     places = origin + ways[ray] * (tuning.RAY_FROM + tuning.RAY_STEP * number)[:, None]
     found = surfaces.match(places)
-    cells = surfaces.surfels(found.cells)
+    cells, planes = surfaces.cells(found.cells), surfaces.planes(found.cells)
     ray = ray[found.index]
-    offset = places[found.index] - cells["mean"]
-    beside = np.einsum("nij,nj->ni", cells["axes"][:, 1:], offset) ** 2
+    offset = places[found.index] - planes["mean"]
+    beside = np.einsum("nij,nj->ni", planes["axes"][:, 1:], offset) ** 2
     through = (
         (np.abs(found.distances) < tuning.RAY_NEAR)
         & (np.abs(np.einsum("ni,ni->n", found.normals, ways[ray])) > tuning.RAY_FACING)
-        & (beside < tuning.RAY_EXTENT**2 * cells["spread"][:, 1:]).all(axis=1)
+        & (beside < tuning.RAY_EXTENT**2 * planes["spread"][:, 1:]).all(axis=1)
         & (cells["count"] >= tuning.RAY_POINTS)
         & (cells["sweeps"] >= tuning.RAY_SWEEPS)
     )

@@ -152,7 +152,7 @@ class SweepMatcher:
         """Return some points of a sweep, deskewed along a motion."""
         some = records.selected(sweep.points, chosen)
         moved = coordinates(some, sweep.start, motion.trajectory(self.lever), motion.state.stamp)
-        points = np.stack(moved, axis=1).astype(np.float64)
+        points = np.stack(moved, dtype=np.float64).T
         offset = (sweep.start - motion.state.stamp) * 1e-9
         return Source(
             points - self.lever,

@@ -13,7 +13,8 @@ plane of either is off to its side, by up to 3 cm at 5 m.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,13 @@ from numpy.typing import NDArray
 from l2lidar_node import records
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.cell_grid import CellGrid, Groups, levels_of, places_of, shifted
+from l2lidar_proc.odometry.cell_grid import CellGrid, Cells, Groups, levels_of, places_of, shifted
 from l2lidar_proc.odometry.cell_index import CellIndex
 from l2lidar_proc.odometry.surfels import (
     CELL,
     FLAT,
+    PLANE,
+    Candidates,
     Matches,
     are_behind,
     fit,
@@ -73,6 +76,7 @@ class SurfelMap:
         self._index = CellIndex()
         # row 0 is that of all places without a cell
         self._cells: NDArray[np.void] = np.zeros(1, CELL)
+        self._planes: NDArray[np.void] = np.zeros(1, PLANE)
         self._kind: NDArray[np.int8] = np.zeros(1, np.int8)  # by row, apart: quickly looked up
 
     def __len__(self) -> int:
@@ -86,6 +90,7 @@ class SurfelMap:
         self._index.clear()
         # the arrays stay for the next map: memory freed and asked for again comes back in pieces
         self._cells[:used] = np.zeros(1, CELL)
+        self._planes[:used] = np.zeros(1, PLANE)
         self._kind[:used] = 0
 
     def add(
@@ -116,15 +121,16 @@ class SurfelMap:
             return 0.0
         self.latest = sweep
         groups = self._grid.groups(points)
-        distinct, cell = self._grid.cells_of(groups)
-        rows = self._index.find(distinct)
+        cells = self._grid.cells_of(groups)
+        rows = self._index.find(cells.keys)
         new = rows == 0
-        rows[new] = self._open(distinct[new])
-        fresh = self._note_sweep(rows, new, cell, groups.counts, sweep, apart)
-        weights = np.ones(len(distinct))
+        rows[new] = self._open(cells.keys[new])
+        fresh = self._note_sweep(rows, new, cells.of_groups, groups.counts, sweep, apart)
+        weights = np.ones(len(rows))
         if weighted and origin is not None:
-            weights = weights_from(self._grid.middles(distinct) - origin)
-        self._extend(points, groups, rows, distinct, cell, weights, origin)
+            weights = weights_from(np.ascontiguousarray(cells.middles.T) - origin)
+        grown = self._extend(points, groups, cells, rows, weights)
+        self._fit(rows[grown], cells.middles[:, grown], origin)
         return fresh
 
     def _note_sweep(
@@ -153,66 +159,99 @@ class SurfelMap:
         """
         self._cells["seen"][rows] = sweep
         fresh = float(counts[new[cell[-1]]].sum() / counts.sum())
-        self._cells["born"][rows[new]] = self._cells["opened"][rows[new]] = sweep
+        self._planes["born"][rows[new]] = self._planes["opened"][rows[new]] = sweep
         if fresh < 1.0 and new.any():
             around = np.empty(len(rows), np.int64)
             around[cell] = rows[cell[-1]]
-            born = self._cells["born"][around[new]]
+            born = self._planes["born"][around[new]]
             if apart is not None:
                 is_apart = apart[np.minimum(born, len(apart) - 1)]
                 born = np.where(is_apart, sweep, born)
-            self._cells["born"][rows[new]] = born
+            self._planes["born"][rows[new]] = born
         return fresh
 
     def _extend(
-        self,
-        points: F64,
-        groups: Groups,
-        rows: I64,
-        keys: I64,
-        cell: I64,
-        weights: F64,
-        origin: F64 | None,
-    ) -> None:
-        """Add points (N, 3) to the sums of their cells (C,), as far as these still change.
+        self, points: F64, groups: Groups, cells: Cells, rows: I64, weights: F64
+    ) -> NDArray[np.bool_]:
+        """Add points (N, 3) to the sums of their cells, as far as these still change.
 
-        The points of a group all have the weight of its cell, one of some weights (C,). The sums
-        of a coarser cell are those of its groups, moved to its middle (parallel axis theorem).
+        The points of a group all have the weight of its cell. The sums of a coarser cell are those
+        of its groups, moved to its middle (parallel axis theorem).
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+        groups : Groups
+            Of the points.
+        cells : Cells
+            Of the groups.
+        rows, weights : ndarray, shape (C,)
+            Of the cells.
+
+        Returns
+        -------
+        ndarray, shape (C,)
+            Which cells have grown so much that their planes are due.
         """
         changing = self._cells["weight"][rows] < self._capacity * weights
-        wanted = changing[cell]
+        wanted = changing[cells.of_groups]
         size = len(groups.keys)
-        moments = groups.moments(points, np.logical_or.reduce(wanted)) * weights[:size]
-        squares = moments[0] * weights[:size]
-        middles = self._grid.middles(keys)
-        cells = self._cells
-        added = np.zeros((11, len(rows)))
-        added[:10, :size], added[10, :size] = moments, squares
-        for where, fits in zip(cell[1:], wanted[1:], strict=True):
-            here = np.flatnonzero(fits)
-            numbers = where[here] - size
-            some = shifted(moments[:, here], groups.middles[here] - middles[size + numbers])
-            bins = len(rows) - size
-            lines = (*some, squares[here])
-            added[:, size:] += [np.bincount(numbers, line, bins) for line in lines]
-        rows, added = rows[changing], added[:, changing]
-        grown = records.selected(cells, rows)
-        grown["weight"] += added[0]
-        grown["squares"] += added[10]
-        grown["count"] = grown["weight"] ** 2 / np.maximum(grown["squares"], 1e-300)
-        grown["sweeps"] += 1.0
-        grown["sum"] += added[1:4].T
-        grown["products"] += added[4:10].T
-        fitted = np.flatnonzero(
-            (grown["count"] >= self._least)
-            & (grown["weight"] >= tuning.REFIT_GROWTH * grown["fitted"])
-        )
-        if len(fitted):
-            keys, middles = keys[changing][fitted], middles[changing][fitted]
-            sizes = self._grid.sizes[levels_of(keys)]
-            kinds = fit(grown, fitted, middles, sizes, self._thickness, origin)
-            self._kind[rows[fitted]] = kinds
-        records.assign(cells, rows, grown)
+        moments = np.empty((11, size))
+        moments[:10] = groups.moments(points, np.logical_or.reduce(wanted))
+        moments[:10] *= weights[:size]
+        np.multiply(moments[0], weights[:size], out=moments[10])
+        due = np.zeros(len(rows), np.bool_)
+        # level by level, what is summed stays in the processor's cache
+        for level, (first, last) in enumerate(itertools.pairwise(cells.edges)):
+            sums = moments
+            if level:
+                here = np.flatnonzero(wanted[level])
+                numbers = cells.of_groups[level, here]
+                some = moments if len(here) == size else moments[:, here]
+                offsets = groups.middles[:, here] - cells.middles[:, numbers]
+                lines = (*shifted(some[:10], offsets), some[10])
+                sums = np.empty((11, last - first))
+                numbers -= first
+                for total, line in zip(sums, lines, strict=True):
+                    total[:] = np.bincount(numbers, line, last - first)
+            which = first + np.flatnonzero(changing[first:last])
+            if len(which) < last - first:
+                sums = sums[:, which - first]
+            due[which] = self._grow(rows[which], sums)
+        return due
+
+    def _grow(self, rows: I64, sums: F64) -> NDArray[np.bool_]:
+        """Add sums (11, M) to those of cells, and return which planes (M,) are due for it."""
+        cells = records.selected(self._cells, rows)
+        # column by column: numpy would go through the few columns of each row
+        sum_, products = cells["sum"].T, cells["products"].T
+        columns = (cells["weight"], *sum_, *products, cells["squares"])
+        for column, line in zip(columns, sums, strict=True):
+            column += line
+        cells["count"] = cells["weight"] ** 2 / np.maximum(cells["squares"], 1e-300)
+        cells["sweeps"] += 1.0
+        records.assign(self._cells, rows, cells)
+        is_due = cells["weight"] >= tuning.REFIT_GROWTH * cells["fitted"]
+        return np.asarray(is_due & (cells["count"] >= self._least))
+
+    def _fit(self, rows: I64, middles: F64, origin: F64 | None) -> None:
+        """Fit the planes of some cells anew.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (M,)
+        middles : ndarray, shape (3, M)
+            Of the cells [m].
+        origin : ndarray, shape (3,), optional
+            From which they were seen [m].
+        """
+        if not len(rows):
+            return
+        cells, planes = self.cells(rows), self.planes(rows)
+        sizes = self._grid.sizes[levels_of(cells["key"])]
+        self._kind[rows] = fit(cells, planes, middles, sizes, self._thickness, origin)
+        self._cells["fitted"][rows] = cells["weight"]
+        records.assign(self._planes, rows, planes)
 
     def match(
         self,
@@ -221,6 +260,7 @@ class SurfelMap:
         narrow: bool = False,
         sizes: Sequence[int] = (),
         origins: F64 | None = None,
+        again: bool = False,
     ) -> Matches:
         """Return the surface of every point that has one: the finest at its place.
 
@@ -235,36 +275,34 @@ class SurfelMap:
         sizes : sequence of int
             Points of each of several sweeps that lie one after the other; what most points have
             is asked for each by itself.
-        origins : ndarray, shape (N, 3), optional
-            Where each point is seen from [m]. A surface that would be seen from behind is not the
-            point's: it is the other side of a wall.
+        origins : ndarray, shape (N, 3) or (3,), optional
+            Where each point is seen from, or all [m]. A surface that would be seen from behind is
+            not the point's: it is the other side of a wall.
+        again : bool
+            The points are mostly those of the last call with this, and have hardly moved.
         """
-        # nearly all points have a surface in the finest level
-        finest = self._rows(points, slice(1))
-        is_flat = self._kind[finest] == FLAT
-        left = np.flatnonzero(~is_flat[0])
-        coarser = self._rows(points[left], slice(1, None))
-        found = [(finest[is_flat], np.flatnonzero(is_flat), 0)]
-        found += [(*item, 0) for item in _taken(coarser, self._kind[coarser] == FLAT, left)]
+        keys = self._grid.keys(points)
+        find = self._index.find_again if again else self._index.find
+        rows = find(keys.ravel()).reshape(keys.shape)
+        kind = self._kind[rows]
+        is_flat = kind == FLAT
+        found = _finest(rows, is_flat, np.arange(len(points)))
         if narrow:
-            kind = self._kind[coarser]
-            bare = _edges(left[~(kind == FLAT).any(axis=0)], sizes or [len(points)])
-            rows = self._rows(points[bare], slice(None))
-            for row, index in _taken(rows, self._kind[rows] > 0, bare):
-                both = self._kind[row] > 1
-                found += [(row, index, 0), (row[both], index[both], 1)]
-        rows_found, indices, axes = zip(*found, strict=True)
-        axis = np.repeat(axes, [len(some) for some in indices])
-        row, index = np.concatenate(rows_found), np.concatenate(indices)
-        cells = records.selected(self._cells, row)
+            bare = np.flatnonzero(~is_flat.any(axis=0))
+            bare = _edges(bare, sizes or [len(points)])
+            if len(bare):
+                some = _finest(rows[:, bare], kind[:, bare] > 0, bare)
+                found = found.followed_by(_both_axes(some, self._kind[some.cells]))
+        flat = self._kind[found.cells] == FLAT
+        planes, places = self.planes(found.cells), points[found.point]
         if origins is not None:
-            behind = are_behind(points[index], origins[index], cells)
-            behind &= self._kind[row] == FLAT
+            eyes = origins if origins.ndim == 1 else origins[found.point]
+            behind = flat & are_behind(places, eyes, planes)
             if behind.any():
                 seen = np.flatnonzero(~behind)
-                row, index, axis = row[seen], index[seen], axis[seen]
-                cells = records.selected(cells, seen)
-        return matches_with(points, index, row, cells, axis, self._kind[row])
+                found, flat, places = found.some(seen), flat[seen], places[seen]
+                planes = records.selected(planes, seen)
+        return matches_with(found, places, planes, self._cells["count"][found.cells], flat)
 
     def are_along(self, points: F64, direction: F64) -> NDArray[np.bool_]:
         """Return which points lie on thin flat surfaces that run along a direction.
@@ -277,7 +315,7 @@ class SurfelMap:
             Unit.
         """
         found = self.match(points)
-        thickness2 = self._cells["spread"][found.cells, 0]
+        thickness2 = self._planes["spread"][found.cells, 0]
         on_wall = (
             (np.abs(found.normals @ direction) < tuning.LINE_WALL_SLOPE)
             & (np.abs(found.distances) < tuning.LINE_WALL_REACH)
@@ -295,22 +333,21 @@ class SurfelMap:
         cells, axis : ndarray, shape (M,)
             Of :class:`Matches`; the map must not have changed since.
         """
-        return tilts_of(self.surfels(cells), axis)
+        return tilts_of(self.planes(cells), self._cells["sweeps"][cells], axis)
 
-    def surfels(self, cells: I64) -> NDArray[np.void]:
-        """Return what is known about the cells (M,) of some :class:`Matches`, dtype CELL."""
-        return records.selected(self._cells, cells)
+    def cells(self, rows: I64) -> NDArray[np.void]:
+        """Return what the cells (M,) of some :class:`Matches` have seen, dtype CELL."""
+        return records.selected(self._cells, rows)
 
-    def _rows(self, points: F64, levels: slice) -> I64:
-        """Return the rows of the cells of some levels that points (N, 3) lie in, (L, N)."""
-        keys = self._grid.keys(points, levels)
-        return self._index.find(keys.ravel()).reshape(keys.shape)
+    def planes(self, rows: I64) -> NDArray[np.void]:
+        """Return the surfaces in the cells (M,) of some :class:`Matches`, dtype PLANE."""
+        return records.selected(self._planes, rows)
 
     def forget(self, origin: F64, distance: float, since: int = 0) -> None:
         """Drop cells farther than a distance [m] from a place (3,), or not seen since a sweep."""
         cells = self._cells[1 : len(self) + 1]
-        ways = self._grid.middles(cells["key"]) - origin
-        kept = (ways**2).sum(axis=1) <= distance * distance
+        x, y, z = self._grid.middles(cells["key"].copy()) - origin[:, None]
+        kept = x * x + y * y + z * z <= distance * distance
         kept &= cells["seen"] >= since
         if not kept.all():
             self._drop(1 + np.flatnonzero(~kept))
@@ -324,12 +361,13 @@ class SurfelMap:
         left = end - len(rows)
         holes = rows[: np.searchsorted(rows, left)]
         last = np.setdiff1d(np.arange(left, end), rows, assume_unique=True)
-        records.assign(self._cells, holes, records.selected(self._cells, last))
+        self._index.remove(self._cells["key"][rows])
+        self._index.move(self._cells["key"][last], holes)
+        for table in (self._cells, self._planes):
+            records.assign(table, holes, records.selected(table, last))
+            table[left:end] = np.zeros(1, table.dtype)
         self._kind[holes] = self._kind[last]
-        self._cells[left:end] = np.zeros(1, CELL)
         self._kind[left:end] = 0
-        self._index.clear()
-        self._index.insert(self._cells["key"][1:left].copy(), np.arange(1, left))
 
     def part_of(self, sweeps: NDArray[np.bool_]) -> SurfelMap:
         """Return a map with the cells of the places that some of the sweeps (S,) saw first."""
@@ -340,7 +378,7 @@ class SurfelMap:
             capacity=self._capacity,
         )
         part.latest = self.latest
-        born = self._cells["born"][1 : len(self) + 1]
+        born = self._planes["born"][1 : len(self) + 1]
         part._take(self, sweeps[np.minimum(born, len(sweeps) - 1)])
         return part
 
@@ -348,6 +386,7 @@ class SurfelMap:
         """Take some of the cells (C,) of another map; this one is empty."""
         rows = np.concatenate(([0], 1 + np.flatnonzero(kept)))
         self._cells = records.selected(other._cells, rows)
+        self._planes = records.selected(other._planes, rows)
         self._kind = other._kind[rows]
         self._index.insert(self._cells["key"][1:].copy(), np.arange(1, len(rows)))
 
@@ -359,9 +398,9 @@ class SurfelMap:
         """
         order = np.argsort(self._cells["key"][1 : len(self) + 1]) + 1
         flat = order[self._kind[order] == FLAT]
-        cells = records.selected(self._cells, flat)
-        level = levels_of(cells["key"])
-        places, means, normals = places_of(cells["key"]), cells["mean"], cells["axes"][:, 0]
+        keys, planes = self._cells["key"][flat], self.planes(flat)
+        level = levels_of(keys)
+        places, means, normals = places_of(keys), planes["mean"], planes["axes"][:, 0]
         return [
             (size, places[level == number], means[level == number], normals[level == number])
             for number, size in enumerate(self._grid.sizes.tolist())
@@ -374,8 +413,9 @@ class SurfelMap:
         self._index.insert(keys, rows)
         if first + len(keys) > len(self._cells):
             size = max(first + len(keys), 2 * len(self._cells))
-            self._cells, self._kind = _grown(self._cells, size), _grown(self._kind, size)
-        self._cells["key"][rows] = keys
+            self._cells, self._planes = _grown(self._cells, size), _grown(self._planes, size)
+            self._kind = _grown(self._kind, size)
+        self._cells["key"][first : first + len(keys)] = keys
         return rows
 
 
@@ -392,20 +432,32 @@ def _edges(bare: I64, sizes: Sequence[int]) -> I64:
     )
 
 
-def _taken(rows: I64, wanted: NDArray[np.bool_], index: I64) -> Iterator[tuple[I64, I64]]:
-    """Yield, level by level, the first wanted of the rows (L, N) of points, and these points.
+def _finest(rows: I64, wanted: NDArray[np.bool_], index: I64) -> Candidates:
+    """Return the finest wanted of the cells that points lie in, level by level.
 
-    ``index`` (N,) names the points.
+    Parameters
+    ----------
+    rows : ndarray, shape (L, N)
+        Of the cells.
+    wanted : ndarray, shape (L, N)
+    index : ndarray, shape (N,)
+        Names of the points.
     """
-    free = np.ones(len(index), np.bool_)
-    for row, fits in zip(rows, wanted, strict=True):
-        here = np.flatnonzero(fits & free)
-        free[here] = False
-        yield row[here], index[here]
+    first = wanted.copy()
+    first[1:] &= ~np.logical_or.accumulate(wanted[:-1], axis=0)
+    level, place = np.nonzero(first)
+    return Candidates(index[place], rows[first], level, np.zeros(len(level), np.int64))
+
+
+def _both_axes(found: Candidates, kind: NDArray[np.int8]) -> Candidates:
+    """Return candidates with the second axes of those cells whose kind (M,) has two."""
+    second = found.some(kind > 1)
+    both = found.followed_by(second._replace(axis=second.axis + 1))
+    return both.some(np.argsort(2 * both.level + both.axis, kind="stable"))
 
 
 def _grown(rows: NDArray[Any], size: int) -> NDArray[Any]:
     """Return rows with zeros after them; what is never used stays without memory."""
     grown = np.zeros(size, rows.dtype)
-    grown[: len(rows)] = rows
+    records.assign(grown, np.arange(len(rows)), rows)
     return grown

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.cell_grid import levels_of
 from l2lidar_proc.odometry.principal_axes import principal_axes, products
 
 CELL: Final = np.dtype(
@@ -21,18 +20,24 @@ CELL: Final = np.dtype(
         ("count", "<f8"),  # of points with equal weights that are worth as much (Kish 1965)
         ("sum", "<f8", (3,)),  # [m] weighted, of the points' offsets from the cell's middle
         ("products", "<f8", (6,)),  # [m^2] weighted, of the offsets: xx xy xz yy yz zz
+        ("sweeps", "<f8"),  # in which points came
+        ("seen", "<i8"),  # number of the latest sweep with points in it
+        ("fitted", "<f8"),  # weight when its plane was fitted
+    ],
+)
+"""What a cell has seen: what most of the cells that a sweep meets change with it."""
+
+PLANE: Final = np.dtype(
+    [
         ("mean", "<f8", (3,)),  # [m] map frame
         ("axes", "<f8", (3, 3)),  # rows: the normal, then the two axes of the surface; unit
         ("spread", "<f8", (3,)),  # [m^2] variance along each of the axes, ascending
-        ("sweeps", "<f8"),  # in which points came
         ("born", "<i8"),  # number of the sweep that was the first at its place
         ("opened", "<i8"),  # number of the sweep whose points opened it
-        ("seen", "<i8"),  # number of the latest sweep with points in it
-        ("fitted", "<f8"),  # weight when mean, axes and spread were computed
         ("sided", "<i8"),  # from which sides its points were seen, as _NO_SIDE and others
     ],
 )
-"""What is known about a cell."""
+"""The surface in a cell: what points are matched with, and what seldom changes."""
 
 # Sides from which the points of a cell were seen: nobody said; the one that the normal points to;
 # both. A flat cell with points from both is a board. A wall is thicker, and has two surfaces.
@@ -83,69 +88,96 @@ class Matches:
     axis: I64
 
 
+class Candidates(NamedTuple):
+    """Points and the surfaces that may be theirs.
+
+    Attributes
+    ----------
+    point : ndarray, shape (M,)
+        Which of the points.
+    cells : ndarray, shape (M,)
+        Rows of the surfaces' cells in the map.
+    level : ndarray, shape (M,)
+        Of these cells.
+    axis : ndarray, shape (M,)
+        Which of its cell's axes a surface's normal is.
+    """
+
+    point: I64
+    cells: I64
+    level: I64
+    axis: I64
+
+    def some(self, which: I64 | NDArray[np.bool_]) -> Candidates:
+        """Return some of these, by indices or a mask."""
+        return Candidates(*(part[which] for part in self))
+
+    def followed_by(self, others: Candidates) -> Candidates:
+        """Return these and others after them."""
+        return Candidates(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
+
+
 def matches_with(
+    found: Candidates,
     points: F64,
-    index: I64,
-    rows: I64,
-    cells: NDArray[np.void],
-    axis: I64,
-    kind: NDArray[np.int8],
+    planes: NDArray[np.void],
+    count: F64,
+    flat: NDArray[np.bool_],
 ) -> Matches:
-    """Return how far some points are from the middles of their cells (M,) along axes (M,).
+    """Return how far points are from the surfaces that may be theirs.
 
     Parameters
     ----------
-    points : ndarray, shape (N, 3)
+    found : Candidates
+    points : ndarray, shape (M, 3)
         [m], map frame.
-    index : ndarray, shape (M,)
-        Which of the points.
-    rows : ndarray, shape (M,)
-        Of the cells in the map.
-    cells : ndarray, shape (M,), dtype CELL
-    axis : ndarray, shape (M,)
-    kind : ndarray, shape (M,)
+    planes : ndarray, shape (M,), dtype PLANE
         Of the cells.
+    count : ndarray, shape (M,)
+        Of the points in the cells.
+    flat : ndarray, shape (M,)
+        Whether the cells are flat.
     """
-    offset = points[index] - cells["mean"]
-    axes = cells["axes"]
+    offset = points - planes["mean"]
+    axes = planes["axes"]
     along = np.einsum("nij,nj->ni", axes, offset)
-    spread = cells["spread"]
+    spread = planes["spread"]
     # a plane fitted to n points is worst known far from their middle
     reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
-    each = np.arange(len(index))
-    across = spread[each, axis]
+    each = np.arange(len(found.point))
+    across = spread[each, found.axis]
     return Matches(
-        index,
-        axes[each, axis],
-        along[each, axis],
-        across * reach / cells["count"],
-        np.where(kind == FLAT, 0.0, across),
-        cells["born"],
-        cells["opened"],
-        levels_of(cells["key"]) < tuning.FINE_LEVELS,
-        rows,
-        axis,
+        found.point,
+        axes[each, found.axis],
+        along[each, found.axis],
+        across * reach / count,
+        np.where(flat, 0.0, across),
+        planes["born"],
+        planes["opened"],
+        found.level < tuning.FINE_LEVELS,
+        found.cells,
+        found.axis,
     )
 
 
-def are_behind(points: F64, origins: F64, cells: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Return which points are seen from the other side than the surfaces of their cells.
+def are_behind(points: F64, origins: F64, planes: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return which points are seen from the other side than their surfaces.
 
     Parameters
     ----------
     points : ndarray, shape (M, 3)
         [m], map frame.
-    origins : ndarray, shape (M, 3)
-        Where each is seen from [m].
-    cells : ndarray, shape (M,), dtype CELL
+    origins : ndarray, shape (M, 3) or (3,)
+        Where each is seen from, or all [m].
+    planes : ndarray, shape (M,), dtype PLANE
     """
     ways = origins - points
-    along = np.einsum("ni,ni->n", cells["axes"][:, 0], ways)
+    along = np.einsum("ni,ni->n", planes["axes"][:, 0], ways)
     least = tuning.SIDE_SLACK * np.sqrt(np.einsum("ni,ni->n", ways, ways))
-    return np.asarray((cells["sided"] == _ONE_SIDE) & (along < -least))
+    return np.asarray((planes["sided"] == _ONE_SIDE) & (along < -least))
 
 
-def tilts_of(cells: NDArray[np.void], axis: I64) -> F64:
+def tilts_of(planes: NDArray[np.void], sweeps: F64, axis: I64) -> F64:
     """Return how far normals may be tilted towards each axis of their cells, 1 sigma.
 
     A plane fitted to points of extent l and scatter s is tilted by s / l / sqrt(n) (the first
@@ -154,7 +186,9 @@ def tilts_of(cells: NDArray[np.void], axis: I64) -> F64:
 
     Parameters
     ----------
-    cells : ndarray, shape (M,), dtype CELL
+    planes : ndarray, shape (M,), dtype PLANE
+    sweeps : ndarray, shape (M,)
+        In which points of them came.
     axis : ndarray, shape (M,)
         Which of its cell's axes each normal is.
 
@@ -164,12 +198,12 @@ def tilts_of(cells: NDArray[np.void], axis: I64) -> F64:
         Row i is the cell's axis i, as long as the normal's tilt towards it [rad]; zero for the
         normal itself.
     """
-    each = np.arange(len(cells))
-    spread = cells["spread"]
-    across = np.maximum(spread[each, axis], tuning.NORMAL_SCATTER**2) / cells["sweeps"]
+    each = np.arange(len(planes))
+    spread = planes["spread"]
+    across = np.maximum(spread[each, axis], tuning.NORMAL_SCATTER**2) / sweeps
     angles = np.sqrt(across[:, None] / np.maximum(spread, tuning.NORMAL_LEAST_EXTENT**2))
     angles[each, axis] = 0.0
-    return np.asarray(cells["axes"] * angles[:, :, None])
+    return np.asarray(planes["axes"] * angles[:, :, None])
 
 
 def weights_from(ways: F64) -> F64:
@@ -180,21 +214,21 @@ def weights_from(ways: F64) -> F64:
 
 def fit(
     cells: NDArray[np.void],
-    rows: I64,
+    planes: NDArray[np.void],
     middles: F64,
     sizes: F64,
     thickness: float,
     origin: F64 | None,
 ) -> NDArray[np.int8]:
-    """Fit planes to the moments of some cells, in place; return the kinds (M,) of these cells.
+    """Fit planes, in place, to the points in some cells; return the kinds (M,) of these cells.
 
     Parameters
     ----------
-    cells : ndarray, shape (C,), dtype CELL
-    rows : ndarray, shape (M,)
-        Which of them.
-    middles : ndarray, shape (M, 3)
-        Of these [m].
+    cells : ndarray, shape (M,), dtype CELL
+    planes : ndarray, shape (M,), dtype PLANE
+        As they are known so far.
+    middles : ndarray, shape (3, M)
+        Of the cells [m].
     sizes : ndarray, shape (M,)
         Their edges [m].
     thickness : float
@@ -202,29 +236,26 @@ def fit(
     origin : ndarray, shape (3,), optional
         Of the latest points: normals point to it, if there is one [m].
     """
-    weight = cells["weight"][rows]
-    mean = cells["sum"][rows] / weight[:, None]
-    covariance = cells["products"][rows].T / weight
-    for line, product in zip(covariance, products(*mean.T), strict=True):
+    weight = cells["weight"]
+    mean = cells["sum"].T / weight
+    covariance = cells["products"].T / weight
+    for line, product in zip(covariance, products(*mean), strict=True):
         line -= product
     spread, axes = principal_axes(covariance)
     spread = np.maximum(spread, 1e-8)
     wide = np.maximum(tuning.ELONGATED * spread[:, 0], (tuning.FLAT_WIDTH * sizes) ** 2)
     flat = (spread[:, 0] < thickness**2) & (spread[:, 1] > wide)
-    mean += middles
+    place = np.ascontiguousarray((mean + middles).T)
     if origin is not None:
-        ways = origin - mean
+        ways = origin - place
         behind = np.einsum("ni,ni->n", axes[:, 0], ways) < 0.0
         axes[behind, 0] *= -1.0
         least = tuning.SIDE_SLACK * np.sqrt(np.einsum("ni,ni->n", ways, ways))
-        is_other = np.einsum("ni,ni->n", cells["axes"][rows, 0], ways) < -least
-        both = is_other & (cells["sided"][rows] == _ONE_SIDE)
-        both |= cells["sided"][rows] == _BOTH_SIDES
-        cells["sided"][rows] = np.where(both, _BOTH_SIDES, _ONE_SIDE)
-    cells["mean"][rows] = mean
-    cells["axes"][rows] = axes
-    cells["spread"][rows] = spread
-    cells["fitted"][rows] = weight
+        is_other = np.einsum("ni,ni->n", planes["axes"][:, 0], ways) < -least
+        both = is_other & (planes["sided"] == _ONE_SIDE)
+        both |= planes["sided"] == _BOTH_SIDES
+        planes["sided"] = np.where(both, _BOTH_SIDES, _ONE_SIDE)
+    planes["mean"], planes["axes"], planes["spread"] = place, axes, spread
     close = spread[:, :2] < (tuning.NARROW * sizes[:, None]) ** 2
-    close &= (cells["sweeps"][rows] >= tuning.NARROW_SWEEPS)[:, None]
+    close &= (cells["sweeps"] >= tuning.NARROW_SWEEPS)[:, None]
     return np.where(flat, FLAT, close.sum(axis=1)).astype(np.int8)

@@ -41,6 +41,18 @@ def test_it_finds_what_a_dictionary_finds(batches: list[list[int]], others: list
         asked = np.array([*known, *others], np.int64)
         found = index.find(asked).tolist()
         assert found == [known.get(key, 0) for key in asked.tolist()]
+        again = index.find_again(asked).tolist()
+        assert again == found == index.find_again(asked).tolist()
+        # some go, others take their places; those of the next batches come back
+        gone, moved = list(known)[::3], list(known)[1::3]
+        index.remove(np.array(gone, np.int64))
+        index.move(np.array(moved, np.int64), 1000 + np.arange(len(moved)))
+        known = {key: row for key, row in known.items() if key not in gone}
+        known |= {key: 1000 + number for number, key in enumerate(moved)}
+        assert len(index) == len(known)
+        for found in (index.find(asked), index.find_again(asked), index.find_again(asked[::-1])):
+            assert sorted(found.tolist()) == sorted(known.get(key, 0) for key in asked.tolist())
+        assert index.find(asked).tolist() == [known.get(key, 0) for key in asked.tolist()]
     index.clear()
     assert len(index) == 0
     assert not index.find(np.array([*known, *others], np.int64)).any()
