@@ -6,11 +6,14 @@ A quaternion ``q_a_b`` takes vectors of frame b to frame a, like the matrix of t
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from l2lidar_node.types import F64
+
+_Number = TypeVar("_Number", float, F64)
 
 
 def multiply(a_wxyz: ArrayLike, b_wxyz: ArrayLike) -> F64:
@@ -57,20 +60,41 @@ def exp(rotation_vectors: ArrayLike) -> F64:
         Exactly (1, 0, 0, 0) for a zero vector.
     """
     phi = np.asarray(rotation_vectors, dtype=np.float64)
+    if phi.ndim == 1:
+        return _exp_of_one(*phi.tolist())
     half = 0.5 * np.sqrt((phi * phi).sum(axis=-1, keepdims=True))
     # numpy's sinc is sin(pi x) / (pi x) and is exact at zero
     return np.concatenate((np.cos(half), 0.5 * np.sinc(half / np.pi) * phi), axis=-1)
 
 
+def _exp_of_one(x: float, y: float, z: float) -> F64:
+    """Return :func:`exp` of one vector, to the bit, in a tenth of the time."""
+    half = 0.5 * math.sqrt(x * x + y * y + z * z)
+    angle = np.pi * (half / np.pi) or np.finfo(np.float64).eps
+    factor = 0.5 * float(np.sin(angle) / angle)
+    return np.array((float(np.cos(half)), factor * x, factor * y, factor * z))
+
+
 def log(q_wxyz: ArrayLike) -> F64:
     """Return the shortest rotation vectors [rad] of unit quaternions, shape (..., 3)."""
     q = np.asarray(q_wxyz, dtype=np.float64)
+    if q.ndim == 1:
+        return _log_of_one(*q.tolist())
     q = np.where(q[..., :1] < 0.0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
     small = sine < 1e-12
     factor = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
     return np.asarray(factor * q[..., 1:])
+
+
+def _log_of_one(w: float, x: float, y: float, z: float) -> F64:
+    """Return :func:`log` of one quaternion, to the bit, in a tenth of the time."""
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 if sine < 1e-12 else 2.0 * float(np.arctan2(sine, w)) / sine
+    return np.array((factor * x, factor * y, factor * z))
 
 
 def rotate(q_wxyz: ArrayLike, vectors: ArrayLike) -> F64:
@@ -84,13 +108,20 @@ def rotate(q_wxyz: ArrayLike, vectors: ArrayLike) -> F64:
 
 def matrices(q_wxyz: ArrayLike) -> F64:
     """Return the rotation matrices, shape (..., 3, 3); exactly I for (1, 0, 0, 0)."""
-    w, x, y, z = _parts(q_wxyz)
-    entries = _joined(
+    q = np.asarray(q_wxyz, dtype=np.float64)
+    if q.ndim == 1:  # plain numbers take a tenth of the time
+        return np.array(_entries(*q.tolist())).reshape(3, 3)
+    entries = _joined(*_entries(*_parts(q)))
+    return entries.reshape(*entries.shape[:-1], 3, 3)
+
+
+def _entries(w: _Number, x: _Number, y: _Number, z: _Number) -> tuple[_Number, ...]:
+    """Return the entries of the matrices of quaternions, row by row."""
+    return (
         1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
         2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
         2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
     )  # fmt: skip
-    return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
 def matrix_exp(rotation_vector: F64) -> F64:
@@ -134,8 +165,11 @@ def from_matrix(matrix: ArrayLike) -> F64:
         found = (xz - zx, xy + yx, 1.0 + 2.0 * yy - trace, yz + zy)
     else:
         found = (yx - xy, xz + zx, yz + zy, 1.0 + 2.0 * zz - trace)
-    q = normalised(found)
-    return -q if q[0] < 0.0 else q
+    w, x, y, z = found
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if w < 0.0:
+        norm = -norm
+    return np.array((w / norm, x / norm, y / norm, z / norm))
 
 
 def from_rpy(rpy: ArrayLike) -> F64:

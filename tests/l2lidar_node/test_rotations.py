@@ -40,6 +40,16 @@ def test_the_matrix_of_one_vector_is_that_of_many() -> None:
         np.testing.assert_allclose(rotations.matrix_exp(vector), expected, atol=1e-15)
 
 
+def test_one_rotation_by_itself_is_to_the_bit_what_it_is_among_many() -> None:
+    for scale in (0.0, 1e-14, 1e-5, 1.0):
+        vectors = scale * VECTORS
+        q = rotations.exp(vectors)
+        turns, back = rotations.matrices(q), rotations.log(q)
+        assert [rotations.exp(vector).tolist() for vector in vectors] == q.tolist()
+        assert [rotations.matrices(one).tolist() for one in q] == turns.tolist()
+        assert [rotations.log(-one).tolist() for one in q] == back.tolist()
+
+
 def test_products_rotations_and_matrices_agree_with_scipy() -> None:
     a, b = rotations.exp(VECTORS), rotations.exp(VECTORS[::-1])
     v = RNG.normal(size=(50, 3))
