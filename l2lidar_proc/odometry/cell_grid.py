@@ -84,8 +84,8 @@ class CellGrid:
             np.add(number, edges[-1], out=where)
             found.append(distinct)
             edges.append(edges[-1] + len(distinct))
-        keys = np.concatenate(found)
-        return Cells(keys, self.middles(keys), cell, edges)
+        middles = [groups.middles, *map(self.middles, found[1:])]
+        return Cells(np.concatenate(found), np.concatenate(middles, axis=1), cell, edges)
 
 
 class Cells(NamedTuple):

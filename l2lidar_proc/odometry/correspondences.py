@@ -268,7 +268,8 @@ def correspondences_of(
         )
     )
     scales = np.sqrt(config.outlier_scale**2 + matches.scatter)
-    near = np.abs(matches.distances) < np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
+    far = np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
+    near = np.flatnonzero(np.abs(matches.distances) < far)
     index, distances, scales = matches.index[near], matches.distances[near], scales[near]
     far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * ranges[index]
     surface = matches.variances[near] + tuning.SCATTER_SHARED * matches.scatter[near]
@@ -287,7 +288,7 @@ def correspondences_of(
         matches.is_fine[near],
         matches.cells[near],
         matches.axis[near],
-        len(near),
+        len(matches.index),
         int(np.count_nonzero(matches.is_fine)),
         surfaces.latest,
     )
@@ -353,9 +354,8 @@ def robust_weights(distances: F64, scales: F64) -> F64:
 
 def _deskewed_again(source: Source, error: F64, rotation: F64) -> F64:
     """Return the points (N, 3) as a corrected motion deskews them, to first order."""
-    since = source.times[:, None]
-    velocity = error[VELOCITY] @ rotation
-    acceleration = error[GRAVITY] @ rotation - error[ACCEL_BIAS]
-    turned = (skew(-error[GYRO_BIAS]) @ source.points.T).T
-    moved = turned + velocity + (0.5 * since) * acceleration
-    return np.asarray(source.points + since * moved)
+    since, points = source.times, source.points.T
+    velocity = (error[VELOCITY] @ rotation)[:, None]
+    acceleration = (error[GRAVITY] @ rotation - error[ACCEL_BIAS])[:, None]
+    moved = skew(-error[GYRO_BIAS]) @ points + velocity + (0.5 * since) * acceleration
+    return np.asarray((points + since * moved).T)

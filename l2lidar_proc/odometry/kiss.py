@@ -189,8 +189,10 @@ def thinned_indices(points: F64, size: float) -> NDArray[np.intp]:
     keys = _voxels(points, size)
     # neighbors in a scan line mostly share a voxel: only the first of them can be the first
     runs = np.flatnonzero(np.diff(keys, prepend=keys[0] - 1))
-    _, first = np.unique(keys[runs], return_index=True)
-    return np.sort(runs[first])
+    some = keys[runs]
+    order = np.argsort(some)
+    begins = np.flatnonzero(np.diff(some[order], prepend=some[order[0]] - 1))
+    return np.sort(runs[np.minimum.reduceat(order, begins)])
 
 
 def _voxels(points: F64, size: float) -> NDArray[np.int64]:

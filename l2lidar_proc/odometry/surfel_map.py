@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,8 @@ from l2lidar_proc.odometry.surfels import (
     tilts_of,
     weights_from,
 )
+
+_CACHED: Final = 4096  # cells that are looked through at a time
 
 
 class SurfelMap:
@@ -125,7 +127,7 @@ class SurfelMap:
         rows = self._index.find(cells.keys)
         new = rows == 0
         rows[new] = self._open(cells.keys[new])
-        fresh = self._note_sweep(rows, new, cells.of_groups, groups.counts, sweep, apart)
+        fresh = self._note_openers(rows, new, cells.of_groups, groups.counts, sweep, apart)
         weights = np.ones(len(rows))
         if weighted and origin is not None:
             weights = weights_from(np.ascontiguousarray(cells.middles.T) - origin)
@@ -133,7 +135,7 @@ class SurfelMap:
         self._fit(rows[grown], cells.middles[:, grown], origin)
         return fresh
 
-    def _note_sweep(
+    def _note_openers(
         self,
         rows: I64,
         new: NDArray[np.bool_],
@@ -142,7 +144,7 @@ class SurfelMap:
         sweep: int,
         apart: NDArray[np.bool_] | None,
     ) -> float:
-        """Note who opened the new cells (C,) among some, and who has seen all of these last.
+        """Note who opened the new cells among some (C,).
 
         The coarsest level tells what is new, finer ones open cells in known walls as well: such a
         place is as old as the coarsest cell around it. Return the share of points in new places.
@@ -157,7 +159,6 @@ class SurfelMap:
         sweep : int
         apart : ndarray, shape (S,), optional
         """
-        self._cells["seen"][rows] = sweep
         fresh = float(counts[new[cell[-1]]].sum() / counts.sum())
         self._planes["born"][rows[new]] = self._planes["opened"][rows[new]] = sweep
         if fresh < 1.0 and new.any():
@@ -194,6 +195,7 @@ class SurfelMap:
             Which cells have grown so much that their planes are due.
         """
         changing = self._cells["weight"][rows] < self._capacity * weights
+        self._cells["seen"][rows[~changing]] = self.latest
         wanted = changing[cells.of_groups]
         size = len(groups.keys)
         moments = np.empty((11, size))
@@ -221,7 +223,7 @@ class SurfelMap:
         return due
 
     def _grow(self, rows: I64, sums: F64) -> NDArray[np.bool_]:
-        """Add sums (11, M) to those of cells, and return which planes (M,) are due for it."""
+        """Add sums (11, M) to those of cells, and return which planes (M,) are due for a fit."""
         cells = records.selected(self._cells, rows)
         # column by column: numpy would go through the few columns of each row
         sum_, products = cells["sum"].T, cells["products"].T
@@ -230,6 +232,7 @@ class SurfelMap:
             column += line
         cells["count"] = cells["weight"] ** 2 / np.maximum(cells["squares"], 1e-300)
         cells["sweeps"] += 1.0
+        cells["seen"] = self.latest
         records.assign(self._cells, rows, cells)
         is_due = cells["weight"] >= tuning.REFIT_GROWTH * cells["fitted"]
         return np.asarray(is_due & (cells["count"] >= self._least))
@@ -346,9 +349,14 @@ class SurfelMap:
     def forget(self, origin: F64, distance: float, since: int = 0) -> None:
         """Drop cells farther than a distance [m] from a place (3,), or not seen since a sweep."""
         cells = self._cells[1 : len(self) + 1]
-        x, y, z = self._grid.middles(cells["key"].copy()) - origin[:, None]
-        kept = x * x + y * y + z * z <= distance * distance
-        kept &= cells["seen"] >= since
+        kept = np.empty(len(cells), np.bool_)
+        # some at a time, so that what is computed stays in the processor's cache
+        for first in range(0, len(cells), _CACHED):
+            part = slice(first, first + _CACHED)
+            some = cells[part]
+            x, y, z = self._grid.middles(some["key"].copy()) - origin[:, None]
+            kept[part] = x * x + y * y + z * z <= distance * distance
+            kept[part] &= some["seen"] >= since
         if not kept.all():
             self._drop(1 + np.flatnonzero(~kept))
 
@@ -421,6 +429,8 @@ class SurfelMap:
 
 def _edges(bare: I64, sizes: Sequence[int]) -> I64:
     """Return the points without a flat surface (N,) of those sweeps in which they are many."""
+    if len(bare) <= tuning.EDGE_SHARE * min(sizes):
+        return bare[:0]
     ends = np.cumsum(sizes)
     places = np.searchsorted(bare, [0, *ends.tolist()])
     parts = zip(places[:-1].tolist(), places[1:].tolist(), sizes, strict=True)
@@ -443,10 +453,14 @@ def _finest(rows: I64, wanted: NDArray[np.bool_], index: I64) -> Candidates:
     index : ndarray, shape (N,)
         Names of the points.
     """
-    first = wanted.copy()
-    first[1:] &= ~np.logical_or.accumulate(wanted[:-1], axis=0)
-    level, place = np.nonzero(first)
-    return Candidates(index[place], rows[first], level, np.zeros(len(level), np.int64))
+    free = np.ones(len(index), np.bool_)
+    places = []
+    for fits in wanted:
+        places.append(np.flatnonzero(fits & free))
+        free &= ~fits
+    place = np.concatenate(places)
+    level = np.repeat(np.arange(len(places)), [len(some) for some in places])
+    return Candidates(index[place], rows[level, place], level, np.zeros(len(level), np.int64))
 
 
 def _both_axes(found: Candidates, kind: NDArray[np.int8]) -> Candidates:

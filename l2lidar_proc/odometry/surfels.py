@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,12 +144,14 @@ def matches_with(
     spread = planes["spread"]
     # a plane fitted to n points is worst known far from their middle
     reach = 1.0 + along[:, 1] ** 2 / spread[:, 1] + along[:, 2] ** 2 / spread[:, 2]
-    each = np.arange(len(found.point))
-    across = spread[each, found.axis]
+    normal: tuple[Any, ...] = slice(None), 0  # of nearly all the first of their axes
+    if found.axis.any():
+        normal = np.arange(len(found.axis)), found.axis
+    across = spread[normal]
     return Matches(
         found.point,
-        axes[each, found.axis],
-        along[each, found.axis],
+        np.ascontiguousarray(axes[normal]),
+        along[normal],
         across * reach / count,
         np.where(flat, 0.0, across),
         planes["born"],
