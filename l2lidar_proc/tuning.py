@@ -127,8 +127,8 @@ TRUSTED_ACCELERATION: Final = 0.6  # [m/s^2] largest uncertainty with which forc
 
 # ---- odometry: prediction
 
-# The gyro's noise is measured at rest, and by second differences of samples in motion, which show
-# its white part but not the lines of the head. Source: units from 0.03 to 0.35 rad/s, most of it
+# The gyro's noise is measured at rest, and by the spectrum of samples in motion, which shows its
+# white part but not the lines of the head. Source: units from 0.03 to 0.35 rad/s, most of it
 # lines; with 0.3 rad/s of them that were not known, a crowded hall ended 220 m off.
 GYRO_REST_SAMPLES: Final = 100  # needed
 GYRO_REST_MEMORY: Final = 1000  # that count, 4 s
@@ -136,6 +136,13 @@ LEAST_GYRO_NOISE: Final = 0.01  # [rad/s]
 # Derived: errors of scale and axes of 0.6 %, in turns of a second; source: calibrations of units
 GYRO_SHARE: Final = 0.006  # [sqrt(s)] of the angular velocity
 GYRO_NOISE_FACTOR: Final = 1.7  # on the white part. Tuned on: narrow views, seeds 8 to 15
+# [sqrt(s)] of the acceleration, likewise. Tuned on: narrow views, seeds 100 to 109; with 0.01,
+# three of six cameras on stairs ended 0.3 to 3 m off
+ACCEL_SHARE: Final = 0.004
+NOISE_WINDOW_NS: Final = 1_000_000_000  # [ns] of samples whose spectrum shows the noise
+NOISE_LEAST_SAMPLES: Final = 64  # Derived: lines of 4 bins each leave the median alone
+# Derived: hands tremble at 8 to 12 Hz, legs step below; motors and frames vibrate above
+NOISE_FROM_HZ: Final = 15.0
 
 RATE_SMOOTHING_NS: Final = 20_000_000  # [ns] either side, over which the reported rate is averaged
 ODOMETRY_MEMORY_S: Final = 12.0  # [s] of IMU samples; more than a held-up node has waiting

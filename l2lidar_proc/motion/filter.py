@@ -136,6 +136,10 @@ class Noise:
     gyro_share : float
         Of the angular velocity that counts as noise besides, for errors of scale and axes
         [sqrt(s)].
+    accel_share : float
+        Likewise of the acceleration.
+    gyro_swing, accel_swing : float
+        Errors of angle [rad] and velocity [m/s] that vibrations make, however long they last.
     """
 
     gyro: float
@@ -143,6 +147,9 @@ class Noise:
     gyro_walk: float
     accel_walk: float
     gyro_share: float = 0.0
+    accel_share: float = 0.0
+    gyro_swing: float = 0.0
+    accel_swing: float = 0.0
 
 
 class Update(NamedTuple):
@@ -212,11 +219,16 @@ def predict(
     measured = noise.gyro**2 + (noise.gyro_share * turning) ** 2
     gyro2 = (1.0 - blind) * measured + blind * unmeasured
     blind = np.ones_like(blind) if blind_forces else blind
-    accel2 = (1.0 - blind) * noise.accel**2 + blind * tuning.BLIND_ACCEL**2
+    moving = np.linalg.norm(forces - back @ state.rest_force, axis=1)
+    measured = noise.accel**2 + (noise.accel_share * moving) ** 2
+    accel2 = (1.0 - blind) * measured + blind * tuning.BLIND_ACCEL**2
     q = process_noise(gyro2, accel2, noise, dt)
     whole, added = f[0], q[0]
     for step, more in zip(f[1:], q[1:], strict=True):
         whole, added = step @ whole, step @ added @ step.T + more
+    # a vibration errs at the end as it did at the beginning, by chance
+    added[ROTATION, ROTATION] += 2.0 * noise.gyro_swing**2 * np.eye(3)
+    added[VELOCITY, VELOCITY] += 2.0 * noise.accel_swing**2 * np.eye(3)
     _, covariance = kalman().predict(np.zeros(ERRORS), covariance, whole, added)
     return state.at(preintegrated, knot), covariance
 

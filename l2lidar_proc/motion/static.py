@@ -174,6 +174,46 @@ def may_be_static(samples: Samples) -> bool:
     )
 
 
+class NoiseSpectrum(NamedTuple):
+    """What the spectrum of a sensor's samples shows of its noise.
+
+    Attributes
+    ----------
+    floor : float
+        Standard deviation of the white noise of a sample, of the worst axis.
+    swing : float
+        What vibrations integrate to, standard deviation, of the worst axis: an error of the angle
+        [rad] for angular velocities, of the velocity [m/s] for forces. It swings about zero and
+        does not add up.
+    """
+
+    floor: float
+    swing: float
+
+
+def noise_spectrum(values: F64) -> NoiseSpectrum:
+    """Return what samples (N, 3) at the IMU's rate show of its noise.
+
+    Motors and vibrations are lines of the spectrum; slow motion ends below
+    :data:`tuning.NOISE_FROM_HZ`. The median of the periodogram above is not moved by a few lines.
+    It is ln 2 of the mean, as a bin has the chi-squared distribution of two degrees of freedom.
+    Too few samples to resolve lines show only :func:`white_noise`.
+    """
+    count = len(values)
+    if count < tuning.NOISE_LEAST_SAMPLES:
+        return NoiseSpectrum(white_noise(values), 0.0)
+    window = np.hanning(count)[:, None]
+    amplitudes = np.fft.rfft((values - values.mean(axis=0)) * window, axis=0)
+    frequencies = np.fft.rfftfreq(count, tuning.IMU_PERIOD_S)
+    high = frequencies >= tuning.NOISE_FROM_HZ
+    power = np.square(np.abs(amplitudes[high])) / np.square(window).sum()  # white: the variance
+    integrated = power / np.square(2.0 * np.pi * frequencies[high, None])
+    return NoiseSpectrum(
+        float(np.sqrt(np.median(power, axis=0).max() / np.log(2.0))),
+        float(np.sqrt(2.0 / count * integrated.sum(axis=0).max())),
+    )
+
+
 def white_noise(values: F64) -> float:
     """Return the standard deviation of the white part of samples (N, 3), despite slow motion.
 

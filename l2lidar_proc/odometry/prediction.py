@@ -23,7 +23,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import GYRO_BIAS, VELOCITY, InertialState, Noise
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
-from l2lidar_proc.motion.static import white_noise
+from l2lidar_proc.motion.static import noise_spectrum
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
 from l2lidar_proc.motion.tracker import turned
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -168,14 +168,21 @@ class Predictor:
         """Return the noise of samples: as known, or more where more shows."""
         settings = self.config.inertial
         scale = float(np.sqrt(tuning.IMU_PERIOD_S))
-        shown = tuning.GYRO_NOISE_FACTOR * white_noise(samples["angular_velocity"])
-        self.gyro_noise = max(self._least_gyro_noise, shown)
+        if len(samples):
+            latest = HostNs(int(samples["stamp"][-1]))
+            samples = self.samples(HostNs(latest - tuning.NOISE_WINDOW_NS), latest)
+        gyro = noise_spectrum(samples["angular_velocity"])
+        accel = noise_spectrum(samples["linear_acceleration"])
+        self.gyro_noise = max(self._least_gyro_noise, tuning.GYRO_NOISE_FACTOR * gyro.floor)
         return Noise(
             self.gyro_noise * scale,
-            max(settings.accel_noise, white_noise(samples["linear_acceleration"])) * scale,
+            max(settings.accel_noise, accel.floor) * scale,
             settings.gyro_bias_walk,
             settings.accel_bias_walk,
             tuning.GYRO_SHARE,
+            tuning.ACCEL_SHARE,
+            gyro.swing,
+            accel.swing,
         )
 
 
