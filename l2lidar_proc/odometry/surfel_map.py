@@ -36,6 +36,7 @@ from l2lidar_proc.odometry.surfels import (
     matches_with,
     tilts_of,
     weights_from,
+    widths_of,
 )
 
 _CACHED: Final = 4096  # cells that are looked through at a time
@@ -337,6 +338,13 @@ class SurfelMap:
             Of :class:`Matches`; the map must not have changed since.
         """
         return tilts_of(self.planes(cells), self._cells["sweeps"][cells], axis)
+
+    def widths(self, cells: I64, axis: I64) -> F64:
+        """Return how wide surfaces are, (M,) [m], as :func:`widths_of` has it.
+
+        ``cells`` and ``axis`` (M,) are as for :meth:`tilts`.
+        """
+        return widths_of(self.planes(cells), axis)
 
     def cells(self, rows: I64) -> NDArray[np.void]:
         """Return what the cells (M,) of some :class:`Matches` have seen, dtype CELL."""

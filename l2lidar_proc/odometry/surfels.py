@@ -208,6 +208,20 @@ def tilts_of(planes: NDArray[np.void], sweeps: F64, axis: I64) -> F64:
     return np.asarray(planes["axes"] * angles[:, :, None])
 
 
+def widths_of(planes: NDArray[np.void], axis: I64) -> F64:
+    """Return the standard deviations [m], (M,), of surfaces along the narrower of their own axes.
+
+    Parameters
+    ----------
+    planes : ndarray, shape (M,), dtype PLANE
+    axis : ndarray, shape (M,)
+        Which of its cell's axes each normal is.
+    """
+    spread = planes["spread"].copy()
+    spread[np.arange(len(planes)), axis] = np.inf
+    return np.asarray(np.sqrt(spread.min(axis=1)))
+
+
 def weights_from(ways: F64) -> F64:
     """Return the weights (C,) of points that are seen at the ends of some ways (C, 3) [m]."""
     squared = np.einsum("ni,ni->n", ways, ways)
