@@ -77,8 +77,8 @@ FAULTS: Final = (
     ),
     Fault(
         "l2lidar_proc/odometry/prediction.py",
-        'max(settings.accel_noise, white_noise(samples["linear_acceleration"])) * scale',
-        'max(settings.accel_noise, white_noise(samples["linear_acceleration"]))',
+        "max(settings.accel_noise, accel.floor) * scale",
+        "max(settings.accel_noise, accel.floor)",
         (f"{_PROC}/odometry/test_prediction.py",),
     ),
     Fault(

@@ -165,7 +165,7 @@ class Predictor:
         return max(float(np.sqrt(known.max())), tuning.LEAST_GYRO_NOISE)
 
     def _noise(self, samples: Samples) -> Noise:
-        """Return the noise of samples: as known, or more where more shows."""
+        """Return the noise at the end of samples: as known, or more where a second shows more."""
         settings = self.config.inertial
         scale = float(np.sqrt(tuning.IMU_PERIOD_S))
         if len(samples):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,6 +134,46 @@ def test_a_share_of_the_rate_counts_as_noise_of_the_gyro() -> None:
             )
         )
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-15)
+
+
+def covariance_after(noise: Noise, motion: Motion, **changes: Any) -> F64:
+    """Return the covariance after 0.2 s of a motion."""
+    state, p = dataclasses.replace(some_state(), **changes), 1e-6 * np.eye(eskf.ERRORS)
+    imu = segment(motion.imu(0.0, 0.21), [at(0.0), at(0.2)], 50_000_000, np.zeros(3))
+    sums = integrate(
+        imu, 0, gyro_bias=np.zeros(3), accel_bias=state.accel_bias, rest_force=state.rest_force
+    )
+    return eskf.predict(state, p, imu, sums, len(imu.stamps) - 1, noise)[1]
+
+
+@pytest.mark.parametrize("force", [0.0, 2.0])
+def test_a_share_of_the_acceleration_counts_as_noise_of_the_accelerometer(force: float) -> None:
+    """Gravity, which the accelerometer measures as well, does not count."""
+    state = some_state()
+    gravity = np.array([0.0, 0.0, -9.80665])
+    steady = Motion(turn=0.0).imu(0.0, 0.21)
+    measured = steady["linear_acceleration"][0]
+    # so that the force is that of rest, and some acceleration
+    bias = measured + state.rotation.T @ gravity - np.array([force, 0.0, 0.0])
+    assert np.ptp(steady["linear_acceleration"], axis=0).max() < 1e-9
+    found, expected = (
+        covariance_after(noise, Motion(turn=0.0), accel_bias=bias, gravity=gravity)
+        for noise in (
+            Noise(0.003, 0.02, 1e-4, 1e-3, accel_share=0.01),
+            Noise(0.003, float(np.hypot(0.02, 0.01 * force)), 1e-4, 1e-3),
+        )
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-15)
+
+
+def test_a_vibration_errs_at_both_ends_however_long_it_lasts() -> None:
+    quiet = covariance_after(Noise(0.003, 0.02, 1e-4, 1e-3), Motion())
+    shaken = Noise(0.003, 0.02, 1e-4, 1e-3, gyro_swing=0.001, accel_swing=0.02)
+    found = covariance_after(shaken, Motion())
+    expected = np.zeros((eskf.ERRORS, eskf.ERRORS))
+    expected[eskf.ROTATION, eskf.ROTATION] = 2.0 * 0.001**2 * np.eye(3)
+    expected[eskf.VELOCITY, eskf.VELOCITY] = 2.0 * 0.02**2 * np.eye(3)
+    np.testing.assert_allclose(found - quiet, expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -130,6 +130,35 @@ def test_a_normal_that_is_hardly_known_faces_nothing() -> None:
     assert driven.facing(at(), found)[is_reveal, 0].mean() > 0.9
 
 
+def test_a_surface_hardly_wider_than_the_noise_does_not_tell_the_way() -> None:
+    """Scan lines on the leaf of a door, behind its frame, look like the reveal."""
+    rng = np.random.default_rng(15)
+    surfaces = mapped(rng, facing=600)
+
+    def leaf(count: int, width: float) -> F64:
+        points = rng.uniform((3.61, 0.31, -0.8), (3.61, 0.31 + width, 1.2), (count, 3))
+        points[:, 0] += 0.003 * rng.standard_normal(count)
+        return points
+
+    faces = []
+    for width in (0.08, 0.13):  # standard deviations of 23 and 38 mm
+        for number in range(8):
+            surfaces.add(leaf(200, width), number)
+        surfaces.add(walls(rng, 100), 12)
+        seen = np.vstack((walls(rng, 2000), reveals(rng, 90), leaf(30, width)))
+        found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
+        driven = weak_axes(at(), found, surfaces, NOTHING)
+        assert driven is not None
+        some = (found.index >= len(seen) - 30) & (np.abs(found.normals[:, 0]) > 0.9)
+        assert np.count_nonzero(some) > 10
+        faces.append(float(driven.facing(at(), found)[some, 0].mean()))
+        by_hand = weak_axes(at(), found, surfaces)
+        assert by_hand is not None
+        assert by_hand.facing(at(), found)[some, 0].mean() > 0.9
+    assert faces[0] < 0.1
+    assert faces[1] > 0.9
+
+
 def test_what_faces_the_direction_does_not_bend_it() -> None:
     """Oblique surfaces on one side only turn the weakest direction of all points away."""
     rng = np.random.default_rng(8)
