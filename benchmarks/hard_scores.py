@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.hard_recordings import Recording
+from benchmarks.hard_scenarios import Imperfections
 from l2lidar_node import rotations
 from l2lidar_node.types import F64
 
@@ -93,6 +94,7 @@ def score(recording: Recording, track: Track | None) -> Row:
     wanted = int(np.count_nonzero(np.diff(recording.edges)))
     row: Row = {
         "way_m": recording.way_m,
+        "scale_ate_m": scale_ate(recording),
         "poses": 0 if track is None else len(track.stamps) / max(wanted, 1),
         "ate_m": np.inf,
         "end_m": np.inf,
@@ -180,6 +182,17 @@ def _ate(recording: Recording, track: Track) -> float:
     ape = APE(PoseRelation.translation_part)
     ape.process_data((reference, estimate))
     return float(np.sqrt(np.mean(ape.error**2)))
+
+
+def scale_ate(recording: Recording) -> float:
+    """Return the ATE [m] of the truth itself, of the size that ranges of a wrong scale give it.
+
+    Scaled by 1 + e about its mean, which no rotation improves, every place is off by e times its
+    distance from there.
+    """
+    places = recording.truth_at(recording.spans.mean(axis=1).astype(np.int64))["position"]
+    spread = np.square(places - places.mean(axis=0)).sum(axis=1).mean()
+    return Imperfections().range_scale * float(np.sqrt(spread))
 
 
 def _logs(turns: F64) -> F64:
