@@ -458,7 +458,7 @@ def test_clock_that_goes_back_keeps_pose_and_map() -> None:
 
 def test_lost_elsewhere_it_begins_a_new_map_and_returns_into_the_old_one() -> None:
     """Carried blindly into another place, and back: the pose jumps back to where it is."""
-    room, yard = recording("room", "walk", 10.5), recording("yard", "walk", 10.5)
+    room, yard = recording("room", "walk", 11.5), recording("yard", "walk", 11.5)
     epoch = sweep_epoch(room)
     away, home = epoch + 3_300_000_000, epoch + 9_000_000_000
     some = [one for one in sweeps(room, "turn") if one.end < away]
