@@ -303,7 +303,7 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
     monkeypatch.setattr(bench_odometry_hard, "PAGE", pages[0])
     monkeypatch.setattr(bench_odometry_hard, "UNSEEN_PAGE", pages[1])
     figures = score(given, true_track(given))
-    last = bench_odometry_hard.FIRST_UNSEEN - 1
+    last = bench_odometry_hard.TUNED[0][-1]
     for first, page in ((last, pages[0]), (last + 1, pages[1])):
         rows = [
             {"family": name, "method": "ours", "seed": seed, "seconds": 4.0, **figures}
@@ -312,6 +312,8 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
         reached = list(bench_odometry_hard.targets(rows))
         assert bench_odometry_hard.write(rows, reached) == page
     assert "seeds 15 to 16, some used for tuning" in pages[0].read_text()
+    later = [{**row, "seed": 101} for row in rows]
+    assert bench_odometry_hard.write(later, reached) == pages[0]
     unseen = pages[1].read_text()
     assert "seeds 16 to 17, which were not used for tuning" in unseen
     assert 'BENCH_ARGS="--full --first-seed 16 --page"' in unseen
