@@ -178,7 +178,7 @@ REASONS: Final[dict[tuple[str, str], str]] = {
         "tuning.COVARIANCE_STEPS + 1 -> tuning.COVARIANCE_STEPS - 1",
     ): "a tuned number of steps of the same integral: two less do as well",
     (
-        "l2lidar_proc/motion/filter.py",
+        "l2lidar_proc/motion/carrier_priors.py",
         "noise = np.array([[(tuning.SPEED_BOUND_SHARE * max_speed) ** 2]]): 2 -> 3",
     ): "2 % of the bound, beside an excess of several times the bound, is nothing either way",
 }

@@ -39,14 +39,13 @@ ZERO_VELOCITY: Final = 0.003  # [m/s] noise of a zero-velocity update. Tuned on:
 DRIVING_SPEED: Final = 0.8  # [m/s]
 PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
 PRIOR_SPEED: Final = 1.0  # [m/s]
-PRIOR_LEARN_SIGMA: Final = 0.1  # [m/s] of velocities that show the peak speed,
-PRIOR_LEARN_SIGMAS: Final = 2.0  # or less so many times that, if they are less certain
+PRIOR_LEARN_SIGMA: Final = 0.1  # [m/s] of velocities that show the peak speed
+PRIOR_LEARN_SIGMAS: Final = 2.0  # less certain ones count with so many sigmas subtracted
 PRIOR_MEMORY_S: Final = 60.0  # [s] time constant of its decay
-# A carrier that was never so fast is moved by hand. Its velocity is drawn from the first on, and
-# the zero measured with its peak speed, at least with the second. Tuned on: narrow views and
+# A carrier that was never as fast as DRIVING_SPEED is moved by hand. Tuned on: narrow views and
 # corridors, seeds 100 to 115
-HAND_FROM_SIGMA: Final = 0.1  # [m/s]
-HAND_SPEED: Final = 0.3  # [m/s]
+HAND_FROM_SIGMA: Final = 0.1  # [m/s] less certain, its velocity is drawn to zero,
+HAND_SPEED: Final = 0.3  # [m/s] with its peak speed as the standard deviation, at least this
 # The same for the vertical velocity where sweeps hardly ever fix the height. Derived: the height
 # of what walks or drives wanders by half a meter in a minute. Tuned on: bare trunks. The first is
 # the least sigma, as the IMU may know better.

@@ -181,23 +181,30 @@ class NoiseSpectrum(NamedTuple):
     ----------
     floor : float
         Standard deviation of the white noise of a sample, of the worst axis.
-    swing : float
+    vibration : float
         What vibrations integrate to, standard deviation, of the worst axis: an error of the angle
-        [rad] for angular velocities, of the velocity [m/s] for forces. It swings about zero and
-        does not add up.
+        [rad] for angular velocities, of the velocity [m/s] for forces. It oscillates about zero
+        and does not add up.
     """
 
     floor: float
-    swing: float
+    vibration: float
 
 
 def noise_spectrum(values: F64) -> NoiseSpectrum:
-    """Return what samples (N, 3) at the IMU's rate show of its noise.
+    """Return the noise floor of samples at the IMU's rate, and the effect of vibrations.
 
-    Motors and vibrations are lines of the spectrum; slow motion ends below
-    :data:`tuning.NOISE_FROM_HZ`. The median of the periodogram above is not moved by a few lines.
-    It is ln 2 of the mean, as a bin has the chi-squared distribution of two degrees of freedom.
-    Too few samples to resolve lines show only :func:`white_noise`.
+    Motors and vibrations are lines of the spectrum; the motion of a carrier ends below
+    :data:`tuning.NOISE_FROM_HZ`. A few lines do not move the median of the periodogram above it
+    (modified periodogram with a Hann window, Welch 1967). The median of white noise is its mean
+    times ln 2: bins have the chi-squared distribution of two degrees of freedom. A line of
+    amplitude a at the frequency f integrates to one of a / (2 pi f).
+
+    Parameters
+    ----------
+    values : ndarray, shape (N, 3)
+        Angular velocities [rad/s] or forces [m/s^2]. Too few of them to resolve lines show only
+        their :func:`white_noise`.
     """
     count = len(values)
     if count < tuning.NOISE_LEAST_SAMPLES:

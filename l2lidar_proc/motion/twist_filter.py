@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion import carrier_priors, filter as eskf
 from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration, integrate, segment
@@ -296,7 +296,7 @@ class TwistFilter:
             seconds = (due - self._state.stamp) * 1e-9
             self._predict(HostNs(due))
             # no peak speed: a source that is silent for seconds may have stopped with the carrier
-            self._state, self._covariance = eskf.apply_zero_velocity_prior(
+            self._state, self._covariance = carrier_priors.apply_zero_velocity_prior(
                 self._state, self._covariance, seconds, 0.0
             )
 

@@ -252,10 +252,9 @@ def correspondences_of(
     sizes = [len(points) for points in seen]
     # a wall between rooms is thinner than the first step reaches, and what comes into sight
     # through a door is mostly another side of a wall: it would pull the sweep by the thickness
-    origins = views[0][0].position
     is_single = len(views) == 1
-    if not is_single:
-        origins = np.repeat([state.position for state, _ in views], sizes, axis=0)
+    places = [state.position for state, _ in views]
+    origins = places[0] if is_single else np.repeat(places, sizes, axis=0)
     matches = surfaces.match(
         _joined(seen), narrow=True, sizes=sizes, origins=origins, again=is_single
     )
@@ -268,8 +267,8 @@ def correspondences_of(
         )
     )
     scales = np.sqrt(config.outlier_scale**2 + matches.scatter)
-    far = np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
-    near = np.flatnonzero(np.abs(matches.distances) < far)
+    farthest = np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
+    near = np.flatnonzero(np.abs(matches.distances) < farthest)
     index, distances, scales = matches.index[near], matches.distances[near], scales[near]
     far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * ranges[index]
     surface = matches.variances[near] + tuning.SCATTER_SHARED * matches.scatter[near]

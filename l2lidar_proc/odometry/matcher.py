@@ -17,6 +17,7 @@ from l2lidar_node import records, rotations
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.deskew.deskew import coordinates, deskew
+from l2lidar_proc.motion.carrier_priors import is_driving_speed
 from l2lidar_proc.motion.filter import (
     ERRORS,
     POSE,
@@ -24,7 +25,6 @@ from l2lidar_proc.motion.filter import (
     ROTATION,
     VELOCITY,
     InertialState,
-    is_driving_speed,
     square_root,
     update_with_information,
 )

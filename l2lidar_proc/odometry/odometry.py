@@ -11,7 +11,7 @@ import numpy as np
 
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion import carrier_priors, filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
@@ -309,19 +309,21 @@ class Odometry:
         assert self._belief is not None
         before = self._belief[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
-        self._peak_speed = eskf.peak_speed_after(self._peak_speed, after, covariance, lasted)
+        self._peak_speed = carrier_priors.peak_speed_after(
+            self._peak_speed, after, covariance, lasted
+        )
         height = self.matcher.observes_height
-        posterior = eskf.apply_zero_velocity_prior(
+        posterior = carrier_priors.apply_zero_velocity_prior(
             after, covariance, lasted, self._peak_speed, height_observed=height
         )
-        self.matcher.driving = eskf.is_driving_speed(self._peak_speed)
-        posterior = eskf.with_gravity_of_known_size(*posterior)
+        self.matcher.driving = carrier_priors.is_driving_speed(self._peak_speed)
+        posterior = carrier_priors.with_gravity_of_known_size(*posterior)
         way = float(np.linalg.norm(posterior[0].position - before.position))
         lean = way * tuning.MAP_BEND**2
         posterior = posterior[0], eskf.with_leaning_gravity(*posterior, lean)
         gravity = posterior[1][eskf.GRAVITY, eskf.GRAVITY]
         self.matcher.drift.lean(posterior[0].gravity, gravity)
-        bounded = eskf.bound_speed(*posterior, self.config.max_speed)
+        bounded = carrier_priors.bound_speed(*posterior, self.config.max_speed)
         is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)
         if is_suspect and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
@@ -352,7 +354,7 @@ class Odometry:
         if self._innovations.contradicts:
             return True
         # without a gyro its bias stands for the change of the rate
-        return not (motion.imu.missing.all() or eskf.biases_are_plausible(motion.state))
+        return not (motion.imu.missing.all() or carrier_priors.biases_are_plausible(motion.state))
 
     def _consistency(self, quality: AlignmentQuality, stamp: HostNs) -> AlignmentQuality:
         """Return the quality of the alignment at an instant with what the innovations say."""

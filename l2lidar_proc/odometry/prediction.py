@@ -181,8 +181,8 @@ class Predictor:
             settings.accel_bias_walk,
             tuning.GYRO_SHARE,
             tuning.ACCEL_SHARE,
-            gyro.swing,
-            accel.swing,
+            gyro.vibration,
+            accel.vibration,
         )
 
 

@@ -111,7 +111,7 @@ class WeakAxes:
         if self.scatter is None:
             return faces
         some = np.flatnonzero(faces)
-        if number == 0:
+        if number == 0:  # the way that the carrier drives
             widths = self.surfaces.widths(found.cells[some], found.axis[some])
             faces[some] = widths > tuning.FACING_WIDTH
             some = np.flatnonzero(faces)

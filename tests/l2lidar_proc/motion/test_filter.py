@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion import carrier_priors, filter as eskf
 from l2lidar_proc.motion.filter import InertialState, Noise
 from l2lidar_proc.motion.preintegration import integrate, segment
 from tests.l2lidar_proc.motion.analytic import EPOCH, G, Motion, at
@@ -168,7 +168,7 @@ def test_a_share_of_the_acceleration_counts_as_noise_of_the_accelerometer(force:
 
 def test_a_vibration_errs_at_both_ends_however_long_it_lasts() -> None:
     quiet = covariance_after(Noise(0.003, 0.02, 1e-4, 1e-3), Motion())
-    shaken = Noise(0.003, 0.02, 1e-4, 1e-3, gyro_swing=0.001, accel_swing=0.02)
+    shaken = Noise(0.003, 0.02, 1e-4, 1e-3, gyro_vibration=0.001, accel_vibration=0.02)
     found = covariance_after(shaken, Motion())
     expected = np.zeros((eskf.ERRORS, eskf.ERRORS))
     expected[eskf.ROTATION, eskf.ROTATION] = 2.0 * 0.001**2 * np.eye(3)
@@ -225,20 +225,20 @@ def test_a_static_stretch_measures_bias_and_gravity() -> None:
 def test_the_prior_touches_only_a_velocity_that_is_hardly_known() -> None:
     state = some_state()
     tight = np.eye(eskf.ERRORS) * 0.1**2
-    assert eskf.apply_zero_velocity_prior(state, tight, 1.0, 0.0)[0] is state
+    assert carrier_priors.apply_zero_velocity_prior(state, tight, 1.0, 0.0)[0] is state
     loose = np.eye(eskf.ERRORS)
-    slowed, covariance = eskf.apply_zero_velocity_prior(state, loose, 1.0, 0.0)
+    slowed, covariance = carrier_priors.apply_zero_velocity_prior(state, loose, 1.0, 0.0)
     np.testing.assert_allclose(slowed.velocity, 0.5 * state.velocity, atol=1e-9)
     assert covariance[6, 6] == pytest.approx(0.5)
     # nor does one that drives, until its velocity is known worse than it has ever driven
     drives = tuning.DRIVING_SPEED + 0.1
     known = np.eye(eskf.ERRORS) * (0.99 * drives) ** 2
     level = dataclasses.replace(state, gravity=np.zeros(3))
-    assert eskf.apply_zero_velocity_prior(level, known, 1.0, drives)[0] is level
-    slowed, _ = eskf.apply_zero_velocity_prior(level, 1.1 * known, 1.0, drives)
+    assert carrier_priors.apply_zero_velocity_prior(level, known, 1.0, drives)[0] is level
+    slowed, _ = carrier_priors.apply_zero_velocity_prior(level, 1.1 * known, 1.0, drives)
     assert np.linalg.norm(slowed.velocity) < 0.6 * np.linalg.norm(level.velocity)
     crawls = tuning.DRIVING_SPEED - 0.1
-    assert eskf.apply_zero_velocity_prior(level, known, 1.0, crawls)[0] is not level
+    assert carrier_priors.apply_zero_velocity_prior(level, known, 1.0, crawls)[0] is not level
 
 
 def test_a_minute_of_the_prior_brakes_no_drive_but_ends_a_climb() -> None:
@@ -249,18 +249,22 @@ def test_a_minute_of_the_prior_brakes_no_drive_but_ends_a_climb() -> None:
     start = dataclasses.replace(some_state(), gravity=gravity, velocity=1.2 * ahead + 1.5 * up)
     state, covariance = start, np.eye(eskf.ERRORS) * 0.3**2
     for _ in range(600):
-        state, covariance = eskf.apply_zero_velocity_prior(state, covariance, 0.1, 1.2)
+        state, covariance = carrier_priors.apply_zero_velocity_prior(state, covariance, 0.1, 1.2)
     assert ahead @ state.velocity == pytest.approx(1.2, abs=1e-9)
     # until the vertical velocity is known well enough
     least = tuning.PRIOR_FROM_SIGMA**2
     assert up @ covariance[eskf.VELOCITY, eskf.VELOCITY] @ up == pytest.approx(least, rel=0.01)
     assert up @ state.velocity == pytest.approx(1.5 * least / 0.3**2, rel=0.01)
     # a slow carrier stops; where gravity is not known nothing is vertical
-    slow, _ = eskf.apply_zero_velocity_prior(start, np.eye(eskf.ERRORS) * 0.3**2, 60.0, 0.3)
+    slow, _ = carrier_priors.apply_zero_velocity_prior(
+        start, np.eye(eskf.ERRORS) * 0.3**2, 60.0, 0.3
+    )
     assert np.linalg.norm(slow.velocity) < 0.2 * np.linalg.norm(start.velocity)
     adrift = dataclasses.replace(start, gravity=np.zeros(3))
     assert (
-        eskf.apply_zero_velocity_prior(adrift, np.eye(eskf.ERRORS) * 0.3**2, 60.0, 1.2)[0]
+        carrier_priors.apply_zero_velocity_prior(adrift, np.eye(eskf.ERRORS) * 0.3**2, 60.0, 1.2)[
+            0
+        ]
         is adrift
     )
 
@@ -272,10 +276,10 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
     start = dataclasses.replace(some_state(), gravity=gravity, velocity=0.5 * ahead + 0.1 * up)
     sigma = 1.1 * tuning.RISE_FROM_SIGMA
     loose = np.eye(eskf.ERRORS) * sigma**2
-    assert eskf.apply_zero_velocity_prior(start, loose, 0.1, 1.2)[0] is start
+    assert carrier_priors.apply_zero_velocity_prior(start, loose, 0.1, 1.2)[0] is start
     noise = tuning.RISE_SPEED**2 / 0.1
     left = noise / (noise + sigma**2)
-    state, covariance = eskf.apply_zero_velocity_prior(
+    state, covariance = carrier_priors.apply_zero_velocity_prior(
         start, loose, 0.1, 1.2, height_observed=False
     )
     assert up @ state.velocity == pytest.approx(0.1 * left, rel=1e-6)
@@ -286,10 +290,11 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
     # what the IMU knows better stays as it is
     known = loose * (0.9 / 1.1) ** 2
     assert (
-        eskf.apply_zero_velocity_prior(start, known, 0.1, 1.2, height_observed=False)[0] is start
+        carrier_priors.apply_zero_velocity_prior(start, known, 0.1, 1.2, height_observed=False)[0]
+        is start
     )
     # in all directions a velocity that is hardly known at all is drawn as before
-    lost, _ = eskf.apply_zero_velocity_prior(
+    lost, _ = carrier_priors.apply_zero_velocity_prior(
         start, np.eye(eskf.ERRORS), 1.0, 0.0, height_observed=False
     )
     assert ahead @ lost.velocity == pytest.approx(0.25)
@@ -299,13 +304,13 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
 def test_the_peak_speed_is_the_highest_that_was_known_of_late() -> None:
     state = dataclasses.replace(some_state(), velocity=np.array([0.0, 1.2, 0.0]))
     known = np.eye(eskf.ERRORS) * (0.9 * tuning.PRIOR_LEARN_SIGMA) ** 2
-    assert eskf.peak_speed_after(0.3, state, known, 0.1) == pytest.approx(1.2)
+    assert carrier_priors.peak_speed_after(0.3, state, known, 0.1) == pytest.approx(1.2)
     # one that stands is slow after some minutes
-    left = eskf.peak_speed_after(2.4, state, known, tuning.PRIOR_MEMORY_S / 2.0)
+    left = carrier_priors.peak_speed_after(2.4, state, known, tuning.PRIOR_MEMORY_S / 2.0)
     assert left == pytest.approx(2.4 * np.exp(-0.5))
-    assert eskf.peak_speed_after(2.4, state, known, 3.0 * tuning.PRIOR_MEMORY_S) == pytest.approx(
-        1.2
-    )
+    assert carrier_priors.peak_speed_after(
+        2.4, state, known, 3.0 * tuning.PRIOR_MEMORY_S
+    ) == pytest.approx(1.2)
 
 
 def test_of_a_velocity_that_is_hardly_known_only_the_least_speed_counts() -> None:
@@ -314,10 +319,10 @@ def test_of_a_velocity_that_is_hardly_known_only_the_least_speed_counts() -> Non
     for sigma in (1.1 * tuning.PRIOR_LEARN_SIGMA, 0.2):
         loose[8, 8] = sigma**2
         expected = 1.3 - tuning.PRIOR_LEARN_SIGMAS * sigma
-        assert eskf.peak_speed_after(0.3, state, loose, 0.1) == pytest.approx(expected)
+        assert carrier_priors.peak_speed_after(0.3, state, loose, 0.1) == pytest.approx(expected)
     # nothing is forgotten meanwhile
     loose[8, 8] = 1.0
-    assert eskf.peak_speed_after(0.3, state, loose, 60.0) == 0.3
+    assert carrier_priors.peak_speed_after(0.3, state, loose, 60.0) == 0.3
 
 
 def test_what_is_moved_by_hand_is_drawn_to_zero_by_its_own_speed() -> None:
@@ -326,13 +331,13 @@ def test_what_is_moved_by_hand_is_drawn_to_zero_by_its_own_speed() -> None:
     )
     known = np.eye(eskf.ERRORS) * (0.9 * tuning.HAND_FROM_SIGMA) ** 2
     loose = np.eye(eskf.ERRORS) * (1.1 * tuning.HAND_FROM_SIGMA) ** 2
-    assert eskf.apply_zero_velocity_prior(level, known, 1.0, 0.5)[0] is level
+    assert carrier_priors.apply_zero_velocity_prior(level, known, 1.0, 0.5)[0] is level
     # of a carrier of which nothing is known, it has to be less certain
-    assert eskf.apply_zero_velocity_prior(level, loose, 1.0, 0.0)[0] is level
+    assert carrier_priors.apply_zero_velocity_prior(level, loose, 1.0, 0.0)[0] is level
     for peak in (0.5, 0.01):  # a very slow one does not say that it stands
         noise = max(peak, tuning.HAND_SPEED) ** 2 / 0.5
         left = noise / (noise + loose[7, 7])
-        slowed, covariance = eskf.apply_zero_velocity_prior(level, loose, 0.5, peak)
+        slowed, covariance = carrier_priors.apply_zero_velocity_prior(level, loose, 0.5, peak)
         assert slowed.velocity[1] == pytest.approx(0.4 * left)
         assert covariance[7, 7] == pytest.approx(loose[7, 7] * left)
 
@@ -341,15 +346,17 @@ def test_the_size_of_gravity_comes_back_and_the_bias_with_it() -> None:
     down = np.array([0.02, -0.01, -9.80])
     state = dataclasses.replace(some_state(), gravity=down)
     covariance = 1e-4 * np.eye(eskf.ERRORS)
-    assert eskf.with_gravity_of_known_size(state, covariance)[0] is state  # within 0.1 %
+    assert carrier_priors.with_gravity_of_known_size(state, covariance)[0] is state  # within 0.1 %
     nothing = dataclasses.replace(state, gravity=np.zeros(3))
-    assert eskf.with_gravity_of_known_size(nothing, covariance)[0] is nothing
+    assert carrier_priors.with_gravity_of_known_size(nothing, covariance)[0] is nothing
     # 1 % of gravity and a bias along it have been taken for each other
     state = dataclasses.replace(state, gravity=1.01 * down)
     along = np.zeros((eskf.ERRORS, 1))
     along[eskf.GRAVITY, 0] = down / 9.8
     along[eskf.ACCEL_BIAS, 0] = state.rotation.T @ down / 9.8
-    found, after = eskf.with_gravity_of_known_size(state, covariance + 0.1**2 * along @ along.T)
+    found, after = carrier_priors.with_gravity_of_known_size(
+        state, covariance + 0.1**2 * along @ along.T
+    )
     assert np.linalg.norm(found.gravity) == pytest.approx(9.80665, abs=0.01)
     np.testing.assert_allclose(np.cross(found.gravity, down), 0.0, atol=0.02)
     moved = found.accel_bias - state.accel_bias
@@ -370,11 +377,11 @@ def test_a_leaning_map_makes_the_vertical_less_certain_not_its_size() -> None:
 
 def test_biases_that_no_sensor_has_are_told() -> None:
     state = dataclasses.replace(some_state(), gyro_bias=np.zeros(3), accel_bias=np.zeros(3))
-    assert eskf.biases_are_plausible(state)
+    assert carrier_priors.biases_are_plausible(state)
     fast = dataclasses.replace(state, gyro_bias=np.array([0.0, 0.25, 0.0]))
-    assert not eskf.biases_are_plausible(fast)
+    assert not carrier_priors.biases_are_plausible(fast)
     heavy = dataclasses.replace(state, accel_bias=np.array([0.0, 0.0, -1.1]))
-    assert not eskf.biases_are_plausible(heavy)
+    assert not carrier_priors.biases_are_plausible(heavy)
 
 
 def test_a_speed_above_the_bound_comes_back_with_what_it_led_to() -> None:
@@ -383,8 +390,8 @@ def test_a_speed_above_the_bound_comes_back_with_what_it_led_to() -> None:
     # 2 s of a wrong velocity are in the place
     covariance[3:6, 3:6] = 0.05 * np.eye(3)
     covariance[3:6, 6:9] = covariance[6:9, 3:6] = 0.02 * np.eye(3)
-    assert eskf.bound_speed(state, covariance, 10.0)[0] is state
-    found, after = eskf.bound_speed(state, covariance, 3.0)
+    assert carrier_priors.bound_speed(state, covariance, 10.0)[0] is state
+    found, after = carrier_priors.bound_speed(state, covariance, 3.0)
     assert np.linalg.norm(found.velocity) == pytest.approx(3.0, abs=0.02)
     np.testing.assert_allclose(found.velocity / np.linalg.norm(found.velocity), (0.6, 0.8, 0.0))
     moved = found.position - state.position

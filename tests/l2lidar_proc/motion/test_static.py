@@ -118,18 +118,18 @@ def test_the_spectrum_shows_white_noise_alone_as_it_is() -> None:
     rng = np.random.default_rng(1)
     for sigma in (0.01, 0.5):
         found = [noise_spectrum(rng.normal(0.0, sigma, (250, 3))) for _ in range(200)]
-        floors, swings = np.array(found).T
+        floors, vibrations = np.array(found).T
         # of the worst axis, so a little more
         assert 1.0 < floors.mean() / sigma < 1.15
         assert np.abs(floors / floors.mean() - 1.0).max() < 0.3
         # 2 T s^2 / (2 pi f)^2 integrated from 15 to 125 Hz
         expected = sigma * np.sqrt(0.008 * (1.0 / 15.0 - 1.0 / 125.0)) / (2.0 * np.pi)
-        assert swings.mean() == pytest.approx(expected, rel=0.2)
+        assert vibrations.mean() == pytest.approx(expected, rel=0.2)
 
 
 @pytest.mark.parametrize("lines", [(37.0,), (71.0, 113.0), (37.0, 71.0, 113.0)])
-def test_vibrations_are_no_white_noise_but_swing(lines: tuple[float, ...]) -> None:
-    """A line of amplitude a at f integrates to a / (2 pi f), which swings about zero."""
+def test_vibrations_are_no_white_noise(lines: tuple[float, ...]) -> None:
+    """A line of amplitude a at f integrates to a / (2 pi f), which oscillates about zero."""
     rng, times = np.random.default_rng(2), 0.004 * np.arange(250)
     force = rng.normal(0.0, 0.06, (250, 3))
     variance = 0.0
@@ -138,7 +138,7 @@ def test_vibrations_are_no_white_noise_but_swing(lines: tuple[float, ...]) -> No
         variance += 0.5 * (1.2 / (2.0 * np.pi * hz)) ** 2
     found = noise_spectrum(force)
     assert found.floor == pytest.approx(0.06, rel=0.35)
-    assert found.swing == pytest.approx(np.sqrt(variance), rel=0.1)
+    assert found.vibration == pytest.approx(np.sqrt(variance), rel=0.1)
     assert white_noise(force) > 5.0 * found.floor
 
 
@@ -149,7 +149,7 @@ def test_a_trembling_hand_is_no_noise() -> None:
     held += 9.8 + 2.0 * times
     found = noise_spectrum(held)
     assert found.floor == pytest.approx(noise_spectrum(still).floor, rel=0.15)
-    assert found.swing < 0.002
+    assert found.vibration < 0.002
 
 
 def test_a_few_samples_show_the_noise_of_their_differences() -> None:
@@ -157,4 +157,4 @@ def test_a_few_samples_show_the_noise_of_their_differences() -> None:
     assert noise_spectrum(few) == (white_noise(few), 0.0)
     assert noise_spectrum(few[:0]) == (0.0, 0.0)
     enough = np.vstack((few, few[:1]))
-    assert noise_spectrum(enough).swing > 0.0
+    assert noise_spectrum(enough).vibration > 0.0

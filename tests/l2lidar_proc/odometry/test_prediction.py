@@ -271,9 +271,9 @@ def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> No
     assert loud.gyro == pytest.approx(tuning.GYRO_NOISE_FACTOR * 0.3 * np.sqrt(0.004), rel=0.2)
     assert predictor.gyro_noise == pytest.approx(loud.gyro / np.sqrt(0.004))
     assert loud.accel == pytest.approx(0.7 * np.sqrt(0.004), rel=0.2)
-    # white noise swings as well: 3.5 ms of its standard deviation above 15 Hz
-    assert loud.gyro_swing == pytest.approx(0.3 * 0.0035, rel=0.3)
-    assert loud.accel_swing == pytest.approx(0.7 * 0.0035, rel=0.3)
+    # white noise vibrates as well: 3.5 ms of its standard deviation above 15 Hz
+    assert loud.gyro_vibration == pytest.approx(0.3 * 0.0035, rel=0.3)
+    assert loud.accel_vibration == pytest.approx(0.7 * 0.0035, rel=0.3)
 
 
 _KNOWN = np.r_[eskf.ROTATION, eskf.VELOCITY]
