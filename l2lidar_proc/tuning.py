@@ -31,6 +31,12 @@ COVARIANCE_STEPS: Final = 6  # per prediction; the mean uses every sample. Tuned
 BLIND_GYRO: Final = 0.5  # [rad/s/sqrt(Hz)]
 BLIND_GYRO_SHARE: Final = 0.6  # [sqrt(s)] and this part of the rate held: what shakes turns back
 BLIND_ACCEL: Final = 1.0  # [m/s^2/sqrt(Hz)]
+# In gaps no longer than that, what the steps around them show, with these as the least spread
+# [rad/s, m/s^2]. Derived: hands tremble by these within 0.1 s; with the densities above, a gap of
+# 55 ms made a velocity uncertain by 0.2 m/s that was known to 0.03
+BLIND_SHORT_S: Final = 0.1
+BLIND_SHORT_SPREAD: Final = (0.2, 0.5)
+BLIND_STEPS: Final = 2  # without a gap, at least
 ZERO_VELOCITY: Final = 0.003  # [m/s] noise of a zero-velocity update. Tuned on: captures
 # A carrier that has been faster than the first drives. A velocity known worse than the second, if
 # it drives worse than its peak speed, is drawn towards zero as if that were measured once a second

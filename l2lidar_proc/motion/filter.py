@@ -16,7 +16,7 @@ from importlib import import_module
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
@@ -214,15 +214,17 @@ def predict(
     blind = np.add.reduceat(spans * imu.missing[:knot], first) / lasted
     rates = np.abs(preintegrated.rates[: knot + 1]).max(axis=1)
     held = np.maximum(np.maximum.reduceat(rates[:-1], first), rates[last])
-    unmeasured = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
     ways = np.add.reduceat(spans[:, None] * preintegrated.rates[:knot], first, axis=0)
-    turning = np.abs(ways / lasted[:, None]).max(axis=1)  # a vibration turns nothing
+    means = ways / lasted[:, None]
+    turning = np.abs(means).max(axis=1)  # a vibration turns nothing
     measured = noise.gyro**2 + (noise.gyro_share * turning) ** 2
-    gyro2 = (1.0 - blind) * measured + blind * unmeasured
-    blind = np.ones_like(blind) if blind_forces else blind
     accelerations = np.linalg.norm(forces - back @ state.rest_force, axis=1)
+    unmeasured = _unmeasured(blind * dt, blind == 0.0, held, means, accelerations)
+    gyro2 = (1.0 - blind) * measured + blind * unmeasured.gyro2
+    blind = np.ones_like(blind) if blind_forces else blind
+    accel2 = tuning.BLIND_ACCEL**2 if blind_forces else unmeasured.accel2
     measured = noise.accel**2 + (noise.accel_share * accelerations) ** 2
-    accel2 = (1.0 - blind) * measured + blind * tuning.BLIND_ACCEL**2
+    accel2 = (1.0 - blind) * measured + blind * accel2
     q = process_noise(gyro2, accel2, noise, dt)
     whole, added = f[0], q[0]
     for step, more in zip(f[1:], q[1:], strict=True):
@@ -232,6 +234,46 @@ def predict(
     added[VELOCITY, VELOCITY] += 2.0 * noise.accel_vibration**2 * np.eye(3)
     _, covariance = kalman().predict(np.zeros(ERRORS), covariance, whole, added)
     return state.at(preintegrated, knot), covariance
+
+
+class _Unmeasured(NamedTuple):
+    """What a carrier may do while nothing is measured, as squared densities of white noise."""
+
+    gyro2: F64 | float
+    accel2: float
+
+
+def _unmeasured(
+    blind: F64, is_measured: NDArray[np.bool_], held: F64, rates: F64, accelerations: F64
+) -> _Unmeasured:
+    """Return how much the motion may change where samples are missing.
+
+    In a gap of a few samples a carrier goes on as in the samples around it: rates and
+    accelerations spread by what they do there, and not beyond.
+
+    Parameters
+    ----------
+    blind : ndarray, shape (S,)
+        Time of each step in which samples are missing [s].
+    is_measured : ndarray, shape (S,)
+        Steps without a gap.
+    held : ndarray, shape (S,)
+        Largest rate about any axis [rad/s].
+    rates : ndarray, shape (S, 3)
+        Mean angular velocity [rad/s].
+    accelerations : ndarray, shape (S,)
+        Size of the mean acceleration [m/s^2].
+    """
+    gyro2 = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
+    lasted = float(blind.sum())
+    if lasted > tuning.BLIND_SHORT_S or np.count_nonzero(is_measured) < tuning.BLIND_STEPS:
+        return _Unmeasured(gyro2, tuning.BLIND_ACCEL**2)
+    least_rate, least_acceleration = tuning.BLIND_SHORT_SPREAD
+    spread = float(rates[is_measured].var(axis=0).max()) + least_rate**2
+    change = float(np.square(accelerations[is_measured]).mean()) + least_acceleration**2
+    return _Unmeasured(
+        np.minimum(gyro2, lasted * spread), min(tuning.BLIND_ACCEL**2, lasted * change)
+    )
 
 
 def transition(rotation: F64, turn: F64, force: F64, dt: ArrayLike) -> F64:
@@ -313,6 +355,25 @@ def update(
     error, posterior = kalman().update(np.zeros(ERRORS), covariance, innovation, noise, jacobian)
     symmetric = 0.5 * (posterior + posterior.T)
     return Update(state.boxplus(np.asarray(error)), symmetric, nis)
+
+
+def association_probability(innovation: float, variance: float, odds: float) -> float:
+    """Return the probability that a scalar measurement is what it was taken for, not clutter.
+
+    Probabilistic data association (Bar-Shalom and Tse 1975) with one candidate.
+
+    Parameters
+    ----------
+    innovation : float
+        Measured minus predicted.
+    variance : float
+        Of the innovation, if it is the right one.
+    odds : float
+        How often right measurements come, for each density of false ones; of the innovation's
+        unit.
+    """
+    density = np.exp(-0.5 * innovation**2 / variance) / np.sqrt(2.0 * np.pi * variance)
+    return float(odds * density / (1.0 + odds * density))
 
 
 def square_root(covariance: F64) -> F64:

@@ -78,9 +78,9 @@ def test_the_transition_is_the_derivative_of_the_prediction() -> None:
 def test_the_covariance_is_that_of_one_step_after_the_other() -> None:
     """With a gap in the samples, so that the noise differs between the steps."""
     state, p = some_state(), np.diag(np.linspace(0.1, 1.0, eskf.ERRORS)) ** 2
-    samples = Motion(turn=1.0, nod=0.2, speed=1.0).imu(0.0, 0.31)
-    samples = samples[(samples["stamp"] < at(0.1)) | (samples["stamp"] > at(0.19))]
-    imu = segment(samples, [at(0.0), at(0.3)], 50_000_000, np.zeros(3))
+    samples = Motion(turn=1.0, nod=0.2, speed=1.0).imu(0.0, 0.41)
+    samples = samples[(samples["stamp"] < at(0.1)) | (samples["stamp"] > at(0.22))]
+    imu = segment(samples, [at(0.0), at(0.4)], 50_000_000, np.zeros(3))
     sums = integrate(
         imu,
         0,
@@ -109,6 +109,69 @@ def test_the_covariance_is_that_of_one_step_after_the_other() -> None:
         shares.append(blind)
     assert min(shares) == 0.0 < max(shares)
     np.testing.assert_allclose(found, p, rtol=1e-9, atol=1e-12)
+
+
+def sigmas_after_gap(lasted: float, motion: Motion) -> tuple[float, float]:
+    """Return the sigmas of attitude [rad] and velocity [m/s] that 0.3 s with a gap in them add."""
+    samples = motion.imu(0.0, 0.31)
+    begin = 0.1 + 1e-4  # between two samples
+    samples = samples[(samples["stamp"] < at(begin)) | (samples["stamp"] > at(begin + lasted))]
+    imu = segment(samples, [at(0.0), at(0.3)], 50_000_000, np.zeros(3))
+    state = dataclasses.replace(
+        some_state(), gyro_bias=np.zeros(3), accel_bias=np.zeros(3), gravity=np.array([0, 0, -G])
+    )
+    state = dataclasses.replace(state, rotation=motion.rotation(np.zeros(1)).as_matrix()[0])
+    sums = integrate(
+        imu,
+        0,
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        rest_force=state.rest_force,
+    )
+    nothing = np.zeros((eskf.ERRORS, eskf.ERRORS))
+    knot = len(imu.stamps) - 1
+    found = eskf.predict(state, nothing, imu, sums, knot, Noise(0.0, 0.0, 0.0, 0.0))[1]
+    turned, moved = np.linalg.eigvalsh(found[eskf.ROTATION, eskf.ROTATION]), found[8, 8]
+    return float(np.sqrt(turned[-1])), float(np.sqrt(moved))
+
+
+def test_in_a_short_gap_a_carrier_goes_on_as_around_it() -> None:
+    steady, walk = Motion(turn=0.3), Motion(turn=0.3, nod=0.3, speed=1.2)
+    least_rate, least_acceleration = tuning.BLIND_SHORT_SPREAD
+    for lasted in (0.06, 0.09):
+        turned, moved = sigmas_after_gap(lasted, steady)
+        # drifts by the least spread for as long as the gap, from sample to sample
+        assert turned == pytest.approx(least_rate * (lasted + 0.004), rel=0.05)
+        assert moved == pytest.approx(least_acceleration * (lasted + 0.004), rel=0.2)
+        more_turned, more_moved = sigmas_after_gap(lasted, walk)
+        assert more_turned > 3.0 * turned
+        assert more_moved > 2.0 * moved
+    # beyond that nothing around it tells
+    turned, moved = sigmas_after_gap(0.11, steady)
+    assert turned > tuning.BLIND_GYRO * np.sqrt(0.11)
+    assert moved > tuning.BLIND_ACCEL * np.sqrt(0.11)
+
+
+def test_a_short_gap_tells_no_less_than_a_long_one() -> None:
+    wild = Motion(turn=8.0, nod=1.5, speed=30.0)
+    turned, _ = sigmas_after_gap(0.09, wild)
+    held = tuning.BLIND_GYRO_SHARE * 20.0
+    assert turned < np.hypot(tuning.BLIND_GYRO, held) * np.sqrt(0.1)
+
+
+def test_the_probability_of_an_association_is_its_frequency() -> None:
+    """Right innovations as expected, and false ones anywhere, a hundred in each unit."""
+    rng = np.random.default_rng(3)
+    sigma, count, density = 0.2, 400, 1000.0
+    odds = count / density
+    right = sigma * rng.standard_normal(100 * count)
+    false = rng.uniform(-2.0, 2.0, round(100 * density * 4.0))
+    for innovation in (0.0, 0.15, 0.4, 0.8):
+        hits, misses = (
+            np.count_nonzero(np.abs(some - innovation) < 0.02) for some in (right, false)
+        )
+        found = eskf.association_probability(innovation, sigma**2, odds)
+        assert found == pytest.approx(hits / (hits + misses), rel=0.1, abs=0.01)
 
 
 def test_a_share_of_the_rate_counts_as_noise_of_the_gyro() -> None:
