@@ -188,9 +188,18 @@ FACING_SIGMAS: Final = 5.0  # of the error of its normal, by which a surface fac
 # [m] of a surface that faces the way, 1 sigma. Derived: 2.5 times the range noise; what is called
 # a reveal and is none has 0.02 to 0.033, niches 0.03 to 0.085
 FACING_WIDTH: Final = 0.03
+# [m] How often surfaces that face the way are real, for a density of false ones: with fewer
+# points than below, and with as many. Tuned on: narrow corridors, seeds 100 to 115: 5 to
+# 20 points had 0.12 of the sweeps with a right velocity, 0.05 of those with a wrong one
+FACING_TRUE: Final = (0.3, 1.7)
+FACING_MANY: Final = 20
 NORMAL_SCATTER: Final = 0.015  # [m] of points about their plane, at least: few happen to lie flat
 NORMAL_LEAST_EXTENT: Final = 0.001  # [m] Derived: keeps a division finite
 NORMAL_KNOWN: Final = 0.02  # [rad] from here on, a normal's error lowers its weight
+# [rad] by which the walls may be turned against those along which the place has become uncertain.
+# Tuned on: narrow corridors, seeds 100 to 127. Without it, 2 mm across were taken for 0.4 m along,
+# and the velocity changed by 0.05 m/s in a sweep that told nothing about it
+WAY_TURN: Final = 0.02
 WALL_ROUNDS: Final = 2  # in which what faces the direction is left out
 WALL_LEAST: Final = 0.2  # share of the points that must be left
 WALL_BLEND: Final = 0.95  # share of the scatter that is left at each sweep: 4 s
@@ -236,6 +245,11 @@ LINE_VOTES: Final = (0.8, 1.5)
 LINE_UNSURE: Final = 0.025  # [m] 1 sigma
 LINE_CHANCE: Final = 2.0  # times the votes that chance gives, besides
 LINE_RIVAL: Final = 0.6  # of the votes, that no other velocity may have
+# [m/s] How often the velocity with most votes is right, for a density of false ones: with two
+# votes, and by how much more often with each further one. Tuned on: narrow corridors, seeds 100
+# to 115, where 7 of 71 with less than two votes were false, 1 of 282 with more
+LINE_TRUE: Final = 4.0
+LINE_TRUE_VOTE: Final = 10.0
 LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ at least
 
 # ---- odometry: map of surfaces
@@ -288,7 +302,7 @@ MAP_SHARE: Final = 0.0003  # of the way, each axis
 BEGUN_IN_MOTION: Final = (0.045, 0.011)
 # The map bends where it grows, so the vertical where it began is not quite that of its other end.
 # Tuned on: corridors with narrow views, where 0.01 m/s^2 (0.06 degrees) made 1 to 5 m.
-MAP_BEND: Final = 0.0008  # [rad/sqrt(m)] of the way
+MAP_BEND: Final = 0.0005  # [rad/sqrt(m)] of the way
 # Gravity is known, as a direction, when it is known as well as at rest, where it cannot be told
 # from a bias (ACCEL_BIAS_SIGMA, 0.9 degrees); as much of what it turns later may be that bias.
 LEAN_KNOWN: Final = 0.02  # [rad]

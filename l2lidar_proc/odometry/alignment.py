@@ -159,7 +159,8 @@ def align(
             if axes.scatter is not None:
                 source = views.with_facing(source, at, axes)
                 found = views.of([(at, source)])[0]
-            weak = weak_directions(at, found, axes, partial(views.of_some, source))
+            again = partial(views.of_some, source)
+            weak = weak_directions(at, found, axes, again, covariance[POSE, POSE])
             before = step.state
             step = _step(prior, root, at, found, weak, number + 1)
             done = _is_small(step.state.boxminus(before))

@@ -178,8 +178,8 @@ class SweepMatcher:
         """
         if len(source.points) < self.config.min_points or not len(self.surfaces):
             return Match(None, False)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[POSITION, POSITION])[-1]))
-        loose = sigma > tuning.LOOSE_POSITION or rotation_is_loose(motion.covariance)
+        motion = self._with_turned_way(motion)
+        loose = self._place_is_loose(motion.covariance) or rotation_is_loose(motion.covariance)
         young = self.is_young
         strict = loose and not initial and not young
         found = self._align(source, motion, motion.state)
@@ -211,6 +211,45 @@ class SweepMatcher:
         elif best is None and young and found is None:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         return self._believed(best)
+
+    @property
+    def _bare_way(self) -> F64 | None:
+        """The direction (3,) of the walls along which the carrier drives, None where it does not.
+
+        Unit, map axes.
+        """
+        if not (self.driving and self._is_weak):
+            return None
+        return np.asarray(np.linalg.eigh(self._scatter)[1][:, 0])
+
+    def _with_turned_way(self, motion: SweepMotion) -> SweepMotion:
+        """Return a predicted motion that allows for bare walls which do not run quite straight.
+
+        Place and velocity are uncertain along the walls as they were, by meters if nothing faced
+        the way for long. That is not quite along the walls as they are, and millimeters across
+        would be taken for meters along.
+        """
+        way = self._bare_way
+        if way is None:
+            return motion
+        across = np.eye(3) - np.outer(way, way)
+        covariance = motion.covariance.copy()
+        for errors in (POSITION, VELOCITY):
+            along = float(way @ covariance[errors, errors] @ way)
+            covariance[errors, errors] += tuning.WAY_TURN**2 * along * across
+        return dataclasses.replace(motion, covariance=covariance)
+
+    def _place_is_loose(self, covariance: F64) -> bool:
+        """Return whether the place is so uncertain that it may be a surface off.
+
+        Along bare walls it does not matter how far: they fit everywhere.
+        """
+        places = covariance[POSITION, POSITION]
+        way = self._bare_way
+        if way is not None:
+            across = np.eye(3) - np.outer(way, way)
+            places = across @ places @ across
+        return bool(np.linalg.eigvalsh(places)[-1] > tuning.LOOSE_POSITION**2)
 
     def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> float:
         """Add the deskewed points (N,) of a sweep to the maps.

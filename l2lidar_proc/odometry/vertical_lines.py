@@ -34,6 +34,7 @@ from l2lidar_proc.motion.filter import (
     POSITION,
     VELOCITY,
     InertialState,
+    association_probability,
     square_root,
     update_with_information,
 )
@@ -191,11 +192,21 @@ class VerticalLines:
         self._lines["sweep"][len(kept) :] = int(state.stamp)
         sigma = float(np.sqrt(axes[0] @ covariance[VELOCITY, VELOCITY] @ axes[0]))
         pairs = self._pairs(len(kept), state, sigma, axes)
-        pairs = self._with_relief(pairs[_agreeing(pairs, sigma)], axes)
+        agreeing, votes = _agreeing(pairs, sigma)
+        pairs = self._with_relief(pairs[agreeing], axes)
+        after, posterior = state, covariance
         for number in np.unique(pairs["line"]).tolist():
             earlier = pairs["earlier"][pairs["line"] == number]
-            state, covariance = self._compared(number, earlier, state, covariance, axes[0])
-        return state, covariance
+            after, posterior = self._compared(number, earlier, after, posterior, axes[0])
+        if after is state:
+            return state, covariance
+        # chance agrees on any error alike, the fewer votes the more often
+        odds = tuning.LINE_TRUE * tuning.LINE_TRUE_VOTE ** (votes - 2.0)
+        error = float(axes[0] @ (after.velocity - state.velocity))
+        right = association_probability(error, sigma**2, odds)
+        mean, covariance = _mixed(state, covariance, after, posterior, right)
+        self.correct(after, mean)
+        return mean, covariance
 
     def _ages(self, state: InertialState) -> F64:
         """Return how much older than a state the lines are [s], shape (N,)."""
@@ -307,10 +318,25 @@ class VerticalLines:
         return residual, h, variance
 
 
-def _agreeing(pairs: NDArray[np.void], sigma: float) -> NDArray[np.bool_]:
+def _mixed(
+    state: InertialState,
+    covariance: F64,
+    after: InertialState,
+    posterior: F64,
+    right: float,
+) -> tuple[InertialState, F64]:
+    """Return mean and covariance (18, 18) of two Gaussians, the second with a probability."""
+    change = after.boxminus(state)
+    spread = right * (1.0 - right) * np.outer(change, change)
+    mixed = right * posterior + (1.0 - right) * covariance + spread
+    return state.boxplus(right * change), mixed
+
+
+def _agreeing(pairs: NDArray[np.void], sigma: float) -> tuple[NDArray[np.bool_], float]:
     """Return which pairs (P,) agree with the error of the velocity that most vote for.
 
-    None of them where chance explains as many votes, or another error has nearly as many.
+    None of them where chance explains as many votes, or another error has nearly as many. The
+    second result is how many these are.
 
     Parameters
     ----------
@@ -320,7 +346,7 @@ def _agreeing(pairs: NDArray[np.void], sigma: float) -> NDArray[np.bool_]:
     """
     none = np.zeros(len(pairs), np.bool_)
     if not len(pairs):
-        return none
+        return none, 0.0
     apart, shift, noise = pairs["apart"], pairs["shift"], pairs["noise"]
     errors = np.clip(shift / apart, -tuning.LINE_SIGMAS * sigma, tuning.LINE_SIGMAS * sigma)
     near = np.exp(-0.5 * ((shift - errors[:, None] * apart) / noise) ** 2)
@@ -332,7 +358,7 @@ def _agreeing(pairs: NDArray[np.void], sigma: float) -> NDArray[np.bool_]:
     error = float((weights @ shift) / (weights @ apart + max(sigma, 1e-6) ** -2.0))
     agree = np.abs(shift - error * apart) < tuning.LINE_OUTLIER * noise
     if not agree.any():
-        return none
+        return none, 0.0
     others = np.maximum.reduceat(np.where(agree, 0.0, near), begins, axis=1).sum(axis=1)
     rival = float(np.where(agree, 0.0, others).max())
     unsure = float(apart[agree].max()) * sigma > tuning.LINE_UNSURE
@@ -340,5 +366,5 @@ def _agreeing(pairs: NDArray[np.void], sigma: float) -> NDArray[np.bool_]:
     chance = float((np.sqrt(2.0 * np.pi) * noise / (2.0 * pairs["reach"])).sum())
     needed = tuning.LINE_VOTES[unsure] + tuning.LINE_CHANCE * chance
     if votes[best] < needed or rival > tuning.LINE_RIVAL * votes[best]:
-        return none
-    return agree
+        return none, 0.0
+    return agree, float(votes[best])

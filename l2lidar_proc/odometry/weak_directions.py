@@ -40,7 +40,12 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import ERRORS, POSE, InertialState
+from l2lidar_proc.motion.filter import (
+    ERRORS,
+    POSE,
+    InertialState,
+    association_probability,
+)
 from l2lidar_proc.odometry.correspondences import (
     Correspondences,
     pose_jacobian,
@@ -273,7 +278,11 @@ class WeakDirections:
 
 
 def weak_directions(
-    state: InertialState, found: Correspondences, weak: WeakAxes, match_again: MatchAgain
+    state: InertialState,
+    found: Correspondences,
+    weak: WeakAxes,
+    match_again: MatchAgain,
+    covariance: F64,
 ) -> WeakDirections:
     """Return how much of what is claimed about some directions a sweep confirms.
 
@@ -284,10 +293,14 @@ def weak_directions(
     found : Correspondences
     weak : WeakAxes
     match_again : callable
+    covariance : ndarray, shape (6, 6)
+        Of turn and place, as predicted.
     """
     trials = [_Trial(state, found, weak, number) for number in range(weak.axes.shape[1])]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
+    if weak.scatter is not None and shares[0] > 0.0:
+        shares[0] *= np.sqrt(trials[0].associated(shares[0] ** 2, covariance))
     return WeakDirections(weak, shares)
 
 
@@ -309,6 +322,35 @@ class _Trial:
         for step in _STEPS if len(facing) else ():
             move[POSE] = step * self._axis
             self._moved.append(state.boxplus(move))
+
+    def associated(self, share: float, covariance: F64) -> float:
+        """Return how much of some information is left as the surfaces may be others.
+
+        What moves along with the view is always where it is expected, and a few points face any
+        way. The less is known of the place, the less likely is it that what is near it is the
+        surface that was there before. The measurement then counts as a coarser one, which leaves
+        the same variance as the mixture of both cases.
+
+        Parameters
+        ----------
+        share : float
+            Of the information that the residuals claim.
+        covariance : ndarray, shape (6, 6)
+            Of turn and place, as predicted.
+        """
+        levers, distances, scales = self._facing
+        weights = robust_weights(distances, scales) / self._variances
+        claimed = float((weights * levers**2).sum())
+        information = share * claimed
+        off = float((weights * levers * distances).sum()) / claimed
+        before = float(self._axis @ covariance @ self._axis)
+        expected = before + 1.0 / information
+        many = len(levers) >= tuning.FACING_MANY
+        right = association_probability(off, expected, tuning.FACING_TRUE[many])
+        gain = before / expected
+        spread = right * (1.0 - right) * (gain * off) ** 2
+        mixed = right * before * (1.0 - gain) + (1.0 - right) * before + spread
+        return max(1.0 / mixed - 1.0 / before, 0.0) / information
 
     @property
     def views(self) -> Views:
