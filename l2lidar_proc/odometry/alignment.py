@@ -243,12 +243,15 @@ def _step(
     number: int,
 ) -> _Step:
     """Return the posterior of correspondences found from a state."""
-    pose = pose_jacobian(found, at.rotation)
+    pose = by_pose = pose_jacobian(found, at.rotation)
     if weak is not None:
-        pose = weak.reduced(pose, weak.weak.facing(at, found))
+        pose, by_pose = weak.reduced(pose, weak.weak.facing(at, found))
     h = residual_jacobian(pose, found.times, at.rotation)
     weighted = h * found.weights[:, None]
     information = weighted.T @ h
+    if by_pose is not pose:
+        h = residual_jacobian(by_pose, found.times, at.rotation)
+        weighted = h * found.weights[:, None]
     state, posterior = update_with_information(
         prior, root, at, information, -(weighted.T @ found.distances)
     )

@@ -258,23 +258,45 @@ class WeakDirections:
     weak : WeakAxes
     shares : ndarray, shape (K,)
         How much of what facing surfaces claim is real, 0 to 1.
+    associated : float
+        By how much the standard deviation along the first direction is smaller than it has to be,
+        as the surfaces may be others, 0 to 1.
     """
 
     weak: WeakAxes
     shares: F64
+    associated: float = 1.0
 
-    def reduced(self, pose: F64, facing: NDArray[np.bool_]) -> F64:
+    def reduced(self, pose: F64, facing: NDArray[np.bool_]) -> tuple[F64, F64]:
         """Return derivatives (M, 6) by turn and place, of residuals that claim no more than so.
 
-        ``facing`` (M, K) tells which surfaces face which direction.
+        Those of the information come first, then those of the gradient.
 
         A residual of which the share f is real measures 1/f times as coarsely: information falls
-        by f^2 and the gradient by f, so that where it is zero stays.
+        by f^2 and the gradient by f, so that where it is zero stays. What may be another surface
+        is as far away as it seems, but less certain: information and gradient fall alike.
+
+        Parameters
+        ----------
+        pose : ndarray, shape (M, 6)
+            Derivatives of the residuals.
+        facing : ndarray, shape (M, K)
+            Which surfaces face which direction.
         """
-        scale, axes = self.weak.scale, self.weak.axes
-        scaled = pose * scale
-        lost = (scaled @ axes) * np.where(facing, 1.0 - self.shares, 1.0)
-        return np.asarray((scaled - lost @ axes.T) / scale)
+        scaled = pose * self.weak.scale
+        shares = self.shares.copy()
+        shares[0] *= self.associated
+        information = self._without(scaled, facing, shares)
+        if self.associated == 1.0:
+            return information, information
+        shares[0] *= self.associated
+        return information, self._without(scaled, facing, shares)
+
+    def _without(self, scaled: F64, facing: NDArray[np.bool_], shares: F64) -> F64:
+        """Return scaled derivatives (M, 6) without what is not real, as those of turn and place."""
+        axes = self.weak.axes
+        lost = (scaled @ axes) * np.where(facing, 1.0 - shares, 1.0)
+        return np.asarray((scaled - lost @ axes.T) / self.weak.scale)
 
 
 def weak_directions(
@@ -299,9 +321,9 @@ def weak_directions(
     trials = [_Trial(state, found, weak, number) for number in range(weak.axes.shape[1])]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
-    if weak.scatter is not None and shares[0] > 0.0:
-        shares[0] *= np.sqrt(trials[0].associated(shares[0] ** 2, covariance))
-    return WeakDirections(weak, shares)
+    if weak.scatter is None or shares[0] == 0.0:
+        return WeakDirections(weak, shares)
+    return WeakDirections(weak, shares, trials[0].associated(shares[0], covariance))
 
 
 class _Trial:
@@ -324,7 +346,7 @@ class _Trial:
             self._moved.append(state.boxplus(move))
 
     def associated(self, share: float, covariance: F64) -> float:
-        """Return how much of some information is left as the surfaces may be others.
+        """Return how much smaller the standard deviation is than it has to be.
 
         What moves along with the view is always where it is expected, and a few points face any
         way. The less is known of the place, the less likely is it that what is near it is the
@@ -334,15 +356,15 @@ class _Trial:
         Parameters
         ----------
         share : float
-            Of the information that the residuals claim.
+            Of what the residuals claim that is real.
         covariance : ndarray, shape (6, 6)
             Of turn and place, as predicted.
         """
         levers, distances, scales = self._facing
         weights = robust_weights(distances, scales) / self._variances
         claimed = float((weights * levers**2).sum())
-        information = share * claimed
-        off = float((weights * levers * distances).sum()) / claimed
+        information = share**2 * claimed
+        off = float((weights * levers * distances).sum()) / (share * claimed)
         before = float(self._axis @ covariance @ self._axis)
         expected = before + 1.0 / information
         many = len(levers) >= tuning.FACING_MANY
@@ -350,7 +372,7 @@ class _Trial:
         gain = before / expected
         spread = right * (1.0 - right) * (gain * off) ** 2
         mixed = right * before * (1.0 - gain) + (1.0 - right) * before + spread
-        return max(1.0 / mixed - 1.0 / before, 0.0) / information
+        return float(np.sqrt(max(1.0 / mixed - 1.0 / before, 0.0) / information))
 
     @property
     def views(self) -> Views:

@@ -206,13 +206,31 @@ def test_reduced_derivatives_scale_information_by_the_square_of_the_share() -> N
     weak = WeakDirections(WeakAxes(scale, axes[:, :2], SurfelMap(SIZES)), np.array([0.0, 0.5]))
     pose = rng.normal(size=(200, 6)) * 3.0
     facing = np.ones((len(pose), 2), np.bool_)
-    before, after = (pose * scale) @ axes, (weak.reduced(pose, facing) * scale) @ axes
+    reduced, by_gradient = weak.reduced(pose, facing)
+    assert by_gradient is reduced
+    before, after = (pose * scale) @ axes, (reduced * scale) @ axes
     np.testing.assert_allclose(after[:, 0], 0.0, atol=1e-12)
     np.testing.assert_allclose(after[:, 1], 0.5 * before[:, 1])
     np.testing.assert_allclose(after[:, 2:], before[:, 2:])
     # residuals that do not face a direction say nothing of it, whatever the share
-    after = (weak.reduced(pose, ~facing) * scale) @ axes
+    after = (weak.reduced(pose, ~facing)[0] * scale) @ axes
     np.testing.assert_allclose(after[:, :2], 0.0, atol=1e-12)
+
+
+def test_an_unlikely_association_keeps_where_the_place_seems_to_be() -> None:
+    """Information and gradient fall alike, so that their quotient stays."""
+    rng = np.random.default_rng(1)
+    axes = np.eye(6)[:, [3, 4]]
+    weak = WeakDirections(
+        WeakAxes(np.ones(6), axes, SurfelMap(SIZES)), np.array([0.8, 0.5]), associated=0.1
+    )
+    pose, off = rng.normal(size=(200, 6)), rng.normal(size=200)
+    information, gradient = weak.reduced(pose, np.ones((200, 2), np.bool_))
+    np.testing.assert_allclose(information[:, 3], 0.8 * 0.1 * pose[:, 3])
+    before = (0.8 * pose[:, 3]) @ off / ((0.8 * pose[:, 3]) ** 2).sum()
+    after = gradient[:, 3] @ off / (information[:, 3] ** 2).sum()
+    assert after == pytest.approx(before)
+    np.testing.assert_allclose(gradient[:, 4:], information[:, 4:])
 
 
 def test_derivatives_by_all_errors_are_those_of_the_residuals() -> None:

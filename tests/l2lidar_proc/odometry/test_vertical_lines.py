@@ -342,6 +342,25 @@ def test_lines_at_random_move_the_velocity_in_few_sweeps(sigma: float) -> None:
     assert moved < 0.06 * 800
 
 
+def test_a_few_votes_are_believed_by_how_often_they_are_right() -> None:
+    """Two lines that agree with a third by chance say as much as those of a reveal."""
+    shares, sigmas = [], (0.1, 0.3, 1.0)
+    for sigma in sigmas:
+        lines, state, covariance = VerticalLines(), at(0.0), known(sigma)
+        for found in (FIRST, SECOND, THIRD):
+            now = at(float(found["stamp"].max()) * 1e-9, velocity=state.velocity)
+            state, covariance = lines.update(now, covariance, found, AXES)
+        shares.append(np.sqrt(covariance[6, 6]) / sigma)
+        # the mean of both cases: it is the reveal, or it is not
+        right = eskf.association_probability(-1.0 / 30.0, sigma**2, tuning.LINE_TRUE)
+        assert state.velocity[0] == pytest.approx(-right / 30.0, abs=0.012)
+        assert covariance[6, 6] > 0.9 * (1.0 - right) * sigma**2
+    assert shares[2] > shares[1] > 0.25
+    # with more of them, chance is ruled out
+    _, sure = seen(np.random.default_rng(7), TIMES, 0.05, sigma=0.3)
+    assert np.sqrt(sure[6, 6]) < 0.1 * 0.3
+
+
 def test_a_line_is_compared_once() -> None:
     lines, state, covariance = VerticalLines(), at(0.0), known(0.05)
     for one in (FIRST, SECOND, THIRD):

@@ -279,6 +279,41 @@ def test_points_that_thinning_left_out_fix_the_place_if_they_face_the_way() -> N
     assert len(thin.points) < driven.matched < len(thin.points) + 2 * 90
 
 
+def along_way(prior: float, count: int, offset: float = 0.0) -> tuple[float, float]:
+    """Return the place along a corridor and its sigma [m], with points of reveals in view.
+
+    The carrier drives; its place along the corridor was known to the prior's sigma.
+    """
+    rng = np.random.default_rng(4)
+    surfaces = mapped(rng, facing=600)
+    seen = source(np.vstack((walls(rng, 1000), reveals(rng, count))))
+    covariance = 1e-6 * np.eye(eskf.ERRORS)
+    covariance[3, 3] = prior**2
+    # the direction that is found differs from x by some mrad
+    covariance[4, 4] = covariance[5, 5] = 1e-6 + (0.02 * prior) ** 2
+    found = align(
+        at(offset, 0.0, 0.0), covariance, seen, surfaces, SurfaceConfig(), 100, None, NOTHING
+    )
+    assert found is not None
+    return float(found.state.position[0]), float(np.sqrt(found.covariance[3, 3]))
+
+
+def test_the_less_is_known_of_the_place_the_less_a_few_points_tell() -> None:
+    """What is near the prediction may be another surface."""
+    known, hardly, lost = (along_way(prior, 18)[1] / prior for prior in (0.03, 0.3, 2.0))
+    assert known < 0.7 < 0.8 < hardly < 0.9 < lost < 1.0
+    assert along_way(0.3, 39)[1] < 0.6 * 0.3  # more points are less often others
+
+
+def test_what_may_be_another_surface_moves_the_place_by_as_much_less() -> None:
+    shift = 0.02
+    sure, hardly = (
+        shift - along_way(prior, 18, shift)[0] + along_way(prior, 18)[0] for prior in (0.03, 0.3)
+    )
+    assert 0.4 * shift < sure < shift
+    assert 0.0 < hardly < 0.3 * shift
+
+
 def test_a_way_that_nothing_faces_is_free_however_weak_turns_are() -> None:
     """One wall and a strip of floor: the way along the wall is weak, and so are two turns."""
     rng = np.random.default_rng(4)
