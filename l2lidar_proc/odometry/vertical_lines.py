@@ -11,7 +11,8 @@ Most vertical lines are no reveals: a scan line that crosses a wall which the ma
 leaves one as well. So points on known walls are left out, and the lines of a sweep vote with those
 of the last seconds: two lines of one reveal are apart by the error of the velocity times the time
 between them, whichever reveal it is, others by anything. The error for which most pairs vote is
-believed if chance cannot explain it, and if no other error has nearly as many votes.
+believed if chance hardly explains it, and if no other error has nearly as many votes; and then
+with the probability that it is right, as two votes are false in one of ten cases.
 
 Earlier lines are kept where the state has them by now: whenever that is corrected, so are they.
 The difference of two of them then depends on the velocity, not on the place.

@@ -27,6 +27,10 @@ soon. There, four things are stricter, and in turn surfaces count sooner:
   are known;
 * it is steadied over the last sweeps. One that differs from sweep to sweep lets the strong
   directions speak about it.
+
+What passes these tests is not always real either, and phantoms are always where they are expected:
+they confirm any velocity. So it is believed with the probability of an association, which is the
+lower, the less is known of the place.
 """
 
 from __future__ import annotations
@@ -293,7 +297,7 @@ class WeakDirections:
         return information, self._without(scaled, facing, shares)
 
     def _without(self, scaled: F64, facing: NDArray[np.bool_], shares: F64) -> F64:
-        """Return scaled derivatives (M, 6) without what is not real, as those of turn and place."""
+        """Return derivatives (M, 6), given scaled, without what is not real in them."""
         axes = self.weak.axes
         lost = (scaled @ axes) * np.where(facing, 1.0 - shares, 1.0)
         return np.asarray((scaled - lost @ axes.T) / self.weak.scale)

@@ -10,6 +10,7 @@ import pytest
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
@@ -255,15 +256,80 @@ def test_a_scene_with_strays_lowers_what_is_needed_after_a_loose_prediction() ->
     assert matcher.match(rainy(0.7), loose).alignment is None
 
 
+def corridor(rng: np.random.Generator, count: int) -> F64:
+    """Return points of two walls and a floor along x."""
+    points = rng.uniform((-4.0, -1.2, -1.0), (4.0, 1.2, 1.0), (count, 3))
+    side = rng.integers(0, 3, count)
+    points[side == 0, 1], points[side == 1, 1], points[side == 2, 2] = -1.2, 1.2, -1.0
+    return np.asarray(points + rng.normal(0.0, 0.01, points.shape))
+
+
+def driven_along(rng: np.random.Generator) -> SweepMatcher:
+    """Return a matcher with a map of the corridor, along which the carrier drives."""
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, corridor(rng, 4000))
+    matcher.driving = True
+    for _ in range(2):  # the first shows that the way is weak
+        found = matcher.match(source(corridor(rng, 2000)), motion(TIGHT, np.zeros(3))).alignment
+        assert found is not None
+        matcher.meet(found, 0.2)
+    return matcher
+
+
+def uncertain_along(direction: F64, sigma: float, place: F64) -> SweepMotion:
+    """Return a motion whose place is uncertain along a direction, else to 3 mm."""
+    moved = motion(TIGHT, place)
+    covariance = moved.covariance.copy()
+    covariance[eskf.POSITION, eskf.POSITION] = 0.003**2 * np.eye(3) + sigma**2 * np.outer(
+        direction, direction
+    )
+    return dataclasses.replace(moved, covariance=covariance)
+
+
+def test_millimeters_across_the_way_are_not_meters_along_it() -> None:
+    """The place became uncertain along walls that ran by 5 mrad another way."""
+    rng = np.random.default_rng(24)
+    matcher = driven_along(rng)
+    before = np.array([np.cos(0.005), np.sin(0.005), 0.0])
+    across = np.array([0.0, 0.004, 0.0])  # by which the prediction is off
+    seen = source(corridor(rng, 2000))
+
+    def found() -> Alignment:
+        alignment = matcher.match(seen, uncertain_along(before, 1.5, across)).alignment
+        assert alignment is not None
+        return alignment
+
+    state, covariance = found().state, found().covariance
+    assert abs(state.position[1]) < 0.002
+    assert abs(state.position[0]) < 0.1
+    assert np.sqrt(covariance[3, 3]) > 1.3
+    matcher.driving = False  # else the walls as they are tell the way along those that were
+    assert np.sqrt(found().covariance[3, 3]) < 0.7
+
+
+def test_a_place_that_is_uncertain_along_bare_walls_is_not_loose() -> None:
+    """Where some of the walls have moved, a sweep fits badly, and no other place fits better."""
+    rng = np.random.default_rng(25)
+    matcher = driven_along(rng)
+    points = corridor(rng, 2000)
+    strays = rng.random(len(points)) < 0.3
+    points[strays] += rng.choice((-0.13, 0.13), (np.count_nonzero(strays), 3))
+    seen, (along, across, _) = source(points), np.eye(3)
+
+    def is_found(direction: F64) -> bool:
+        moved = uncertain_along(direction, 0.3, np.zeros(3))
+        return matcher.match(seen, moved).alignment is not None
+
+    assert is_found(along)
+    assert not is_found(across)
+    matcher.driving = False
+    assert not is_found(along)
+
+
 def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
     """What faces the way along a corridor is small; of it, thinning must leave something."""
     rng, matcher = np.random.default_rng(21), SweepMatcher(OdometryConfig(), np.zeros(3))
-
-    def corridor(count: int) -> F64:
-        points = rng.uniform((-4.0, -1.2, -1.0), (4.0, 1.2, 1.0), (count, 3))
-        side = rng.integers(0, 3, count)
-        points[side == 0, 1], points[side == 1, 1], points[side == 2, 2] = -1.2, 1.2, -1.0
-        return np.asarray(points + rng.normal(0.0, 0.01, points.shape))
 
     def sweep(points: F64) -> Sweep:
         cloud = np.zeros(len(points), [(axis, "<f4") for axis in ("x", "y", "z", "time")])
@@ -271,9 +337,9 @@ def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
         return Sweep(EPOCH, HostNs(EPOCH + 200_000_000), cloud, 1, 0)
 
     for _ in range(tuning.YOUNG_SWEEPS + 1):
-        extended(matcher, corridor(4000))
+        extended(matcher, corridor(rng, 4000))
     at = motion(TIGHT, np.zeros(3))
-    sparse, dense = sweep(corridor(2000)), sweep(corridor(30_000))
+    sparse, dense = sweep(corridor(rng, 2000)), sweep(corridor(rng, 30_000))
 
     def kept(some: Sweep) -> int:
         found = matcher.source(some, at)
