@@ -301,8 +301,8 @@ MAP_SHARE: Final = 0.0003  # of the way, each axis
 # over the 0.45 s of the first sweeps
 BEGUN_IN_MOTION: Final = (0.045, 0.011)
 # The map bends where it grows, so the vertical where it began is not quite that of its other end.
-# Tuned on: narrow corridors, seeds 100 to 127, where 0.01 m/s^2 (0.06 degrees) makes 1 to 5 m. With
-# 0.0008, the acceleration along them erred by 0.3 to 0.5 sigma where nothing false was believed
+# Tuned on: narrow corridors, seeds 100 to 127, where 0.01 m/s^2 (0.06 degrees) makes 1 to 5 m.
+# With 0.0008, the acceleration along them erred by 0.3 to 0.5 sigma where nothing was false
 MAP_BEND: Final = 0.0005  # [rad/sqrt(m)] of the way
 # Gravity is known, as a direction, when it is known as well as at rest, where it cannot be told
 # from a bias (ACCEL_BIAS_SIGMA, 0.9 degrees); as much of what it turns later may be that bias.
