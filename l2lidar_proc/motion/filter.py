@@ -221,10 +221,10 @@ def predict(
     accelerations = np.linalg.norm(forces - back @ state.rest_force, axis=1)
     unmeasured = _unmeasured(blind * dt, blind == 0.0, held, means, accelerations)
     gyro2 = (1.0 - blind) * measured + blind * unmeasured.gyro2
-    blind = np.ones_like(blind) if blind_forces else blind
-    accel2 = tuning.BLIND_ACCEL**2 if blind_forces else unmeasured.accel2
     measured = noise.accel**2 + (noise.accel_share * accelerations) ** 2
-    accel2 = (1.0 - blind) * measured + blind * accel2
+    accel2 = (1.0 - blind) * measured + blind * unmeasured.accel2
+    if blind_forces:
+        accel2 = np.full_like(accel2, tuning.BLIND_ACCEL**2)
     q = process_noise(gyro2, accel2, noise, dt)
     whole, added = f[0], q[0]
     for step, more in zip(f[1:], q[1:], strict=True):
@@ -239,7 +239,7 @@ def predict(
 class _Unmeasured(NamedTuple):
     """What a carrier may do while nothing is measured, as squared densities of white noise."""
 
-    gyro2: F64 | float
+    gyro2: F64
     accel2: float
 
 
@@ -271,8 +271,9 @@ def _unmeasured(
     least_rate, least_acceleration = tuning.BLIND_SHORT_SPREAD
     spread = float(rates[is_measured].var(axis=0).max()) + least_rate**2
     change = float(np.square(accelerations[is_measured]).mean()) + least_acceleration**2
+    # a rate that is off throughout the gap errs by spread * lasted, not by its root
     return _Unmeasured(
-        np.minimum(gyro2, lasted * spread), min(tuning.BLIND_ACCEL**2, lasted * change)
+        np.full_like(gyro2, lasted * spread), min(tuning.BLIND_ACCEL**2, lasted * change)
     )
 
 

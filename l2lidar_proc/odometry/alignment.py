@@ -160,7 +160,7 @@ def align(
                 source = views.with_facing(source, at, axes)
                 found = views.of([(at, source)])[0]
             again = partial(views.of_some, source)
-            weak = weak_directions(at, found, axes, again, covariance[POSE, POSE])
+            weak = weak_directions(at, found, axes, again, prior, covariance[POSE, POSE])
             before = step.state
             step = _step(prior, root, at, found, weak, number + 1)
             done = _is_small(step.state.boxminus(before))

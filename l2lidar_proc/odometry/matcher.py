@@ -213,7 +213,7 @@ class SweepMatcher:
         return self._believed(best)
 
     @property
-    def _bare_way(self) -> F64 | None:
+    def _wall_direction(self) -> F64 | None:
         """The direction (3,) of the walls along which the carrier drives, None where it does not.
 
         Unit, map axes.
@@ -229,7 +229,7 @@ class SweepMatcher:
         the way for long. That is not quite along the walls as they are, and millimeters across
         would be taken for meters along.
         """
-        way = self._bare_way
+        way = self._wall_direction
         if way is None:
             return motion
         across = np.eye(3) - np.outer(way, way)
@@ -245,7 +245,7 @@ class SweepMatcher:
         Along bare walls it does not matter how far: they fit everywhere.
         """
         places = covariance[POSITION, POSITION]
-        way = self._bare_way
+        way = self._wall_direction
         if way is not None:
             across = np.eye(3) - np.outer(way, way)
             places = across @ places @ across

@@ -263,8 +263,8 @@ class WeakDirections:
     shares : ndarray, shape (K,)
         How much of what facing surfaces claim is real, 0 to 1.
     associated : float
-        By how much the standard deviation along the first direction is smaller than it has to be,
-        as the surfaces may be others, 0 to 1.
+        Square root of the share of the information along the first direction that is left, since
+        the surfaces may be others, 0 to 1.
     """
 
     weak: WeakAxes
@@ -308,6 +308,7 @@ def weak_directions(
     found: Correspondences,
     weak: WeakAxes,
     match_again: MatchAgain,
+    prior: InertialState,
     covariance: F64,
 ) -> WeakDirections:
     """Return how much of what is claimed about some directions a sweep confirms.
@@ -319,15 +320,18 @@ def weak_directions(
     found : Correspondences
     weak : WeakAxes
     match_again : callable
+    prior : InertialState
+        As predicted.
     covariance : ndarray, shape (6, 6)
-        Of turn and place, as predicted.
+        Of its turn and place.
     """
     trials = [_Trial(state, found, weak, number) for number in range(weak.axes.shape[1])]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
     if weak.scatter is None or shares[0] == 0.0:
         return WeakDirections(weak, shares)
-    return WeakDirections(weak, shares, trials[0].associated(shares[0], covariance))
+    moved = state.boxminus(prior)[POSE]
+    return WeakDirections(weak, shares, trials[0].associated(shares[0], moved, covariance))
 
 
 class _Trial:
@@ -349,8 +353,8 @@ class _Trial:
             move[POSE] = step * self._axis
             self._moved.append(state.boxplus(move))
 
-    def associated(self, share: float, covariance: F64) -> float:
-        """Return how much smaller the standard deviation is than it has to be.
+    def associated(self, share: float, moved: F64, covariance: F64) -> float:
+        """Return the square root of the share of the information that is left.
 
         What moves along with the view is always where it is expected, and a few points face any
         way. The less is known of the place, the less likely is it that what is near it is the
@@ -361,20 +365,24 @@ class _Trial:
         ----------
         share : float
             Of what the residuals claim that is real.
+        moved : ndarray, shape (6,)
+            Turn and place from which the correspondences were found, against the predicted ones.
         covariance : ndarray, shape (6, 6)
-            Of turn and place, as predicted.
+            Of the predicted ones.
         """
         levers, distances, scales = self._facing
         weights = robust_weights(distances, scales) / self._variances
         claimed = float((weights * levers**2).sum())
         information = share**2 * claimed
-        off = float((weights * levers * distances).sum()) / (share * claimed)
-        before = float(self._axis @ covariance @ self._axis)
+        unit = self._weak.axes[:, self._number] / self._weak.scale
+        pulled = -float((weights * levers * distances).sum()) / (share * claimed)
+        innovation = float(unit @ moved) + pulled
+        before = float(unit @ covariance @ unit)
         expected = before + 1.0 / information
         many = len(levers) >= tuning.FACING_MANY
-        right = association_probability(off, expected, tuning.FACING_TRUE[many])
+        right = association_probability(innovation, expected, tuning.FACING_TRUE[many])
         gain = before / expected
-        spread = right * (1.0 - right) * (gain * off) ** 2
+        spread = right * (1.0 - right) * (gain * innovation) ** 2
         mixed = right * before * (1.0 - gain) + (1.0 - right) * before + spread
         return float(np.sqrt(max(1.0 / mixed - 1.0 / before, 0.0) / information))
 

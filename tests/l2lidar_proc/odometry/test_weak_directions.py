@@ -314,6 +314,13 @@ def test_what_may_be_another_surface_moves_the_place_by_as_much_less() -> None:
     assert 0.0 < hardly < 0.3 * shift
 
 
+def test_what_lies_far_from_the_prediction_is_hardly_the_surface_expected_there() -> None:
+    """The innovation is that from the prediction, however well the sweep fits in the end."""
+    near, far = (along_way(0.01, 18, offset)[1] / 0.01 for offset in (0.0, 0.05))
+    assert near < 0.9
+    assert far > 0.97
+
+
 def test_a_way_that_nothing_faces_is_free_however_weak_turns_are() -> None:
     """One wall and a strip of floor: the way along the wall is weak, and so are two turns."""
     rng = np.random.default_rng(4)
