@@ -247,7 +247,7 @@ LINE_CHANCE: Final = 2.0  # times the votes that chance gives, besides
 LINE_RIVAL: Final = 0.6  # of the votes, that no other velocity may have
 # [m/s] How often the velocity with most votes is right, for a density of false ones: with two
 # votes, and by how much more often with each further one. Tuned on: narrow corridors, seeds 100
-# to 115, where 7 of 71 with less than two votes were false, 1 of 282 with more
+# to 115, where 7 of 71 with less than two votes were false, 1 of 445 with more
 LINE_TRUE: Final = 4.0
 LINE_TRUE_VOTE: Final = 10.0
 LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ at least
@@ -258,6 +258,13 @@ ELONGATED: Final = 9.0  # variance ratio: a surface is at least 3 times wider th
 FLAT_WIDTH: Final = 0.08  # of its cell (1 sigma) in its shorter direction
 NARROW: Final = 0.16  # of the cell's edge: largest scatter that fixes a place; evenly filled: 0.29
 NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is narrow as well
+# A point is on a flat surface within so many standard deviations of its points, and a length [m],
+# of its middle. Derived: twice the half width of points that fill it evenly, and the range noise.
+# Observed: points on the front of a wall, taken for the jamb beside it, were 4 to 7 off
+EXTENT: Final = (3.5, 0.02)
+# What goes on beyond both sides with so much of the weight is no surface. Tuned on: cameras
+# looking into rooms and cones, seeds 0 to 7, where 0.2 does as well
+GOING_ON: Final = 0.5
 # Sine of the angle by which a surface may be seen from behind: the normals of small ones are off
 SIDE_SLACK: Final = 0.1
 # A point at this range has half the weight in the map of one at hand: there, the error of a range

@@ -142,11 +142,13 @@ def align(
     root = square_root(covariance)
     step, weak = None, None
     last = config.iterations - 1
+    # what is ahead of a carrier that drives shows little of itself at first, and more each sweep
+    clear_cut = scatter is None
     for number in range(config.iterations + tuning.WEAK_STEPS):
         reach = max(
             tuning.FIRST_REACH_M * 0.5**number, tuning.LAST_REACH_SCALES * config.outlier_scale
         )
-        found = correspondences(prior, at, source, surfaces, config, reach)
+        found = correspondences(prior, at, source, surfaces, config, reach, clear_cut=clear_cut)
         if len(found.index) < least:
             break
         step = _step(prior, root, at, found, weak, number + 1)
@@ -155,7 +157,7 @@ def align(
             axes = weak_axes(at, found, surfaces, scatter)
             if axes is None:
                 break
-            views = _Views(prior, surfaces, config, reach)
+            views = _Views(prior, surfaces, config, reach, clear_cut)
             if axes.scatter is not None:
                 source = views.with_facing(source, at, axes)
                 found = views.of([(at, source)])[0]
@@ -178,10 +180,18 @@ class _Views(NamedTuple):
     surfaces: SurfelMap
     config: SurfaceConfig
     reach: float
+    clear_cut: bool
 
     def of(self, seen: Sequence[tuple[InertialState, Source]]) -> list[Correspondences]:
         """Return the correspondences of several states and sources."""
-        return correspondences_of(seen, self.prior, self.surfaces, self.config, self.reach)
+        return correspondences_of(
+            seen,
+            self.prior,
+            self.surfaces,
+            self.config,
+            self.reach,
+            clear_cut=self.clear_cut,
+        )
 
     def of_some(self, source: Source, views: Views) -> list[Correspondences]:
         """Return the correspondences of several states, each with some of the points."""

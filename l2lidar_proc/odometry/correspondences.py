@@ -206,6 +206,8 @@ def correspondences(
     surfaces: SurfelMap,
     config: SurfaceConfig,
     reach: float,
+    *,
+    clear_cut: bool = False,
 ) -> Correspondences:
     """Return the points that are near a surface.
 
@@ -220,8 +222,11 @@ def correspondences(
     config : SurfaceConfig
     reach : float
         Largest distance [m]; more where a surface is thick.
+    clear_cut : bool
+        As for :meth:`~l2lidar_proc.odometry.surfel_map.SurfelMap.match`.
     """
-    return correspondences_of([(state, source)], prior, surfaces, config, reach)[0]
+    views = [(state, source)]
+    return correspondences_of(views, prior, surfaces, config, reach, clear_cut=clear_cut)[0]
 
 
 def correspondences_of(
@@ -230,13 +235,15 @@ def correspondences_of(
     surfaces: SurfelMap,
     config: SurfaceConfig,
     reach: float,
+    *,
+    clear_cut: bool = False,
 ) -> list[Correspondences]:
     """Return the points near a surface of several states and sources, which costs less at once.
 
     Parameters
     ----------
     views : sequence of tuple
-    prior, surfaces, config, reach
+    prior, surfaces, config, reach, clear_cut
         As for :func:`correspondences`, of all.
     """
     if not views:
@@ -256,7 +263,12 @@ def correspondences_of(
     places = [state.position for state, _ in views]
     origins = places[0] if is_single else np.repeat(places, sizes, axis=0)
     matches = surfaces.match(
-        _joined(seen), narrow=True, sizes=sizes, origins=origins, again=is_single
+        _joined(seen),
+        narrow=True,
+        sizes=sizes,
+        origins=origins,
+        again=is_single,
+        clear_cut=clear_cut,
     )
     points, times, ranges = (
         _joined(items)

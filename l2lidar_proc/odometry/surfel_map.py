@@ -9,6 +9,11 @@ Near points count for more than far ones, which are off by the noise of the rang
 attitude. A full cell takes points again from so near that they count for more than those in it. A
 wall that lies at the face of two cells needs that: seen from afar, its noise fills both, and the
 plane of either is off to its side, by up to 3 cm at 5 m.
+
+Not all that is flat or narrow in a cell is a surface, and a point in a cell need not be on its
+surface. Asked for clear-cut surfaces, the map leaves out both: a wall that a depth camera samples
+by columns of points, which pass for surfaces across it; and the front of a wall whose jamb is the
+surface of the cell at its corner.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ from l2lidar_proc.odometry.surfels import (
     Candidates,
     Matches,
     are_behind,
+    are_within,
     fit,
     matches_with,
     tilts_of,
@@ -265,6 +271,7 @@ class SurfelMap:
         sizes: Sequence[int] = (),
         origins: F64 | None = None,
         again: bool = False,
+        clear_cut: bool = False,
     ) -> Matches:
         """Return the surface of every point that has one: the finest at its place.
 
@@ -284,6 +291,8 @@ class SurfelMap:
             not the point's: it is the other side of a wall.
         again : bool
             The points are mostly those of the last call with this, and have hardly moved.
+        clear_cut : bool
+            Only surfaces that end where they seem to end, and points where a flat one is known.
         """
         keys = self._grid.keys(points)
         find = self._index.find_again if again else self._index.find
@@ -299,14 +308,41 @@ class SurfelMap:
                 found = found.followed_by(_both_axes(some, self._kind[some.cells]))
         flat = self._kind[found.cells] == FLAT
         planes, places = self.planes(found.cells), points[found.point]
+        kept = np.ones(len(places), np.bool_)
         if origins is not None:
             eyes = origins if origins.ndim == 1 else origins[found.point]
-            behind = flat & are_behind(places, eyes, planes)
-            if behind.any():
-                seen = np.flatnonzero(~behind)
-                found, flat, places = found.some(seen), flat[seen], places[seen]
-                planes = records.selected(planes, seen)
+            kept = ~(flat & are_behind(places, eyes, planes))
+        if clear_cut:
+            kept &= ~flat | are_within(places, planes)
+            kept &= ~self._go_on(found, planes)
+        if not kept.all():
+            left = np.flatnonzero(kept)
+            found, flat, places = found.some(left), flat[left], places[left]
+            planes = records.selected(planes, left)
         return matches_with(found, places, planes, self._cells["count"][found.cells], flat)
+
+    def _go_on(self, found: Candidates, planes: NDArray[np.void]) -> NDArray[np.bool_]:
+        """Return which surfaces (M,) are no boundary: beyond both sides of them there is more.
+
+        Before a surface the space is free, and nobody sees what is behind it. Where the cells next
+        to it along its normal are as full as its own, its points lie as they do because of how the
+        sensor samples something larger.
+
+        Parameters
+        ----------
+        found : Candidates
+        planes : ndarray, shape (M,), dtype PLANE
+        """
+        normals = planes["axes"][np.arange(len(planes)), found.axis]
+        moves = self._grid.sizes[found.level][:, None] * normals
+        enough = tuning.GOING_ON * self._cells["weight"][found.cells]
+        go_on = np.ones(len(planes), np.bool_)
+        for side in (1.0, -1.0):
+            some = np.flatnonzero(go_on)
+            keys = self._grid.keys(planes["mean"][some] + side * moves[some])
+            rows = self._index.find(keys[found.level[some], np.arange(len(some))])
+            go_on[some] = self._cells["weight"][rows] > enough[some]
+        return go_on
 
     def are_along(self, points: F64, direction: F64) -> NDArray[np.bool_]:
         """Return which points lie on thin flat surfaces that run along a direction.

@@ -179,6 +179,22 @@ def are_behind(points: F64, origins: F64, planes: NDArray[np.void]) -> NDArray[n
     return np.asarray((planes["sided"] == _ONE_SIDE) & (along < -least))
 
 
+def are_within(points: F64, planes: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return which points lie where flat surfaces are known, not beside them.
+
+    Parameters
+    ----------
+    points : ndarray, shape (M, 3)
+        [m], map frame.
+    planes : ndarray, shape (M,), dtype PLANE
+        The surface of each.
+    """
+    along = np.einsum("nij,nj->ni", planes["axes"][:, 1:], points - planes["mean"])
+    sigmas, more = tuning.EXTENT
+    limits = sigmas * np.sqrt(planes["spread"][:, 1:]) + more
+    return np.asarray((np.abs(along) <= limits).all(axis=1))
+
+
 def tilts_of(planes: NDArray[np.void], sweeps: F64, axis: I64) -> F64:
     """Return how far normals may be tilted towards each axis of their cells, 1 sigma.
 

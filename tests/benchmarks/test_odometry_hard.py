@@ -26,9 +26,11 @@ from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.types import HostNs
+from l2lidar_proc.odometry import surfel_map
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.vertical_lines import LINE, VerticalLines
 from tests.support.other_sensors import SENSORS
 
@@ -218,6 +220,25 @@ def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
         )
     assert ends[0] < 0.1
     assert ends[1] > 1.2
+
+
+def test_a_camera_that_looks_into_rooms_does_not_run_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With all that is flat or narrow taken for surfaces, it ends ten meters off."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    rooms = recording(scenario("camera, looking into rooms", 5, 45.0))
+    ends = []
+    for _ in range(2):
+        track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, rooms)
+        assert track is not None
+        ends.append(score(rooms, track)["end_m"])
+        monkeypatch.setattr(surfel_map, "are_within", lambda points, _: np.ones(len(points), bool))
+        monkeypatch.setattr(
+            SurfelMap, "_go_on", lambda _, found, __: np.zeros(len(found.point), bool)
+        )
+    assert ends[0] < 0.15
+    assert ends[1] > 3.0
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:

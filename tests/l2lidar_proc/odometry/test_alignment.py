@@ -61,6 +61,26 @@ def test_a_displaced_start_comes_back() -> None:
     assert np.abs(left[eskf.ROTATION]).max() < 0.002
 
 
+def test_only_what_does_not_drive_takes_surfaces_to_end_where_they_seem_to() -> None:
+    """Of what is ahead of a carrier that drives, each sweep shows more."""
+    rng = np.random.default_rng(7)
+    surfaces = SurfelMap((0.6,))
+    seen = rng.uniform((-3.0, -3.0, -1.0), (3.0, 3.0, -1.0), (4000, 3))  # a floor,
+    front = rng.uniform((3.3, 0.0, -1.0), (3.3, 0.2, 1.0), (800, 3))  # a strip of a wall,
+    more = rng.uniform((3.3, 0.35, -0.3), (3.3, 0.55, 0.3), (300, 3))  # and what is beside it
+    for points in (seen, front, more):
+        points += 0.01 * rng.standard_normal(points.shape)
+    surfaces.add(np.concatenate((seen, front)))
+    source = source_of(np.concatenate((seen[::5], more)), np.zeros(len(seen[::5]) + len(more)))
+    matched = {}
+    for name, scatter in (("by hand", None), ("driving", np.zeros((3, 3)))):
+        prior = 1e-6 * np.eye(eskf.ERRORS)
+        found = align(still(), prior, source, surfaces, SurfaceConfig(), 100, scatter=scatter)
+        assert found is not None
+        matched[name] = found.matched
+    assert matched["driving"] - matched["by hand"] > 250
+
+
 def test_a_wrong_range_noise_costs_little(monkeypatch: pytest.MonkeyPatch) -> None:
     run, slope = recording("yard", "walk"), tuning.RANGE_NOISE_SLOPE
     right = errors(run, drive(run)).max()

@@ -128,6 +128,66 @@ def test_what_is_no_surface_has_no_side() -> None:
     assert len(here.index) == len(there.index) > 0
 
 
+def test_the_front_of_a_wall_is_not_taken_for_the_jamb_at_its_corner() -> None:
+    """Both lie in one cell, whose surface is the jamb, and the front is all on one side of it."""
+    rng = np.random.default_rng(RNG_SEED)
+    surfaces = SurfelMap((0.3,))
+    jamb = rng.uniform((2.2, 0.6, 0.0), (2.2, 0.7, 2.0), (2000, 3))  # 29 mm about its middle
+    jamb[:, 0] += 0.004 * rng.standard_normal(len(jamb))
+    surfaces.add(jamb)
+
+    def met(y: float, z: float = 1.05) -> tuple[int, int]:
+        probe = np.array([[2.17, y, z]])
+        return len(surfaces.match(probe).index), len(surfaces.match(probe, clear_cut=True).index)
+
+    assert met(0.65) == met(0.76) == (1, 1)  # on it, and where more of it may be
+    assert met(0.79) == met(0.85) == (1, 0)
+    # what is no flat surface tells a place across the directions in which its points are few
+    pole = SurfelMap((0.3,))
+    for number in range(5):
+        pole.add(rng.uniform((2.2, 0.62, 1.0), (2.21, 0.63, 1.1), (60, 3)), number)
+    probe = np.array([[2.2, 0.62, 0.95]])
+    both = [pole.match(probe, narrow=True, clear_cut=clear_cut) for clear_cut in (False, True)]
+    assert len(both[0].index) == len(both[1].index) > 0
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_columns_of_points_on_a_wall_are_no_surfaces_across_it(noise: float) -> None:
+    """A depth camera sees one column in each small cell of a wall that is far away."""
+    rng = np.random.default_rng(RNG_SEED)
+    columns = 0.075 + 0.15 * np.arange(5)
+
+    def seen(columns: Any) -> SurfelMap:
+        surfaces = SurfelMap((0.15,))
+        for number in range(5):
+            points = rng.uniform((0.0, 4.725, 0.0), (0.0, 4.725, 1.5), (200 * len(columns), 3))
+            points[:, 0] = np.repeat(columns, 200)
+            points += rng.standard_normal(points.shape) * (0.004, noise, 0.0)
+            surfaces.add(points, number)
+        return surfaces
+
+    def across(surfaces: SurfelMap, **how: Any) -> list[int]:
+        """Return which of the columns are met across the wall."""
+        probe = np.column_stack((columns, np.full(5, 4.725), np.full(5, 0.8)))
+        found = surfaces.match(probe, narrow=True, **how)
+        assert set(found.index.tolist()) == set(range(5)) or how or len(found.index) < 5
+        return sorted(found.index[np.abs(found.normals[:, 0]) > 0.9].tolist())
+
+    wall = seen(columns)
+    assert across(wall) == [0, 1, 2, 3, 4]
+    assert across(wall, clear_cut=True) == [0, 4]  # beyond one side of these there is nothing
+    # so it is with posts and reveals, and what is beside them on one side does not matter
+    for few in (columns[2:3], columns[1:3]):
+        alone = seen(few)
+        assert across(alone) == across(alone, clear_cut=True) != []
+    # nor do fewer points that lie there; its own cell has a hundred
+    for count, met in ((30, [2]), (90, [])):
+        alone = seen(columns[2:3])
+        for x in columns[[1, 3]]:
+            alone.add(np.tile((x, 4.725, 0.8), (count, 1)), 5)
+        assert across(alone, clear_cut=True) == met
+
+
 def test_rays_pass_through_surfaces_only_where_these_are() -> None:
     surfaces, origin = SurfelMap((0.15, 0.3, 0.6)), np.array([0.0, 0.0, 1.0])
     rng = np.random.default_rng(RNG_SEED)
