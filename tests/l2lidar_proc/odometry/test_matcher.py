@@ -287,7 +287,9 @@ def uncertain_along(direction: F64, sigma: float, place: F64) -> SweepMotion:
     return dataclasses.replace(moved, covariance=covariance)
 
 
-def test_millimeters_across_the_way_are_not_meters_along_it() -> None:
+def test_millimeters_across_the_way_are_not_meters_along_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The place became uncertain along walls that ran by 5 mrad another way."""
     rng = np.random.default_rng(24)
     matcher = driven_along(rng)
@@ -304,7 +306,8 @@ def test_millimeters_across_the_way_are_not_meters_along_it() -> None:
     assert abs(state.position[1]) < 0.002
     assert abs(state.position[0]) < 0.1
     assert np.sqrt(covariance[3, 3]) > 1.3
-    matcher.driving = False  # else the walls as they are tell the way along those that were
+    # else the walls as they are tell the way along those that were
+    monkeypatch.setattr(tuning, "WAY_TURN", 0.0)
     assert np.sqrt(found().covariance[3, 3]) < 0.7
 
 
