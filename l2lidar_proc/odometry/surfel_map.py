@@ -292,7 +292,8 @@ class SurfelMap:
         again : bool
             The points are mostly those of the last call with this, and have hardly moved.
         clear_cut : bool
-            Only surfaces that end where they seem to end, and points where a flat one is known.
+            Leave out surfaces with more points beyond both of their sides, and points beside the
+            known part of a flat one.
         """
         keys = self._grid.keys(points)
         find = self._index.find_again if again else self._index.find
