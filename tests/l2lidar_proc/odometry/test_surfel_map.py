@@ -146,7 +146,7 @@ def test_the_front_of_a_wall_is_not_taken_for_the_jamb_at_its_corner() -> None:
     pole = SurfelMap((0.3,))
     for number in range(5):
         pole.add(rng.uniform((2.2, 0.62, 1.0), (2.21, 0.63, 1.1), (60, 3)), number)
-    probe = np.array([[2.2, 0.62, 0.95]])
+    probe = np.array([[2.2, 0.62, 0.91]])  # far below its points
     both = [pole.match(probe, narrow=True, clear_cut=clear_cut) for clear_cut in (False, True)]
     assert len(both[0].index) == len(both[1].index) > 0
 
@@ -166,16 +166,19 @@ def test_columns_of_points_on_a_wall_are_no_surfaces_across_it(noise: float) -> 
             surfaces.add(points, number)
         return surfaces
 
-    def across(surfaces: SurfelMap, **how: Any) -> list[int]:
-        """Return which of the columns are met across the wall."""
+    def across(surfaces: SurfelMap, axis: int = 0, **how: Any) -> list[int]:
+        """Return which of the columns are met across the wall, or along another axis."""
         probe = np.column_stack((columns, np.full(5, 4.725), np.full(5, 0.8)))
         found = surfaces.match(probe, narrow=True, **how)
         assert set(found.index.tolist()) == set(range(5)) or how or len(found.index) < 5
-        return sorted(found.index[np.abs(found.normals[:, 0]) > 0.9].tolist())
+        return sorted(found.index[np.abs(found.normals[:, axis]) > 0.9].tolist())
 
     wall = seen(columns)
     assert across(wall) == [0, 1, 2, 3, 4]
     assert across(wall, clear_cut=True) == [0, 4]  # beyond one side of these there is nothing
+    # where they lie on the wall is as clear as before
+    assert across(wall, 1) == across(wall, 1, clear_cut=True)
+    assert bool(across(wall, 1)) == (noise < 0.02)  # else they are flat, across it only
     # so it is with posts and reveals, and what is beside them on one side does not matter
     for few in (columns[2:3], columns[1:3]):
         alone = seen(few)
