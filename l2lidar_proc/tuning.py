@@ -258,13 +258,14 @@ ELONGATED: Final = 9.0  # variance ratio: a surface is at least 3 times wider th
 FLAT_WIDTH: Final = 0.08  # of its cell (1 sigma) in its shorter direction
 NARROW: Final = 0.16  # of the cell's edge: largest scatter that fixes a place; evenly filled: 0.29
 NARROW_SWEEPS: Final = 4  # that must have seen it: one scan line on a wall is narrow as well
-# A point is on a flat surface within so many standard deviations of its points, and a length [m],
-# of its middle. Derived: twice the half width of points that fill it evenly, and the range noise.
-# Observed: points on the front of a wall, taken for the jamb beside it, were 4 to 7 off
+# Extent of a flat surface on either side of its middle: so many standard deviations of its points,
+# and so much more [m]. Derived: twice the half width of evenly spread points, and 1.5 times the
+# range noise. Observed: points on the front of a wall, taken for the jamb beside it, were 4 to 7
+# standard deviations away
 EXTENT: Final = (3.5, 0.02)
-# What goes on beyond both sides with so much of the weight is no surface. Tuned on: cameras
-# looking into rooms and cones, seeds 0 to 7, where 0.2 does as well
-GOING_ON: Final = 0.5
+# Share of a surface's weight that both neighbors across it have where something larger continues.
+# Tuned on: cameras looking into rooms and cones, seeds 0 to 7, where 0.2 does as well
+CONTINUED: Final = 0.5
 # Sine of the angle by which a surface may be seen from behind: the normals of small ones are off
 SIDE_SLACK: Final = 0.1
 # A point at this range has half the weight in the map of one at hand: there, the error of a range

@@ -142,13 +142,16 @@ def align(
     root = square_root(covariance)
     step, weak = None, None
     last = config.iterations - 1
-    # what is ahead of a carrier that drives shows little of itself at first, and more each sweep
-    clear_cut = scatter is None
+    # what is ahead of a carrier that drives is seen from afar first: its surfaces grow with each
+    # sweep, and points beyond their extent are right
+    reject_ambiguous = scatter is None
     for number in range(config.iterations + tuning.WEAK_STEPS):
         reach = max(
             tuning.FIRST_REACH_M * 0.5**number, tuning.LAST_REACH_SCALES * config.outlier_scale
         )
-        found = correspondences(prior, at, source, surfaces, config, reach, clear_cut=clear_cut)
+        found = correspondences(
+            prior, at, source, surfaces, config, reach, reject_ambiguous=reject_ambiguous
+        )
         if len(found.index) < least:
             break
         step = _step(prior, root, at, found, weak, number + 1)
@@ -157,7 +160,7 @@ def align(
             axes = weak_axes(at, found, surfaces, scatter)
             if axes is None:
                 break
-            views = _Views(prior, surfaces, config, reach, clear_cut)
+            views = _Views(prior, surfaces, config, reach, reject_ambiguous)
             if axes.scatter is not None:
                 source = views.with_facing(source, at, axes)
                 found = views.of([(at, source)])[0]
@@ -180,7 +183,7 @@ class _Views(NamedTuple):
     surfaces: SurfelMap
     config: SurfaceConfig
     reach: float
-    clear_cut: bool
+    reject_ambiguous: bool
 
     def of(self, seen: Sequence[tuple[InertialState, Source]]) -> list[Correspondences]:
         """Return the correspondences of several states and sources."""
@@ -190,7 +193,7 @@ class _Views(NamedTuple):
             self.surfaces,
             self.config,
             self.reach,
-            clear_cut=self.clear_cut,
+            reject_ambiguous=self.reject_ambiguous,
         )
 
     def of_some(self, source: Source, views: Views) -> list[Correspondences]:

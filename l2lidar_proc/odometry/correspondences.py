@@ -207,7 +207,7 @@ def correspondences(
     config: SurfaceConfig,
     reach: float,
     *,
-    clear_cut: bool = False,
+    reject_ambiguous: bool = False,
 ) -> Correspondences:
     """Return the points that are near a surface.
 
@@ -222,11 +222,13 @@ def correspondences(
     config : SurfaceConfig
     reach : float
         Largest distance [m]; more where a surface is thick.
-    clear_cut : bool
+    reject_ambiguous : bool
         As for :meth:`~l2lidar_proc.odometry.surfel_map.SurfelMap.match`.
     """
     views = [(state, source)]
-    return correspondences_of(views, prior, surfaces, config, reach, clear_cut=clear_cut)[0]
+    return correspondences_of(
+        views, prior, surfaces, config, reach, reject_ambiguous=reject_ambiguous
+    )[0]
 
 
 def correspondences_of(
@@ -236,14 +238,14 @@ def correspondences_of(
     config: SurfaceConfig,
     reach: float,
     *,
-    clear_cut: bool = False,
+    reject_ambiguous: bool = False,
 ) -> list[Correspondences]:
     """Return the points near a surface of several states and sources, which costs less at once.
 
     Parameters
     ----------
     views : sequence of tuple
-    prior, surfaces, config, reach, clear_cut
+    prior, surfaces, config, reach, reject_ambiguous
         As for :func:`correspondences`, of all.
     """
     if not views:
@@ -268,7 +270,7 @@ def correspondences_of(
         sizes=sizes,
         origins=origins,
         again=is_single,
-        clear_cut=clear_cut,
+        reject_ambiguous=reject_ambiguous,
     )
     points, times, ranges = (
         _joined(items)

@@ -7,6 +7,7 @@ import numpy as np
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.surfels import are_within
 
 
 def rays_through(surfaces: SurfelMap, origin: F64, points: F64) -> float:
@@ -34,12 +35,10 @@ def rays_through(surfaces: SurfelMap, origin: F64, points: F64) -> float:
     found = surfaces.match(places)
     cells, planes = surfaces.cells(found.cells), surfaces.planes(found.cells)
     ray = ray[found.index]
-    offset = places[found.index] - planes["mean"]
-    beside = np.einsum("nij,nj->ni", planes["axes"][:, 1:], offset) ** 2
     through = (
         (np.abs(found.distances) < tuning.RAY_NEAR)
         & (np.abs(np.einsum("ni,ni->n", found.normals, ways[ray])) > tuning.RAY_FACING)
-        & (beside < tuning.RAY_EXTENT**2 * planes["spread"][:, 1:]).all(axis=1)
+        & are_within(places[found.index], planes, tuning.RAY_EXTENT)
         & (cells["count"] >= tuning.RAY_POINTS)
         & (cells["sweeps"] >= tuning.RAY_SWEEPS)
     )

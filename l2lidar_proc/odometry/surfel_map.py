@@ -10,10 +10,10 @@ attitude. A full cell takes points again from so near that they count for more t
 wall that lies at the face of two cells needs that: seen from afar, its noise fills both, and the
 plane of either is off to its side, by up to 3 cm at 5 m.
 
-Not all that is flat or narrow in a cell is a surface, and a point in a cell need not be on its
-surface. Asked for clear-cut surfaces, the map leaves out both: a wall that a depth camera samples
-by columns of points, which pass for surfaces across it; and the front of a wall whose jamb is the
-surface of the cell at its corner.
+Two kinds of correspondences are ambiguous, and can be rejected. A point may lie in a surface's
+cell but not on the surface, as on the front of a wall beside its jamb (Turk and Levoy 1994 reject
+pairs at the boundaries of meshes). And what is flat in a cell may be part of something larger, as
+one of the columns of points by which a depth camera samples a wall that is far away.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ class SurfelMap:
         sizes: Sequence[int] = (),
         origins: F64 | None = None,
         again: bool = False,
-        clear_cut: bool = False,
+        reject_ambiguous: bool = False,
     ) -> Matches:
         """Return the surface of every point that has one: the finest at its place.
 
@@ -291,9 +291,9 @@ class SurfelMap:
             not the point's: it is the other side of a wall.
         again : bool
             The points are mostly those of the last call with this, and have hardly moved.
-        clear_cut : bool
-            Leave out surfaces with more points beyond both of their sides, and points beside the
-            known part of a flat one.
+        reject_ambiguous : bool
+            Leave out points beyond the extent of a flat surface, and surfaces beyond both sides of
+            which there are more points.
         """
         keys = self._grid.keys(points)
         find = self._index.find_again if again else self._index.find
@@ -313,21 +313,21 @@ class SurfelMap:
         if origins is not None:
             eyes = origins if origins.ndim == 1 else origins[found.point]
             kept = ~(flat & are_behind(places, eyes, planes))
-        if clear_cut:
-            kept &= ~flat | are_within(places, planes)
-            kept &= ~self._go_on(found, planes)
+        if reject_ambiguous:
+            kept &= ~flat | are_within(places, planes, *tuning.EXTENT)
+            kept &= ~self._continue_across(found, planes)
         if not kept.all():
             left = np.flatnonzero(kept)
             found, flat, places = found.some(left), flat[left], places[left]
             planes = records.selected(planes, left)
         return matches_with(found, places, planes, self._cells["count"][found.cells], flat)
 
-    def _go_on(self, found: Candidates, planes: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Return which surfaces (M,) are no boundary: beyond both sides of them there is more.
+    def _continue_across(self, found: Candidates, planes: NDArray[np.void]) -> NDArray[np.bool_]:
+        """Return which surfaces (M,) are part of something that continues across them.
 
-        Before a surface the space is free, and nobody sees what is behind it. Where the cells next
-        to it along its normal are as full as its own, its points lie as they do because of how the
-        sensor samples something larger.
+        A surface is a boundary: the space before it is free, and what is behind it is hidden.
+        Where both neighboring cells along the normal have points as well, its shape only shows
+        how the sensor samples something larger.
 
         Parameters
         ----------
@@ -336,14 +336,14 @@ class SurfelMap:
         """
         normals = planes["axes"][np.arange(len(planes)), found.axis]
         moves = self._grid.sizes[found.level][:, None] * normals
-        enough = tuning.GOING_ON * self._cells["weight"][found.cells]
-        go_on = np.ones(len(planes), np.bool_)
+        enough = tuning.CONTINUED * self._cells["weight"][found.cells]
+        continued = np.ones(len(planes), np.bool_)
         for side in (1.0, -1.0):
-            some = np.flatnonzero(go_on)
+            some = np.flatnonzero(continued)
             keys = self._grid.keys(planes["mean"][some] + side * moves[some])
             rows = self._index.find(keys[found.level[some], np.arange(len(some))])
-            go_on[some] = self._cells["weight"][rows] > enough[some]
-        return go_on
+            continued[some] = self._cells["weight"][rows] > enough[some]
+        return continued
 
     def are_along(self, points: F64, direction: F64) -> NDArray[np.bool_]:
         """Return which points lie on thin flat surfaces that run along a direction.

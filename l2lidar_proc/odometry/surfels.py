@@ -179,8 +179,10 @@ def are_behind(points: F64, origins: F64, planes: NDArray[np.void]) -> NDArray[n
     return np.asarray((planes["sided"] == _ONE_SIDE) & (along < -least))
 
 
-def are_within(points: F64, planes: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Return which points lie where flat surfaces are known, not beside them.
+def are_within(
+    points: F64, planes: NDArray[np.void], sigmas: float, margin: float = 0.0
+) -> NDArray[np.bool_]:
+    """Return which points (M,) lie within the extent of flat surfaces, along these.
 
     Parameters
     ----------
@@ -188,10 +190,13 @@ def are_within(points: F64, planes: NDArray[np.void]) -> NDArray[np.bool_]:
         [m], map frame.
     planes : ndarray, shape (M,), dtype PLANE
         The surface of each.
+    sigmas : float
+        The extent on either side of the middle, in standard deviations of a surface's points,
+    margin : float
+        and so much more [m].
     """
     along = np.einsum("nij,nj->ni", planes["axes"][:, 1:], points - planes["mean"])
-    sigmas, more = tuning.EXTENT
-    limits = sigmas * np.sqrt(planes["spread"][:, 1:]) + more
+    limits = sigmas * np.sqrt(planes["spread"][:, 1:]) + margin
     return np.asarray((np.abs(along) <= limits).all(axis=1))
 
 

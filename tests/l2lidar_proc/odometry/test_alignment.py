@@ -61,8 +61,8 @@ def test_a_displaced_start_comes_back() -> None:
     assert np.abs(left[eskf.ROTATION]).max() < 0.002
 
 
-def test_only_what_does_not_drive_takes_surfaces_to_end_where_they_seem_to() -> None:
-    """Of what is ahead of a carrier that drives, each sweep shows more."""
+def test_a_carrier_that_drives_keeps_points_beyond_the_extent_of_surfaces() -> None:
+    """What is ahead of it grows with each sweep; one that is moved by hand rejects them."""
     rng = np.random.default_rng(7)
     surfaces = SurfelMap((0.6,))
     seen = rng.uniform((-3.0, -3.0, -1.0), (3.0, 3.0, -1.0), (4000, 3))  # a floor,
