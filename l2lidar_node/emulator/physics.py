@@ -179,6 +179,10 @@ class RayCastWorker:
             resource_tracker.ensure_running()  # or starting it lets signals through
             with held():
                 prepared = self._pool.submit(_prepare, config, truth)
+            # The process has its own by now. With another one open, the pipe would never end, and
+            # the rest of a block that a killed process was writing would be waited for.
+            results: Any = self._pool._result_queue
+            results._writer.close()
             prepared.result()
         except BrokenProcessPool:  # open3d's readers crash on some damaged files
             self._end()
@@ -210,12 +214,10 @@ class RayCastWorker:
     def _end(self, grace_s: float = 0.0) -> None:
         workers = [*(self._pool._processes or {}).values()]  # there is no public way to get them
         manager: Any = self._pool._executor_manager_thread  # forgotten by not waiting for it
-        results: Any = self._pool._result_queue
         self._pool.shutdown(wait=False, cancel_futures=True)
         if len(wait([worker.sentinel for worker in workers], grace_s)) < len(workers):
             for worker in workers:
                 worker.kill()
-            results._writer.close()  # the rest of a truncated block is not needed
         if manager is not None:
             manager.join()  # else it closes what the interpreter writes to at its end
 

@@ -14,6 +14,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -192,18 +194,39 @@ def half_a_block(path: Path) -> None:
     signal.pause()
 
 
-@needs_rays
-def test_the_rest_of_a_block_that_was_cut_off_is_not_waited_for(tmp_path: Path) -> None:
+def half_sent(path: Path) -> tuple[RayCastWorker, Future[None]]:
+    """Return a worker that has sent the beginning of an answer, and that answer."""
     worker = RayCastWorker(PhysicsConfig(world="box"))
-    worker._pool.submit(half_a_block, tmp_path / "sent")
+    answer = worker._pool.submit(half_a_block, path)
     deadline = time.monotonic() + LIMIT_S
-    while not (tmp_path / "sent").exists():
+    while not path.exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
+    return worker, answer
+
+
+def close(worker: RayCastWorker) -> None:
+    """Close a worker, which must not take forever."""
     closing = threading.Thread(target=worker.close, daemon=True)
     closing.start()
     closing.join(LIMIT_S)
     assert not closing.is_alive()
+
+
+@needs_rays
+def test_the_rest_of_a_block_that_was_cut_off_is_not_waited_for(tmp_path: Path) -> None:
+    worker, _ = half_sent(tmp_path / "sent")
+    close(worker)
+
+
+@needs_rays
+def test_a_measuring_process_that_is_killed_while_it_writes_is_noticed(tmp_path: Path) -> None:
+    worker, answer = half_sent(tmp_path / "sent")
+    for process in worker._pool._processes.values():
+        process.kill()
+    with pytest.raises(BrokenProcessPool):
+        answer.result(LIMIT_S)
+    close(worker)
 
 
 @needs_rays
