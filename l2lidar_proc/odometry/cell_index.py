@@ -143,8 +143,10 @@ class CellIndex:
         return slots
 
     def _make_slots(self, bits: int) -> None:
-        self._keys: I64 = np.zeros(1 << bits, np.int64)
-        self._rows: I64 = np.zeros(1 << bits, np.int64)
+        # side by side: what a lookup needs of a slot comes into the cache at once
+        slots = np.zeros((1 << bits, 2), np.int64)
+        self._keys: I64 = slots[:, 0]
+        self._rows: I64 = slots[:, 1]
         self._last = (1 << bits) - 1
         self._shift = np.uint64(64 - bits)
 
