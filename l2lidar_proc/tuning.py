@@ -405,6 +405,10 @@ FAR_POINTS: Final = 10.0
 FAR_UNIQUE: Final = (0.8, 0.02)
 MEETING: Final = (0.25, 100)  # share of the points that must be near surfaces, and enough of them
 YOUNG_SWEEPS: Final = 12  # in a map before a sweep without surfaces around is remarkable
+# Turn, and sweeps, since the latest keyframe of KISS-ICP's map that make another. Derived: points
+# in a room, at 5 m, have moved by a voxel of it; a second of an L2, whose scan lines fill the map
+KEYFRAME_TURN: Final = 0.1  # [rad]
+KEYFRAME_SWEEPS: Final = 4
 KISS_SIGMA: Final = (0.03, 0.15)  # [rad, m] of KISS-ICP's registration on its own
 # A surface that was not seen for so much way is forgotten: met again it contradicts the present by
 # the drift. Tuned on: a lap of 80 m in an office, typical unit (0.25 % of the way): the floor met

@@ -76,10 +76,17 @@ class KissMatcher:
         self._config = config
         self._voxel_size = config.kiss.kiss_voxel_size
         self._made: _Parts | None = None
+        self._forget_keyframes()
+
+    def _forget_keyframes(self) -> None:
+        self._keyframe: F64 | None = None  # pose of the latest
+        self._since = 0  # sweeps that came after it
+        self._pruned_at = np.zeros(3)
 
     def clear(self) -> None:
         """Forget the map and what was learnt about the predictions."""
         self._made = None
+        self._forget_keyframes()
 
     @property
     def _parts(self) -> _Parts:
@@ -126,12 +133,41 @@ class KissMatcher:
         )
         return np.asarray(pose) if np.isfinite(pose).all() else None
 
-    def update(self, points: F64, pose: F64, guess: F64) -> None:
-        """Add points (N, 3) [m] at a pose (4, 4) to the map; learn how good its guess was."""
+    def update(self, points: F64, pose: F64, guess: F64, *, keyframes: bool = False) -> None:
+        """Add a sweep to the map; learn how good its guess was.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            Deskewed [m].
+        pose, guess : ndarray, shape (4, 4)
+        keyframes : bool
+            Add only keyframes: sweeps by which the sensor has moved by a voxel, or turned, since
+            the one that was added last; and every fourth sweep, which fills the map at rest.
+        """
         if len(points) < LEAST_POINTS:
             return
         self._parts.threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
-        self._parts.map.update(_thinned(points, 0.5 * self._voxel_size), pose)
+        self._since += 1
+        if keyframes and self._since < tuning.KEYFRAME_SWEEPS and not self._has_moved(pose):
+            return
+        self._keyframe, self._since = pose, 0
+        placed = (pose[:3, :3] @ _thinned(points, 0.5 * self._voxel_size).T + pose[:3, 3:]).T
+        self._parts.map.add_points(np.ascontiguousarray(placed))
+        # to look through the whole map takes as long as to add a third of a sweep
+        place, most = pose[:3, 3], tuning.PRUNE_SHARE * self._config.max_range
+        if np.linalg.norm(place - self._pruned_at) > most:
+            self._parts.map.remove_far_away_points(place)
+            self._pruned_at = place
+
+    def _has_moved(self, pose: F64) -> bool:
+        """Return whether a pose (4, 4) is far from the latest keyframe's."""
+        if self._keyframe is None:
+            return True
+        moved = np.linalg.inv(self._keyframe) @ pose
+        angle = float(np.linalg.norm(rotations.log(rotations.from_matrix(moved[:3, :3]))))
+        way = float(np.linalg.norm(moved[:3, 3]))
+        return way > self._voxel_size or angle > tuning.KEYFRAME_TURN
 
     def points(self) -> F64:
         """Return the map's points [m], shape (N, 3)."""

@@ -273,7 +273,8 @@ class SweepMatcher:
         # points from nearby, which the errors of that way have moved, must not take its place
         weighted = not self.driving
         fresh = self.surfaces.add(placed, self._sweeps, apart, state.position, weighted=weighted)
-        self.kiss.update(points, _pose(state), _pose(guess))
+        measured = not motion.imu.missing.all()
+        self.kiss.update(points, _pose(state), _pose(guess), keyframes=measured)
         self._walk(state.position)
         self._sweeps += 1
         return fresh

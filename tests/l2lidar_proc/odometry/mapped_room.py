@@ -53,9 +53,15 @@ def source(points: F64) -> Source:
     return Source(points, np.zeros(len(points)), np.linalg.norm(points, axis=1))
 
 
-def extended(matcher: SweepMatcher, points: F64, known: tuple[float, float] = TIGHT) -> float:
+def extended(
+    matcher: SweepMatcher,
+    points: F64,
+    known: tuple[float, float] = TIGHT,
+    *,
+    imu: bool = True,
+) -> float:
     """Add points that are seen from the origin; return the share where there was no map."""
     cloud = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"])
     cloud["x"], cloud["y"], cloud["z"] = points.T
-    at = motion(known, np.zeros(3))
+    at = motion(known, np.zeros(3), imu=imu)
     return matcher.extend(cloud, at, at.state)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from kiss_icp.voxelization import voxel_down_sample
 
-from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_node import rotations
+from l2lidar_node.types import F64, POINT, HostNs, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
-from l2lidar_proc.odometry.kiss import PlainOdometry, thinned_indices
+from l2lidar_proc.odometry.kiss import KissMatcher, PlainOdometry, thinned_indices
 from tests.l2lidar_proc.motion.analytic import at
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps
@@ -107,3 +109,95 @@ def test_plain_mode_leaves_out_points_with_their_times() -> None:
     odometry = PlainOdometry(OdometryConfig(mode="plain"))
     (estimate,) = odometry.register(Sweep(at(0), at(0.2), points, 0, 0))
     assert len(estimate.points) == np.isfinite(points["y"]).sum()
+
+
+VOXEL = OdometryConfig().kiss.kiss_voxel_size
+RANGE = OdometryConfig().max_range
+
+
+def pose(way: float = 0.0, turn: float = 0.0) -> F64:
+    """Return a pose (4, 4) on the x axis, turned about z."""
+    found = np.eye(4)
+    found[:3, :3] = rotations.matrices(rotations.exp((0.0, 0.0, turn)))
+    found[0, 3] = way
+    return found
+
+
+def grown(*poses: F64, keyframes: bool = True) -> list[int]:
+    """Return how many points the map has after a sweep of another wall at each pose."""
+    matcher = KissMatcher(OdometryConfig())
+    counts = []
+    for number, here in enumerate(poses):
+        matcher.update(wall(3.0 + 2.0 * number), here, here, keyframes=keyframes)
+        counts.append(len(matcher.points()))
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("near", "far"),
+    [
+        (pose(0.9 * VOXEL), pose(1.1 * VOXEL)),
+        (pose(-0.9 * VOXEL), pose(-1.1 * VOXEL)),
+        (pose(0.0, 0.9 * tuning.KEYFRAME_TURN), pose(0.0, 1.1 * tuning.KEYFRAME_TURN)),
+        (pose(0.0, -0.9 * tuning.KEYFRAME_TURN), pose(0.0, -1.1 * tuning.KEYFRAME_TURN)),
+    ],
+)
+def test_a_sweep_is_a_keyframe_where_the_sensor_has_moved_or_turned(near: F64, far: F64) -> None:
+    begun, unchanged, grown_at_last = grown(pose(), near, far)
+    assert begun == unchanged
+    assert grown_at_last > 1.5 * begun
+    every = grown(pose(), near, far, keyframes=False)
+    assert every[0] < every[1] < every[2]
+
+
+def test_motion_counts_from_the_latest_keyframe() -> None:
+    steps = [pose(0.6 * number * VOXEL) for number in range(5)]
+    counts = grown(*steps)
+    assert [after > before for before, after in itertools.pairwise(counts)] == [
+        False,
+        True,
+        False,
+        True,
+    ]
+
+
+def test_at_rest_every_fourth_sweep_is_a_keyframe() -> None:
+    counts = grown(*[pose()] * 9)
+    added = [after > before for before, after in itertools.pairwise(counts)]
+    assert added == [False, False, False, True] * 2
+
+
+def test_a_cleared_map_begins_with_the_next_sweep() -> None:
+    matcher = KissMatcher(OdometryConfig())
+    for _ in range(2):
+        matcher.update(wall(), pose(), pose(), keyframes=True)
+        assert len(matcher.points())
+        matcher.clear()
+
+
+def test_sweeps_between_keyframes_show_how_good_predictions_are() -> None:
+    matcher = KissMatcher(OdometryConfig())
+    matcher.update(wall(), pose(), pose(), keyframes=True)
+    before = matcher.threshold
+    matcher.update(wall(), pose(), pose(0.5), keyframes=True)
+    assert matcher.threshold != before
+
+
+def test_a_sweep_enters_the_map_where_its_pose_puts_it() -> None:
+    matcher, here = KissMatcher(OdometryConfig()), pose(7.0, 0.5)
+    points = wall()
+    matcher.update(points, here, here, keyframes=True)
+    placed = {tuple(p) for p in (points @ here[:3, :3].T + here[:3, 3]).round(9).tolist()}
+    found = matcher.points()
+    assert len(found) > 20
+    assert {tuple(p) for p in found.round(9).tolist()} <= placed
+
+
+def test_the_map_is_pruned_beyond_the_range() -> None:
+    matcher = KissMatcher(OdometryConfig())
+    reach = tuning.PRUNE_SHARE * RANGE
+    for way in np.arange(0.0, RANGE + 2.0 * reach, 0.9 * reach):
+        matcher.update(wall(), pose(way), pose(way), keyframes=True)
+        farthest = way - matcher.points()[:, 0].min()
+        assert farthest <= RANGE + reach
+        assert way < RANGE or farthest > 0.8 * RANGE  # what is near enough stays

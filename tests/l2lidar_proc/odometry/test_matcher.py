@@ -452,3 +452,13 @@ def test_points_count_by_their_range_unless_the_carrier_drives(driving: bool) ->
     extended(matcher, points)
     cells = matcher.surfaces._cells[1 : len(matcher.surfaces) + 1]
     assert (cells["weight"].sum() < 0.9 * cells["count"].sum()) != driving
+
+
+@pytest.mark.parametrize("imu", [False, True])
+def test_without_an_imu_every_sweep_is_a_keyframe(imu: bool) -> None:
+    """There a pose may be KISS-ICP's alone, for which its map has to be complete."""
+    rng, matcher = np.random.default_rng(5), SweepMatcher(OdometryConfig(), np.zeros(3))
+    extended(matcher, room(rng, 300), imu=imu)
+    begun = len(matcher.kiss.points())
+    extended(matcher, room(rng, 300), imu=imu)
+    assert (len(matcher.kiss.points()) > begun) is not imu
