@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import POINT, HostNs, Level, Sweep
+from l2lidar_node.types import F64, POINT, HostNs, Level, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
+from l2lidar_proc.odometry.uncertainty import MapDrift
 from tests.l2lidar_proc.odometry.odometry_world import (
     T_CLOUD_IMU,
     drive,
@@ -506,6 +508,34 @@ def test_the_old_map_is_searched_again_after_the_clock_has_gone_back() -> None:
     estimates = feed(odometry, room, back, imu)
     assert Status.RESTARTED in estimates[0].status
     assert any(Status.RETURNED in item.status for item in estimates)
+
+
+def test_an_older_part_of_the_map_is_looked_for_again_after_the_clock_has_gone_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With each sweep, where the pose is as certain as the map."""
+    run, hour = recording("room", "walk", 8.0), 3_600_000_000_000
+    some = list(sweeps(run, "turn"))
+    half = len(some) // 2
+    look, places = MapDrift.more_certain_than_held, []
+
+    def noted(drift: MapDrift, place: F64) -> NDArray[np.bool_] | None:
+        places.append(place)
+        return look(drift, place)
+
+    monkeypatch.setattr(MapDrift, "more_certain_than_held", noted)
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    feed(odometry, run, some[:half])
+    places.clear()
+    imu = run.imu[run.imu["stamp"] >= some[half].start].copy()
+    imu["stamp"] -= hour
+    late = [
+        dataclasses.replace(one, start=HostNs(one.start - hour), end=HostNs(one.end - hour))
+        for one in some[half:]
+    ]
+    estimates = feed(odometry, run, late, imu)
+    assert Status.RESTARTED in estimates[0].status
+    assert len(places) == len(late) > 10
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 9, 50])
