@@ -231,6 +231,7 @@ LINE_SPREAD: Final = 0.0135  # [m] standard deviation along the direction, at mo
 LINE_NOISE: Final = (0.008, 0.004)  # [m] of one point at least, and common to all of a line
 LINE_KEPT_NS: Final = 6_000_000_000  # [ns] in which a door is passed
 LINE_KEPT: Final = 1000  # lines at most. Bounds memory and time
+LINE_PAIRS: Final = 1000  # of lines at most, likewise: a matrix has as many rows and columns
 LINE_PAUSE_S: Final = 0.1  # [s] between two sweeps, at least
 LINE_DEEPEST: Final = 0.15  # [m] across, between two lines of one reveal
 LINE_REACH: Final = 0.3  # [m] along, likewise: two reveals are farther apart
@@ -250,6 +251,7 @@ LINE_RIVAL: Final = 0.6  # of the votes, that no other velocity may have
 # to 115, where 7 of 71 with less than two votes were false, 1 of 445 with more
 LINE_TRUE: Final = 4.0
 LINE_TRUE_VOTE: Final = 10.0
+LINE_SURE: Final = 20.0  # votes from which on more of them add nothing. Bounds the power
 LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ at least
 
 # ---- odometry: map of surfaces

@@ -202,7 +202,7 @@ class VerticalLines:
         if after is state:
             return state, covariance
         # chance agrees on any error alike, the fewer votes the more often
-        odds = tuning.LINE_TRUE * tuning.LINE_TRUE_VOTE ** (votes - 2.0)
+        odds = tuning.LINE_TRUE * tuning.LINE_TRUE_VOTE ** (min(votes, tuning.LINE_SURE) - 2.0)
         error = float(axes[0] @ (after.velocity - state.velocity))
         right = association_probability(error, sigma**2, odds)
         mean, covariance = _mixed(state, covariance, after, posterior, right)
@@ -258,6 +258,7 @@ class VerticalLines:
             & (np.abs(offset[:, 0]) < pairs["reach"])
             & (np.abs(offset[:, 1]) < tuning.LINE_DEEPEST)
         ]
+        pairs = pairs[:: max(-(-len(pairs) // tuning.LINE_PAIRS), 1)]
         votes = np.stack((face[pairs["line"] - first], lines["sweep"][pairs["earlier"]]))
         pairs["vote"] = np.unique(votes, axis=1, return_inverse=True)[1].ravel()
         return np.sort(pairs, order=["vote", "line", "earlier"])

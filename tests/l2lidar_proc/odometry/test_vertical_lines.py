@@ -444,3 +444,30 @@ def test_lines_of_an_hour_take_no_memory() -> None:
     lines.update(at(100.0), known(0.01), FIRST, AXES)
     lines.clear()
     assert len(lines) == 0
+
+
+def test_a_colonnade_has_hundreds_of_votes() -> None:
+    """Ten columns at ten turns a second, as a spinning lidar sees them."""
+    rng = np.random.default_rng(23)
+    lines = VerticalLines()
+    for number in range(60):
+        depths = 1.0 + 0.02 * rng.random(10)
+        many = np.concatenate(
+            [line(0.12 * number, 3.0 + k, depth) for k, depth in enumerate(depths.tolist())]
+        )
+        state, covariance = lines.update(at(0.12 * number), known(0.1), many, AXES)
+        assert np.isfinite(covariance).all()
+    assert abs(state.velocity[0]) < 0.01
+    assert np.sqrt(covariance[6, 6]) < 0.01
+
+
+def test_crowded_lines_take_bounded_memory() -> None:
+    """Every pair has a row and a column."""
+    rng = np.random.default_rng(22)
+    lines = VerticalLines()
+    for number in range(10):
+        places = rng.uniform((3.0, 1.0), (3.2, 1.1), (tuning.LINE_MOST, 2)).tolist()
+        many = np.concatenate([line(0.1 * number, *place) for place in places])
+        lines.update(at(0.1 * number), known(1.0), many, AXES)
+    pairs = lines._pairs(len(lines) - tuning.LINE_MOST, at(0.9), 1.0, AXES)
+    assert tuning.LINE_PAIRS / 2 < len(pairs) <= tuning.LINE_PAIRS
