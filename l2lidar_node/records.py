@@ -1,4 +1,4 @@
-"""Copying of structured arrays, record by record rather than field by field.
+"""Copying of structured arrays, record by record rather than field by field; and decimation.
 
 numpy copies, joins and indexes structured arrays one field of one record at a time: 1.2 ms for the
 14,000 points of a sweep. As opaque blocks of bytes the same takes 20 us. Results are equal to the
@@ -8,13 +8,15 @@ bit, padding included.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Records = NDArray[np.void]
 """A structured array."""
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 def copied(records: Records) -> Records:
@@ -52,6 +54,18 @@ def joined(parts: Sequence[Records]) -> Records:
     if layout is None or any(part.dtype != layout for part in parts):
         raise ValueError(f"expected arrays of one layout, not {[part.dtype for part in parts]}")
     return np.concatenate([_opaque(part) for part in parts]).view(layout)
+
+
+def decimated(rows: NDArray[_Scalar], most: int) -> NDArray[_Scalar]:
+    """Return every n-th row of any array, a view, with the least n that leaves few enough.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (N, ...)
+    most : int
+        Rows to leave at most; positive.
+    """
+    return rows[:: max(-(-len(rows) // most), 1)]
 
 
 def _opaque(records: Records) -> Records:

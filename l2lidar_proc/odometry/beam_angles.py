@@ -24,6 +24,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import F64, I64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.principal_axes import principal_axes, products
@@ -70,7 +71,7 @@ def halves(points: NDArray[np.void], rate: float | None = None) -> Halves | None
     far = np.flatnonzero(radius > _NEAR_M)
     if len(far) < tuning.BEAM_POINTS:
         return None
-    some = far[:: -(-len(far) // _MOST)]
+    some = records.decimated(far, _MOST)
     doubled = ((x[some] + 1j * y[some]) / radius[some]) ** 2
     rates = 2.0 * np.pi * _HEAD_HZ if rate is None else rate * _RATE_NEAR
     means = np.exp(-2j * np.outer(rates, time[some])) @ doubled / len(some)

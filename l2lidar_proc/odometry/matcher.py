@@ -140,7 +140,7 @@ class SweepMatcher:
         chosen = thinned_indices(points, settings.source_voxel)
         if self._is_weak and len(chosen) < tuning.DRIVING_POINTS:
             chosen = thinned_indices(points, tuning.DRIVING_VOXEL * settings.source_voxel)
-        chosen = chosen[:: max(-(-len(chosen) // settings.source_points), 1)]
+        chosen = records.decimated(chosen, settings.source_points)
 
         def denser() -> Source:
             dense = thinned_indices(points, tuning.FACING_VOXEL * settings.source_voxel)
@@ -355,7 +355,7 @@ class SweepMatcher:
         """
         seen = xyz(sweep.points)
         near = np.flatnonzero((seen**2).sum(axis=1) < tuning.LINE_RANGE**2)
-        near = near[:: max(-(-len(near) // tuning.LINE_SCANNED), 1)]
+        near = records.decimated(near, tuning.LINE_SCANNED)
         some = dataclasses.replace(sweep, points=records.selected(sweep.points, near))
         moved = self.deskewed(some, motion)
         state = motion.state

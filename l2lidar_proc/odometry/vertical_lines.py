@@ -258,7 +258,7 @@ class VerticalLines:
             & (np.abs(offset[:, 0]) < pairs["reach"])
             & (np.abs(offset[:, 1]) < tuning.LINE_DEEPEST)
         ]
-        pairs = pairs[:: max(-(-len(pairs) // tuning.LINE_PAIRS), 1)]
+        pairs = records.decimated(pairs, tuning.LINE_PAIRS)
         votes = np.stack((face[pairs["line"] - first], lines["sweep"][pairs["earlier"]]))
         pairs["vote"] = np.unique(votes, axis=1, return_inverse=True)[1].ravel()
         return np.sort(pairs, order=["vote", "line", "earlier"])

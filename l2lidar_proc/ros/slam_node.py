@@ -21,6 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
+from l2lidar_node import records
 from l2lidar_node.ros.conversions import (
     diagnostic_array,
     diagnostic_status,
@@ -294,8 +295,7 @@ class SlamNode(ManagedNode):
         """Publish map, path and graph; called in the worker's thread."""
         frame = self._settings.value.topics.map_frame
         if self._map.get_subscription_count():
-            points = built.points()
-            points = points[:: max(-(-len(points) // _SHOWN_POINTS), 1)]
+            points = records.decimated(built.points(), _SHOWN_POINTS)
             self._map.publish(to_cloud(messages.as_cloud(points), stamp, frame))
         if self._path.get_subscription_count():
             places = built.trajectory()

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from l2lidar_node import records
 from l2lidar_node.types import F64, I64
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.slam.se3 import error, magnitude, transformed
@@ -291,7 +292,7 @@ class SubmapView:
 
     @cached_property
     def _open(self) -> I64:
-        chosen = self._submap.points[:: max(-(-len(self._submap.points) // _OPEN_RAYS), 1)]
+        chosen = records.decimated(self._submap.points, _OPEN_RAYS)
         ends = chosen["xyz"] * STEP_M
         way = self._submap.views[chosen["view"]] - ends
         length = np.linalg.norm(way, axis=1)
@@ -350,7 +351,7 @@ def _spread(points: F64) -> F64:
 
 def _free_cells(submap: Submap) -> I64:
     """Return the sorted keys of the cells that rays passed and no surface is next to."""
-    chosen = submap.points[:: max(-(-len(submap.points) // _FREE_RAYS), 1)]
+    chosen = records.decimated(submap.points, _FREE_RAYS)
     occupied = np.floor(submap.xyz * (1.0 / _FREE_CELL_M)).astype(np.int64)
     ends = chosen["xyz"] * (STEP_M / _FREE_CELL_M)
     origins = submap.views[chosen["view"]].astype(np.float64) * (1.0 / _FREE_CELL_M)

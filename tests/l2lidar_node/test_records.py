@@ -52,3 +52,14 @@ def test_a_copy_is_its_own() -> None:
 def test_what_cannot_be_joined_is_refused(parts: list[Any]) -> None:
     with pytest.raises(ValueError, match="one layout"):
         records.joined(parts)
+
+
+@given(st.integers(0, 200), st.integers(1, 50))
+def test_decimated_are_the_most_evenly_spaced_that_are_few_enough(rows: int, most: int) -> None:
+    left = records.decimated(np.arange(rows), most)
+    assert len(left) <= most
+    assert left.tolist() == list(range(0, rows, int(left[1]) if len(left) > 1 else rows or 1))
+    if 1 < len(left) < rows:
+        assert len(range(0, rows, int(left[1]) - 1)) > most
+    if rows <= most:
+        assert len(left) == rows

@@ -447,7 +447,7 @@ def test_lines_of_an_hour_take_no_memory() -> None:
 
 
 def test_a_colonnade_has_hundreds_of_votes() -> None:
-    """Ten columns at ten turns a second, as a spinning lidar sees them."""
+    """Ten columns at eight turns a second, as a spinning lidar sees them."""
     rng = np.random.default_rng(23)
     lines = VerticalLines()
     for number in range(60):
