@@ -32,10 +32,10 @@ from l2lidar_proc.motion.filter import (
     ACCEL_BIAS,
     ERRORS,
     GRAVITY,
-    POSITION,
     VELOCITY,
     InertialState,
     association_probability,
+    correction_of_passed,
     square_root,
     update_with_information,
 )
@@ -158,20 +158,13 @@ class VerticalLines:
     def correct(self, before: InertialState, after: InertialState) -> None:
         """Move the lines along with a correction of the state at one instant.
 
-        The error of the velocity is taken for constant, as that of gravity and of the bias: so
-        much has moved the places that the state has passed.
-
         Parameters
         ----------
         before, after : InertialState
             At the same instant, not before the lines'.
         """
-        if not len(self._lines):
-            return
-        change = after.boxminus(before)
-        force = change[GRAVITY] - after.rotation @ change[ACCEL_BIAS]
-        tau = self._ages(after)[:, None]
-        self._lines["place"] += change[POSITION] - tau * change[VELOCITY] + 0.5 * tau * tau * force
+        if len(self._lines):
+            self._lines["place"] += correction_of_passed(before, after, self._lines["stamp"])
 
     def update(
         self, state: InertialState, covariance: F64, found: Lines, axes: F64
