@@ -28,7 +28,7 @@ from tests.support.other_sensors import CLOUD_POINT, SENSORS
 
 FOLDER: Final = Path("out") / "recordings"
 EPOCH: Final = 1_700_000_000_000_000_000
-_VERSION: Final = 1  # of what a scenario's name stands for; a new one makes all recordings anew
+_VERSION: Final = 2  # of what a scenario's name stands for; a new one makes all recordings anew
 _BATCH: Final = 50
 _TRUTH_HZ: Final = 500
 
@@ -136,7 +136,7 @@ def recording(given: Scenario, *, fresh: bool = False) -> Recording:
     with np.load(path) as file:
         points = np.zeros(len(file["times"]), CLOUD_POINT)
         points["x"], points["y"], points["z"] = file["points"].T
-        points["time"] = file["times"]
+        points["time"], points["intensity"] = file["times"], file["intensities"]
         points.flags.writeable = False
         return Recording(
             path,
@@ -165,6 +165,7 @@ def _measured(given: Scenario) -> dict[str, Any]:
     return {
         "points": np.stack([points[axis] for axis in "xyz"], axis=1),
         "times": points["time"],
+        "intensities": points["intensity"],
         "edges": edges,
         "spans": spans,
         "imu": _samples(given, setting),
@@ -210,8 +211,8 @@ def _l2(
     length = 299 * wire.MIRROR_PERIOD_S / 600.0
     spans = np.stack([start_s[cuts[:-1]], start_s[cuts[1:] - 1] + length], axis=1)
     points = np.zeros(len(cloud), CLOUD_POINT)
-    for axis in "xyz":
-        points[axis] = cloud[axis]
+    for name in ("x", "y", "z", "intensity"):
+        points[name] = cloud[name]
     for k, (first, last) in enumerate(pairwise(edges.tolist())):
         if last > first:
             spans[k, 0] = when[first]

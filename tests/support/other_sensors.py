@@ -19,8 +19,16 @@ from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.types import F64
 
-CLOUD_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
-"""A point in the sensor's frame [m], and seconds after the start of its sweep."""
+CLOUD_POINT: Final = np.dtype(
+    [
+        ("x", "<f4"),  # [m] sensor's frame
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("time", "<f4"),  # [s] after the start of its sweep
+        ("intensity", "<f4"),  # [1] 0 where the sensor measures none
+    ]
+)
+"""A measured point."""
 
 _WEAKEST: Final = 0.0004  # reflectivity * incidence / (range / longest range * 42 m)^2
 
