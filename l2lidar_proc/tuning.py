@@ -213,12 +213,15 @@ WALL_FLAT: Final = 0.1  # of the scatter's second eigenvalue: below it the first
 RANGE_NOISE_SLOPE: Final = 0.0011  # [m/m]
 RANGE_NOISE_FACTOR: Final = 2.0  # on the standard deviation: neighbors err together
 
+# ---- odometry: velocity along walls
+
+WALL_POINTS: Final = 15_000  # of a sweep. Bounds the time; a turn of an L2 has fewer
+
 # ---- odometry: vertical lines. Tuned on: seeds 0 to 7 of the hard corridors, where 4 to 9 sweeps
 # see a reveal of a door, and each gives its place along the corridor to 2 or 3 mm.
 
 LINE_SLOPE: Final = 0.3  # sine of the direction against the horizontal
 LINE_RANGE: Final = 8.0  # [m] farther away they are few, and false ones prevail
-LINE_SCANNED: Final = 15_000  # points of a sweep. Bounds the time; a turn of an L2 has fewer
 LINE_WALL_SLOPE: Final = 0.2  # cosine: surfaces along the direction are walls
 LINE_WALL_REACH: Final = 0.02  # [m] points nearer to such a surface belong to it,
 LINE_WALL_THICKNESS: Final = 0.015  # [m] unless it is thicker: that may be wall and reveal
@@ -253,6 +256,46 @@ LINE_TRUE: Final = 4.0
 LINE_TRUE_VOTE: Final = 10.0
 LINE_SURE: Final = 20.0  # votes from which on more of them add nothing. Bounds the power
 LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ at least
+
+# ---- odometry: wall profile. Tuned on: hard corridors, seeds 100 to 115, at first with the true
+# poses; the rest in the corridor of tests/l2lidar_proc/odometry/test_wall_profile.py.
+
+PROFILE_RANGE: Final = 10.0  # [m]
+PROFILE_CELL: Final = 0.03  # [m] of a spot along the way, 2.5 times the range noise,
+PROFILE_ROW: Final = 0.3  # [m] and upwards: four points of an L2 at 6 m
+PROFILE_POINTS: Final = 3  # of a spot, at least
+PROFILE_FLAT: Final = 0.03  # [m] standard deviation across, at most: 2.5 times the range noise
+PROFILE_UPRIGHT: Final = 1.5  # times as high as wide, at least: a floor is not
+PROFILE_BESIDE: Final = 0.3  # [m] beside the sensor, at least
+PROFILE_SPOTS: Final = 300  # of a sweep at most; an L2 has 130 to 250. Bounds memory and time,
+PROFILE_MOST: Final = 10_000  # and so does this number of those compared
+PROFILE_KEPT_NS: Final = 4_000_000_000  # [ns] in which a door is passed
+PROFILE_PAUSE_NS: Final = 900_000_000  # [ns] between comparisons, four sweeps
+PROFILE_SPAN_NS: Final = 1_500_000_000  # [ns] over which spots are spread, at least
+PROFILE_SIDE: Final = 100  # spots of a wall, at least
+# [m] Scatter of a wall's depth at most: of walls of corridors it is 0.01, of what stands in a
+# hall 0.05 to 5. And [m], sigma, and share of spots that may stand before a wall
+PROFILE_SCATTER: Final = 0.03
+PROFILE_BEFORE: Final = (0.1, 3.0, 0.05)
+# Terms of the likelihood that say the same: seven rows of a wall see an edge together, and each
+# edge counts with all pairs of neighbors. With this number the errors of the velocity are as
+# large as the likelihood says (their NEES is 0.7 to 1.3).
+PROFILE_DEPENDENT: Final = 20.0
+PROFILE_NOISE: Final = 0.01  # [m/s] 1 sigma, common to all spots: what niches hide, for one
+PROFILE_SURE: Final = 0.03  # [m/s] 1 sigma: below, that would count
+PROFILE_SIGMAS: Final = 4.0  # of the velocity, to which errors are compared,
+PROFILE_REACH: Final = 0.6  # [m/s] and at most
+PROFILE_STEP: Final = 0.01  # [m/s] between them, which is 5 cm in the time that spots are kept
+PROFILE_STEPS: Final = 15  # to each side, at least
+# Standard deviations, common to a spot and of one of its points (12 mm: range noise), and of an
+# edge: of the logarithm of the intensity; and of the depth [m], where errors of the beams add
+# some per meter
+PROFILE_BRIGHTNESS: Final = (0.03, 0.05, 0.25)
+PROFILE_DEPTH: Final = (0.01, 0.005, 0.012, 0.3)
+PROFILE_RATE: Final = 0.3  # [1/m] edges of a wall
+PROFILE_EDGE: Final = 0.1  # [m] width of an edge: without, reveals seem to repel each other
+PROFILE_ROUNDS: Final = 6  # of weighting
+PROFILE_CAUCHY: Final = 2.0  # [1] times the scatter: weight one half
 
 # ---- odometry: map of surfaces
 

@@ -578,7 +578,7 @@ def correction_of_passed(before: InertialState, after: InertialState, stamps: I6
     before, after : InertialState
         At the same instant.
     stamps : ndarray, shape (N,)
-        When the places were seen [ns], not after that instant.
+        When the places were seen [ns].
     """
     change = after.boxminus(before)
     force = change[GRAVITY] - after.rotation @ change[ACCEL_BIAS]

@@ -44,6 +44,7 @@ from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import MapDrift
 from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
+from l2lidar_proc.odometry.wall_profile import Spots, extract_spots
 
 
 class Match(NamedTuple):
@@ -341,8 +342,8 @@ class SweepMatcher:
         least = abs(float(along @ found.state.velocity)) - sigma
         return along if self.driving or is_driving_speed(least) else None
 
-    def vertical_lines(self, sweep: Sweep, motion: SweepMotion, axes: F64) -> Lines:
-        """Return the vertical lines that a sweep sees away from known walls.
+    def beside_walls(self, sweep: Sweep, motion: SweepMotion, axes: F64) -> tuple[Spots, Lines]:
+        """Return what a sweep sees beside the way: spots of walls, and vertical lines elsewhere.
 
         Parameters
         ----------
@@ -350,18 +351,25 @@ class SweepMatcher:
         motion : SweepMotion
             Places the points.
         axes : ndarray, shape (3, 3)
-            As :func:`~l2lidar_proc.odometry.vertical_lines.level_axes` returns them, of the
+            As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them, of the
             direction along which the walls run.
         """
         seen = xyz(sweep.points)
-        near = np.flatnonzero((seen**2).sum(axis=1) < tuning.LINE_RANGE**2)
-        near = records.decimated(near, tuning.LINE_SCANNED)
+        near = np.flatnonzero((seen**2).sum(axis=1) < tuning.PROFILE_RANGE**2)
+        near = records.decimated(near, tuning.WALL_POINTS)
         some = dataclasses.replace(sweep, points=records.selected(sweep.points, near))
         moved = self.deskewed(some, motion)
         state = motion.state
-        placed = (xyz(moved) - self.lever) @ state.rotation.T + state.position
+        sights = (xyz(moved) - self.lever) @ state.rotation.T
+        placed = sights + state.position
         stamps = sweep.start + np.round(moved["time"] * 1e9).astype(np.int64)
-        return extract_lines(placed, stamps, self.surfaces.are_along(placed, axes[0]), axes)
+        has_intensity = "intensity" in (moved.dtype.names or ())
+        bright = moved["intensity"].astype(np.float64) if has_intensity else None
+        spots = extract_spots(placed, stamps, bright, sights, axes)
+        close = (sights**2).sum(axis=1) < tuning.LINE_RANGE**2
+        placed, stamps = placed[close], stamps[close]
+        is_wall = self.surfaces.are_along(placed, axes[0])
+        return spots, extract_lines(placed, stamps, is_wall, axes)
 
     def _note_height(self, found: Alignment, seconds: float) -> None:
         """Note for how long the height has been fixed, of late."""

@@ -37,7 +37,7 @@ from l2lidar_proc.odometry.uncertainty import (
     inflated_prior,
     with_loose_motion,
 )
-from l2lidar_proc.odometry.vertical_lines import VerticalLines, level_axes
+from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
 LIBRARIES: Final = (*kiss.LIBRARIES, eskf.LIBRARY, "scipy.spatial.transform")
@@ -109,7 +109,7 @@ class Odometry:
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0
         self._next_check = 0  # stamp from which on a sweep that fits badly is aligned again
-        self._lines = VerticalLines()
+        self._walls = WallVelocity()
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
         self._revisit = MapRevisit()
@@ -236,12 +236,12 @@ class Odometry:
             self._note_unmatched(sweep, len(source.points), status)
             posterior = predicted.state, predicted.covariance
         else:
-            found = self._with_lines(sweep, predicted, found)
+            found = self._with_wall_velocity(sweep, predicted, found)
             self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
         motion = self._constrained(predicted, *posterior, status)
-        self._lines.correct(posterior[0], motion.state)
+        self._walls.correct(posterior[0], motion.state)
         if self._unmatched_ns >= tuning.LOST_NS:
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
@@ -290,16 +290,18 @@ class Odometry:
             return predicted, found
         return loose, other
 
-    def _with_lines(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> Alignment:
-        """Return an alignment with what vertical lines tell where surfaces leave it free."""
-        self._lines.correct(predicted.state, found.state)
+    def _with_wall_velocity(
+        self, sweep: Sweep, predicted: SweepMotion, found: Alignment
+    ) -> Alignment:
+        """Return an alignment with what walls tell of the velocity that surfaces leave free."""
+        self._walls.correct(predicted.state, found.state)
         direction = self.matcher.driving_direction(found)
         if direction is None:
             return found
         axes = level_axes(direction, found.state.gravity)
         motion = predicted.with_state(found.state, found.covariance)
-        lines = self.matcher.vertical_lines(sweep, motion, axes)
-        state, covariance = self._lines.update(found.state, found.covariance, lines, axes)
+        spots, lines = self.matcher.beside_walls(sweep, motion, axes)
+        state, covariance = self._walls.update(found.state, found.covariance, spots, lines, axes)
         return dataclasses.replace(found, state=state, covariance=covariance)
 
     def _constrained(
@@ -343,7 +345,7 @@ class Odometry:
             self._keep_at_rest(motion)
         else:
             motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
-            self._lines.correct(predicted.state, motion.state)
+            self._walls.correct(predicted.state, motion.state)
             self._keep(motion)
         quality = self.matcher.quality(len(sweep.points), None)
         quality = self._consistency(quality, motion.state.stamp)
@@ -398,7 +400,7 @@ class Odometry:
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
         if rests:
             self._innovations.clear()
-            self._lines.clear()
+            self._walls.clear()
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map at the predicted pose; keep the one before, it may be seen again."""
@@ -412,7 +414,7 @@ class Odometry:
             self._earlier.keep(self.matcher, before, motion.state.stamp)
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
-        self._lines.clear()
+        self._walls.clear()
         self._unmatched_ns = 0
         self._innovations.clear()
         self.phase = Phase.LOST
@@ -440,7 +442,7 @@ class Odometry:
         self._initializer = self._new_initializer()
         self.matcher.meet(back.alignment, 0.0)
         self._zero_velocity.clear()
-        self._lines.clear()
+        self._walls.clear()
         self._innovations.clear()
         self._unmatched_ns = 0
         self.phase = Phase.TRACKING
@@ -561,7 +563,7 @@ class Odometry:
         self._jump = self._jump.unseen(self._belief[0])
         self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
         self._zero_velocity.clear()
-        self._lines.clear()
+        self._walls.clear()
         self._innovations.clear()
         self._next_check = int(reference)
         self._earlier.restart(reference)

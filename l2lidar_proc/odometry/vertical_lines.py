@@ -66,22 +66,6 @@ _PAIR: Final = np.dtype(
 )
 
 
-def level_axes(direction: F64, gravity: F64) -> F64:
-    """Return level axes as the rows of a rotation matrix: along, across to the left, and up.
-
-    Parameters
-    ----------
-    direction : ndarray, shape (3,)
-        Map axes; not vertical.
-    gravity : ndarray, shape (3,)
-        [m/s^2]
-    """
-    up = -gravity / np.linalg.norm(gravity)
-    along = direction - (direction @ up) * up
-    along /= np.linalg.norm(along)
-    return np.stack((along, np.cross(up, along), up))
-
-
 def extract_lines(points: F64, stamps: I64, is_wall: NDArray[np.bool_], axes: F64) -> Lines:
     """Return the vertical lines in the points of a sweep, those with most points first.
 
@@ -94,7 +78,7 @@ def extract_lines(points: F64, stamps: I64, is_wall: NDArray[np.bool_], axes: F6
     is_wall : ndarray, shape (N,)
         Which points lie on known surfaces along the direction.
     axes : ndarray, shape (3, 3)
-        As :func:`level_axes` returns them.
+        As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
 
     Returns
     -------
@@ -178,7 +162,7 @@ class VerticalLines:
         covariance : ndarray, shape (18, 18)
         found : ndarray, shape (N,), dtype LINE
         axes : ndarray, shape (3, 3)
-            As :func:`level_axes` returns them.
+            As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
         """
         oldest = int(state.stamp) - tuning.LINE_KEPT_NS
         kept = np.flatnonzero(self._lines["stamp"] >= oldest)[-tuning.LINE_KEPT :]

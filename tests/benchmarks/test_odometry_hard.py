@@ -29,7 +29,9 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.vertical_lines import LINE, VerticalLines
+from l2lidar_proc.odometry.vertical_lines import LINE
+from l2lidar_proc.odometry.wall_profile import SPOT
+from l2lidar_proc.odometry.wall_velocity import WallVelocity
 from tests.support.other_sensors import SENSORS
 
 pytest.importorskip("open3d")
@@ -208,7 +210,7 @@ def end_of(some: Recording) -> float:
     return score(some, track)["end_m"]
 
 
-def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
+def test_walls_measure_the_velocity_along_a_corridor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the surfaces alone the sensor ends two meters off along it."""
@@ -216,9 +218,23 @@ def test_reveals_of_doors_measure_the_velocity_along_a_corridor(
     corridor = recording(scenario("corridor, 80 degrees", 113, 24.0))
     assert end_of(corridor) < 0.1
     monkeypatch.setattr(
-        VerticalLines, "update", lambda _, state, covariance, *others: (state, covariance)
+        WallVelocity, "update", lambda _, state, covariance, *others: (state, covariance)
     )
     assert end_of(corridor) > 2.0
+
+
+@pytest.mark.parametrize("has_intensity", [True, False])
+def test_a_narrow_corridor_does_not_run_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_intensity: bool
+) -> None:
+    """By vertical lines alone this one ended 23 m off."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    corridor = recording(scenario("corridor, 120 degrees, imperfect", 110, 60.0))
+    if not has_intensity:
+        points = corridor.points.copy()
+        points["intensity"] = 0.0
+        corridor = replace(corridor, points=points)
+    assert end_of(corridor) < 1.5
 
 
 def test_a_camera_that_looks_into_rooms_does_not_run_away(
@@ -240,12 +256,12 @@ def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
     line["stamp"] = some[-1].start
     state = odometry.motion.state if odometry.motion else None
     assert state is not None
-    odometry._lines.update(state, np.eye(18), line, np.eye(3))
-    assert len(odometry._lines) == 1
+    odometry._walls.update(state, np.eye(18), np.zeros(0, SPOT), line, np.eye(3))
+    assert len(odometry._walls._lines) == 1
     odometry.register(
         replace(some[-1], start=HostNs(some[-1].start - hour), end=HostNs(some[-1].end - hour))
     )
-    assert len(odometry._lines) == 0
+    assert len(odometry._walls._lines) == 0
 
 
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:

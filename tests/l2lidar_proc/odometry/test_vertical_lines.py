@@ -18,8 +18,8 @@ from l2lidar_proc.odometry.vertical_lines import (
     Lines,
     VerticalLines,
     extract_lines,
-    level_axes,
 )
+from l2lidar_proc.odometry.wall_velocity import level_axes
 
 DOWN = np.array([0.0, 0.0, -9.8])
 AXES = np.eye(3)
@@ -182,16 +182,6 @@ def test_the_number_of_lines_is_bounded() -> None:
     rng = np.random.default_rng(5)
     many = [face(rng, 0.2 * k, (1.0, 1.02), 13 + k % 2) for k in range(80)]
     assert len(extracted(np.vstack(many))) == tuning.LINE_MOST
-
-
-def test_axes_are_level() -> None:
-    axes = level_axes(np.array([0.6, 0.3, 0.2]), np.array([0.5, 0.0, -9.7]))
-    assert axes @ axes.T == pytest.approx(np.eye(3))
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    assert axes @ np.array([0.5, 0.0, -9.7]) == pytest.approx(
-        [0.0, 0.0, -np.hypot(0.5, 9.7)], abs=1e-12
-    )
-    assert axes[0] @ np.array([0.6, 0.3, 0.2]) > 0.0
 
 
 def test_walls_are_thin_surfaces_along_a_direction() -> None:

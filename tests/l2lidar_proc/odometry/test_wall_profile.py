@@ -1,0 +1,553 @@
+"""The profile of walls: what a spot is, which velocity a corridor tells, and how certain it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc import tuning
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.odometry import wall_profile
+from l2lidar_proc.odometry.wall_profile import (
+    SPOT,
+    Spots,
+    WallProfile,
+    extract_spots,
+    log_likelihood,
+    velocity_likelihood,
+)
+
+AXES = np.eye(3)
+EPOCH = 1_700_000_000_000_000_000  # [ns]
+SPEED = 1.25  # [m/s]
+SWEEP_S = 0.23
+HALF_WIDTH = 1.2  # [m] of the corridor
+LINES = np.deg2rad(7.27)  # from one upright line of an L2 to the next
+
+
+class Opening(NamedTuple):
+    """In the right wall: from and to [m], how far back [m], and its reflectivity."""
+
+    start: float
+    end: float
+    depth: float
+    reflectivity: float
+
+
+WALL = 0.75
+PAINTED = (Opening(3.0, 3.95, 0.0, 0.45), Opening(9.5, 10.45, 0.0, 0.45))
+NICHES = (Opening(3.0, 4.2, 0.4, WALL), Opening(9.0, 10.0, 0.5, WALL))
+DOORS = (Opening(3.0, 3.95, 0.05, 0.45), Opening(9.5, 10.45, 0.1, 0.45))
+
+
+def state_at(seconds: float, error: float = 0.0) -> InertialState:
+    """Return the state of a sensor that passes at constant speed, of which it is wrong."""
+    zero, speed = np.zeros(3), SPEED + error
+    return InertialState(
+        HostNs(EPOCH + round(seconds * 1e9)),
+        np.eye(3),
+        np.array([speed * seconds, 0.0, 0.5]),
+        np.array([speed, 0.0, 0.0]),
+        zero,
+        zero,
+        np.array([0.0, 0.0, -9.81]),
+    )
+
+
+def known(speed: float) -> F64:
+    """Return a covariance of which the velocity along x is known to a standard deviation."""
+    covariance = 1e-10 * np.eye(eskf.ERRORS)
+    covariance[6, 6] = speed**2
+    return covariance
+
+
+def swept(
+    rng: np.random.Generator,
+    seconds: float,
+    openings: tuple[Opening, ...],
+    error: float,
+    *,
+    bend: float = 0.0,
+    has_intensity: bool = True,
+) -> Spots:
+    """Return what a sweep sees of a corridor, where a sensor with a wrong velocity places it.
+
+    Upright lines at a random phase, seven rows of the wall each.
+    """
+    x, places = SPEED * seconds, []
+    for side in (-1.0, 1.0):
+        for angle in np.arange(LINES * (1.0 + rng.random()), np.deg2rad(60.0), LINES).tolist():
+            slope = 1.0 / np.tan(angle)
+            at, depth, brightness = x + HALF_WIDTH * slope, 0.0, 0.5 * np.log(WALL)
+            for hole in openings if side < 0.0 else ():
+                if not hole.start < at < hole.end:
+                    continue
+                back = at + hole.depth * slope
+                if back > hole.end:  # the reveal, which faces the sensor more than walls do
+                    depth, at = (hole.end - at) / slope, hole.end
+                    brightness += 0.5 * np.log(slope)
+                else:
+                    at, depth, brightness = back, hole.depth, 0.5 * np.log(hole.reflectivity)
+                break
+            places.append((at, side, depth, brightness))
+    at, side, depth, brightness = np.repeat(np.array(places), 7, axis=0).T
+    at = at + 0.004 * rng.standard_normal(len(at))
+    found = np.zeros(len(at), SPOT)
+    state = state_at(seconds, error)
+    found["stamp"] = state.stamp
+    found["points"] = 8
+    noise = 0.006 * rng.standard_normal(len(at))
+    lateral = side * (HALF_WIDTH + depth + noise)
+    up = np.tile(0.15 + 0.3 * np.arange(7.0), len(places)) - 0.5
+    sight = found["sight"]
+    sight[:, 0], sight[:, 1], sight[:, 2] = at - x, lateral, up
+    found["place"] = sight + state.position
+    found["place"][:, 1] += bend * (at - 5.0) ** 2
+    if has_intensity:
+        reach = np.linalg.norm(sight, axis=1)
+        found["brightness"] = brightness - 0.4 * np.log(reach)
+        found["brightness"] += 0.02 * rng.standard_normal(len(at))
+    return found[np.linalg.norm(sight, axis=1) < tuning.PROFILE_RANGE]
+
+
+def passed(
+    seed: int,
+    openings: tuple[Opening, ...],
+    error: float,
+    *,
+    bend: float = 0.0,
+    has_intensity: bool = True,
+    seconds: float = 5.5,
+) -> Spots:
+    """Return the spots of all sweeps of some seconds."""
+    rng = np.random.default_rng(seed)
+    return np.concatenate(
+        [
+            swept(rng, time, openings, error, bend=bend, has_intensity=has_intensity)
+            for time in np.arange(0.0, seconds, SWEEP_S).tolist()
+        ]
+    )
+
+
+ERRORS = np.linspace(-0.4, 0.4, 81)
+
+
+def likelihood(spots: Spots) -> F64:
+    now = int(spots["stamp"].max())
+    return np.asarray(np.log(velocity_likelihood(spots, now, AXES, ERRORS)))
+
+
+def mean_and_sigma(logs: F64) -> tuple[float, float]:
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    mean = float(weights @ ERRORS)
+    return mean, float(np.sqrt(weights @ (ERRORS - mean) ** 2))
+
+
+# ---- spots
+
+
+def upright(count: int = 20, across: float = 1.2, along: float = 3.01, up: float = 0.61) -> F64:
+    """Return points of an upright line on the left wall, within one cell."""
+    points = np.zeros((count, 3))
+    points[:, 0] = along
+    points[:, 1] = across
+    points[:, 2] = np.linspace(up, up + 0.28, count)
+    return points
+
+
+def extracted(points: F64, intensities: F64 | None = None) -> Spots:
+    stamps = np.arange(len(points)) * 1000
+    return extract_spots(points, stamps, intensities, points, AXES)
+
+
+def test_an_upright_line_is_a_spot() -> None:
+    points = upright()
+    found = extracted(points, np.full(20, 100.0))
+    assert len(found) == 1
+    assert found["place"][0] == pytest.approx(points.mean(axis=0))
+    assert found["sight"][0] == pytest.approx(points.mean(axis=0))
+    assert found["stamp"][0] == 9500
+    assert found["points"][0] == 20
+    assert found["brightness"][0] == pytest.approx(np.log(100.0))
+
+
+def test_cells_are_small_and_sides_apart() -> None:
+    lines = [upright(), upright(across=-1.2), upright(along=3.04), upright(up=0.91)]
+    assert len(extracted(np.concatenate(lines))) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "is_spot"),
+    [
+        ("none", True),
+        ("floor", False),
+        ("thick", False),
+        ("two points", False),
+        ("near the axis", False),
+    ],
+)
+def test_only_upright_faces_beside_the_sensor_are_spots(change: str, is_spot: bool) -> None:
+    points = upright()
+    if change == "floor":
+        points[:, 1], points[:, 2] = np.linspace(1.0, 1.05, 20), 0.7
+    elif change == "thick":
+        points[::2, 1] += 0.07
+    elif change == "two points":
+        points = points[:2]
+    elif change == "near the axis":
+        points[:, 1] = 0.25
+    assert len(extracted(points)) == is_spot
+
+
+def test_points_without_an_intensity_are_left_out_if_others_have_one() -> None:
+    points = np.concatenate([upright(), upright()])
+    bad = np.resize([0.0, np.nan, np.inf, -1.0], 20)
+    both = np.concatenate([np.full(20, 50.0), bad])
+    found = extracted(points, both)
+    assert found["points"].tolist() == [20.0]
+    assert found["brightness"][0] == pytest.approx(np.log(50.0))
+    assert extracted(points, np.concatenate([bad, bad]))["points"].tolist() == [40.0]
+    assert extracted(points, None)["brightness"].tolist() == [0.0]
+
+
+def test_an_empty_sweep_has_no_spots() -> None:
+    assert len(extracted(np.zeros((0, 3)))) == 0
+
+
+def test_the_number_of_spots_is_bounded() -> None:
+    lines = [upright(along=0.01 + 0.03 * k) for k in range(2 * tuning.PROFILE_SPOTS)]
+    assert 0 < len(extracted(np.concatenate(lines))) <= tuning.PROFILE_SPOTS
+
+
+# ---- likelihood
+
+
+@pytest.mark.parametrize("error", [-0.15, 0.0, 0.1])
+@pytest.mark.parametrize(
+    ("openings", "has_intensity"),
+    [(PAINTED, True), (NICHES, True), (NICHES, False), (DOORS, True), (DOORS, False)],
+)
+def test_edges_tell_the_velocity(
+    openings: tuple[Opening, ...], has_intensity: bool, error: float
+) -> None:
+    spots = passed(3, openings, error, has_intensity=has_intensity)
+    mean, sigma = mean_and_sigma(likelihood(spots))
+    assert sigma < 0.08
+    assert abs(mean + error) < 3.0 * np.hypot(sigma, 0.01)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.002])
+@pytest.mark.parametrize("error", [-0.2, 0.0])
+def test_bare_walls_leave_the_velocity_open(error: float, bend: float) -> None:
+    spots = passed(4, (), error, bend=bend)
+    logs = likelihood(spots)
+    near = np.abs(ERRORS) < 0.2
+    assert np.ptp(logs[near]) < 3.0
+
+
+def test_a_bend_of_the_walls_is_no_edge() -> None:
+    straight, bent = (passed(5, DOORS, 0.1, bend=bend) for bend in (0.0, 0.003))
+    (mean, sigma), (other, _) = (mean_and_sigma(likelihood(s)) for s in (straight, bent))
+    assert other == pytest.approx(mean, abs=0.3 * sigma)
+
+
+@pytest.mark.parametrize("openings", [DOORS, NICHES])
+def test_what_niches_hide_is_no_motion(openings: tuple[Opening, ...]) -> None:
+    """The part of a niche that its near edge hides shrinks as it is passed; reveals are deep."""
+    found = np.array(
+        [
+            mean_and_sigma(likelihood(passed(seed, openings, 0.0, seconds=4.0)))
+            for seed in range(60)
+        ]
+    )
+    assert abs(found[:, 0].mean()) < 0.015
+    assert 0.3 < np.mean((found[:, 0] / found[:, 1]) ** 2) < 2.0
+
+
+def test_a_shift_of_all_spots_changes_nothing() -> None:
+    spots = passed(6, DOORS, 0.1)
+    before = likelihood(spots)
+    spots["place"] += (17.0, 0.0, 0.0)
+    assert likelihood(spots) == pytest.approx(before, abs=1e-6)
+
+
+def test_the_direction_may_be_turned_round() -> None:
+    spots = passed(7, DOORS, 0.1)
+    now, turned = int(spots["stamp"].max()), np.diag([-1.0, -1.0, 1.0])
+    found = log_likelihood(spots, now, turned, -ERRORS)
+    assert found == pytest.approx(log_likelihood(spots, now, AXES, ERRORS), rel=1e-3)
+
+
+def chain(
+    brightness: list[float], along: list[float], *, copies: int = tuning.PROFILE_SIDE
+) -> Spots:
+    """Return the spots of a row of a bare left wall, as often as it takes to be one."""
+    found = np.zeros(len(along) * copies, SPOT)
+    found["stamp"] = EPOCH
+    found["points"] = 9
+    found["sight"] = 0.0, HALF_WIDTH, 0.0
+    found["place"] = 0.0, HALF_WIDTH, 0.1
+    found["place"][:, 0] = np.repeat(along, copies)
+    found["brightness"] = np.repeat(brightness, copies)
+    return found
+
+
+def test_neighbors_are_alike_or_there_is_an_edge_between_them() -> None:
+    """Against the densities of a normal distribution and the probability of an edge."""
+    copies, step, apart = tuning.PROFILE_SIDE, 0.4, 0.5
+    spots = chain([0.0, step, step], [0.0, apart, 2.0 * apart], copies=copies)
+    spots["brightness"][:copies] += np.resize([0.01, -0.01], copies)  # a scatter, for the trend
+    samples = wall_profile._samples(spots, EPOCH, AXES)
+    found = log_likelihood(spots, EPOCH, AXES, np.zeros(1))
+
+    def log_normal(change: F64, variance: F64) -> F64:
+        return np.asarray(-0.5 * (change**2 / variance + np.log(variance)))
+
+    gaps = np.diff(samples["along"])
+    stays, edge = np.zeros(len(gaps)), np.zeros(len(gaps))
+    for name, jump in (
+        ("brightness", tuning.PROFILE_BRIGHTNESS[2]),
+        ("depth", tuning.PROFILE_DEPTH[3]),
+    ):
+        change = np.diff(samples[name][:, 0])
+        variance = samples[name][1:, 1] + samples[name][:-1, 1]
+        stays += log_normal(change, variance)
+        edge += log_normal(change, variance + jump**2)
+    none = np.exp(-tuning.PROFILE_RATE * (gaps + tuning.PROFILE_EDGE))
+    expected = np.log(none * np.exp(stays) + (1.0 - none) * np.exp(edge)).sum()
+    assert found[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_walls_and_rows_are_apart() -> None:
+    """The likelihood of two walls is the product of theirs, however far errors move spots."""
+    spots = passed(11, DOORS, 0.1)
+    is_near = np.abs(spots["place"][:, 0] - 4.0) < 1.0
+    errors, now = np.array([-3.0, -1.0, 0.0, 2.0]), int(spots["stamp"].max())
+    for kept in (spots, spots[is_near]):
+        is_left = kept["sight"][:, 1] > 0.0
+        parts = [log_likelihood(kept[side], now, AXES, errors) for side in (is_left, ~is_left)]
+        assert (np.abs(parts) > 1.0).all()
+        assert log_likelihood(kept, now, AXES, errors) == pytest.approx(sum(parts), rel=1e-6)
+
+
+def test_variances_are_those_of_points_and_reach() -> None:
+    spots = chain([0.0], [0.0])
+    spots["points"][::2] = 4
+    spots["sight"][:, 0] = np.linspace(0.0, 8.0, len(spots))
+    samples = wall_profile._samples(spots, EPOCH, AXES)
+    reach = np.linalg.norm(spots["sight"], axis=1)
+    assert samples["brightness"][:, 1] == pytest.approx(0.03**2 + 0.05**2 / spots["points"])
+    depth = 0.01**2 + (0.005 * reach) ** 2 + 0.012**2 / spots["points"]
+    assert samples["depth"][:, 1] == pytest.approx(depth)
+
+
+def test_a_few_spots_are_no_wall() -> None:
+    spots = chain([0.0], [0.0], copies=tuning.PROFILE_SIDE)
+    assert len(wall_profile._samples(spots, EPOCH, AXES)) == len(spots)
+    assert len(wall_profile._samples(spots[1:], EPOCH, AXES)) == 0
+    assert log_likelihood(spots[1:], EPOCH, AXES, np.zeros(3)).tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("share", "depth", "is_wall"),
+    [
+        (0.03, -0.5, True),  # a little stands before it
+        (0.08, -0.5, False),
+        (0.08, -0.06, True),  # within its noise
+        (0.15, 0.5, True),  # niches
+        (0.3, -0.5, False),
+    ],
+)
+def test_what_stands_before_a_wall_rules_it_out(share: float, depth: float, is_wall: bool) -> None:
+    """What it hides would tell a velocity, as the edge of that moves with the view."""
+    spots = passed(12, (), 0.0)
+    spots = spots[spots["sight"][:, 1] > 0.0]
+    rng = np.random.default_rng(12)
+    others = rng.random(len(spots)) < share
+    spots["place"][others, 1] += depth
+    assert (len(wall_profile._samples(spots, int(spots["stamp"].max()), AXES)) > 0) == is_wall
+
+
+def test_scattered_things_are_no_wall() -> None:
+    spots = passed(13, (), 0.0)
+    rng = np.random.default_rng(13)
+    spots["place"][:, 1] += 0.05 * rng.standard_normal(len(spots))
+    assert len(wall_profile._samples(spots, int(spots["stamp"].max()), AXES)) == 0
+
+
+def test_errors_are_compared_finely_and_not_beyond_reason() -> None:
+    few, many = wall_profile._candidates(0.01), wall_profile._candidates(5.0)
+    assert few.max() == pytest.approx(0.04)
+    assert len(few) == 2 * tuning.PROFILE_STEPS + 1
+    assert many.max() == pytest.approx(tuning.PROFILE_REACH)
+    assert np.diff(many).max() <= tuning.PROFILE_STEP + 1e-12
+
+
+def test_the_trend_of_a_wall_is_removed_and_edges_stay() -> None:
+    rng = np.random.default_rng(8)
+    x = np.sort(rng.uniform(-6.0, 6.0, 800))
+    step = np.where((x > 1.0) & (x < 2.0), 0.3, 0.0)
+    rest = wall_profile._without_trend(
+        0.5 + 0.1 * x + 0.02 * x * x + step + 0.01 * rng.standard_normal(800), x
+    )
+    assert np.abs(np.median(rest[step == 0.0])) < 0.002
+    assert np.median(rest[step > 0.0]) == pytest.approx(0.3, abs=0.01)
+
+
+# ---- state
+
+
+def driven(
+    seed: int, openings: tuple[Opening, ...], error: float, sigma: float, seconds: float = 5.0
+) -> tuple[InertialState, F64]:
+    """Return what is known of the velocity at the end of a drive past some openings."""
+    rng = np.random.default_rng(seed)
+    profile, state, covariance = WallProfile(), state_at(0.0, error), known(sigma)
+    for time in np.arange(0.0, seconds, SWEEP_S).tolist():
+        lasted = time - (int(state.stamp) - EPOCH) * 1e-9
+        state = dataclasses.replace(
+            state,
+            stamp=HostNs(EPOCH + round(time * 1e9)),
+            position=state.position + lasted * state.velocity,
+        )
+        found = swept(rng, time, openings, 0.0)
+        found["place"][:, 0] += state.position[0] - SPEED * time
+        state, covariance = profile.update(state, covariance, found, AXES)
+    return state, covariance
+
+
+def test_a_wrong_velocity_is_corrected() -> None:
+    state, covariance = driven(1, DOORS, 0.15, 0.15)
+    sigma = np.sqrt(covariance[6, 6])
+    assert sigma < 0.07
+    assert abs(state.velocity[0] - SPEED) < 3.0 * sigma
+
+
+@pytest.mark.parametrize("openings", [PAINTED, DOORS, NICHES])
+def test_the_covariance_tells_the_error(openings: tuple[Opening, ...]) -> None:
+    """The mean of the NEES is 1 if it is right."""
+    rng = np.random.default_rng(2)
+    nees = []
+    for seed in range(60):
+        error = 0.1 * rng.standard_normal()
+        state, covariance = driven(seed, openings, error, 0.1)
+        nees.append((state.velocity[0] - SPEED) ** 2 / covariance[6, 6])
+    assert 0.15 < np.mean(nees) < 1.5
+    assert np.mean(np.array(nees) < 3.84) > 0.9  # the bound of 95 %
+
+
+def test_what_it_measures_is_the_velocity_in_the_middle() -> None:
+    """A velocity known now, of a wrong acceleration: the bias of the accelerometer explains it."""
+    error, seconds = 0.1, 4.0
+    state, covariance = state_at(seconds, error), 1e-10 * np.eye(eskf.ERRORS)
+    covariance[eskf.ACCEL_BIAS, eskf.ACCEL_BIAS] = 0.1**2 * np.eye(3)
+    spots = passed(1, DOORS, error, seconds=seconds)
+    after, posterior = WallProfile().update(state, covariance, spots, AXES)
+    assert after.velocity[0] == pytest.approx(state.velocity[0], abs=1e-6)
+    sigma = np.sqrt(posterior[eskf.ACCEL_BIAS, eskf.ACCEL_BIAS][0, 0])
+    assert sigma < 0.05
+    assert abs(after.accel_bias[0] + error / (0.5 * seconds)) < 3.0 * sigma
+    assert after.accel_bias[1:] == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+def test_a_well_known_velocity_is_left_alone() -> None:
+    state = state_at(4.0, 0.1)
+    spots = passed(1, DOORS, 0.1, seconds=4.0)
+    covariance = known(0.9 * tuning.PROFILE_SURE)
+    after, posterior = WallProfile().update(state, covariance, spots, AXES)
+    assert after is state
+    assert posterior is covariance
+    after, _ = WallProfile().update(state, known(1.1 * tuning.PROFILE_SURE), spots, AXES)
+    assert after.velocity[0] < state.velocity[0]
+
+
+def test_bare_walls_do_no_harm() -> None:
+    moves, sigmas = [], []
+    for seed in range(20):
+        state, covariance = driven(seed, (), 0.0, 0.05)
+        moves.append(state.velocity[0] - SPEED)
+        sigmas.append(np.sqrt(covariance[6, 6]))
+    assert np.abs(moves).max() < 0.025
+    assert np.mean(sigmas) > 0.045
+
+
+def test_the_velocity_is_that_of_the_middle() -> None:
+    """Against numerical derivatives of the velocity some seconds ago."""
+    rng = np.random.default_rng(9)
+    state = state_at(1.0).boxplus(rng.normal(0.0, 0.3, eskf.ERRORS))
+    along, age, force = np.array([0.8, 0.6, 0.0]), 2.5, np.array([0.1, -0.2, 9.7])
+
+    def velocity(one: InertialState) -> float:
+        # the attitude is taken for known
+        sensed = state.rotation @ (force - one.accel_bias) + one.gravity
+        return float(along @ (one.velocity - age * sensed))
+
+    h = wall_profile._mean_velocity(state, age, along)
+    for k in range(eskf.ERRORS):
+        if k in range(*eskf.ROTATION.indices(eskf.ERRORS)):
+            continue
+        step = np.zeros(eskf.ERRORS)
+        step[k] = 1e-5
+        slope = (velocity(state.boxplus(step)) - velocity(state.boxplus(-step))) / 2e-5
+        assert h[k] == pytest.approx(slope, abs=1e-6)
+
+
+def test_spots_are_compared_about_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    instants: list[int] = []
+
+    def noted(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
+        instants.append(now)
+        return log_likelihood(spots, now, axes, errors)
+
+    monkeypatch.setattr(wall_profile, "log_likelihood", noted)
+    driven(1, DOORS, 0.0, 0.1, seconds=10.0)
+    assert instants[0] - EPOCH >= tuning.PROFILE_SPAN_NS
+    pauses = np.diff(instants)
+    assert pauses.min() >= tuning.PROFILE_PAUSE_NS
+    assert pauses.max() <= tuning.PROFILE_PAUSE_NS + SWEEP_S * 1e9 + 1
+
+
+def test_spots_follow_what_the_state_has_passed() -> None:
+    """A correction of place and velocity moves spots as it does the places passed."""
+    profile, state = WallProfile(), state_at(2.0)
+    found = swept(np.random.default_rng(1), 1.0, DOORS, 0.0)
+    profile.update(state, known(0.01), found.copy(), AXES)
+    change = np.zeros(eskf.ERRORS)
+    change[eskf.POSITION], change[eskf.VELOCITY] = (0.5, 0.1, 0.0), (0.2, 0.0, 0.0)
+    profile.correct(state, state.boxplus(change))
+    moved: NDArray[np.float64] = profile._spots["place"] - found["place"]
+    assert moved == pytest.approx(np.broadcast_to([0.3, 0.1, 0.0], moved.shape))
+
+
+def test_spots_are_forgotten() -> None:
+    profile, rng = WallProfile(), np.random.default_rng(1)
+    counts = []
+    for time in np.arange(0.0, 60.0, SWEEP_S).tolist():
+        state = state_at(time)
+        profile.update(state, known(0.1), swept(rng, time, DOORS, 0.0), AXES)
+        counts.append(len(profile))
+    within = int(tuning.PROFILE_KEPT_NS * 1e-9 / SWEEP_S) + 2
+    assert max(counts) <= within * tuning.PROFILE_SPOTS
+    assert max(counts[60:]) < 1.5 * np.median(counts[60:])
+    profile.clear()
+    assert len(profile) == 0
+
+
+def test_crowded_spots_take_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    spots = np.resize(passed(1, DOORS, 0.1), 100_000)
+    compared = wall_profile._samples
+
+    def bounded(some: Spots, now: int, axes: F64) -> NDArray[np.void]:
+        assert len(some) <= tuning.PROFILE_MOST
+        return compared(some, now, axes)
+
+    monkeypatch.setattr(wall_profile, "_samples", bounded)
+    mean, sigma = mean_and_sigma(likelihood(spots))
+    assert abs(mean + 0.1) < 3.0 * sigma
