@@ -245,6 +245,22 @@ def test_a_camera_that_looks_into_rooms_does_not_run_away(
     assert end_of(recording(scenario("camera, looking into rooms", 5, 45.0))) < 0.15
 
 
+@pytest.mark.parametrize("seed", [109, 114])
+def test_both_beam_angles_of_a_narrow_view_are_corrected_within_seconds(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are off in the same sense: uncorrected, a corridor bends by 2 degrees in a minute."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario("corridor, 120 degrees, imperfect", seed, 12.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    for sweep in given.sweeps():
+        odometry.imu(given.imu[given.imu["stamp"] <= sweep.end])
+        odometry.register(sweep)
+    found = np.degrees(odometry._beams.correction)
+    true = np.degrees(Imperfections().beam_rad)
+    assert found == pytest.approx([true, true], abs=0.15)
+
+
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
     odometry = Odometry(OdometryConfig(), narrow.T_cloud_imu)
     hour = 3_600_000_000_000
