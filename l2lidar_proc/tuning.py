@@ -284,7 +284,7 @@ PROFILE_DEPENDENT: Final = 20.0
 PROFILE_NOISE: Final = 0.01  # [m/s] 1 sigma, common to all spots: what niches hide, for one
 PROFILE_SURE: Final = 0.03  # [m/s] 1 sigma: below, that would count
 PROFILE_SIGMAS: Final = 4.0  # of the velocity, to which errors are compared,
-PROFILE_REACH: Final = 0.6  # [m/s] and at most
+PROFILE_REACH: Final = 1.5  # [m/s] and at most
 PROFILE_STEP: Final = 0.01  # [m/s] between them, which is 5 cm in the time that spots are kept
 PROFILE_STEPS: Final = 15  # to each side, at least
 # Standard deviations, common to a spot and of one of its points (12 mm: range noise), and of an

@@ -132,6 +132,7 @@ class WallProfile:
     def clear(self) -> None:
         """Forget all spots."""
         self._spots = self._spots[:0]
+        self._measured = 0  # another time line may begin
 
     def correct(self, before: InertialState, after: InertialState) -> None:
         """Move the spots along with a correction of the state at one instant.
@@ -180,11 +181,12 @@ class WallProfile:
         errors = _candidates(float(np.sqrt(variance)))
         likelihood = velocity_likelihood(self._spots, now, axes, errors)
         share = min(pause / tuning.PROFILE_KEPT_NS, 1.0)
-        logs = share * np.log(likelihood) - 0.5 * errors**2 / variance
-        posterior = np.exp(logs - logs.max())
-        posterior /= posterior.sum()
-        mean = float(posterior @ errors)
-        left = float(posterior @ (errors - mean) ** 2)
+        prior = np.exp(-0.5 * errors**2 / variance)
+        posterior = prior * likelihood**share
+        mean = float(np.average(errors, weights=posterior))
+        left = float(np.average((errors - mean) ** 2, weights=posterior))
+        # beyond the errors compared nothing is known: without edges all stays as it is
+        left *= variance / float(np.average(errors**2, weights=prior))
         gain = cross / variance
         after = state.boxplus(gain * mean)
         self.correct(state, after)

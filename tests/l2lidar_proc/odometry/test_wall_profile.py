@@ -457,6 +457,29 @@ def test_what_it_measures_is_the_velocity_in_the_middle() -> None:
     assert after.accel_bias[1:] == pytest.approx([0.0, 0.0], abs=1e-6)
 
 
+@pytest.mark.parametrize("sigma", [0.1, 1.0])
+def test_without_walls_nothing_is_learned(sigma: float) -> None:
+    """However uncertain the velocity is."""
+    spots = passed(1, (), 0.0, seconds=4.0)
+    spots["place"][:, 1] += 0.2 * np.random.default_rng(1).standard_normal(len(spots))
+    state = state_at(4.0)
+    after, covariance = WallProfile().update(state, known(sigma), spots, AXES)
+    assert after.velocity[0] == pytest.approx(SPEED)
+    assert covariance == pytest.approx(known(sigma))
+
+
+def test_a_time_line_that_begins_earlier_is_measured_at_once() -> None:
+    profile = WallProfile()
+    hour = 3600.0
+    spots = passed(1, DOORS, 0.1, seconds=4.0)
+    later = spots.copy()
+    later["stamp"] += round(hour * 1e9)
+    profile.update(state_at(4.0 + hour, 0.1), known(0.1), later, AXES)
+    profile.clear()
+    after, _ = profile.update(state_at(4.0, 0.1), known(0.1), spots, AXES)
+    assert after.velocity[0] < SPEED + 0.1 - 0.01
+
+
 def test_a_well_known_velocity_is_left_alone() -> None:
     state = state_at(4.0, 0.1)
     spots = passed(1, DOORS, 0.1, seconds=4.0)
