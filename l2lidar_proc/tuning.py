@@ -260,7 +260,7 @@ LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ 
 # ---- odometry: wall profile. Tuned on: hard corridors, seeds 100 to 115, at first with the true
 # poses; the rest in the corridor of tests/l2lidar_proc/odometry/test_wall_profile.py.
 
-PROFILE_RANGE: Final = 10.0  # [m]
+PROFILE_RANGE: Final = 10.0  # [m] farther away, lines on a wall are meters apart
 PROFILE_CELL: Final = 0.03  # [m] of a spot along the way, 2.5 times the range noise,
 PROFILE_ROW: Final = 0.3  # [m] and upwards: four points of an L2 at 6 m
 PROFILE_POINTS: Final = 3  # of a spot, at least
@@ -279,13 +279,13 @@ PROFILE_SCATTER: Final = 0.03
 PROFILE_BEFORE: Final = (0.1, 3.0, 0.05)
 # Terms of the likelihood that say the same: seven rows of a wall see an edge together, and each
 # edge counts with all pairs of neighbors. With this number the errors of the velocity are as
-# large as the likelihood says (their NEES is 0.7 to 1.3).
+# large as the likelihood says (their NEES is 0.2 to 1.5).
 PROFILE_DEPENDENT: Final = 20.0
 PROFILE_NOISE: Final = 0.01  # [m/s] 1 sigma, common to all spots: what niches hide, for one
 PROFILE_SURE: Final = 0.03  # [m/s] 1 sigma: below, that would count
 PROFILE_SIGMAS: Final = 4.0  # of the velocity, to which errors are compared,
 PROFILE_REACH: Final = 1.5  # [m/s] and at most
-PROFILE_STEP: Final = 0.01  # [m/s] between them, which is 5 cm in the time that spots are kept
+PROFILE_STEP: Final = 0.01  # [m/s] between them, which is 4 cm in the time that spots are kept
 PROFILE_STEPS: Final = 15  # to each side, at least
 # Standard deviations, common to a spot and of one of its points (12 mm: range noise), and of an
 # edge: of the logarithm of the intensity; and of the depth [m], where errors of the beams add

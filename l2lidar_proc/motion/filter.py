@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import F64, I64, HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.preintegration import ImuSegment, Preintegration
@@ -566,26 +566,6 @@ def with_leaning_gravity(state: InertialState, covariance: F64, variance: float)
     lever = skew(state.gravity)
     out[GRAVITY, GRAVITY] += variance * lever @ lever.T
     return out
-
-
-def correction_of_passed(before: InertialState, after: InertialState, stamps: I64) -> F64:
-    """Return by how much a correction of the state moves what it has placed before, (N, 3) [m].
-
-    The error of the velocity is taken for constant, as that of gravity and of the bias.
-
-    Parameters
-    ----------
-    before, after : InertialState
-        At the same instant.
-    stamps : ndarray, shape (N,)
-        When the places were seen [ns].
-    """
-    change = after.boxminus(before)
-    force = change[GRAVITY] - after.rotation @ change[ACCEL_BIAS]
-    tau = ((int(after.stamp) - stamps) * 1e-9)[:, None]
-    return np.asarray(
-        change[POSITION] - tau * change[VELOCITY] + 0.5 * tau * tau * force, np.float64
-    )
 
 
 def at_map_origin(covariance: F64) -> F64:

@@ -15,7 +15,6 @@ believed if chance hardly explains it, and if no other error has nearly as many 
 with the probability that it is right, as two votes are false in one of ten cases.
 
 Earlier lines are kept where the state has them by now: whenever that is corrected, so are they.
-The difference of two of them then depends on the velocity, not on the place.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ from l2lidar_proc.motion.filter import (
     VELOCITY,
     InertialState,
     association_probability,
-    correction_of_passed,
     square_root,
     update_with_information,
 )
+from l2lidar_proc.motion.passed_places import PassedPlaces
 
 LINE: Final = np.dtype(
     [
@@ -125,30 +124,11 @@ def extract_lines(points: F64, stamps: I64, is_wall: NDArray[np.bool_], axes: F6
     return found[:count]
 
 
-class VerticalLines:
+class VerticalLines(PassedPlaces):
     """The vertical lines of the last seconds, which measure the velocity."""
 
     def __init__(self) -> None:
-        self._lines: Lines = np.zeros(0, LINE)
-
-    def __len__(self) -> int:
-        """Return the number of lines kept."""
-        return len(self._lines)
-
-    def clear(self) -> None:
-        """Forget all lines."""
-        self._lines = self._lines[:0]
-
-    def correct(self, before: InertialState, after: InertialState) -> None:
-        """Move the lines along with a correction of the state at one instant.
-
-        Parameters
-        ----------
-        before, after : InertialState
-            At the same instant, not before the lines'.
-        """
-        if len(self._lines):
-            self._lines["place"] += correction_of_passed(before, after, self._lines["stamp"])
+        super().__init__(LINE)
 
     def update(
         self, state: InertialState, covariance: F64, found: Lines, axes: F64
@@ -165,9 +145,9 @@ class VerticalLines:
             As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
         """
         oldest = int(state.stamp) - tuning.LINE_KEPT_NS
-        kept = np.flatnonzero(self._lines["stamp"] >= oldest)[-tuning.LINE_KEPT :]
-        self._lines = records.joined((records.selected(self._lines, kept), found))
-        self._lines["sweep"][len(kept) :] = int(state.stamp)
+        kept = np.flatnonzero(self._kept["stamp"] >= oldest)[-tuning.LINE_KEPT :]
+        self._kept = records.joined((records.selected(self._kept, kept), found))
+        self._kept["sweep"][len(kept) :] = int(state.stamp)
         sigma = float(np.sqrt(axes[0] @ covariance[VELOCITY, VELOCITY] @ axes[0]))
         pairs = self._pairs(len(kept), state, sigma, axes)
         agreeing, votes = _agreeing(pairs, sigma)
@@ -188,7 +168,7 @@ class VerticalLines:
 
     def _ages(self, state: InertialState) -> F64:
         """Return how much older than a state the lines are [s], shape (N,)."""
-        return np.asarray((int(state.stamp) - self._lines["stamp"]) * 1e-9)
+        return np.asarray((int(state.stamp) - self._kept["stamp"]) * 1e-9)
 
     def _pairs(
         self, first: int, state: InertialState, sigma: float, axes: F64
@@ -208,7 +188,7 @@ class VerticalLines:
         -------
         ndarray, shape (P,), dtype _PAIR
         """
-        lines = self._lines
+        lines = self._kept
         line, earlier = np.mgrid[first : len(lines), :first].reshape(2, -1)
         pairs = np.zeros(len(line), _PAIR)
         pairs["line"], pairs["earlier"] = line, earlier
@@ -242,7 +222,7 @@ class VerticalLines:
 
     def _with_relief(self, pairs: NDArray[np.void], axes: F64) -> NDArray[np.void]:
         """Return the pairs (P,) of lines that were seen at several depths, unlike a wall's."""
-        across = self._lines["place"] @ axes[1]
+        across = self._kept["place"] @ axes[1]
         depth = across[pairs["earlier"]] - across[pairs["line"]]
         kept = np.zeros(len(pairs), np.bool_)
         for number in np.unique(pairs["line"]).tolist():
@@ -277,11 +257,11 @@ class VerticalLines:
 
         The residual [m], its derivatives (18,) by the errors of the state, and its variance [m^2].
         """
-        weights = self._lines["sigma"][earlier] ** -2.0
+        weights = self._kept["sigma"][earlier] ** -2.0
         total = float(weights.sum())
         weights /= total
         tau = self._ages(state)
-        offsets = (self._lines["place"][earlier] - self._lines["place"][number]) @ along
+        offsets = (self._kept["place"][earlier] - self._kept["place"][number]) @ along
         residual = -float(weights @ offsets)
         span = float(weights @ tau[earlier]) - float(tau[number])
         square = float(tau[number] ** 2 - weights @ tau[earlier] ** 2)
@@ -290,7 +270,7 @@ class VerticalLines:
         h[GRAVITY] = 0.5 * square * along
         h[ACCEL_BIAS] = -0.5 * square * (state.rotation.T @ along)
         variance = (
-            float(self._lines["sigma"][number] ** 2)
+            float(self._kept["sigma"][number] ** 2)
             + 1.0 / total
             + tuning.LINE_WANDER**2 * span**3 / 3.0
         )

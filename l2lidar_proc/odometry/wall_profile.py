@@ -22,14 +22,8 @@ from numpy.typing import NDArray
 from l2lidar_node import records
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import (
-    ACCEL_BIAS,
-    ERRORS,
-    GRAVITY,
-    VELOCITY,
-    InertialState,
-    correction_of_passed,
-)
+from l2lidar_proc.motion.filter import ACCEL_BIAS, ERRORS, GRAVITY, VELOCITY, InertialState
+from l2lidar_proc.motion.passed_places import PassedPlaces
 
 SPOT: Final = np.dtype(
     [
@@ -118,32 +112,17 @@ def extract_spots(
     return records.decimated(found[is_upright], tuning.PROFILE_SPOTS)
 
 
-class WallProfile:
+class WallProfile(PassedPlaces):
     """The spots of the last seconds, which measure the velocity."""
 
     def __init__(self) -> None:
-        self._spots: Spots = np.zeros(0, SPOT)
+        super().__init__(SPOT)
         self._measured = 0  # stamp of the latest measurement
 
-    def __len__(self) -> int:
-        """Return the number of spots kept."""
-        return len(self._spots)
-
     def clear(self) -> None:
-        """Forget all spots."""
-        self._spots = self._spots[:0]
-        self._measured = 0  # another time line may begin
-
-    def correct(self, before: InertialState, after: InertialState) -> None:
-        """Move the spots along with a correction of the state at one instant.
-
-        Parameters
-        ----------
-        before, after : InertialState
-            At the same instant, not before the spots'.
-        """
-        if len(self._spots):
-            self._spots["place"] += correction_of_passed(before, after, self._spots["stamp"])
+        """Forget all spots; another time line may begin."""
+        super().clear()
+        self._measured = 0
 
     def update(
         self, state: InertialState, covariance: F64, found: Spots, axes: F64
@@ -164,12 +143,12 @@ class WallProfile:
             As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
         """
         now = int(state.stamp)
-        kept = np.flatnonzero(self._spots["stamp"] >= now - tuning.PROFILE_KEPT_NS)
-        self._spots = records.joined((records.selected(self._spots, kept), found))
+        kept = np.flatnonzero(self._kept["stamp"] >= now - tuning.PROFILE_KEPT_NS)
+        self._kept = records.joined((records.selected(self._kept, kept), found))
         pause = now - self._measured
-        if pause < tuning.PROFILE_PAUSE_NS or len(self._spots) < tuning.PROFILE_SIDE:
+        if pause < tuning.PROFILE_PAUSE_NS or len(self._kept) < tuning.PROFILE_SIDE:
             return state, covariance
-        span = now - int(self._spots["stamp"].min())
+        span = now - int(self._kept["stamp"].min())
         if span < tuning.PROFILE_SPAN_NS:
             return state, covariance
         self._measured = now
@@ -179,7 +158,7 @@ class WallProfile:
         if variance < tuning.PROFILE_SURE**2:
             return state, covariance
         errors = _candidates(float(np.sqrt(variance)))
-        likelihood = velocity_likelihood(self._spots, now, axes, errors)
+        likelihood = velocity_likelihood(self._kept, now, axes, errors)
         share = min(pause / tuning.PROFILE_KEPT_NS, 1.0)
         prior = np.exp(-0.5 * errors**2 / variance)
         posterior = prior * likelihood**share
@@ -311,11 +290,9 @@ def _is_wall(depth: F64, variance: F64) -> bool:
     What stands before a wall hides another part of it from each place, and the edge of what it
     hides moves with the view.
     """
-    # 1.4826: of a Gaussian, the standard deviation over the median of the sizes
-    scatter = 1.4826 * float(np.median(np.abs(depth)))
     far, sigmas, most = tuning.PROFILE_BEFORE
     before = float(np.mean(depth < -np.maximum(far, sigmas * np.sqrt(variance))))
-    return scatter < tuning.PROFILE_SCATTER and before < most
+    return _scatter(depth) < tuning.PROFILE_SCATTER and before < most
 
 
 def _without_trend(values: F64, *terms: F64) -> F64:
@@ -334,7 +311,14 @@ def _without_trend(values: F64, *terms: F64) -> F64:
         weighted = (base * weights[:, None]).T
         fit = np.linalg.lstsq(weighted @ base, weighted @ values, rcond=1e-9)[0]
         rest = values - base @ fit
-        # 1.4826: of a Gaussian, the standard deviation over the median of the sizes
-        scale = tuning.PROFILE_CAUCHY * 1.4826 * float(np.median(np.abs(rest)))
-        weights = 1.0 / (1.0 + (rest / max(scale, 1e-6)) ** 2)
+        scale = max(tuning.PROFILE_CAUCHY * _scatter(rest), 1e-6)
+        weights = 1.0 / (1.0 + (rest / scale) ** 2)
     return np.asarray(rest)
+
+
+def _scatter(values: F64) -> float:
+    """Return the standard deviation about zero of what most of the values (N,) are.
+
+    1.4826: of a Gaussian, the standard deviation over the median of the sizes.
+    """
+    return 1.4826 * float(np.median(np.abs(values)))

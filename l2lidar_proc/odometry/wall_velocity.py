@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from l2lidar_node.types import F64
-from l2lidar_proc.motion.filter import InertialState, correction_of_passed
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.passed_places import correction_of_passed
 from l2lidar_proc.odometry.vertical_lines import Lines, VerticalLines
 from l2lidar_proc.odometry.wall_profile import Spots, WallProfile
 

@@ -420,7 +420,7 @@ def test_lines_follow_what_the_state_has_passed() -> None:
 
     moved = place_at_line(after) - place_at_line(before)
     lines.correct(before, after)
-    assert lines._lines["place"][0] == pytest.approx(np.array([3.0, 1.0, 1.0]) + moved)
+    assert lines._kept["place"][0] == pytest.approx(np.array([3.0, 1.0, 1.0]) + moved)
 
 
 def test_lines_of_an_hour_take_no_memory() -> None:

@@ -545,7 +545,7 @@ def test_spots_follow_what_the_state_has_passed() -> None:
     change = np.zeros(eskf.ERRORS)
     change[eskf.POSITION], change[eskf.VELOCITY] = (0.5, 0.1, 0.0), (0.2, 0.0, 0.0)
     profile.correct(state, state.boxplus(change))
-    moved: NDArray[np.float64] = profile._spots["place"] - found["place"]
+    moved: NDArray[np.float64] = profile._kept["place"] - found["place"]
     assert moved == pytest.approx(np.broadcast_to([0.3, 0.1, 0.0], moved.shape))
 
 

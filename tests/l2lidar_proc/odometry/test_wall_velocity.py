@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from l2lidar_proc.motion import filter as eskf
-from l2lidar_proc.motion.filter import correction_of_passed
+from l2lidar_proc.motion.passed_places import correction_of_passed
 from l2lidar_proc.odometry.vertical_lines import LINE, Lines
 from l2lidar_proc.odometry.wall_profile import SPOT, WallProfile
 from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
@@ -38,7 +38,7 @@ def test_lines_of_a_sweep_follow_what_the_profile_corrects() -> None:
     change = after.position[0] - state.position[0]
     assert abs(after.velocity[0] - SPEED) < 0.07
     assert change == pytest.approx(3.0 * (after.velocity[0] - state.velocity[0]))
-    for kept, given in ((walls._lines._lines, before[0]), (walls._profile._spots, before[1])):
+    for kept, given in ((walls._lines._kept, before[0]), (walls._profile._kept, before[1])):
         moved = given["place"] + correction_of_passed(state, after, given["stamp"])
         assert kept["place"] == pytest.approx(moved)
     assert (lines == before[0]).all()
@@ -56,7 +56,6 @@ def test_what_was_kept_follows_both_corrections() -> None:
     walls, error = WallVelocity(), 0.1
     covariance = 1e-10 * np.eye(eskf.ERRORS)
     covariance[6, 6] = 0.1**2
-    seen: list[Lines] = []
     for seconds in (2.5, 3.0, 3.5):
         state = state_at(seconds, error)
         moved = error * seconds
@@ -65,16 +64,15 @@ def test_what_was_kept_follows_both_corrections() -> None:
         spots = np.zeros(0, SPOT)
         if seconds == 3.5:
             spots = passed(1, DOORS, error, seconds=3.5)
-            kept = walls._lines._lines.copy()
+            kept = walls._lines._kept.copy()
             after, covariance = walls.update(state, covariance, spots, lines, AXES)
         else:
             walls._lines.update(state, 1e-10 * np.eye(eskf.ERRORS), lines, AXES)
-        seen.append(lines)
     profiled, _ = WallProfile().update(state, 1e-2 * np.diag(np.eye(18)[6]), spots, AXES)
     assert abs(after.velocity[0] - profiled.velocity[0]) > 0.005
     assert abs(after.velocity[0] - SPEED) < 0.01
-    for now, given in ((walls._lines._lines, np.concatenate([kept, lines])),
-                       (walls._profile._spots, spots)):  # fmt: skip
+    for now, given in ((walls._lines._kept, np.concatenate([kept, lines])),
+                       (walls._profile._kept, spots)):  # fmt: skip
         moved_to = given["place"] + correction_of_passed(state, after, given["stamp"])
         assert now["place"] == pytest.approx(moved_to, abs=1e-6)
 
@@ -87,7 +85,7 @@ def test_a_correction_moves_both() -> None:
     change = np.zeros(eskf.ERRORS)
     change[eskf.POSITION] = 0.3, 0.2, 0.1
     walls.correct(state, state.boxplus(change))
-    for now, given in ((walls._lines._lines, lines), (walls._profile._spots, spots)):
+    for now, given in ((walls._lines._kept, lines), (walls._profile._kept, spots)):
         assert now["place"] == pytest.approx(given["place"] + (0.3, 0.2, 0.1))
 
 
