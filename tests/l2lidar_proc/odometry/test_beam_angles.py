@@ -14,8 +14,9 @@ from l2lidar_node.calibration.model import BETA, NAMES, RETURN, XI, Block
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.beam_angles import BeamAngles, between_halves, halves
+from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
+from l2lidar_proc.odometry.fan_halves import between_halves, halves
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.verbs.odometry import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
