@@ -374,6 +374,21 @@ BEAM_WIDTH: Final = 0.15  # of the cell's edge (1 sigma) in its shorter directio
 BEAM_GAP_SIGMA: Final = 0.02  # [m] of the gap in one cell; 12 mm of range noise hardly count
 BEAM_GAP_SCALE: Final = 0.04  # [m] off, a gap keeps a quarter of its weight
 BEAM_GAP_MOST: Final = 0.2  # [m] farther apart, they are two surfaces
+# Sweeps at rest are compared together. Tuned on: the first 2 s of trunks, woods, rooms, halls and
+# corridors, seeds 0 to 7 and 34 to 41: both angles err by 0.2 to 1.2 sigma, root mean square
+BEAM_REST_POINTS: Final = 8  # of either half in a cell
+BEAM_REST_LINES: Final = 4  # scan lines of either half in a cell, if they are
+BEAM_REST_APART: Final = 0.008  # [rad] apart; a head in step with its packets repeats its lines
+# of a cell's edge: scatter (1 sigma) of what does not end in the cell. Evenly filled, it is 0.29
+BEAM_REST_WIDTH: Final = 0.15
+BEAM_REST_SCATTER: Final = 2.0  # a mean's variance, by the points' over the number of lines
+BEAM_REST_UNKNOWN: Final = 0.1  # [m] of a gap as the angles are known, 1 sigma, to be compared
+BEAM_REST_NS: Final = 1_200_000_000  # [ns] of rest before they are compared,
+BEAM_REST_AGAIN: Final = 1.4  # and again when it has lasted so many times as long. Speed only
+# Sweeps at rest deviate by so many standard deviations of the angle that is known less. Source:
+# trunks and woods, where 0.57 degrees turned them by 0.35 to 0.66 degrees, and shifted by 27 mm
+BEAM_DRIFT_TURN: Final = 1.3
+BEAM_DRIFT_SHIFT: Final = 3.0  # [m/rad]
 # By which the motion that deskewed a sweep may be off. With 0.05 m/s, a constant error of 0.1 m/s
 # passed for 0.3 degrees of a unit that was right.
 BEAM_SPEED: Final = 0.2  # [m/s]

@@ -17,9 +17,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from l2lidar_node import records
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.fan_halves import between_halves, halves, levers
+from l2lidar_proc.odometry.fan_halves import angles_at_rest, between_halves, halves, levers
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
 
@@ -34,12 +35,14 @@ class BeamAngles:
     """
 
     def __init__(self) -> None:
-        self.correction: F64 = np.zeros(2)
-        self._information: F64 = np.eye(2) / tuning.BEAM_SIGMA**2
-        self._weighted: F64 = np.zeros(2)  # information by estimate
+        self.correction: F64
+        self._information: F64
+        self._weighted: F64  # information by estimate
+        self.forget()
         self._rate: float | None = None
         self._failures = 0
         self._sweeps = 0
+        self._rested_ns = 0  # of the sweeps at rest that were compared last
         self._latest: tuple[Sweep, F64, F64] | None = None  # its halves, and what corrected it
 
     def corrected(self, sweep: Sweep) -> Sweep:
@@ -107,6 +110,39 @@ class BeamAngles:
         self._information = self._information + information
         self._weighted = self._weighted + gradient
         self.correction = self._known()
+
+    def is_due_at_rest(self, sweeps: list[Sweep]) -> bool:
+        """Return whether a rest has lasted long enough to :meth:`learn_at_rest`, again perhaps."""
+        lasted = sweeps[-1].end - sweeps[0].start
+        return lasted >= max(tuning.BEAM_REST_NS, tuning.BEAM_REST_AGAIN * self._rested_ns)
+
+    def learn_at_rest(self, sweeps: list[Sweep]) -> None:
+        """Estimate the angles anew from the sweeps of a sensor at rest, all of them together.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            As the unit reports them, from one place, oldest first.
+        """
+        self._rested_ns = sweeps[-1].end - sweeps[0].start
+        if self._failures >= _GIVE_UP:
+            return
+        shown = [(one.points, halves(one.points, self._rate)) for one in sweeps]
+        whole = [(points, found.sign) for points, found in shown if found is not None]
+        if not whole:
+            return
+        points = records.joined([points for points, _ in whole])
+        prior = np.eye(2) / tuning.BEAM_SIGMA**2
+        found = angles_at_rest(points, np.concatenate([sign for _, sign in whole]), prior)
+        if found is not None:
+            angles, self._information = found
+            self._weighted = self._information @ angles
+            self.correction = self._known()
+
+    def forget(self) -> None:
+        """Forget what was learned, as after a rest that was none."""
+        self.correction = np.zeros(2)
+        self._information, self._weighted = np.eye(2) / tuning.BEAM_SIGMA**2, np.zeros(2)
 
     @property
     def sigmas(self) -> tuple[float, float] | None:

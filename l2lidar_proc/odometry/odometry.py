@@ -465,12 +465,14 @@ class Odometry:
             self._zero_velocity.clear()
             self._leave_rest()
             return None
-        if not self._zero_velocity.stays(found):
-            return self._retry_in_motion(sweep, status)
-        if self._first_sweeps and sweep.end - self._first_sweeps[0].start > tuning.RETRY_NS:
-            self._first_sweeps = []
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
+        if not self._zero_velocity.stays(found):
+            if not self._beams_explain_drift(still):
+                return self._retry_in_motion(sweep, status)
+            self._zero_velocity.resume(still.state)
+        if self._first_sweeps and sweep.end - self._first_sweeps[0].start > tuning.RETRY_NS:
+            self._first_sweeps = []
         back = self._way_back(sweep, still)
         if back is not None:
             self._first_sweeps = []
@@ -480,20 +482,45 @@ class Odometry:
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
-        self._beams.learn(sweep, estimate.points, at_rest=True)
-        changed = np.abs(self._beams.correction - self._mapped_with).max() > tuning.BEAM_CHANGE
-        if changed and self._first_sweeps:
-            self._map_first_sweeps_again(still)
+        first = self._first_sweeps
+        if first and self.config.correct_beams and self._beams.is_due_at_rest(first):
+            self._beams.learn_at_rest(first)
         else:
+            self._beams.learn(sweep, estimate.points, at_rest=True)
+        if not self._map_first_sweeps_again(still):
             self.matcher.extend(estimate.points, still, still.state)
         return estimate
 
-    def _map_first_sweeps_again(self, still: SweepMotion) -> None:
-        """Begin the map of a rest again with the first sweeps, as the beams are known now."""
+    def _beams_explain_drift(self, still: SweepMotion) -> bool:
+        """Return whether beam angles are to blame that sweeps at the first rest deviate.
+
+        They are if they turn out to be others than those of the map, which is then begun again,
+        or if they may be off by as much as the sweeps deviate.
+        """
+        if not (self._first_sweeps and self.config.correct_beams):
+            return False
+        self._beams.learn_at_rest(self._first_sweeps)
+        if self._map_first_sweeps_again(still):
+            return True
+        sigmas = self._beams.sigmas
+        return sigmas is not None and self._zero_velocity.has_drifted_within(
+            tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
+        )
+
+    def _map_first_sweeps_again(self, still: SweepMotion) -> bool:
+        """Begin the map of the first rest again if the beams are known better than in it.
+
+        Return whether it was.
+        """
+        changed = np.abs(self._beams.correction - self._mapped_with).max() > tuning.BEAM_CHANGE
+        if not (changed and self._first_sweeps):
+            return False
         self._mapped_with = self._beams.correction
         self.matcher.clear()
+        self._zero_velocity.forget_deviations()
         for sweep in self._first_sweeps:
             self.matcher.extend(self._beams.corrected(sweep).points, still, still.state)
+        return True
 
     def _stays_at_rest(self, sweep: Sweep) -> bool:
         """Return whether the sensor rests and the IMU does not object; if it does, let go."""
@@ -522,7 +549,7 @@ class Odometry:
         self._belief = state, self._zero_velocity.widened(covariance)
         first = self._first_sweeps
         if first and self._zero_velocity.drifted:
-            first = [self._beams.corrected(one) for one in first]
+            self._beams.forget()  # what it learned, it learned from a sensor that moved
             for may_rest in (False, True):
                 motions = self._initializer.begin(first, first[0].start, may_rest)
                 if not motions:

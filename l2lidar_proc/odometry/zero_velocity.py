@@ -57,6 +57,11 @@ class ZeroVelocityTest:
         """Whether the last anchor was given up since sweeps deviated from it."""
         return bool(self._drift.any())
 
+    def has_drifted_within(self, turn: float, way: float) -> bool:
+        """Return whether the drift for which the anchor was given up is small [rad, m]."""
+        size = np.linalg.norm(self._drift.reshape(2, 3), axis=1)
+        return self.drifted and bool((size <= (turn, way)).all())
+
     def anchored(self, state: InertialState, samples: Samples) -> bool:
         """Begin with the hypothesis at a state; return whether the IMU allows it.
 
@@ -162,6 +167,18 @@ class ZeroVelocityTest:
         self._doubt()
         return False
 
+    def forget_deviations(self) -> None:
+        """Compare no earlier sweep any more: the map at the anchor has been made anew."""
+        self._turn: list[F64] = []
+        # the first sweep at the anchor made the map
+        self._deviations: deque[F64] = deque([np.zeros(6)], maxlen=tuning.STILL_COMPARED)
+
+    def resume(self, state: InertialState) -> None:
+        """Take the hypothesis up again at a state: the sensor was not to blame for the drift."""
+        self._drift = np.zeros(6)
+        self._test_ns = tuning.STILL_TEST_NS
+        self.anchor, self._turned = state, state.stamp
+
     def widened(self, covariance: F64) -> F64:
         """Return a covariance (18, 18) that allows for what went unnoticed before the release."""
         out = covariance.copy()
@@ -179,9 +196,7 @@ class ZeroVelocityTest:
     def _release(self) -> None:
         self.anchor = None
         self._turned = 0
-        self._turn: list[F64] = []
-        # the first sweep at the anchor made the map
-        self._deviations: deque[F64] = deque([np.zeros(6)], maxlen=tuning.STILL_COMPARED)
+        self.forget_deviations()
 
 
 def free_pose() -> F64:
