@@ -386,9 +386,9 @@ BEAM_REST_UNKNOWN: Final = 0.1  # [m] of a gap as the angles are known, 1 sigma,
 BEAM_REST_NS: Final = 1_200_000_000  # [ns] of rest before they are compared,
 BEAM_REST_AGAIN: Final = 1.4  # and again when it has lasted so many times as long. Speed only
 # Sweeps at rest deviate by so many standard deviations of the angle that is known less. Source:
-# trunks and woods, where 0.57 degrees turned them by 0.35 to 0.66 degrees, and shifted by 27 mm
+# trunks and woods, where 0.57 degrees turned them by 0.35 to 0.66 degrees; 12 mm allow for noise
 BEAM_DRIFT_TURN: Final = 1.3
-BEAM_DRIFT_SHIFT: Final = 3.0  # [m/rad]
+BEAM_DRIFT_SHIFT: Final = 1.3  # [m/rad]
 # By which the motion that deskewed a sweep may be off. With 0.05 m/s, a constant error of 0.1 m/s
 # passed for 0.3 degrees of a unit that was right.
 BEAM_SPEED: Final = 0.2  # [m/s]

@@ -171,6 +171,26 @@ class MapInitializer:
         trial = self._in_motion(sweeps, since, initial)
         return trial.motions if trial.met or late or not trial.motions else None
 
+    def begin_again_at_rest(
+        self, sweeps: list[Sweep], state: InertialState, covariance: F64
+    ) -> bool:
+        """Begin the map of a rest again; return whether the sweeps agree that it is one.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            Those of the rest so far, as they are known now.
+        state : InertialState
+            At rest, at any stamp.
+        covariance : ndarray, shape (18, 18)
+        """
+        start = dataclasses.replace(state, stamp=self._predictor.reference(sweeps[0]))
+        self._zero_velocity.resume(start)
+        agree = bool(self._at_rest(sweeps, sweeps[0].start, start, covariance).motions)
+        if not agree and not self._zero_velocity.drifted:
+            self._zero_velocity.clear()  # a sweep met nothing of those before it
+        return agree
+
     def _samples(self, sweeps: list[Sweep], since: HostNs) -> NDArray[np.void]:
         until = min(sweeps[-1].end, since + tuning.INITIAL_IMU_NS)
         return self._predictor.samples(since - tuning.INITIAL_NS, until)

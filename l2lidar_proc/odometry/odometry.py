@@ -467,10 +467,11 @@ class Odometry:
             return None
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
-        if not self._zero_velocity.stays(found):
-            if not self._beams_explain_drift(still):
-                return self._retry_in_motion(sweep, status)
-            self._zero_velocity.resume(still.state)
+        stays = self._zero_velocity.stays(found)
+        remapped = self._map_with_known_beams(still, doubted=not stays)
+        agree = remapped if remapped is not None else stays or self._unknown_beams_explain(still)
+        if not agree:
+            return self._retry_in_motion(sweep, status)
         if self._first_sweeps and sweep.end - self._first_sweeps[0].start > tuning.RETRY_NS:
             self._first_sweeps = []
         back = self._way_back(sweep, still)
@@ -482,44 +483,49 @@ class Odometry:
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
-        first = self._first_sweeps
-        if first and self.config.correct_beams and self._beams.is_due_at_rest(first):
-            self._beams.learn_at_rest(first)
-        else:
-            self._beams.learn(sweep, estimate.points, at_rest=True)
-        if not self._map_first_sweeps_again(still):
+        self._beams.learn(sweep, estimate.points, at_rest=True)
+        if remapped is None:
             self.matcher.extend(estimate.points, still, still.state)
         return estimate
 
-    def _beams_explain_drift(self, still: SweepMotion) -> bool:
-        """Return whether beam angles are to blame that sweeps at the first rest deviate.
+    def _map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> bool | None:
+        """Begin the map of the first rest again, if the beams are known better than in it.
 
-        They are if they turn out to be others than those of the map, which is then begun again,
-        or if they may be off by as much as the sweeps deviate.
+        Parameters
+        ----------
+        still : SweepMotion
+            Of the latest sweep.
+        doubted : bool
+            The sweeps deviate: the beams are estimated now, whenever that was done last.
+
+        Returns
+        -------
+        bool or None
+            Whether the sweeps agree that the sensor rests; None where the map stays as it is.
         """
-        if not (self._first_sweeps and self.config.correct_beams):
-            return False
-        self._beams.learn_at_rest(self._first_sweeps)
-        if self._map_first_sweeps_again(still):
-            return True
-        sigmas = self._beams.sigmas
-        return sigmas is not None and self._zero_velocity.has_drifted_within(
-            tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
-        )
-
-    def _map_first_sweeps_again(self, still: SweepMotion) -> bool:
-        """Begin the map of the first rest again if the beams are known better than in it.
-
-        Return whether it was.
-        """
-        changed = np.abs(self._beams.correction - self._mapped_with).max() > tuning.BEAM_CHANGE
-        if not (changed and self._first_sweeps):
-            return False
+        first = self._first_sweeps
+        if not (first and self.config.correct_beams):
+            return None
+        if doubted or self._beams.is_due_at_rest(first):
+            self._beams.learn_at_rest(first)
+        if np.abs(self._beams.correction - self._mapped_with).max() <= tuning.BEAM_CHANGE:
+            return None
         self._mapped_with = self._beams.correction
-        self.matcher.clear()
-        self._zero_velocity.forget_deviations()
-        for sweep in self._first_sweeps:
-            self.matcher.extend(self._beams.corrected(sweep).points, still, still.state)
+        better = [self._beams.corrected(one) for one in first]
+        return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
+
+    def _unknown_beams_explain(self, still: SweepMotion) -> bool:
+        """Return whether unknown beams may be why sweeps at the first rest deviate.
+
+        The sensor is then at rest as before.
+        """
+        sigmas = self._beams.sigmas if self._first_sweeps else None
+        if not self.config.correct_beams or sigmas is None:
+            return False
+        turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
+        if not self._zero_velocity.has_drifted_within(turn, shift):
+            return False
+        self._zero_velocity.resume(still.state)
         return True
 
     def _stays_at_rest(self, sweep: Sweep) -> bool:
@@ -550,6 +556,7 @@ class Odometry:
         first = self._first_sweeps
         if first and self._zero_velocity.drifted:
             self._beams.forget()  # what it learned, it learned from a sensor that moved
+            self._mapped_with = self._beams.correction
             for may_rest in (False, True):
                 motions = self._initializer.begin(first, first[0].start, may_rest)
                 if not motions:

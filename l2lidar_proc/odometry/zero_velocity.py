@@ -167,17 +167,11 @@ class ZeroVelocityTest:
         self._doubt()
         return False
 
-    def forget_deviations(self) -> None:
-        """Compare no earlier sweep any more: the map at the anchor has been made anew."""
-        self._turn: list[F64] = []
-        # the first sweep at the anchor made the map
-        self._deviations: deque[F64] = deque([np.zeros(6)], maxlen=tuning.STILL_COMPARED)
-
     def resume(self, state: InertialState) -> None:
-        """Take the hypothesis up again at a state: the sensor was not to blame for the drift."""
+        """Take the hypothesis up again at a state; no earlier sweep is compared any more."""
         self._drift = np.zeros(6)
-        self._test_ns = tuning.STILL_TEST_NS
-        self.anchor, self._turned = state, state.stamp
+        self._release()
+        self.anchor, self._turned = dataclasses.replace(state, velocity=np.zeros(3)), state.stamp
 
     def widened(self, covariance: F64) -> F64:
         """Return a covariance (18, 18) that allows for what went unnoticed before the release."""
@@ -196,7 +190,9 @@ class ZeroVelocityTest:
     def _release(self) -> None:
         self.anchor = None
         self._turned = 0
-        self.forget_deviations()
+        self._turn: list[F64] = []
+        # the first sweep at the anchor made the map
+        self._deviations: deque[F64] = deque([np.zeros(6)], maxlen=tuning.STILL_COMPARED)
 
 
 def free_pose() -> F64:

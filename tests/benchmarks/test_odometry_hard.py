@@ -27,7 +27,7 @@ from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.vertical_lines import LINE
 from l2lidar_proc.odometry.wall_profile import SPOT
@@ -259,6 +259,30 @@ def test_both_beam_angles_of_a_narrow_view_are_corrected_within_seconds(
     found = np.degrees(odometry._beams.correction)
     true = np.degrees(Imperfections().beam_rad)
     assert found == pytest.approx([true, true], abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("family", "seed"), [("wood, imperfect", 39), ("bare trunks, imperfect", 7)]
+)
+def test_beams_that_nobody_knows_yet_do_not_end_a_rest_between_trees(
+    family: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sweeps turned by 0.5 degrees for it, and the map began again turned by 1 to 2 degrees."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(family, seed, 3.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu)
+    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    rest = [item for item in estimates if item.stamp < given.imu["stamp"][0] + 2_000_000_000]
+    assert len(rest) > 6
+    for item in rest:
+        np.testing.assert_allclose(item.T_map_lidar, rest[0].T_map_lidar, atol=1e-12)
+    starting = [Status.STARTING in item.status for item in estimates]
+    assert starting == sorted(starting, reverse=True)  # the map has begun only once
+    signs = np.random.default_rng((seed, 23)).choice([-1.0, 1.0], 3)
+    found = np.degrees(odometry._beams.correction)
+    true = -signs[[1, 0]] * np.degrees(Imperfections().beam_rad)
+    np.testing.assert_allclose(found, true, atol=0.15)
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,25 @@ CONFIG = OdometryNodeConfig()
 REAL = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"
 
 
-def turn(unit: Any, number: int, rate: float = HEAD_RATE, drift: Any = (0.0, 0.0, 0.0)) -> Any:
-    """Return one turn in a box, as a unit off by (xi, beta) [degrees] reports it, and halves.
+def turn(
+    unit: Any,
+    number: int,
+    rate: float = HEAD_RATE,
+    drift: Any = (0.0, 0.0, 0.0),
+    *,
+    trunks: Any = None,
+    advance: float = 0.37,
+) -> Any:
+    """Return one turn, as a unit off by (xi, beta) [degrees] reports it, and halves.
 
-    ``drift`` is the velocity of the sensor [m/s], for which nobody corrects the points.
+    Parameters
+    ----------
+    drift : array_like, shape (3,)
+        Velocity of the sensor [m/s], for which nobody corrects the points.
+    trunks : array_like, shape (N, 3), optional
+        Places and radii [m] of upright cylinders. Without them there is a box.
+    advance : float
+        Of the head from turn to turn, beside whole ones [rad].
     """
     rng = np.random.default_rng(number)
     returns = np.zeros(SLOTS * PACKETS, RETURN)
@@ -42,23 +58,39 @@ def turn(unit: Any, number: int, rate: float = HEAD_RATE, drift: Any = (0.0, 0.0
     packet = np.repeat(np.arange(PACKETS), SLOTS)
     time = 1.53e-5 * (packet * SLOTS + slot)
     # packets do not begin at the same angles in every turn
-    returns["theta"] = 1.7 + 0.37 * number + rate * time[packet * SLOTS]
+    returns["theta"] = 1.7 + advance * number + rate * time[packet * SLOTS]
     returns["alpha"] = np.pi * (slot + rng.random()) / SLOTS
     correction = np.zeros(len(NAMES))
     correction[[XI, BETA]] = np.radians(unit)
     returns["range"] = 1.0
     direction = model.beams(returns, BLOCK, correction).direction
     place = time[:, None] * drift
-    reach = (np.sign(direction) * ROOM - place) / np.where(direction == 0.0, 1e-9, direction)
-    returns["range"] = reach.min(axis=1) + 0.01 * rng.standard_normal(len(returns))
+    if trunks is None:
+        reach = (np.sign(direction) * ROOM - place) / np.where(direction == 0.0, 1e-9, direction)
+    else:
+        reach = _to_trunks(direction, np.asarray(trunks))
+    nearest = reach.min(axis=1)
+    hit = nearest < 25.0
+    returns["range"] = np.where(hit, nearest, 1.0) + 0.01 * rng.standard_normal(len(returns))
     reported = model.beams(returns, BLOCK, np.zeros(len(NAMES))).points
     cloud = np.zeros(len(returns), CLOUD)
     for name, line in zip("xyz", reported.T, strict=True):
         cloud[name] = line
     cloud["time"] = time
     start = HostNs(number * 230_000_000)
-    sweep = Sweep(start, HostNs(start + 229_000_000), cloud, PACKETS, 0)
-    return sweep, np.where(returns["alpha"] < np.pi / 2, 1.0, -1.0)
+    sweep = Sweep(start, HostNs(start + 229_000_000), cloud[hit], PACKETS, 0)
+    return sweep, np.where(returns["alpha"] < np.pi / 2, 1.0, -1.0)[hit]
+
+
+def _to_trunks(direction: Any, trunks: Any) -> Any:
+    """Return how far it is to each cylinder (N, M) along unit vectors (N, 3) [m]."""
+    flat = direction[:, :2]
+    squared = np.maximum((flat**2).sum(axis=1), 1e-9)[:, None]
+    ahead = flat @ trunks[:, :2].T / squared
+    beside = (trunks[:, :2] ** 2).sum(axis=1) - ahead**2 * squared
+    into = trunks[:, 2] ** 2 - beside
+    depth = np.sqrt(np.maximum(into, 0.0) / squared)
+    return np.where((into > 0.0) & (ahead > depth), ahead - depth, np.inf)
 
 
 def learned(unit: Any, at_rest: bool = True, drift: Any = (0.0, 0.0, 0.0)) -> BeamAngles:
@@ -112,6 +144,96 @@ def test_how_wrong_the_angles_may_still_be_is_told() -> None:
     assert right[0] < 0.2 * tuning.BEAM_SIGMA < 0.5 * tuning.BEAM_SIGMA < right[1]
     assert across == pytest.approx(right, rel=0.3)  # it is corrected
     assert along[1] > 1.3 * right[1]  # it is not
+
+
+def _some_trunks(seed: int) -> Any:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-9.0, 9.0, (60, 2))
+    places = places[np.hypot(*places.T) > 1.5]
+    return np.column_stack((places, rng.uniform(0.06, 0.15, len(places))))
+
+
+OUT_OF_STEP = 0.4  # [rad] the lines of one turn lie between those of the others
+IN_STEP = 3.0 * HEAD_RATE * 1.53e-5 * SLOTS  # [rad] they lie on them
+
+
+def rested(unit: Any, turns: int, trunks: Any, advance: float = OUT_OF_STEP) -> BeamAngles:
+    beams = BeamAngles()
+    beams.learn_at_rest([turn(unit, k, trunks=trunks, advance=advance)[0] for k in range(turns)])
+    return beams
+
+
+@pytest.mark.parametrize("unit", [UNIT, (0.4, 0.4), (-0.4, 0.4), (0.0, 0.0)])
+def test_sweeps_at_rest_show_both_angles_together(unit: Any) -> None:
+    """Single sweeps show only one direction of them in a room."""
+    np.testing.assert_allclose(np.degrees(rested(unit, 12, None).correction), unit, atol=0.06)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("unit", [UNIT, (-0.4, 0.4), (0.0, 0.0)])
+def test_sweeps_at_rest_show_what_moves_the_halves_apart_even_among_trunks(
+    unit: Any, seed: int
+) -> None:
+    """No cell there is flat: trunks are 12 to 30 cm thick."""
+    beams = rested(unit, 12, _some_trunks(seed))
+    assert beams.sigmas is not None
+    assert np.degrees(beams.sigmas[0]) < 0.08
+    apart = np.degrees(beams.correction) - unit
+    assert apart @ (0.82, -0.57) == pytest.approx(0.0, abs=0.17)
+
+
+def test_what_sweeps_at_rest_show_is_as_uncertain_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    nees = []
+    for number in range(12):
+        unit = rng.normal(0.0, 0.4, 2)
+        trunks = _some_trunks(number) if number % 2 else None
+        beams = rested(unit, int(rng.integers(6, 14)), trunks, float(rng.uniform(0.3, 0.5)))
+        error = beams._estimate - np.radians(unit)
+        nees.append(float(error @ beams._information @ error))
+    assert 0.1 < np.mean(nees) < 3.0  # two angles
+    assert max(nees) < 13.8  # the bound of 99.9 %
+
+
+def test_a_head_in_step_with_its_packets_tells_no_more_than_one_turn_does() -> None:
+    """Its lines repeat: they would pass for the edges of what they happen to hit."""
+    trunks = _some_trunks(0)
+    repeated, spread = (rested(UNIT, 12, trunks, step) for step in (IN_STEP, OUT_OF_STEP))
+    assert repeated.sigmas is not None
+    assert spread.sigmas is not None
+    assert repeated.sigmas[0] > 3.0 * spread.sigmas[0]
+    error = repeated._estimate - np.radians(UNIT)
+    assert error @ repeated._information @ error < 13.8
+
+
+def test_sweeps_at_rest_are_compared_again_when_there_are_many_more() -> None:
+    beams = BeamAngles()
+    turns = [turn(UNIT, k, trunks=_some_trunks(0), advance=OUT_OF_STEP)[0] for k in range(20)]
+    compared = []
+    for count in range(1, 21):
+        if beams.is_due_at_rest(turns[:count]):
+            beams.learn_at_rest(turns[:count])
+            compared.append(count)
+    lasted = [(turns[count - 1].end - turns[0].start) for count in compared]
+    assert tuning.BEAM_REST_NS <= lasted[0] < tuning.BEAM_REST_NS + 230_000_000
+    assert len(lasted) > 2
+    for before, after in itertools.pairwise(lasted):
+        assert before * tuning.BEAM_REST_AGAIN <= after
+        assert after < before * tuning.BEAM_REST_AGAIN + 230_000_000
+    beams.forget()
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+    assert beams.sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
+
+
+def test_of_other_sensors_nothing_is_learned_at_rest() -> None:
+    beams = BeamAngles()
+    some = [Sweep(HostNs(k), HostNs(k + 1), _camera(k), 0, 0) for k in range(12)]
+    beams.learn_at_rest(some)
+    beams.learn_at_rest([dataclasses.replace(turn(UNIT, 0)[0], points=_camera(0)[:0])])
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
+    far = [turn(UNIT, k, trunks=[[20.0, 0.0, 0.1]])[0] for k in range(6)]
+    beams.learn_at_rest(far)  # nothing that both halves see often enough
+    np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
 
 
 @pytest.mark.parametrize("drift", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (-0.1, 0.1, 0.0)])

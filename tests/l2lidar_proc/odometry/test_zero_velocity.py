@@ -15,12 +15,12 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GYRO_BIAS, POSE, POSITION, VELOCITY, InertialState
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
-from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive
+from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, feed
 from tests.support.build import REAL_L2
-from tests.support.odometry_runs import EPOCH, record, truth
+from tests.support.odometry_runs import EPOCH, record, sweeps, truth
 
 PERIOD = 4.633e-3  # [s] from packet to packet
 HZ = 100  # of a motion file
@@ -132,6 +132,25 @@ def test_a_sensor_that_creeps_is_followed_and_its_rests_stay(
     assert np.ptp(way(estimates)[after]) < 1e-9
 
 
+@pytest.mark.parametrize("unit", ["perfect", "typical"])
+def test_a_start_in_slow_motion_is_not_taken_for_wrong_beams(tmp_path: Path, unit: str) -> None:
+    """What the halves of a moving sensor show at rest explains no drift, and is forgotten."""
+    slow = creeping(tmp_path / "creep.tum", (0.05, 0.0, 0.0), 0.0)
+    run = record("room", slow, 1, RESTED + 5.0, unit=unit)
+    since = EPOCH + round((RESTED + 2.0) * 1e9)
+    moving = [one for one in sweeps(run, "turn") if one.start > since]
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, moving)
+    begun = [k for k, item in enumerate(estimates) if Status.STARTING in item.status]
+    assert 1 < begun[-1] < 12
+    true, _ = truth(run, np.array([one.stamp for one in estimates]))
+    gone = way(estimates) - np.linalg.norm(true - true[0], axis=1)
+    assert np.abs(gone).max() < 0.12
+    assert np.abs(gone[begun[-1] :]).max() < 0.02
+    wrong = 0.4 if unit == "typical" else 0.0
+    assert np.abs(np.degrees(odometry._beams.correction)).max() < wrong + 0.05
+
+
 def test_a_shock_ends_rest_at_once() -> None:
     run = record("room", "walk", 1, RESTED + 3.0)
     estimates = drive(run)
@@ -223,6 +242,25 @@ def test_a_far_deviation_ends_rest_at_once_and_widens_what_is_known() -> None:
     assert np.count_nonzero(grown) == 4 + 6
     tested.clear()
     np.testing.assert_array_equal(tested.widened(before), before)
+
+
+def test_a_rest_that_is_taken_up_again_compares_no_earlier_sweep() -> None:
+    rng = np.random.default_rng(4)
+    noise = rng.normal(0.0, [[3e-4] * 3 + [2e-3] * 3], (40, 6))
+    turned = noise + np.array([0.0, 0.0, 0.008, 0.0, 0.0, 0.0])
+    tested = anchored()
+    lasted = until_released(tested, 0.23, [*noise[:10], *turned])
+    assert 10 < lasted < 20
+    assert tested.has_drifted_within(0.009, 0.005)
+    assert not tested.has_drifted_within(0.005, 0.005)
+    assert not tested.has_drifted_within(0.009, 1e-4)
+    moving = dataclasses.replace(ORIGIN, velocity=np.array([0.1, 0.0, 0.0]))
+    tested.resume(moving)
+    assert tested.anchor is not None
+    np.testing.assert_array_equal(tested.anchor.velocity, 0.0)
+    assert not tested.drifted
+    assert not tested.has_drifted_within(1.0, 1.0)
+    assert until_released(tested, 0.23, noise) == 40
 
 
 def test_along_a_direction_that_nothing_fixes_rest_is_up_to_the_imu() -> None:
