@@ -57,6 +57,8 @@ HAND_SPEED: Final = 0.3  # [m/s] with its peak speed as the standard deviation, 
 # the least sigma, as the IMU may know better.
 RISE_FROM_SIGMA: Final = 0.02  # [m/s]
 RISE_SPEED: Final = 0.07  # [m/s]
+# [m/s] to which it is known at best. Derived: a slope of a tenth at a walk, and slopes last
+RISE_FLOOR: Final = 0.1
 HEIGHT_MEMORY_S: Final = 20.0  # [s] of which the height is fixed for less than the share below
 HEIGHT_SHARE: Final = 0.1  # where a floor or a crown is in view now and then it is 0.15 and more
 SPEED_BOUND_SHARE: Final = 0.02  # of max_speed: its noise as a measurement. Derived: a hard bound
@@ -150,6 +152,9 @@ NOISE_LEAST_SAMPLES: Final = 64  # Derived: lines of 4 bins each leave the media
 NOISE_FROM_HZ: Final = 15.0
 
 RATE_SMOOTHING_NS: Final = 20_000_000  # [ns] either side, over which the reported rate is averaged
+# [s] of the stamps of samples against those of points. Derived: a sample is a mean over 4 ms, and
+# its stamp is somewhere in there
+IMU_STAMP_SIGMA: Final = 0.0012
 ODOMETRY_MEMORY_S: Final = 12.0  # [s] of IMU samples; more than a held-up node has waiting
 
 # ---- odometry: alignment

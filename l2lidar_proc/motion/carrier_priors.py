@@ -27,7 +27,8 @@ def apply_zero_velocity_prior(
     worse than its peak speed, at which zero is as likely as any. One that is moved by hand stops
     and turns all the time, so zero counts for more, the more the slower it is. The vertical
     velocity is drawn whatever the carrier: what walks or drives comes back to its height. Where
-    nothing observes the height for long, that is all that is known of it, and counts for more.
+    nothing observes the height for long, that is all that is known of it, and counts for more;
+    slopes last for seconds, so such measurements do not add up to a better one.
 
     Parameters
     ----------
@@ -50,6 +51,7 @@ def apply_zero_velocity_prior(
     if not height_observed and rise_sigma >= tuning.RISE_FROM_SIGMA:
         variance = tuning.RISE_SPEED**2 / seconds
         state, covariance = _drawn_to_zero(state, covariance, vertical, variance)
+        covariance = _known_no_better(covariance, vertical[0], tuning.RISE_FLOOR)
     least, speed = tuning.PRIOR_FROM_SIGMA, tuning.PRIOR_SPEED
     if is_driving_speed(peak_speed):
         least = peak_speed
@@ -74,6 +76,14 @@ def _drawn_to_zero(
     noise = variance * np.eye(len(axes))
     found = update(state, covariance, -axes @ state.velocity, jacobian, noise)
     return found.state, found.covariance
+
+
+def _known_no_better(covariance: F64, axis: F64, sigma: float) -> F64:
+    """Return a covariance with a velocity along an axis (3,) known to a sigma [m/s] at best."""
+    out = covariance.copy()
+    missing = sigma**2 - float(axis @ covariance[VELOCITY, VELOCITY] @ axis)
+    out[VELOCITY, VELOCITY] += max(missing, 0.0) * np.outer(axis, axis)
+    return out
 
 
 def is_driving_speed(speed: float) -> bool:

@@ -136,6 +136,18 @@ class SweepMotion:
         near = np.abs(self.preintegrated.stamps - self.state.stamp) <= tuning.RATE_SMOOTHING_NS
         return np.asarray(self.preintegrated.rates[near].mean(axis=0))
 
+    @property
+    def acceleration(self) -> F64:
+        """Acceleration about the reference without bias [m/s^2], shape (3,), cloud axes."""
+        pre, state = self.preintegrated, self.state
+        near = np.flatnonzero(np.abs(pre.stamps - state.stamp) <= tuning.RATE_SMOOTHING_NS)
+        first, last = near[0], near[-1]
+        lasted = float(pre.stamps[last] - pre.stamps[first]) * 1e-9
+        if lasted == 0.0:
+            return np.zeros(3)
+        gained = (pre.velocities[last] - pre.velocities[first]) / lasted
+        return np.asarray(gained + state.gravity @ state.rotation)
+
     def with_state(self, state: InertialState, covariance: F64) -> SweepMotion:
         """Return the motion through another state at the reference."""
         preintegrated = integrate(

@@ -355,7 +355,8 @@ def _grown(
     """
     found = anchor.covariance.copy()
     place = found[:3, :3]
-    speed = rotation @ anchor.twist_covariance[:3, :3] @ rotation.T * seconds**2
+    lasting = anchor.twist_covariance[:3, :3] - np.outer(anchor.late, anchor.late)
+    speed = rotation @ lasting @ rotation.T * seconds**2
     ratio = float(np.sqrt(np.trace(speed) / max(float(np.trace(place)), 1e-12)))
     if ratio > 0.0:
         found[:3, :3] = (1.0 + ratio) * place + (1.0 + 1.0 / ratio) * speed

@@ -336,7 +336,7 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
     up = -gravity / np.linalg.norm(gravity)
     ahead = np.array([-up[2], 0.0, up[0]])
     start = dataclasses.replace(some_state(), gravity=gravity, velocity=0.5 * ahead + 0.1 * up)
-    sigma = 1.1 * tuning.RISE_FROM_SIGMA
+    sigma = 1.5 * tuning.RISE_FLOOR
     loose = np.eye(eskf.ERRORS) * sigma**2
     assert carrier_priors.apply_zero_velocity_prior(start, loose, 0.1, 1.2)[0] is start
     noise = tuning.RISE_SPEED**2 / 0.1
@@ -349,8 +349,17 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
     speeds = covariance[eskf.VELOCITY, eskf.VELOCITY]
     assert up @ speeds @ up == pytest.approx(sigma**2 * left, rel=1e-6)
     assert ahead @ speeds @ ahead == pytest.approx(sigma**2)
+    # nor does it become certain by that
+    for _ in range(100):
+        state, covariance = carrier_priors.apply_zero_velocity_prior(
+            state, covariance, 0.1, 1.2, height_observed=False
+        )
+    assert up @ state.velocity == pytest.approx(0.0, abs=1e-6)
+    speeds = covariance[eskf.VELOCITY, eskf.VELOCITY]
+    np.testing.assert_allclose(speeds @ up, tuning.RISE_FLOOR**2 * up, atol=1e-12)
+    assert ahead @ speeds @ ahead == pytest.approx(sigma**2)
     # what the IMU knows better stays as it is
-    known = loose * (0.9 / 1.1) ** 2
+    known = np.eye(eskf.ERRORS) * (0.9 * tuning.RISE_FROM_SIGMA) ** 2
     assert (
         carrier_priors.apply_zero_velocity_prior(start, known, 0.1, 1.2, height_observed=False)[0]
         is start

@@ -69,6 +69,15 @@ def test_the_rate_is_the_mean_about_the_reference() -> None:
     np.testing.assert_allclose(predicted().rate, near, atol=0.03)
 
 
+def test_the_acceleration_is_the_mean_about_the_reference() -> None:
+    before, after = true_state(REFERENCE - 0.02), true_state(REFERENCE + 0.02)
+    expected = (after.velocity - before.velocity) / 0.04 @ true_state(REFERENCE).rotation
+    assert np.linalg.norm(expected) > 0.5
+    np.testing.assert_allclose(predicted().acceleration, expected, atol=0.03)
+    still = predicted().at_rest(predicted().state, np.eye(eskf.ERRORS))
+    np.testing.assert_allclose(still.acceleration, 0.0, atol=1e-9)
+
+
 def test_the_cloud_frame_is_seen_from_where_it_was_at_the_reference() -> None:
     trajectory = predicted().trajectory(LEVER)
     here = WALK.rotation(np.array([REFERENCE])).inv()

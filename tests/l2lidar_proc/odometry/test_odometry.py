@@ -92,6 +92,25 @@ def test_the_covariance_of_the_velocity_is_neither_too_small_nor_too_large(
     assert np.mean(nees < 7.8147) > 0.85  # the bound of 95 %
 
 
+def test_the_velocity_may_be_that_of_another_instant_by_what_stamps_are_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = recording("room", "walk")
+    known = drive(run)[-1]
+    monkeypatch.setattr(tuning, "IMU_STAMP_SIGMA", 0.0)
+    exact = drive(run)[-1]
+    np.testing.assert_array_equal(known.T_map_lidar, exact.T_map_lidar)
+    moving = run.motion.kinematics(
+        (exact.stamp - sweep_epoch(run)) * 1e-9 + np.array([-0.02, 0.0, 0.02])
+    )
+    gained = (moving.velocity[2] - moving.velocity[0]) / 0.04
+    late = 0.0012 * gained @ rotations.matrices(moving.quaternion_wxyz[1])
+    assert np.linalg.norm(late) > 1e-4
+    added = known.twist_covariance - exact.twist_covariance
+    np.testing.assert_allclose(added[:3, :3], np.outer(late, late), atol=0.15 * late @ late)
+    np.testing.assert_allclose(added[3:], 0.0, atol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("scene", "unit"), [("room", "perfect"), ("yard", "perfect"), ("yard", "typical")]
 )
