@@ -105,123 +105,6 @@ class Gaps(NamedTuple):
     motion: F64
 
 
-def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64, F64] | None:
-    """Return the beam angles with which both halves see a place at rest alike.
-
-    In each cell, the mean of the points of one half is compared with that of the other, along the
-    directions in which the points lie close together: across walls, but also across trunks and
-    poles, of which both halves see the whole width. Along anything that continues in the next
-    cell, the mean is that of the cell, whatever the angles. The halves see a cell in a few lines
-    each, so a mean is as uncertain as the points scatter, over the number of lines.
-
-    The angles are applied before the next round. Points of one thing must lie in one cell, so a
-    cell counts once the angles are known well enough for that.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N,)
-        Of several sweeps from one place, in the order in which they were measured.
-    sign : ndarray, shape (N,)
-        As :class:`Halves` has it.
-    prior : ndarray, shape (2, 2)
-        Information of the angles' being zero [1/rad^2].
-
-    Returns
-    -------
-    angles : ndarray, shape (2,)
-        Corrections of xi and beta [rad].
-    information : ndarray, shape (2, 2)
-        [1/rad^2]. None for both where no cell can be compared.
-    """
-    at = np.stack([points[name].astype(np.float64) for name in "xyz"])
-    along = np.concatenate(levers(points, sign))
-    line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)
-    line -= line.min(initial=0)
-    angles, information = np.zeros(2), prior
-    compared = False
-    for number, scales in enumerate(_SCALES_AT_REST):
-        moved = at.copy()
-        moved[:2] += (along.reshape(2, 2, -1) * angles[:, None]).sum(axis=1)
-        shift = 0.5 * (number % 2)  # what a face of a cell cuts is whole in the next round
-        seen = _seen_by_both(moved, along, sign, line, shift)
-        if seen is None:
-            continue
-        gap, lever, weight = seen
-        unknown = np.einsum("kia,ab,kib->k", lever, np.linalg.inv(information), lever)
-        inside = weight * (unknown < tuning.BEAM_REST_UNKNOWN**2)[:, None]
-        compared |= bool(inside.any())
-        step = np.zeros(2)
-        for scale in scales:
-            squared = (inside * (gap + lever @ step) ** 2).sum(axis=1)
-            robust = inside / (1.0 + squared[:, None] / scale**2) ** 2
-            weighted = lever * robust[..., None]
-            information = prior + np.einsum("kia,kib->ab", weighted, lever)
-            gradient = np.einsum("kia,ki->a", weighted, gap) + prior @ angles
-            step = -np.linalg.solve(information, gradient)
-        angles = angles + step
-    return (angles, information) if compared else None
-
-
-def _seen_by_both(
-    at: F64, along: F64, sign: F64, line: I64, shift: float
-) -> tuple[F64, F64, F64] | None:
-    """Return the differences of the halves' means in cells, along the cells' principal axes.
-
-    Parameters
-    ----------
-    at : ndarray, shape (3, N)
-        Points [m].
-    along : ndarray, shape (4, N)
-        Their :func:`levers`, along x and along y.
-    sign, line : ndarray, shape (N,)
-        Their halves, and the numbers of the directions of the head in which they were seen.
-    shift : float
-        Of the grid, in cells.
-
-    Returns
-    -------
-    gap : ndarray, shape (C, 3)
-        Of the rising half from the falling one [m].
-    levers : ndarray, shape (C, 3, 2)
-        Derivatives of the gap by xi and beta [m/rad].
-    weight : ndarray, shape (C, 3)
-        Of the gaps [1/m^2], 0 along what continues in the next cell.
-    """
-    cell = _cells(at, shift)
-    count = int(cell.max()) + 1 if len(cell) else 0
-    rising = sign > 0.0
-    lines = int(line.max(initial=0)) + 1
-    swept = []
-    numbers = []
-    for half in (rising, ~rising):
-        pairs = np.unique(cell[half] * lines + line[half])
-        swept.append(np.bincount(pairs // lines, minlength=count))
-        numbers.append(np.bincount(cell[half], minlength=count))
-    both = (np.min(numbers, axis=0) >= tuning.BEAM_REST_POINTS) & (
-        np.min(swept, axis=0) >= tuning.BEAM_REST_LINES
-    )
-    inside = both[cell]
-    if not inside.any():
-        return None
-    cell, rising = (np.cumsum(both) - 1)[cell[inside]], rising[inside]
-    numbers, swept = [n[both] for n in numbers], [n[both] for n in swept]
-    values = np.concatenate((at[:, inside], along[:, inside]))
-    means = [_means(values, cell, some, n) for some, n in
-             zip((rising, ~rising), numbers, strict=True)]  # fmt: skip
-    apart = means[0] - means[1]
-    around = values[:3] - np.where(rising, means[0][:3][:, cell], means[1][:3][:, cell])
-    total = numbers[0] + numbers[1]
-    covariance = [np.bincount(cell, row, len(total)) / total for row in products(*around)]
-    spread, axes = principal_axes(np.stack(covariance))
-    ends = 1.0 - spread / (tuning.BEAM_REST_WIDTH * tuning.BEAM_CELL) ** 2
-    per_line = (1.0 / swept[0] + 1.0 / swept[1])[:, None]
-    variance = tuning.BEAM_REST_SCATTER * spread * per_line + tuning.BEAM_GAP_SIGMA**2
-    weight = np.maximum(ends, 0.0) ** 2 / variance
-    gap = np.einsum("kij,jk->ki", axes, apart[:3])
-    lever = axes[..., :1] * apart[3:5].T[:, None] + axes[..., 1:2] * apart[5:7].T[:, None]
-    return gap, lever, weight
-
-
 def levers(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
     """Return how points move along x and y with errors of xi and beta.
 
@@ -265,18 +148,11 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
         return None
     kept = np.cumsum(both) - 1
     at, cell, rising = at[:, inside], kept[cell[inside]], rising[inside]
-    numbers = numbers[:, both]
     x_levers, y_levers = levers(points[inside], sign[inside])
     time = points["time"][inside].astype(np.float64)
     time -= 0.5 * (time.min() + time.max())
-    lines = np.concatenate((at, x_levers, y_levers, time[None], time * at))
-    means = np.stack([_means(lines, cell, some, n) for some, n in
-                      zip((rising, ~rising), numbers, strict=True)])  # fmt: skip
-    apart = means[0] - means[1]
-    around = at - np.where(rising, means[0, :3][:, cell], means[1, :3][:, cell])
-    total = numbers.sum(axis=0)
-    covariance = [np.bincount(cell, line, len(total)) / total for line in products(*around)]
-    spread, axes = principal_axes(np.stack(covariance))
+    values = np.concatenate((at, x_levers, y_levers, time[None], time * at))
+    apart, spread, axes = _compared(values, cell, rising)
     normal = axes[:, 0].T
     gap = (normal * apart[:3]).sum(axis=0)
     beside = np.sqrt(np.maximum((apart[:3] ** 2).sum(axis=0) - gap**2, 0.0))
@@ -292,11 +168,150 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
     return Gaps(gap[flat], across.T[flat], motion[flat])
 
 
-def _means(lines: F64, cell: I64, some: NDArray[np.bool_], numbers: I64) -> F64:
-    """Return the means of lines (L, N) over some points of each cell, (L, C)."""
-    where = cell[some]
-    sums = [np.bincount(where, line[some], len(numbers)) for line in lines]
-    return np.asarray(np.stack(sums) / numbers)
+def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64, F64] | None:
+    """Return the beam angles with which both halves see a place at rest alike, and information.
+
+    In each cell, the mean of the points of one half is compared with that of the other, along the
+    directions in which the points lie close together: across walls, but also across trunks and
+    poles, of which both halves see the whole width. Along anything that continues in the next
+    cell, the mean is that of the cell, whatever the angles. The halves see a cell in a few lines
+    each, so a mean is as uncertain as the points scatter, over the number of lines.
+
+    The angles are applied before the next round. Points of one thing must lie in one cell, so a
+    cell counts once the angles are known well enough for that.
+
+    Parameters
+    ----------
+    points : ndarray, shape (N,)
+        Of several sweeps from one place, in the order in which they were measured.
+    sign : ndarray, shape (N,)
+        As :class:`Halves` has it.
+    prior : ndarray, shape (2, 2)
+        Information of the angles' being zero [1/rad^2].
+
+    Returns
+    -------
+    angles : ndarray, shape (2,)
+        Corrections of xi and beta [rad].
+    information : ndarray, shape (2, 2)
+        Of them, the prior's included [1/rad^2].
+
+    None instead where no cell can be compared.
+    """
+    at = np.stack([points[name].astype(np.float64) for name in "xyz"])
+    along = np.concatenate(levers(points, sign))
+    line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)
+    line -= line.min(initial=0)
+    angles, information = np.zeros(2), prior
+    compared = False
+    for number, scales in enumerate(_SCALES_AT_REST):
+        moved = at.copy()
+        moved[:2] += (along.reshape(2, 2, -1) * angles[:, None]).sum(axis=1)
+        shift = 0.5 * (number % 2)  # what a face of a cell cuts is whole in the next round
+        seen = _seen_by_both(moved, along, sign, line, shift)
+        if seen is None:
+            continue
+        gap, lever, weight = seen
+        unknown = np.einsum("kia,ab,kib->k", lever, np.linalg.inv(information), lever)
+        inside = weight * (unknown < tuning.BEAM_REST_UNKNOWN**2)[:, None]
+        compared |= bool(inside.any())
+        step = np.zeros(2)
+        for scale in scales:
+            squared = (inside * (gap + lever @ step) ** 2).sum(axis=1)
+            robust = inside / (1.0 + squared[:, None] / scale**2) ** 2
+            weighted = lever * robust[..., None]
+            information = prior + np.einsum("kia,kib->ab", weighted, lever)
+            gradient = np.einsum("kia,ki->a", weighted, gap) + prior @ angles
+            step = -np.linalg.solve(information, gradient)
+        angles = angles + step
+    return (angles, information) if compared else None
+
+
+def _seen_by_both(
+    at: F64, along: F64, sign: F64, line: I64, shift: float
+) -> tuple[F64, F64, F64] | None:
+    """Return the gaps between the halves in cells, along the cells' principal axes.
+
+    None where no cell is seen often enough by both.
+
+    Parameters
+    ----------
+    at : ndarray, shape (3, N)
+        Points [m].
+    along : ndarray, shape (4, N)
+        Their :func:`levers`, along x and along y.
+    sign, line : ndarray, shape (N,)
+        Their halves, and the numbers of the directions of the head in which they were seen.
+    shift : float
+        Of the grid, in cells.
+
+    Returns
+    -------
+    gap : ndarray, shape (C, 3)
+        Of the rising half from the falling one [m].
+    levers : ndarray, shape (C, 3, 2)
+        Derivatives of the gap by xi and beta [m/rad].
+    weight : ndarray, shape (C, 3)
+        Of the gaps [1/m^2], 0 along what continues in the next cell.
+    """
+    cell = _cells(at, shift)
+    count = int(cell.max()) + 1 if len(cell) else 0
+    rising = sign > 0.0
+    lines = int(line.max(initial=0)) + 1
+    swept = []
+    numbers = []
+    for half in (rising, ~rising):
+        pairs = np.unique(cell[half] * lines + line[half])
+        swept.append(np.bincount(pairs // lines, minlength=count))
+        numbers.append(np.bincount(cell[half], minlength=count))
+    both = (np.min(numbers, axis=0) >= tuning.BEAM_REST_POINTS) & (
+        np.min(swept, axis=0) >= tuning.BEAM_REST_LINES
+    )
+    inside = both[cell]
+    if not inside.any():
+        return None
+    kept = np.cumsum(both) - 1
+    values = np.concatenate((at, along))[:, inside]
+    apart, spread, axes = _compared(values, kept[cell[inside]], rising[inside])
+    swept = [n[both] for n in swept]
+    ends = 1.0 - spread / (tuning.BEAM_REST_WIDTH * tuning.BEAM_CELL) ** 2
+    per_line = (1.0 / swept[0] + 1.0 / swept[1])[:, None]
+    variance = tuning.BEAM_REST_SCATTER * spread * per_line + tuning.BEAM_GAP_SIGMA**2
+    weight = np.maximum(ends, 0.0) ** 2 / variance
+    gap = np.einsum("kij,jk->ki", axes, apart[:3])
+    lever = axes[..., :1] * apart[3:5].T[:, None] + axes[..., 1:2] * apart[5:7].T[:, None]
+    return gap, lever, weight
+
+
+def _compared(values: F64, cell: I64, rising: NDArray[np.bool_]) -> tuple[F64, F64, F64]:
+    """Return the differences of the halves' means in cells, and the cells' principal axes.
+
+    Parameters
+    ----------
+    values : ndarray, shape (L, N)
+        Of points; the first three are their places [m].
+    cell : ndarray, shape (N,)
+        Numbers of their cells, from 0 on; each has points of both halves.
+    rising : ndarray, shape (N,), bool
+
+    Returns
+    -------
+    apart : ndarray, shape (L, C)
+        Means of the rising half less those of the falling one.
+    spread, axes : ndarray, shape (C, 3) and (C, 3, 3)
+        Of the points about the mean of their half, as :func:`principal_axes` returns them.
+    """
+    halves_of = rising, ~rising
+    numbers = np.stack([np.bincount(cell[some]) for some in halves_of])
+    means = np.stack([
+        [np.bincount(cell[some], line[some]) for line in values] / number
+        for some, number in zip(halves_of, numbers, strict=True)
+    ])  # fmt: skip
+    around = values[:3] - np.where(rising, means[0, :3][:, cell], means[1, :3][:, cell])
+    total = numbers.sum(axis=0)
+    covariance = [np.bincount(cell, line) / total for line in products(*around)]
+    spread, axes = principal_axes(np.stack(covariance))
+    return means[0] - means[1], spread, axes
 
 
 def _cells(at: F64, shift: float) -> I64:
