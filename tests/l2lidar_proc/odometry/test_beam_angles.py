@@ -169,6 +169,19 @@ def test_sweeps_at_rest_show_both_angles_together(unit: Any) -> None:
     np.testing.assert_allclose(np.degrees(rested(unit, 12, None).correction), unit, atol=0.06)
 
 
+def test_sweeps_that_deviate_are_compared_at_once() -> None:
+    odometry = Odometry(OdometryConfig(), np.eye(4))
+    odometry.imu(resting())
+    for k in range(4):
+        odometry.register(turn(UNIT, k)[0])
+    assert odometry._beams._rested_ns == 0
+    assert odometry.motion is not None
+    odometry._map_with_known_beams(odometry.motion, doubted=False)
+    assert odometry._beams._rested_ns == 0
+    odometry._map_with_known_beams(odometry.motion, doubted=True)
+    assert odometry._beams._rested_ns > 600_000_000
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("unit", [UNIT, (-0.4, 0.4), (0.0, 0.0)])
 def test_sweeps_at_rest_show_what_moves_the_halves_apart_even_among_trunks(

@@ -14,6 +14,7 @@ from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GYRO_BIAS, POSE, POSITION, VELOCITY, InertialState
 from l2lidar_proc.odometry.alignment import Alignment
+from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
@@ -133,14 +134,24 @@ def test_a_sensor_that_creeps_is_followed_and_its_rests_stay(
 
 
 @pytest.mark.parametrize("unit", ["perfect", "typical"])
-def test_a_start_in_slow_motion_is_not_taken_for_wrong_beams(tmp_path: Path, unit: str) -> None:
+def test_a_start_in_slow_motion_is_not_taken_for_wrong_beams(
+    tmp_path: Path, unit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What the halves of a moving sensor show at rest explains no drift, and is forgotten."""
     slow = creeping(tmp_path / "creep.tum", (0.05, 0.0, 0.0), 0.0)
     run = record("room", slow, 1, RESTED + 5.0, unit=unit)
     since = EPOCH + round((RESTED + 2.0) * 1e9)
     moving = [one for one in sweeps(run, "turn") if one.start > since]
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    forget, forgot = BeamAngles.forget, []
+
+    def counted(beams: BeamAngles) -> None:
+        forgot.append(beams.correction.copy())
+        forget(beams)
+
+    monkeypatch.setattr(BeamAngles, "forget", counted)
     estimates = feed(odometry, run, moving)
+    assert len(forgot) == 1
     begun = [k for k, item in enumerate(estimates) if Status.STARTING in item.status]
     assert 1 < begun[-1] < 12
     true, _ = truth(run, np.array([one.stamp for one in estimates]))
