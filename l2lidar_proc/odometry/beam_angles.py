@@ -23,6 +23,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.odometry.fan_halves import angles_at_rest, between_halves, halves, levers
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
+_PRIOR: Final = np.eye(2) / tuning.BEAM_SIGMA**2  # information of units [1/rad^2]
 
 
 class BeamAngles:
@@ -132,8 +133,7 @@ class BeamAngles:
         if not whole:
             return
         points = records.joined([points for points, _ in whole])
-        prior = np.eye(2) / tuning.BEAM_SIGMA**2
-        found = angles_at_rest(points, np.concatenate([sign for _, sign in whole]), prior)
+        found = angles_at_rest(points, np.concatenate([sign for _, sign in whole]), _PRIOR)
         if found is not None:
             angles, self._information = found
             self._weighted = self._information @ angles
@@ -142,7 +142,7 @@ class BeamAngles:
     def forget(self) -> None:
         """Forget what was learned, as after a rest that was none."""
         self.correction = np.zeros(2)
-        self._information, self._weighted = np.eye(2) / tuning.BEAM_SIGMA**2, np.zeros(2)
+        self._information, self._weighted = _PRIOR, np.zeros(2)
 
     @property
     def sigmas(self) -> tuple[float, float] | None:

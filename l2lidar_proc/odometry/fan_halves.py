@@ -183,7 +183,7 @@ def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64
     Parameters
     ----------
     points : ndarray, shape (N,)
-        Of several sweeps from one place, in the order in which they were measured.
+        Of several sweeps from one place, cloud frame, as the unit reports them.
     sign : ndarray, shape (N,)
         As :class:`Halves` has it.
     prior : ndarray, shape (2, 2)

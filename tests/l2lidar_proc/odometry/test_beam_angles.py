@@ -229,7 +229,7 @@ def test_sweeps_at_rest_are_compared_again_when_there_are_many_more() -> None:
             compared.append(count)
     lasted = [(turns[count - 1].end - turns[0].start) for count in compared]
     assert tuning.BEAM_REST_NS <= lasted[0] < tuning.BEAM_REST_NS + 230_000_000
-    assert len(lasted) > 2
+    assert len(lasted) == 4
     for before, after in itertools.pairwise(lasted):
         assert before * tuning.BEAM_REST_AGAIN <= after
         assert after < before * tuning.BEAM_REST_AGAIN + 230_000_000

@@ -96,7 +96,7 @@ def test_the_velocity_may_be_that_of_another_instant_by_what_stamps_are_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run = recording("room", "walk")
-    known = drive(run)[-1]
+    known, sigma = drive(run)[-1], tuning.IMU_STAMP_SIGMA
     monkeypatch.setattr(tuning, "IMU_STAMP_SIGMA", 0.0)
     exact = drive(run)[-1]
     np.testing.assert_array_equal(known.T_map_lidar, exact.T_map_lidar)
@@ -104,7 +104,7 @@ def test_the_velocity_may_be_that_of_another_instant_by_what_stamps_are_off(
         (exact.stamp - sweep_epoch(run)) * 1e-9 + np.array([-0.02, 0.0, 0.02])
     )
     gained = (moving.velocity[2] - moving.velocity[0]) / 0.04
-    late = 0.0012 * gained @ rotations.matrices(moving.quaternion_wxyz[1])
+    late = sigma * gained @ rotations.matrices(moving.quaternion_wxyz[1])
     assert np.linalg.norm(late) > 1e-4
     added = known.twist_covariance - exact.twist_covariance
     np.testing.assert_allclose(added[:3, :3], np.outer(late, late), atol=0.15 * late @ late)
