@@ -1,0 +1,120 @@
+"""Hypotheses for a pose that is hardly known: where most points of a sweep lie on surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l2lidar_node import rotations
+from l2lidar_node.types import F64
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
+from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.surfel_map import SurfelMap
+
+
+def pose_hypotheses(
+    state: InertialState, covariance: F64, source: Source, surfaces: SurfelMap, count: int = 3
+) -> list[InertialState]:
+    """Return states nearby at which most points lie on surfaces, best first.
+
+    The place is searched on a grid; gyro and gravity keep the attitude good enough for tens of
+    seconds. Where they were missing, attitude and place are drawn together as the covariance has
+    them.
+
+    Parameters
+    ----------
+    state : InertialState
+        Predicted.
+    covariance : ndarray, shape (18, 18)
+    source : Source
+    surfaces : SurfelMap
+    count : int
+        Largest number of states to return.
+    """
+    errors = _grid(covariance)
+    if rotation_is_loose(covariance):
+        seed = abs(int(state.stamp))  # so that each sweep tries others
+        errors = _drawn(covariance, np.zeros((1, ERRORS)), tuning.SEARCH_PLACES, seed)
+        scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS // 2)
+        likely = errors[np.argsort(-scores, kind="stable")[: tuning.SEARCH_REFINED]]
+        errors = _drawn(
+            covariance / tuning.SEARCH_FINER**2,
+            likely,
+            tuning.SEARCH_PLACES // tuning.SEARCH_REFINED,
+            seed,
+        )
+    scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS)
+    best: list[F64] = []
+    for index in np.argsort(-scores, kind="stable").tolist():
+        if all(_apart(errors[index], other) > 2.0 * tuning.SEARCH_STEP_M for other in best):
+            best.append(errors[index])
+        if len(best) == count:
+            break
+    return [state.boxplus(error) for error in best]
+
+
+def _scores(
+    state: InertialState, errors: F64, source: Source, surfaces: SurfelMap, count: int
+) -> NDArray[np.int64]:
+    """Return how many of some points lie on surfaces for each error (N, 18) of the state."""
+    points = source.points[:: max(len(source.points) // count, 1)]
+    turns = state.rotation @ rotations.matrices(rotations.exp(errors[:, ROTATION]))
+    origins = state.position + errors[:, POSITION]
+    seen = np.einsum("kij,nj->kni", turns, points)
+    seen += origins[:, None]
+    origins = np.repeat(origins, len(points), axis=0)
+    found = surfaces.match(seen.reshape(-1, 3), origins=origins)
+    near = np.abs(found.distances) < tuning.SEARCH_NEAR_M
+    return np.bincount(found.index[near] // len(points), minlength=len(errors))
+
+
+def rotation_is_loose(covariance: F64) -> bool:
+    """Return whether the attitude is so uncertain that other attitudes have to be tried."""
+    return bool(np.linalg.eigvalsh(covariance[ROTATION, ROTATION])[-1] > tuning.LOOSE_ROTATION**2)
+
+
+def _apart(one: F64, other: F64) -> float:
+    difference = one - other
+    turn, way = np.linalg.norm(difference[ROTATION]), np.linalg.norm(difference[POSITION])
+    return float(way + tuning.SEARCH_ARM_M * turn)
+
+
+def _drawn(covariance: F64, middles: F64, count: int, seed: int) -> F64:
+    """Return errors (N, 18) of turn and place, drawn from a covariance about each of some errors.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (18, 18)
+    middles : ndarray, shape (M, 18)
+        Themselves the first of those drawn about them.
+    count : int
+        How many to draw about each.
+    seed : int
+    """
+    both = slice(ROTATION.start, POSITION.stop)
+    strength, axes = np.linalg.eigh(covariance[both, both])
+    normal = np.random.default_rng(seed).standard_normal((len(middles), count, len(strength)))
+    normal[:, 0] = 0.0
+    errors = np.repeat(middles[:, None], count, axis=1)
+    errors[..., both] += normal * np.sqrt(np.maximum(strength, 0.0)) @ axes.T
+    errors[..., ROTATION] = np.clip(
+        errors[..., ROTATION], -tuning.SEARCH_ROTATION, tuning.SEARCH_ROTATION
+    )
+    errors[..., POSITION] = np.clip(
+        errors[..., POSITION], -tuning.SEARCH_RADIUS_M[1], tuning.SEARCH_RADIUS_M[1]
+    )
+    return np.asarray(errors.reshape(-1, ERRORS))
+
+
+def _grid(covariance: F64) -> F64:
+    """Return errors (N, 18) of the place that fill an ellipsoid of three sigma."""
+    radius = np.clip(3.0 * np.sqrt(np.diag(covariance)[POSITION]), *tuning.SEARCH_RADIUS_M)
+    volume = 4.0 / 3.0 * np.pi * float(radius.prod())
+    step = max(tuning.SEARCH_STEP_M, (volume / tuning.SEARCH_PLACES) ** (1.0 / 3.0))
+    axes = [step * np.arange(-np.ceil(r / step), np.ceil(r / step) + 1.0) for r in radius]
+    offsets = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    offsets = offsets[((offsets / radius) ** 2).sum(axis=1) <= 1.0]
+    errors = np.zeros((len(offsets), ERRORS))
+    errors[:, POSITION] = offsets
+    return errors
