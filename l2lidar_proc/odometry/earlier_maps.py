@@ -5,7 +5,8 @@ odometry frame where the prediction had come to, and stays as uncertain as that 
 
 :class:`MapRevisit` looks for the older part of the map in use. Where a narrow view sees one wall
 only, the pose drifts; what it then adds to the map lies beside what was there before, and agrees
-with the drifted pose.
+with the drifted pose. As it turns away from the wall, what shows the drift is in sight for less
+than a second.
 
 When a sweep meets such a map, the odometry goes on in it and the pose jumps back. A wrong jump is
 worse than none, so a meeting counts only if it fixes the place in every direction and the next one
@@ -35,6 +36,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.pose_hypotheses import level_basis
 from l2lidar_proc.odometry.uncertainty import FrameJump
 
 
@@ -142,12 +144,21 @@ class MapRevisit:
     def restart(self, stamp: HostNs) -> None:
         """Begin anew at an instant of another time line."""
         self._next_search = int(stamp)
+        self._is_due = False
         self._met_until = int(stamp)  # until then a meeting may be confirmed
+        self._in_sight_until = int(stamp)  # until then each sweep is tried beside its place
         self._certain_at = None
         self._meetings.clear()
 
+    def note_unobserved(self, stamp: HostNs) -> None:
+        """Note that the sweep of a stamp left a direction of the place free."""
+        self._in_sight_until = int(stamp) + tuning.REVISIT_SIGHT_NS
+
     def part_due(self, matcher: SweepMatcher, state: InertialState) -> SweepMatcher | None:
-        """Return the older part of the map if it should be searched now: more rarely, to a limit.
+        """Return the older part of the map if it should be searched now.
+
+        All of it is due more and more rarely, to a limit; beside the place it is searched while
+        surfaces that hold that may come into sight.
 
         Parameters
         ----------
@@ -156,13 +167,17 @@ class MapRevisit:
         state : InertialState
         """
         stamp = int(state.stamp)
-        if stamp < self._next_search:
+        self._is_due = stamp >= self._next_search
+        if not self._is_due and stamp >= self._in_sight_until:
             return None
         older = matcher.drift.more_certain_than_held(state.position)
         if older is None or matcher.is_young or matcher.driving:
             self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
             self._meetings.clear()
             return None
+        if not self._is_due:
+            loose = _is_loose_beside(state, matcher.drift.at(state.position))
+            return matcher.part_of(older) if loose else None
         if self._certain_at is None:
             self._certain_at = stamp
         pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
@@ -189,9 +204,18 @@ class MapRevisit:
             Of the map in use.
         """
         stamp, place = int(motion.state.stamp), motion.state.position
-        uncertain = FrameJump(place, part.drift.at(place))
-        found = _met_in(EarlierMap(part, FrameJump()), source, motion, uncertain)
-        if found is None or not _is_elsewhere(found, motion, len(source.points)):
+        uncertain = part.drift.at(place)
+        found = None
+        if self._is_due:
+            jump_to_part = FrameJump(place, uncertain)
+            found = _met_in(EarlierMap(part, FrameJump()), source, motion, jump_to_part)
+            if found is not None and not _is_elsewhere(found, motion, len(source.points)):
+                found = None
+        if found is None and _is_loose_beside(motion.state, uncertain):
+            loose = with_loose_pose(motion.state, motion.covariance, uncertain)
+            freed = dataclasses.replace(motion, covariance=loose)
+            found = part.match_beside(source, freed, uncertain[:3, :3])
+        if found is None:
             if stamp < self._met_until:
                 self._next_search = stamp + 1
             else:
@@ -205,6 +229,15 @@ class MapRevisit:
         speed = float(np.linalg.norm(found.state.position - place)) / tuning.REVISIT_DRIFT_S
         covariance[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
         return Return(EarlierMap(part, jump), dataclasses.replace(found, covariance=covariance))
+
+
+def _is_loose_beside(state: InertialState, uncertain: F64) -> bool:
+    """Return whether a place, so uncertain (6, 6), has drifted far on its level."""
+    if not state.gravity.any():
+        return False
+    basis = level_basis(state.gravity)
+    level = basis.T @ uncertain[:3, :3] @ basis
+    return bool(np.linalg.eigvalsh(level)[-1] > tuning.BESIDE_FROM_SIGMA**2)
 
 
 def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int) -> bool:

@@ -40,7 +40,11 @@ from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import AlignmentQuality
 from l2lidar_proc.odometry.free_space import rays_through
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
-from l2lidar_proc.odometry.pose_hypotheses import pose_hypotheses, rotation_is_loose
+from l2lidar_proc.odometry.pose_hypotheses import (
+    hypotheses_beside,
+    pose_hypotheses,
+    rotation_is_loose,
+)
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import MapDrift
 from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
@@ -212,6 +216,53 @@ class SweepMatcher:
         elif best is None and young and found is None:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         return self._believed(best)
+
+    def match_beside(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
+        """Return how a sweep fits the map beside where it was predicted, None if it does not.
+
+        For a place that has drifted while nothing held it. When a surface comes into sight again
+        that holds it, few points are on it, and the others fit everywhere along their walls. So
+        places are tried closely, and what counts is the points in the finest cells. The place
+        must be the only one, and on the same level: a step of a stair looks like the next.
+
+        Parameters
+        ----------
+        source : Source
+        motion : SweepMotion
+            The one that deskewed the source; its pose is loose.
+        places : ndarray, shape (3, 3)
+            How uncertain the place is in this map, map axes [m^2].
+        """
+        state = motion.state
+        if not state.gravity.any() or len(source.points) < self.config.min_points:
+            return None
+        starts = hypotheses_beside(state, places, source, self.surfaces)
+        others = [self._align(source, motion, start) for start in starts]
+        good = [one for one in others if one and self._is_beside(one, source, motion, places)]
+        best = max(good, key=lambda one: one.fine_inliers, default=None)
+        if best is None or any(_are_apart(one, best) for one in good):
+            return None
+        return best
+
+    def _is_beside(
+        self, found: Alignment, source: Source, motion: SweepMotion, places: F64
+    ) -> bool:
+        """Return whether an alignment fixes another place on the level of the predicted one."""
+        move, gravity = found.state.position - motion.state.position, motion.state.gravity
+        if not is_far(found, motion) or self._is_far_fetched(found, motion):
+            return False
+        if abs(float(move @ gravity)) > tuning.BESIDE_HEIGHT_M * float(np.linalg.norm(gravity)):
+            return False
+        allowed = places + tuning.BESIDE_FLOOR_M**2 * np.eye(3)
+        if float(move @ np.linalg.solve(allowed, move)) > tuning.BESIDE_SIGMAS**2:
+            return False
+        inliers, fine_inliers = tuning.BESIDE_INLIERS
+        least = max(float(tuning.FAR_MATCHED), tuning.BESIDE_MATCHED * len(source.points))
+        if found.inlier_ratio < inliers or found.fine_ratio < fine_inliers:
+            return False
+        if found.fine_inliers < least or self._sees_through(found, source):
+            return False
+        return not unobserved_directions(found.information[POSITION, POSITION]).size
 
     @property
     def _wall_direction(self) -> F64 | None:
@@ -538,6 +589,12 @@ def is_ambiguous(best: Alignment, others: list[Alignment | None], motion: SweepM
         for other in others
         if other is not None
     )
+
+
+def _are_apart(one: Alignment, other: Alignment) -> bool:
+    """Return whether two alignments beside a place found different ones."""
+    way = one.state.position - other.state.position
+    return bool(np.linalg.norm(way) > tuning.BESIDE_APART_M)
 
 
 def pose_covariance(motion: SweepMotion) -> F64:

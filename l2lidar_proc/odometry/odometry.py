@@ -363,6 +363,7 @@ class Odometry:
         found = self._innovations
         if not quality.observes_all:
             found.note_unobserved(stamp)
+            self._revisit.note_unobserved(stamp)
         return dataclasses.replace(
             quality,
             nis=found.nis,

@@ -45,20 +45,59 @@ def pose_hypotheses(
             seed,
         )
     scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS)
+    best = _distinct(errors, scores, 2.0 * tuning.SEARCH_STEP_M, count)
+    return [state.boxplus(error) for error in best]
+
+
+def hypotheses_beside(
+    state: InertialState, places: F64, source: Source, surfaces: SurfelMap
+) -> list[InertialState]:
+    """Return states on the same level at which more points lie on surfaces, best first.
+
+    Far more finely spaced than :func:`pose_hypotheses`: where a surface comes into sight again
+    that a drifted place was lost for, few points are on it, and all others fit everywhere.
+
+    Parameters
+    ----------
+    state : InertialState
+        With a gravity.
+    places : ndarray, shape (3, 3)
+        Covariance of its place, map axes [m^2].
+    source : Source
+    surfaces : SurfelMap
+    """
+    shifts = level_grid(places, level_basis(state.gravity))
+    errors = np.zeros((len(shifts), ERRORS))
+    errors[:, POSITION] = shifts
+    scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS)
+    least = tuning.BESIDE_MATCHED * len(_some(source.points, tuning.SEARCH_POINTS))
+    better = scores > max(scores[0], least)
+    count, apart = tuning.BESIDE_STARTS, tuning.BESIDE_APART_M
+    best = _distinct(errors[better], scores[better], apart, count)
+    return [state.boxplus(error) for error in best]
+
+
+def level_basis(gravity: F64) -> F64:
+    """Return two level directions (3, 2), orthonormal, for a gravity (3,) that is not zero."""
+    return np.asarray(np.linalg.svd(gravity[None])[2][1:].T)
+
+
+def _distinct(errors: F64, scores: NDArray[np.int64], apart: float, count: int) -> list[F64]:
+    """Return the errors (18,) of the highest scores, each so far from all others, best first."""
     best: list[F64] = []
     for index in np.argsort(-scores, kind="stable").tolist():
-        if all(_apart(errors[index], other) > 2.0 * tuning.SEARCH_STEP_M for other in best):
+        if all(_apart(errors[index], other) > apart for other in best):
             best.append(errors[index])
         if len(best) == count:
             break
-    return [state.boxplus(error) for error in best]
+    return best
 
 
 def _scores(
     state: InertialState, errors: F64, source: Source, surfaces: SurfelMap, count: int
 ) -> NDArray[np.int64]:
     """Return how many of some points lie on surfaces for each error (N, 18) of the state."""
-    points = source.points[:: max(len(source.points) // count, 1)]
+    points = _some(source.points, count)
     turns = state.rotation @ rotations.matrices(rotations.exp(errors[:, ROTATION]))
     origins = state.position + errors[:, POSITION]
     seen = np.einsum("kij,nj->kni", turns, points)
@@ -67,6 +106,11 @@ def _scores(
     found = surfaces.match(seen.reshape(-1, 3), origins=origins)
     near = np.abs(found.distances) < tuning.SEARCH_NEAR_M
     return np.bincount(found.index[near] // len(points), minlength=len(errors))
+
+
+def _some(points: F64, count: int) -> F64:
+    """Return evenly spaced ones of points (N, 3): ``count`` or a few more, or all."""
+    return points[:: max(len(points) // count, 1)]
 
 
 def rotation_is_loose(covariance: F64) -> bool:
@@ -118,3 +162,27 @@ def _grid(covariance: F64) -> F64:
     errors = np.zeros((len(offsets), ERRORS))
     errors[:, POSITION] = offsets
     return errors
+
+
+def level_grid(places: F64, basis: F64) -> F64:
+    """Return shifts (N, 3) [m] that fill an ellipse of the uncertainty on a level, 0 first.
+
+    Parameters
+    ----------
+    places : ndarray, shape (3, 3)
+        [m^2]
+    basis : ndarray, shape (3, 2)
+        As :func:`level_basis` returns it.
+    """
+    strength, axes = np.linalg.eigh(basis.T @ places @ basis)
+    radius = np.minimum(
+        tuning.BESIDE_SIGMAS * np.sqrt(np.maximum(strength, 0.0)), tuning.SEARCH_RADIUS_M[1]
+    )
+    area = np.pi * float(np.maximum(radius, tuning.BESIDE_STEP_M).prod())
+    step = max(tuning.BESIDE_STEP_M, (area / tuning.BESIDE_PLACES) ** 0.5)
+    counts = np.floor(radius / step).astype(np.int64)
+    steps = np.meshgrid(*(np.arange(-count, count + 1) for count in counts), indexing="ij")
+    shifts = step * np.stack(steps, axis=-1).reshape(-1, 2)
+    shifts = shifts[((shifts / np.maximum(radius, step)) ** 2).sum(axis=1) <= 1.0]
+    shifts = shifts[np.argsort((shifts**2).sum(axis=1), kind="stable")]
+    return np.asarray(shifts @ (basis @ axes).T)

@@ -321,3 +321,86 @@ def test_searches_go_on_when_the_clock_has_gone_back(drifted: SweepMatcher) -> N
     maps.restart(back.stamp)
     assert revisit.part_due(drifted, back) is not None
     assert maps.is_due(back.stamp)
+
+
+ALONG = np.array([0.5, 0.0, 0.0])  # the wall that fills the view
+
+
+@pytest.fixture(scope="module")
+def drifted_along() -> SweepMatcher:
+    """Return a map of the room, and what was seen of it later, from a place off by ALONG."""
+    rng, matcher = np.random.default_rng(41), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(14):
+        extended(matcher, room(rng, 4000))
+    for _ in range(14):
+        extended(matcher, room(rng, 4000) + ALONG, (TIGHT[0], 0.5))
+    at = motion(TIGHT, PLACE + ALONG)
+    found = matcher.match(source(room(rng, 2000) - PLACE), at).alignment
+    assert found is not None
+    matcher.meet(found, 0.2)
+    return matcher
+
+
+def corner_view(rng: np.random.Generator) -> Source:
+    """Return a view of a wall, and of narrow strips of the next wall and of the floor."""
+    wall = rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (300, 3))
+    strip = rng.uniform((4.0, 2.0, -1.2), (4.0, 3.0, 1.8), (25, 3))
+    floor = rng.uniform((0.0, 2.0, -1.2), (4.0, 3.0, -1.2), (40, 3))
+    return source(np.vstack((wall, strip, floor)) - PLACE)
+
+
+AWAY = motion(TIGHT, PLACE + ALONG)
+
+
+def test_a_corner_that_comes_into_sight_again_takes_the_pose_back(
+    drifted_along: SweepMatcher,
+) -> None:
+    rng, revisit = np.random.default_rng(42), MapRevisit()
+    nothing = source(rng.uniform(*NOTHING, (1500, 3)))
+    assert searched(revisit, drifted_along, nothing, AWAY) is None
+    # not due for a second, unless a sweep has left a direction free
+    assert revisit.part_due(drifted_along, later(AWAY, 0.2).state) is None
+    revisit.note_unobserved(later(AWAY, 0.2).state.stamp)
+    assert searched(revisit, drifted_along, corner_view(rng), later(AWAY, 0.4)) is None
+    back = searched(revisit, drifted_along, corner_view(rng), later(AWAY, 0.6))
+    assert back is not None
+    np.testing.assert_allclose(back.alignment.state.position, PLACE, atol=0.02)
+    speed = np.linalg.norm(ALONG) / tuning.REVISIT_DRIFT_S
+    sigmas = np.sqrt(np.diag(back.alignment.covariance)[VELOCITY])
+    np.testing.assert_allclose(sigmas, speed, rtol=0.1)
+
+
+def test_each_sweep_is_tried_for_two_seconds_after_one_that_left_a_direction_free(
+    drifted_along: SweepMatcher,
+) -> None:
+    revisit = MapRevisit()
+    nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
+    assert searched(revisit, drifted_along, nothing, AWAY) is None
+    revisit.note_unobserved(AWAY.state.stamp)
+    tried = []
+    for number in range(1, 30):
+        sweep = later(AWAY, 0.1 * number + 0.05)
+        part = revisit.part_due(drifted_along, sweep.state)
+        if part is not None:
+            tried.append(number)
+            assert revisit.search(nothing, part, sweep, FrameJump()) is None
+    assert set(range(1, 20)) <= set(tried)
+    assert set(tried) <= {*range(1, 20), 20, 21, 22}  # and then as ever, once a second
+    # after a clock that went back, nothing is in sight
+    revisit.note_unobserved(AWAY.state.stamp)
+    revisit.restart(later(AWAY, -3600.0).state.stamp)
+    assert searched(revisit, drifted_along, nothing, later(AWAY, -3600.0)) is None
+    assert revisit.part_due(drifted_along, later(AWAY, -3599.5).state) is None
+
+
+@pytest.mark.parametrize(("known", "tried"), [(0.5, True), (0.3, False)])
+def test_only_a_place_that_is_loose_on_its_level_is_searched_beside(
+    known: float, tried: bool
+) -> None:
+    matcher, revisit = drifted_matcher(known), MapRevisit()
+    nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
+    assert searched(revisit, matcher, nothing, AT) is None
+    revisit.note_unobserved(AT.state.stamp)
+    assert (revisit.part_due(matcher, later(AT, 0.2).state) is not None) == tried
+    weightless = dataclasses.replace(later(AT, 0.2).state, gravity=np.zeros(3))
+    assert revisit.part_due(matcher, weightless) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.matcher import Match, SweepMatcher
+from l2lidar_proc.odometry.pose_hypotheses import level_basis, level_grid
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,
@@ -462,3 +464,144 @@ def test_without_an_imu_every_sweep_is_a_keyframe(imu: bool) -> None:
     begun = len(matcher.kiss.points())
     extended(matcher, room(rng, 300), imu=imu)
     assert (len(matcher.kiss.points()) > begun) is not imu
+
+
+DRIFTED = np.array([0.55, 0.0, 0.0])  # along the wall that fills the view
+DRIFT_SIGMA = np.array([0.5, 0.05, 0.2])
+
+
+def corner(rng: np.random.Generator, strip: int = 25, floor: int = 40, wall: int = 300) -> F64:
+    """Return points of one wall of the room, and of strips of the next one and of the floor."""
+    return np.vstack(
+        (
+            rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (wall, 3)),
+            rng.uniform((4.0, 2.0, -1.2), (4.0, 3.0, 1.8), (strip, 3)),
+            rng.uniform((0.0, 2.0, -1.2), (4.0, 3.0, -1.2), (floor, 3)),
+        )
+    )
+
+
+def beside(
+    matcher: SweepMatcher,
+    points: F64,
+    drift: F64 = DRIFTED,
+    sigma: F64 = DRIFT_SIGMA,
+    gravity: float = 1.0,
+) -> F64 | None:
+    """Return the drift that remains when points are matched beside a place that has drifted."""
+    at = motion(TIGHT, PLACE + drift)
+    places = np.diag(sigma**2)
+    covariance = at.covariance.copy()
+    covariance[eskf.POSITION, eskf.POSITION] = places
+    state = dataclasses.replace(at.state, gravity=gravity * at.state.gravity)
+    loose = dataclasses.replace(at, covariance=covariance, state=state)
+    found = matcher.match_beside(source(points - PLACE), loose, places)
+    return None if found is None else found.state.position - PLACE
+
+
+@pytest.mark.parametrize("along", [0.55, -0.55, 0.2, 0.95])
+def test_a_strip_of_a_wall_that_comes_into_sight_again_shows_how_far_the_place_has_drifted(
+    grown: SweepMatcher, along: float
+) -> None:
+    points = corner(np.random.default_rng(31))
+    left = beside(grown, points, np.array([along, 0.0, 0.0]))
+    assert left is not None
+    np.testing.assert_allclose(left, 0.0, atol=0.02)
+    # all but the strip fits where it was predicted
+    match = grown.match(source(points - PLACE), motion(TIGHT, PLACE + np.array((along, 0.0, 0.0))))
+    assert match.alignment is None or off(match) > 0.1
+
+
+def test_a_place_that_drifted_in_both_level_directions_is_found(grown: SweepMatcher) -> None:
+    drift, sigma = np.array([0.4, -0.3, 0.0]), np.array([0.5, 0.4, 0.1])
+    left = beside(grown, corner(np.random.default_rng(32)), drift, sigma)
+    assert left is not None
+    np.testing.assert_allclose(left, 0.0, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("drift", "sigma"),
+    [
+        ((0.08, 0.0, 0.0), (0.5, 0.05, 0.2)),  # it has hardly drifted
+        ((0.55, 0.0, 0.2), (0.5, 0.05, 0.2)),  # a step of a stair
+        ((0.55, 0.0, 0.0), (0.25, 0.05, 0.2)),  # more than two sigma away
+        ((0.2, 0.35, 0.0), (0.5, 0.1, 0.2)),
+    ],
+)
+def test_only_places_that_drift_explains_are_found_beside(
+    grown: SweepMatcher, drift: tuple[float, ...], sigma: tuple[float, ...]
+) -> None:
+    points = corner(np.random.default_rng(33))
+    assert beside(grown, points, np.array(drift), np.array(sigma)) is None
+
+
+def unknown(rng: np.random.Generator, count: int) -> F64:
+    """Return points beyond the wall that fills the view, where there is no map."""
+    return rng.uniform((-4.0, 7.0, -1.0), (4.0, 12.0, 2.0), (count, 3))
+
+
+def before(rng: np.random.Generator, count: int, gap: tuple[float, float]) -> F64:
+    """Return points so far before that wall, where it does not hide its floor or corner."""
+    return rng.uniform((0.5, 3.0 - gap[1], 0.0), (3.5, 3.0 - gap[0], 1.5), (count, 3))
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        lambda rng: corner(rng, strip=4),  # a few points fit in many places
+        lambda rng: corner(rng, strip=0),
+        lambda rng: corner(rng, floor=0),  # nothing holds the height
+        lambda rng: corner(rng, 25, 10, 8),  # fewer than fifty points
+        lambda rng: np.vstack((corner(rng, 25, 30, 60), unknown(rng, 1200))),
+        lambda rng: np.vstack((corner(rng), before(rng, 500, (0.15, 0.45)))),
+        lambda rng: np.vstack((corner(rng), before(rng, 140, (0.13, 0.2)))),
+    ],
+)
+def test_what_is_found_beside_fits_as_wrong_places_do_not(
+    grown: SweepMatcher, points: Callable[[np.random.Generator], F64]
+) -> None:
+    assert beside(grown, points(np.random.default_rng(34))) is None
+
+
+def test_places_on_one_level_are_searched_where_gravity_tells_which_that_is(
+    grown: SweepMatcher,
+) -> None:
+    points = corner(np.random.default_rng(35))
+    assert beside(grown, points, gravity=0.0) is None
+    assert beside(grown, points[: OdometryConfig().min_points - 1]) is None
+
+
+@pytest.mark.parametrize(("plates", "found"), [((2.0,), True), ((2.0, 2.32), False)])
+def test_a_place_beside_is_the_only_one_that_fits(plates: tuple[float, ...], found: bool) -> None:
+    rng, matcher = np.random.default_rng(36), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def plate(x: float, count: int) -> F64:
+        return np.asarray(rng.uniform((x, -1.5, -1.2), (x, 1.5, 1.0), (count, 3)))
+
+    def wall(count: int) -> F64:
+        return np.asarray(rng.uniform((-3.0, 1.5, -1.2), (4.0, 1.5, 1.0), (count, 3)))
+
+    def floor(count: int) -> F64:
+        return np.asarray(rng.uniform((-3.0, -2.0, -1.2), (4.0, 1.5, -1.2), (count, 3)))
+
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        points = np.vstack((floor(3000), wall(3000), *(plate(x, 1500) for x in plates)))
+        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
+    cloud = np.vstack((floor(150) * (0.3, 1.0, 1.0), wall(150) * (0.3, 1.0, 1.0), plate(2.0, 40)))
+    at = np.array([0.6, 0.0, 0.0])
+    assert (beside(matcher, cloud + PLACE, at - PLACE) is not None) == found
+
+
+def test_places_beside_are_no_farther_apart_than_their_number_allows() -> None:
+    """However uncertain the place is, the search takes no longer."""
+    rng = np.random.default_rng(37)
+    basis = level_basis(np.array([0.1, -0.2, -9.8]))
+    for sigma in (0.01, 0.4, 3.0, 1e6):
+        root = rng.normal(0.0, sigma, (3, 3))
+        shifts = level_grid(root @ root.T, basis)
+        np.testing.assert_array_equal(shifts[0], 0.0)
+        assert 1 <= len(shifts) <= 1.3 * tuning.BESIDE_PLACES
+        np.testing.assert_allclose(shifts @ [0.1, -0.2, -9.8], 0.0, atol=1e-9)
+        assert np.linalg.norm(shifts, axis=1).max() <= tuning.SEARCH_RADIUS_M[1] + 1e-9
+        apart = np.linalg.norm(shifts[:, None] - shifts[None, :], axis=2)
+        assert len(shifts) == 1 or apart[apart > 0.0].min() >= tuning.BESIDE_STEP_M - 1e-9
