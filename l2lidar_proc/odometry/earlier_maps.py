@@ -204,11 +204,12 @@ class MapRevisit:
             Of the map in use.
         """
         stamp, place = int(motion.state.stamp), motion.state.position
-        uncertain = part.drift.at(place)
+        uncertain = _kept_level(motion.state, part.drift.at(place))
         found = None
         if self._is_due:
             jump_to_part = FrameJump(place, uncertain)
-            found = _met_in(EarlierMap(part, FrameJump()), source, motion, jump_to_part)
+            kept = EarlierMap(part, FrameJump())
+            found = _met_in(kept, source, motion, jump_to_part, lean=tuning.REVISIT_LEAN)
             if found is not None and not _is_elsewhere(found, motion, len(source.points)):
                 found = None
         if found is None and _is_loose_beside(motion.state, uncertain):
@@ -229,6 +230,24 @@ class MapRevisit:
         speed = float(np.linalg.norm(found.state.position - place)) / tuning.REVISIT_DRIFT_S
         covariance[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
         return Return(EarlierMap(part, jump), dataclasses.replace(found, covariance=covariance))
+
+
+def _kept_level(state: InertialState, uncertain: F64) -> F64:
+    """Return a drift (6, 6) of the map that has turned it about the vertical only.
+
+    Gravity keeps the map level. A few points that fix a place may fit as well where the pose
+    leans by degrees; gravity would then pull it away, faster and faster.
+    """
+    if not state.gravity.any():
+        return uncertain
+    kept = np.eye(6)
+    kept[3:, 3:] = _vertical(state.gravity)
+    return np.asarray(kept @ uncertain @ kept.T)
+
+
+def _vertical(gravity: F64) -> F64:
+    """Return the projection (3, 3) on the direction of gravity (3,)."""
+    return np.outer(gravity, gravity) / float(gravity @ gravity)
 
 
 def _is_loose_beside(state: InertialState, uncertain: F64) -> bool:
@@ -278,9 +297,16 @@ def _moves(state: InertialState, found: InertialState) -> F64:
 
 
 def _met_in(
-    kept: EarlierMap, source: Source, motion: SweepMotion, jump: FrameJump
+    kept: EarlierMap,
+    source: Source,
+    motion: SweepMotion,
+    jump: FrameJump,
+    lean: float = tuning.EARLIER_SIGMA[0],
 ) -> Alignment | None:
-    """Return how a sweep meets an earlier map, if it does beyond doubt."""
+    """Return how a sweep meets an earlier map, if it does beyond doubt.
+
+    ``lean`` is by how much the pose that the search has found may lean, 1 sigma [rad].
+    """
     state = motion.state
     between = jump.at(state.position) - kept.jump.at(state.position)
     if np.trace(between) < 0.0:  # the kept one is the younger
@@ -297,7 +323,11 @@ def _met_in(
         axes[block, block] = turn
     covariance = axes @ motion.covariance @ axes.T
     covariance[POSE, :] = covariance[:, POSE] = 0.0
-    covariance[ROTATION, ROTATION] = tuning.EARLIER_SIGMA[0] ** 2 * np.eye(3)
+    turns = tuning.EARLIER_SIGMA[0] ** 2 * np.eye(3)
+    if state.gravity.any():
+        up = _vertical(there.gravity)
+        turns = tuning.EARLIER_SIGMA[0] ** 2 * up + lean**2 * (np.eye(3) - up)
+    covariance[ROTATION, ROTATION] = there.rotation.T @ turns @ there.rotation
     covariance[POSITION, POSITION] = tuning.EARLIER_SIGMA[1] ** 2 * np.eye(3)
     found, _ = kept.matcher.match(
         source, dataclasses.replace(motion, state=there, covariance=covariance)

@@ -404,3 +404,37 @@ def test_only_a_place_that_is_loose_on_its_level_is_searched_beside(
     assert (revisit.part_due(matcher, later(AT, 0.2).state) is not None) == tried
     weightless = dataclasses.replace(later(AT, 0.2).state, gravity=np.zeros(3))
     assert revisit.part_due(matcher, weightless) is None
+
+
+@pytest.mark.parametrize("is_due", [True, False])
+def test_gravity_keeps_the_pose_level_that_returns(is_due: bool) -> None:
+    """The strip of floor is narrow: by itself it lets the pose lean about the y axis."""
+    rng, matcher = np.random.default_rng(43), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(14):
+        extended(matcher, room(rng, 4000))
+    for _ in range(14):
+        extended(matcher, room(rng, 4000) + ALONG, (0.1, 0.5))
+    found = matcher.match(source(room(rng, 2000) - PLACE), AWAY).alignment
+    assert found is not None
+    matcher.meet(found, 0.2)
+
+    def seen() -> Source:
+        wall = rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (300, 3))
+        strip = rng.uniform((4.0, 2.6, 0.2), (4.0, 3.0, 0.4), (40, 3))
+        floor = rng.uniform((0.3, 2.4, -1.2), (0.6, 3.0, -1.2), (30, 3))
+        return source(np.vstack((wall, strip, floor)) - PLACE)
+
+    revisit, backs = MapRevisit(), []
+    nothing = source(rng.uniform(*NOTHING, (1500, 3)))
+    if not is_due:
+        assert searched(revisit, matcher, nothing, AWAY) is None
+        revisit.note_unobserved(AWAY.state.stamp)
+    for number in range(1, 4):
+        sweep = later(AWAY, 0.2 * number)
+        part = revisit.part_due(matcher, sweep.state)
+        if part is not None:
+            backs.append(revisit.search(seen(), part, sweep, FrameJump()))
+    back = next(back for back in backs if back is not None)
+    sigmas = np.sqrt(np.diag(back.alignment.covariance)[ROTATION])
+    assert sigmas[1] < 0.012
+    assert abs(back.alignment.state.rotation[0, 2]) < 0.012
