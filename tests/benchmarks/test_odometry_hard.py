@@ -183,6 +183,21 @@ def test_a_narrow_view_finds_its_old_place_again(
     assert "LOST" not in {name for status in track.status for name in status}
 
 
+def test_gravity_keeps_a_narrow_view_level_that_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The few points that fix its place would let it lean by 3 degrees, and then run away."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario("flat, cone of 70 degrees", 43, 54.0))
+    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
+    assert track is not None
+    found = errors(given, track)
+    back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
+    lean = np.linalg.norm(found.turn[back:, :2], axis=1)
+    assert np.degrees(lean.max()) < 1.5
+    assert np.linalg.norm(found.position[back:], axis=1).max() < 0.3
+
+
 def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
     narrow: Recording,
 ) -> None:
