@@ -234,7 +234,7 @@ class SweepMatcher:
             How uncertain the place is in this map, map axes [m^2].
         """
         state = motion.state
-        if not state.gravity.any() or len(source.points) < self.config.min_points:
+        if not state.gravity.any() or len(source.points) < tuning.FAR_MATCHED:
             return None
         starts = hypotheses_beside(state, places, source, self.surfaces)
         others = [self._align(source, motion, start) for start in starts]
@@ -257,10 +257,11 @@ class SweepMatcher:
         if float(move @ np.linalg.solve(allowed, move)) > tuning.BESIDE_SIGMAS**2:
             return False
         inliers, fine_inliers = tuning.BESIDE_INLIERS
-        least = max(float(tuning.FAR_MATCHED), tuning.BESIDE_MATCHED * len(source.points))
         if found.inlier_ratio < inliers or found.fine_ratio < fine_inliers:
             return False
-        if found.fine_inliers < least or self._sees_through(found, source):
+        if found.fine_inliers < tuning.BESIDE_MATCHED * len(source.points):
+            return False
+        if self._sees_through(found, source):
             return False
         return not unobserved_directions(found.information[POSITION, POSITION]).size
 

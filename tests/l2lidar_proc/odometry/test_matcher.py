@@ -568,7 +568,9 @@ def test_places_on_one_level_are_searched_where_gravity_tells_which_that_is(
 ) -> None:
     points = corner(np.random.default_rng(35))
     assert beside(grown, points, gravity=0.0) is None
-    assert beside(grown, points[: OdometryConfig().min_points - 1]) is None
+    few = np.vstack((points[:20], points[300:325], points[325:329]))  # of wall, strip and floor
+    assert len(few) == tuning.FAR_MATCHED - 1
+    assert beside(grown, few) is None
 
 
 @pytest.mark.parametrize(("plates", "found"), [((2.0,), True), ((2.0, 2.32), False)])
@@ -590,6 +592,31 @@ def test_a_place_beside_is_the_only_one_that_fits(plates: tuple[float, ...], fou
     cloud = np.vstack((floor(150) * (0.3, 1.0, 1.0), wall(150) * (0.3, 1.0, 1.0), plate(2.0, 40)))
     at = np.array([0.6, 0.0, 0.0])
     assert (beside(matcher, cloud + PLACE, at - PLACE) is not None) == found
+
+
+@pytest.mark.parametrize("is_in_the_way", [False, True])
+def test_a_place_beside_from_which_a_known_wall_is_seen_through_is_not_found(
+    is_in_the_way: bool,
+) -> None:
+    rng, matcher = np.random.default_rng(38), SweepMatcher(OdometryConfig(), np.zeros(3))
+
+    def plate(x: float, half: float, count: int) -> F64:
+        return np.asarray(rng.uniform((x, -half, -1.2), (x, half, 1.0), (count, 3)))
+
+    def wall(count: int) -> F64:
+        return np.asarray(rng.uniform((-3.0, 1.5, -1.2), (4.0, 1.5, 1.0), (count, 3)))
+
+    def floor(count: int) -> F64:
+        return np.asarray(rng.uniform((-3.0, -2.0, -1.2), (4.0, 1.5, -1.2), (count, 3)))
+
+    plates = ((3.0, 1.5), (1.2, 0.5)) if is_in_the_way else ((3.0, 1.5),)
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        points = np.vstack((floor(3000), wall(3000), *(plate(x, w, 1500) for x, w in plates)))
+        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
+    cloud = np.vstack((floor(80) * (0.3, 1.0, 1.0), wall(80) * (0.3, 1.0, 1.0)))
+    cloud = np.vstack((cloud, plate(2.4, 0.5, 120)))  # 0.6 m nearer than it is
+    left = beside(matcher, cloud + PLACE, -PLACE)
+    assert (left is not None) == (not is_in_the_way)
 
 
 def test_places_beside_are_no_farther_apart_than_their_number_allows() -> None:
