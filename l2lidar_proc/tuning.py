@@ -576,24 +576,27 @@ REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
 REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part
 REVISIT_INLIERS: Final = 0.85  # least share of those that are near its surfaces
 REVISIT_MET_NS: Final = 2_000_000_000  # [ns] within which a meeting must be confirmed
-# After a sweep that left a direction free, surfaces that hold it may come into sight for a second.
-# Until so long after it, each sweep is tried beside its place, if that is so loose on its level.
-# Where it is less, what fits beside it may be something else (tuned on: camera in a room, 0.3 m).
+# Relocalization on a level is tried with each sweep for so long after one that left a direction
+# free: the surface that fixes it again may be in sight for a second only.
 REVISIT_SIGHT_NS: Final = 2_000_000_000  # [ns]
-BESIDE_FROM_SIGMA: Final = 0.35  # [m] 1 sigma
-BESIDE_SIGMAS: Final = 2.0  # about the place within which others are tried,
-BESIDE_STEP_M: Final = 0.1  # [m] so far apart; the robust kernel reaches half as far
-BESIDE_PLACES: Final = 600  # at most, and farther apart if they are not enough. Bounds the time
-BESIDE_STARTS: Final = 4  # of them that are aligned,
-BESIDE_APART_M: Final = 0.25  # [m] so far apart
+# It needs a place at least so uncertain. If it is less, what fits elsewhere may be something else.
+# Tuned on: camera in a room, 0.3 m
+RELOCALIZE_FROM_SIGMA: Final = 0.35  # [m] 1 sigma
+RELOCALIZE_SIGMAS: Final = 2.0  # how far from the predicted place others are tried,
+RELOCALIZE_STEP_M: Final = 0.1  # [m] so far apart; the robust kernel reaches as far
+RELOCALIZE_PLACES: Final = (
+    600  # at most; farther apart where these do not suffice. Bounds the time
+)
+RELOCALIZE_STARTS: Final = 4  # of these places from which sweeps are aligned,
+RELOCALIZE_APART_M: Final = 0.25  # [m] so far apart
 # Tuned on: camera on stairs, where sweeps fit 0.16 m and more higher or lower as well, and flats
 # with a cone of 70 degrees and a rosette, where the height had drifted by 0.1 m besides
-BESIDE_HEIGHT_M: Final = 0.15  # [m] by which the place may move up or down
-BESIDE_FLOOR_M: Final = 0.05  # [m] added to its uncertainty in each direction
+RELOCALIZE_HEIGHT_M: Final = 0.15  # [m] by which the place may move up or down
+RELOCALIZE_FLOOR_M: Final = 0.05  # [m] added to its uncertainty in each direction
 # Share of the points on surfaces, of all in their cells and of those in the finest. Coarse cells
-# beside an old place hold what has not been seen before: 0.56 to 0.98 at right places, 0.38 at
-# wrong ones. Tuned on: as above
-BESIDE_INLIERS: Final = (0.5, 0.85)
-BESIDE_MATCHED: Final = 0.15  # share of the points that must be on surfaces of the finest cells
+# near an old place hold what has not been seen before: 0.56 to 0.98 at right places, 0.38 at wrong
+# ones. Tuned on: as above
+RELOCALIZE_INLIERS: Final = (0.5, 0.85)
+RELOCALIZE_MATCHED: Final = 0.15  # of all points, on surfaces of the finest cells
 # Time in which the place may have moved by the jump. Observed: a view lacks for 3 to 10 s.
 REVISIT_DRIFT_S: Final = 5.0  # [s]

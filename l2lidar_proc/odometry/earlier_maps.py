@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,6 +134,20 @@ class EarlierMaps:
         return None
 
 
+class OlderPart(NamedTuple):
+    """The older part of the map in use.
+
+    Attributes
+    ----------
+    matcher : SweepMatcher
+    is_due : bool
+        Whether all of it is to be searched, not only on the level of the predicted place.
+    """
+
+    matcher: SweepMatcher
+    is_due: bool
+
+
 class MapRevisit:
     """Search of the older part of the map in use while the pose is less certain than that."""
 
@@ -144,9 +159,8 @@ class MapRevisit:
     def restart(self, stamp: HostNs) -> None:
         """Begin anew at an instant of another time line."""
         self._next_search = int(stamp)
-        self._is_due = False
         self._met_until = int(stamp)  # until then a meeting may be confirmed
-        self._in_sight_until = int(stamp)  # until then each sweep is tried beside its place
+        self._in_sight_until = int(stamp)  # until then relocalization is tried with each sweep
         self._certain_at = None
         self._meetings.clear()
 
@@ -154,11 +168,11 @@ class MapRevisit:
         """Note that the sweep of a stamp left a direction of the place free."""
         self._in_sight_until = int(stamp) + tuning.REVISIT_SIGHT_NS
 
-    def part_due(self, matcher: SweepMatcher, state: InertialState) -> SweepMatcher | None:
+    def part_due(self, matcher: SweepMatcher, state: InertialState) -> OlderPart | None:
         """Return the older part of the map if it should be searched now.
 
-        All of it is due more and more rarely, to a limit; beside the place it is searched while
-        surfaces that hold that may come into sight.
+        All of it is searched more and more rarely, to a limit; the level of the predicted place
+        also while a surface that fixes the place may come into sight.
 
         Parameters
         ----------
@@ -167,26 +181,26 @@ class MapRevisit:
         state : InertialState
         """
         stamp = int(state.stamp)
-        self._is_due = stamp >= self._next_search
-        if not self._is_due and stamp >= self._in_sight_until:
+        is_due = stamp >= self._next_search
+        if not is_due and stamp >= self._in_sight_until:
             return None
         older = matcher.drift.more_certain_than_held(state.position)
         if older is None or matcher.is_young or matcher.driving:
             self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
             self._meetings.clear()
             return None
-        if not self._is_due:
-            loose = _is_loose_beside(state, matcher.drift.at(state.position))
-            return matcher.part_of(older) if loose else None
+        if not is_due:
+            loose = _is_loose_on_level(state, matcher.drift.at(state.position))
+            return OlderPart(matcher.part_of(older), False) if loose else None
         if self._certain_at is None:
             self._certain_at = stamp
         pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
         pause = min(max(tuning.EARLIER_PAUSE_NS, pause), tuning.REVISIT_PAUSE_NS)
         self._next_search = stamp + pause
-        return matcher.part_of(older)
+        return OlderPart(matcher.part_of(older), True)
 
     def search(
-        self, source: Source, part: SweepMatcher, motion: SweepMotion, jump: FrameJump
+        self, source: Source, part: OlderPart, motion: SweepMotion, jump: FrameJump
     ) -> Return | None:
         """Return the way back into the older part of the map if two sweeps meet it.
 
@@ -197,25 +211,25 @@ class MapRevisit:
         ----------
         source : Source
             Deskewed by the motion.
-        part : SweepMatcher
+        part : OlderPart
             As :meth:`part_due` returns it.
         motion : SweepMotion
         jump : FrameJump
             Of the map in use.
         """
         stamp, place = int(motion.state.stamp), motion.state.position
-        uncertain = _kept_level(motion.state, part.drift.at(place))
+        older = part.matcher
+        uncertain = _kept_level(motion.state, older.drift.at(place))
         found = None
-        if self._is_due:
-            jump_to_part = FrameJump(place, uncertain)
-            kept = EarlierMap(part, FrameJump())
-            found = _met_in(kept, source, motion, jump_to_part, lean=tuning.REVISIT_LEAN)
+        if part.is_due:
+            drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
+            found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
             if found is not None and not _is_elsewhere(found, motion, len(source.points)):
                 found = None
-        if found is None and _is_loose_beside(motion.state, uncertain):
+        if found is None and _is_loose_on_level(motion.state, uncertain):
             loose = with_loose_pose(motion.state, motion.covariance, uncertain)
             freed = dataclasses.replace(motion, covariance=loose)
-            found = part.match_beside(source, freed, uncertain[:3, :3])
+            found = older.relocalize(source, freed, uncertain[:3, :3])
         if found is None:
             if stamp < self._met_until:
                 self._next_search = stamp + 1
@@ -229,34 +243,36 @@ class MapRevisit:
         covariance = found.covariance.copy()
         speed = float(np.linalg.norm(found.state.position - place)) / tuning.REVISIT_DRIFT_S
         covariance[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
-        return Return(EarlierMap(part, jump), dataclasses.replace(found, covariance=covariance))
+        return Return(EarlierMap(older, jump), dataclasses.replace(found, covariance=covariance))
 
 
 def _kept_level(state: InertialState, uncertain: F64) -> F64:
-    """Return a drift (6, 6) of the map that has turned it about the vertical only.
+    """Return a drift (6, 6) of the map without the turns that gravity rules out.
 
-    Gravity keeps the map level. A few points that fix a place may fit as well where the pose
-    leans by degrees; gravity would then pull it away, faster and faster.
+    A few points that fix the place may also fit a pose that leans by degrees. Gravity would then
+    accelerate it along the lean.
     """
-    if not state.gravity.any():
-        return uncertain
     kept = np.eye(6)
-    kept[3:, 3:] = _vertical(state.gravity)
+    kept[3:, 3:] = _free_turns(state.gravity)
     return np.asarray(kept @ uncertain @ kept.T)
 
 
-def _vertical(gravity: F64) -> F64:
-    """Return the projection (3, 3) on the direction of gravity (3,)."""
-    return np.outer(gravity, gravity) / float(gravity @ gravity)
+def _free_turns(gravity: F64) -> F64:
+    """Return the projection (3, 3) on turns that gravity (3,) does not show: about the vertical.
+
+    On all of them where gravity is zero, as it is not known.
+    """
+    squared = float(gravity @ gravity)
+    return np.outer(gravity, gravity) / squared if squared else np.eye(3)
 
 
-def _is_loose_beside(state: InertialState, uncertain: F64) -> bool:
+def _is_loose_on_level(state: InertialState, uncertain: F64) -> bool:
     """Return whether a place, so uncertain (6, 6), has drifted far on its level."""
     if not state.gravity.any():
         return False
     basis = level_basis(state.gravity)
     level = basis.T @ uncertain[:3, :3] @ basis
-    return bool(np.linalg.eigvalsh(level)[-1] > tuning.BESIDE_FROM_SIGMA**2)
+    return bool(np.linalg.eigvalsh(level)[-1] > tuning.RELOCALIZE_FROM_SIGMA**2)
 
 
 def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int) -> bool:
@@ -305,7 +321,8 @@ def _met_in(
 ) -> Alignment | None:
     """Return how a sweep meets an earlier map, if it does beyond doubt.
 
-    ``lean`` is by how much the pose that the search has found may lean, 1 sigma [rad].
+    ``lean`` is by how much the pose that the search has found may lean, 1 sigma [rad]: as much as
+    it may turn after a loss, as the attitude may have been lost too.
     """
     state = motion.state
     between = jump.at(state.position) - kept.jump.at(state.position)
@@ -323,10 +340,8 @@ def _met_in(
         axes[block, block] = turn
     covariance = axes @ motion.covariance @ axes.T
     covariance[POSE, :] = covariance[:, POSE] = 0.0
-    turns = tuning.EARLIER_SIGMA[0] ** 2 * np.eye(3)
-    if state.gravity.any():
-        up = _vertical(there.gravity)
-        turns = tuning.EARLIER_SIGMA[0] ** 2 * up + lean**2 * (np.eye(3) - up)
+    free = _free_turns(there.gravity)
+    turns = tuning.EARLIER_SIGMA[0] ** 2 * free + lean**2 * (np.eye(3) - free)
     covariance[ROTATION, ROTATION] = there.rotation.T @ turns @ there.rotation
     covariance[POSITION, POSITION] = tuning.EARLIER_SIGMA[1] ** 2 * np.eye(3)
     found, _ = kept.matcher.match(

@@ -41,7 +41,7 @@ from l2lidar_proc.odometry.estimate import AlignmentQuality
 from l2lidar_proc.odometry.free_space import rays_through
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.pose_hypotheses import (
-    hypotheses_beside,
+    level_hypotheses,
     pose_hypotheses,
     rotation_is_loose,
 )
@@ -217,13 +217,13 @@ class SweepMatcher:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         return self._believed(best)
 
-    def match_beside(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
-        """Return how a sweep fits the map beside where it was predicted, None if it does not.
+    def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
+        """Return how a sweep fits the map at another place on its level, None if it does not.
 
-        For a place that has drifted while nothing held it. When a surface comes into sight again
-        that holds it, few points are on it, and the others fit everywhere along their walls. So
-        places are tried closely, and what counts is the points in the finest cells. The place
-        must be the only one, and on the same level: a step of a stair looks like the next.
+        For a place that has drifted while no surface fixed it. Of the first surface that fixes it
+        again few points are seen, and all others fit anywhere along their walls. So the places
+        tried are close together, and only points in the finest cells count. There must be one
+        such place only, and on the same level: a step of a stair looks like the next.
 
         Parameters
         ----------
@@ -236,30 +236,32 @@ class SweepMatcher:
         state = motion.state
         if not state.gravity.any() or len(source.points) < tuning.FAR_MATCHED:
             return None
-        starts = hypotheses_beside(state, places, source, self.surfaces)
+        starts = level_hypotheses(state, places, source, self.surfaces)
         others = [self._align(source, motion, start) for start in starts]
-        good = [one for one in others if one and self._is_beside(one, source, motion, places)]
+        good = [one for one in others if one and self._is_relocalized(one, source, motion, places)]
         best = max(good, key=lambda one: one.fine_inliers, default=None)
         if best is None or any(_are_apart(one, best) for one in good):
             return None
         return best
 
-    def _is_beside(
+    def _is_relocalized(
         self, found: Alignment, source: Source, motion: SweepMotion, places: F64
     ) -> bool:
         """Return whether an alignment fixes another place on the level of the predicted one."""
         move, gravity = found.state.position - motion.state.position, motion.state.gravity
         if not is_far(found, motion) or self._is_far_fetched(found, motion):
             return False
-        if abs(float(move @ gravity)) > tuning.BESIDE_HEIGHT_M * float(np.linalg.norm(gravity)):
+        if abs(float(move @ gravity)) > tuning.RELOCALIZE_HEIGHT_M * float(
+            np.linalg.norm(gravity)
+        ):
             return False
-        allowed = places + tuning.BESIDE_FLOOR_M**2 * np.eye(3)
-        if float(move @ np.linalg.solve(allowed, move)) > tuning.BESIDE_SIGMAS**2:
+        allowed = places + tuning.RELOCALIZE_FLOOR_M**2 * np.eye(3)
+        if float(move @ np.linalg.solve(allowed, move)) > tuning.RELOCALIZE_SIGMAS**2:
             return False
-        inliers, fine_inliers = tuning.BESIDE_INLIERS
+        inliers, fine_inliers = tuning.RELOCALIZE_INLIERS
         if found.inlier_ratio < inliers or found.fine_ratio < fine_inliers:
             return False
-        if found.fine_inliers < tuning.BESIDE_MATCHED * len(source.points):
+        if found.fine_inliers < tuning.RELOCALIZE_MATCHED * len(source.points):
             return False
         if self._sees_through(found, source):
             return False
@@ -593,9 +595,9 @@ def is_ambiguous(best: Alignment, others: list[Alignment | None], motion: SweepM
 
 
 def _are_apart(one: Alignment, other: Alignment) -> bool:
-    """Return whether two alignments beside a place found different ones."""
+    """Return whether two alignments put the sensor in different places."""
     way = one.state.position - other.state.position
-    return bool(np.linalg.norm(way) > tuning.BESIDE_APART_M)
+    return bool(np.linalg.norm(way) > tuning.RELOCALIZE_APART_M)
 
 
 def pose_covariance(motion: SweepMotion) -> F64:

@@ -49,13 +49,13 @@ def pose_hypotheses(
     return [state.boxplus(error) for error in best]
 
 
-def hypotheses_beside(
+def level_hypotheses(
     state: InertialState, places: F64, source: Source, surfaces: SurfelMap
 ) -> list[InertialState]:
     """Return states on the same level at which more points lie on surfaces, best first.
 
-    Far more finely spaced than :func:`pose_hypotheses`: where a surface comes into sight again
-    that a drifted place was lost for, few points are on it, and all others fit everywhere.
+    They are closer together than those of :func:`pose_hypotheses`, as few of the points may be on
+    the surface that fixes the place.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ def hypotheses_beside(
     errors = np.zeros((len(shifts), ERRORS))
     errors[:, POSITION] = shifts
     scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS)
-    least = tuning.BESIDE_MATCHED * len(_some(source.points, tuning.SEARCH_POINTS))
+    least = tuning.RELOCALIZE_MATCHED * len(_some(source.points, tuning.SEARCH_POINTS))
     better = scores > max(scores[0], least)
-    count, apart = tuning.BESIDE_STARTS, tuning.BESIDE_APART_M
+    count, apart = tuning.RELOCALIZE_STARTS, tuning.RELOCALIZE_APART_M
     best = _distinct(errors[better], scores[better], apart, count)
     return [state.boxplus(error) for error in best]
 
@@ -109,7 +109,7 @@ def _scores(
 
 
 def _some(points: F64, count: int) -> F64:
-    """Return evenly spaced ones of points (N, 3): ``count`` or a few more, or all."""
+    """Return every n-th of points (N, 3), so that at least ``count`` are left, or all."""
     return points[:: max(len(points) // count, 1)]
 
 
@@ -176,10 +176,10 @@ def level_grid(places: F64, basis: F64) -> F64:
     """
     strength, axes = np.linalg.eigh(basis.T @ places @ basis)
     radius = np.minimum(
-        tuning.BESIDE_SIGMAS * np.sqrt(np.maximum(strength, 0.0)), tuning.SEARCH_RADIUS_M[1]
+        tuning.RELOCALIZE_SIGMAS * np.sqrt(np.maximum(strength, 0.0)), tuning.SEARCH_RADIUS_M[1]
     )
-    area = np.pi * float(np.maximum(radius, tuning.BESIDE_STEP_M).prod())
-    step = max(tuning.BESIDE_STEP_M, (area / tuning.BESIDE_PLACES) ** 0.5)
+    area = np.pi * float(np.maximum(radius, tuning.RELOCALIZE_STEP_M).prod())
+    step = max(tuning.RELOCALIZE_STEP_M, (area / tuning.RELOCALIZE_PLACES) ** 0.5)
     counts = np.floor(radius / step).astype(np.int64)
     steps = np.meshgrid(*(np.arange(-count, count + 1) for count in counts), indexing="ij")
     shifts = step * np.stack(steps, axis=-1).reshape(-1, 2)

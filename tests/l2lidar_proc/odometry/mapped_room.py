@@ -32,6 +32,15 @@ def room(rng: np.random.Generator, count: int) -> F64:
     return np.asarray(points + rng.normal(0.0, 0.01, points.shape))
 
 
+def corner(rng: np.random.Generator, strip: int = 25, floor: int = 40, wall: int = 300) -> F64:
+    """Return points of one wall of the room, and of strips of the next one and of the floor."""
+    return np.vstack((
+        rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (wall, 3)),
+        rng.uniform((4.0, 2.0, -1.2), (4.0, 3.0, 1.8), (strip, 3)),
+        rng.uniform((0.0, 2.0, -1.2), (4.0, 3.0, -1.2), (floor, 3)),
+    ))  # fmt: skip
+
+
 def motion(
     known: tuple[float, float], place: F64, turn: float = 0.0, *, imu: bool = True
 ) -> SweepMotion:

@@ -30,6 +30,7 @@ from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,
     PLACE,
     TIGHT,
+    corner,
     extended,
     motion,
     room,
@@ -84,17 +85,20 @@ def test_a_few_maps_are_kept_and_the_smallest_go() -> None:
 DRIFT = np.array([0.4, -0.25, 0.0])
 
 
-def drifted_matcher(known: float, sweeps: int = 14) -> SweepMatcher:
-    """Return a map of the room, and beside it what was seen later, off by DRIFT, known so well.
+def drifted_matcher(
+    known: float, sweeps: int = 14, drift: F64 = DRIFT, turn: float = TIGHT[0]
+) -> SweepMatcher:
+    """Return a map of the room, and beside it what was seen later, off by a drift.
 
-    The pose is held by the latter.
+    The pose is held by the latter, whose place is known to ``known`` [m] and whose attitude to
+    ``turn`` [rad], 1 sigma.
     """
     rng, matcher = np.random.default_rng(21), SweepMatcher(OdometryConfig(), np.zeros(3))
     for _ in range(sweeps):
         extended(matcher, room(rng, 4000))
     for _ in range(sweeps):
-        extended(matcher, room(rng, 4000) + DRIFT, (TIGHT[0], known))
-    found = matcher.match(source(room(rng, 2000) - PLACE), motion(TIGHT, PLACE + DRIFT)).alignment
+        extended(matcher, room(rng, 4000) + drift, (turn, known))
+    found = matcher.match(source(room(rng, 2000) - PLACE), motion(TIGHT, PLACE + drift)).alignment
     assert found is not None
     matcher.meet(found, 0.2)
     return matcher
@@ -328,25 +332,12 @@ ALONG = np.array([0.5, 0.0, 0.0])  # the wall that fills the view
 
 @pytest.fixture(scope="module")
 def drifted_along() -> SweepMatcher:
-    """Return a map of the room, and what was seen of it later, from a place off by ALONG."""
-    rng, matcher = np.random.default_rng(41), SweepMatcher(OdometryConfig(), np.zeros(3))
-    for _ in range(14):
-        extended(matcher, room(rng, 4000))
-    for _ in range(14):
-        extended(matcher, room(rng, 4000) + ALONG, (TIGHT[0], 0.5))
-    at = motion(TIGHT, PLACE + ALONG)
-    found = matcher.match(source(room(rng, 2000) - PLACE), at).alignment
-    assert found is not None
-    matcher.meet(found, 0.2)
-    return matcher
+    return drifted_matcher(0.5, drift=ALONG)
 
 
 def corner_view(rng: np.random.Generator) -> Source:
-    """Return a view of a wall, and of narrow strips of the next wall and of the floor."""
-    wall = rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (300, 3))
-    strip = rng.uniform((4.0, 2.0, -1.2), (4.0, 3.0, 1.8), (25, 3))
-    floor = rng.uniform((0.0, 2.0, -1.2), (4.0, 3.0, -1.2), (40, 3))
-    return source(np.vstack((wall, strip, floor)) - PLACE)
+    """Return a view of a wall and of narrow strips of what it meets."""
+    return source(corner(rng) - PLACE)
 
 
 AWAY = motion(TIGHT, PLACE + ALONG)
@@ -377,15 +368,17 @@ def test_each_sweep_is_tried_for_two_seconds_after_one_that_left_a_direction_fre
     nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
     assert searched(revisit, drifted_along, nothing, AWAY) is None
     revisit.note_unobserved(AWAY.state.stamp)
-    tried = []
+    tried, everywhere = [], []
     for number in range(1, 30):
         sweep = later(AWAY, 0.1 * number + 0.05)
         part = revisit.part_due(drifted_along, sweep.state)
         if part is not None:
             tried.append(number)
+            everywhere += [number] * part.is_due
             assert revisit.search(nothing, part, sweep, FrameJump()) is None
-    assert set(range(1, 20)) <= set(tried)
-    assert set(tried) <= {*range(1, 20), 20, 21, 22}  # and then as ever, once a second
+    assert tried[:-1] == list(range(1, 20))
+    assert everywhere == [10, tried[-1]]  # as ever: after a second, and after another
+    assert tried[-1] in (20, 21)
     # after a clock that went back, nothing is in sight
     revisit.note_unobserved(AWAY.state.stamp)
     revisit.restart(later(AWAY, -3600.0).state.stamp)
@@ -394,9 +387,7 @@ def test_each_sweep_is_tried_for_two_seconds_after_one_that_left_a_direction_fre
 
 
 @pytest.mark.parametrize(("known", "tried"), [(0.5, True), (0.3, False)])
-def test_only_a_place_that_is_loose_on_its_level_is_searched_beside(
-    known: float, tried: bool
-) -> None:
+def test_only_a_place_that_is_loose_on_its_level_is_relocalized(known: float, tried: bool) -> None:
     matcher, revisit = drifted_matcher(known), MapRevisit()
     nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
     assert searched(revisit, matcher, nothing, AT) is None
@@ -406,17 +397,10 @@ def test_only_a_place_that_is_loose_on_its_level_is_searched_beside(
     assert revisit.part_due(matcher, weightless) is None
 
 
-@pytest.mark.parametrize("is_due", [True, False])
-def test_gravity_keeps_the_pose_level_that_returns(is_due: bool) -> None:
+def test_gravity_keeps_the_pose_level_that_returns() -> None:
     """The strip of floor is narrow: by itself it lets the pose lean about the y axis."""
-    rng, matcher = np.random.default_rng(43), SweepMatcher(OdometryConfig(), np.zeros(3))
-    for _ in range(14):
-        extended(matcher, room(rng, 4000))
-    for _ in range(14):
-        extended(matcher, room(rng, 4000) + ALONG, (0.1, 0.5))
-    found = matcher.match(source(room(rng, 2000) - PLACE), AWAY).alignment
-    assert found is not None
-    matcher.meet(found, 0.2)
+    matcher, revisit = drifted_matcher(0.5, drift=ALONG, turn=0.1), MapRevisit()
+    rng = np.random.default_rng(43)
 
     def seen() -> Source:
         wall = rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (300, 3))
@@ -424,17 +408,9 @@ def test_gravity_keeps_the_pose_level_that_returns(is_due: bool) -> None:
         floor = rng.uniform((0.3, 2.4, -1.2), (0.6, 3.0, -1.2), (30, 3))
         return source(np.vstack((wall, strip, floor)) - PLACE)
 
-    revisit, backs = MapRevisit(), []
-    nothing = source(rng.uniform(*NOTHING, (1500, 3)))
-    if not is_due:
-        assert searched(revisit, matcher, nothing, AWAY) is None
-        revisit.note_unobserved(AWAY.state.stamp)
-    for number in range(1, 4):
-        sweep = later(AWAY, 0.2 * number)
-        part = revisit.part_due(matcher, sweep.state)
-        if part is not None:
-            backs.append(revisit.search(seen(), part, sweep, FrameJump()))
-    back = next(back for back in backs if back is not None)
-    sigmas = np.sqrt(np.diag(back.alignment.covariance)[ROTATION])
-    assert sigmas[1] < 0.012
+    revisit.note_unobserved(AWAY.state.stamp)
+    assert searched(revisit, matcher, seen(), AWAY) is None
+    back = searched(revisit, matcher, seen(), later(AWAY, 0.2))
+    assert back is not None
+    assert np.sqrt(np.diag(back.alignment.covariance)[ROTATION])[1] < 0.012
     assert abs(back.alignment.state.rotation[0, 2]) < 0.012

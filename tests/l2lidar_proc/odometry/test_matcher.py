@@ -22,6 +22,7 @@ from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,
     PLACE,
     TIGHT,
+    corner,
     extended,
     motion,
     room,
@@ -470,32 +471,21 @@ DRIFTED = np.array([0.55, 0.0, 0.0])  # along the wall that fills the view
 DRIFT_SIGMA = np.array([0.5, 0.05, 0.2])
 
 
-def corner(rng: np.random.Generator, strip: int = 25, floor: int = 40, wall: int = 300) -> F64:
-    """Return points of one wall of the room, and of strips of the next one and of the floor."""
-    return np.vstack(
-        (
-            rng.uniform((0.0, 3.0, -1.2), (4.0, 3.0, 1.8), (wall, 3)),
-            rng.uniform((4.0, 2.0, -1.2), (4.0, 3.0, 1.8), (strip, 3)),
-            rng.uniform((0.0, 2.0, -1.2), (4.0, 3.0, -1.2), (floor, 3)),
-        )
-    )
-
-
-def beside(
+def relocalized(
     matcher: SweepMatcher,
     points: F64,
     drift: F64 = DRIFTED,
     sigma: F64 = DRIFT_SIGMA,
     gravity: float = 1.0,
 ) -> F64 | None:
-    """Return the drift that remains when points are matched beside a place that has drifted."""
+    """Return the drift that remains when points are relocalized, None where they are not."""
     at = motion(TIGHT, PLACE + drift)
     places = np.diag(sigma**2)
     covariance = at.covariance.copy()
     covariance[eskf.POSITION, eskf.POSITION] = places
     state = dataclasses.replace(at.state, gravity=gravity * at.state.gravity)
     loose = dataclasses.replace(at, covariance=covariance, state=state)
-    found = matcher.match_beside(source(points - PLACE), loose, places)
+    found = matcher.relocalize(source(points - PLACE), loose, places)
     return None if found is None else found.state.position - PLACE
 
 
@@ -504,7 +494,7 @@ def test_a_strip_of_a_wall_that_comes_into_sight_again_shows_how_far_the_place_h
     grown: SweepMatcher, along: float
 ) -> None:
     points = corner(np.random.default_rng(31))
-    left = beside(grown, points, np.array([along, 0.0, 0.0]))
+    left = relocalized(grown, points, np.array([along, 0.0, 0.0]))
     assert left is not None
     np.testing.assert_allclose(left, 0.0, atol=0.02)
     # all but the strip fits where it was predicted
@@ -514,7 +504,7 @@ def test_a_strip_of_a_wall_that_comes_into_sight_again_shows_how_far_the_place_h
 
 def test_a_place_that_drifted_in_both_level_directions_is_found(grown: SweepMatcher) -> None:
     drift, sigma = np.array([0.4, -0.3, 0.0]), np.array([0.5, 0.4, 0.1])
-    left = beside(grown, corner(np.random.default_rng(32)), drift, sigma)
+    left = relocalized(grown, corner(np.random.default_rng(32)), drift, sigma)
     assert left is not None
     np.testing.assert_allclose(left, 0.0, atol=0.02)
 
@@ -528,11 +518,11 @@ def test_a_place_that_drifted_in_both_level_directions_is_found(grown: SweepMatc
         ((0.2, 0.35, 0.0), (0.5, 0.1, 0.2)),
     ],
 )
-def test_only_places_that_drift_explains_are_found_beside(
+def test_only_places_that_drift_explains_are_found(
     grown: SweepMatcher, drift: tuple[float, ...], sigma: tuple[float, ...]
 ) -> None:
     points = corner(np.random.default_rng(33))
-    assert beside(grown, points, np.array(drift), np.array(sigma)) is None
+    assert relocalized(grown, points, np.array(drift), np.array(sigma)) is None
 
 
 def unknown(rng: np.random.Generator, count: int) -> F64:
@@ -557,78 +547,73 @@ def before(rng: np.random.Generator, count: int, gap: tuple[float, float]) -> F6
         lambda rng: np.vstack((corner(rng), before(rng, 140, (0.13, 0.2)))),
     ],
 )
-def test_what_is_found_beside_fits_as_wrong_places_do_not(
+def test_what_fits_like_a_wrong_place_is_not_found(
     grown: SweepMatcher, points: Callable[[np.random.Generator], F64]
 ) -> None:
-    assert beside(grown, points(np.random.default_rng(34))) is None
+    assert relocalized(grown, points(np.random.default_rng(34))) is None
 
 
 def test_places_on_one_level_are_searched_where_gravity_tells_which_that_is(
     grown: SweepMatcher,
 ) -> None:
     points = corner(np.random.default_rng(35))
-    assert beside(grown, points, gravity=0.0) is None
+    assert relocalized(grown, points, gravity=0.0) is None
     few = np.vstack((points[:20], points[300:325], points[325:329]))  # of wall, strip and floor
     assert len(few) == tuning.FAR_MATCHED - 1
-    assert beside(grown, few) is None
+    assert relocalized(grown, few) is None
+
+
+def plate(rng: np.random.Generator, x: float, half: float, count: int) -> F64:
+    """Return points of an upright plate across the x axis, so wide to both sides."""
+    return rng.uniform((x, -half, -1.2), (x, half, 1.0), (count, 3))
+
+
+def alley(rng: np.random.Generator, count: int, length: float = 7.0) -> F64:
+    """Return points of a floor and of a wall along the x axis."""
+    end = -3.0 + length
+    floor = rng.uniform((-3.0, -2.0, -1.2), (end, 1.5, -1.2), (count, 3))
+    wall = rng.uniform((-3.0, 1.5, -1.2), (end, 1.5, 1.0), (count, 3))
+    return np.vstack((floor, wall))
+
+
+def alley_with(rng: np.random.Generator, *plates: tuple[float, float]) -> SweepMatcher:
+    """Return a map of the alley with plates at x, so wide to both sides."""
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        some = [plate(rng, x, half, 1500) for x, half in plates]
+        points = np.vstack((alley(rng, 3000), *some))
+        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
+    return matcher
 
 
 @pytest.mark.parametrize(("plates", "found"), [((2.0,), True), ((2.0, 2.32), False)])
-def test_a_place_beside_is_the_only_one_that_fits(plates: tuple[float, ...], found: bool) -> None:
-    rng, matcher = np.random.default_rng(36), SweepMatcher(OdometryConfig(), np.zeros(3))
-
-    def plate(x: float, count: int) -> F64:
-        return np.asarray(rng.uniform((x, -1.5, -1.2), (x, 1.5, 1.0), (count, 3)))
-
-    def wall(count: int) -> F64:
-        return np.asarray(rng.uniform((-3.0, 1.5, -1.2), (4.0, 1.5, 1.0), (count, 3)))
-
-    def floor(count: int) -> F64:
-        return np.asarray(rng.uniform((-3.0, -2.0, -1.2), (4.0, 1.5, -1.2), (count, 3)))
-
-    for _ in range(tuning.YOUNG_SWEEPS + 1):
-        points = np.vstack((floor(3000), wall(3000), *(plate(x, 1500) for x in plates)))
-        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
-    cloud = np.vstack((floor(150) * (0.3, 1.0, 1.0), wall(150) * (0.3, 1.0, 1.0), plate(2.0, 40)))
+def test_the_place_found_is_the_only_one_that_fits(plates: tuple[float, ...], found: bool) -> None:
+    rng = np.random.default_rng(36)
+    matcher = alley_with(rng, *((x, 1.5) for x in plates))
+    cloud = np.vstack((alley(rng, 150, 4.0), plate(rng, 2.0, 1.5, 40)))
     at = np.array([0.6, 0.0, 0.0])
-    assert (beside(matcher, cloud + PLACE, at - PLACE) is not None) == found
+    assert (relocalized(matcher, cloud + PLACE, at - PLACE) is not None) == found
 
 
 @pytest.mark.parametrize("is_in_the_way", [False, True])
-def test_a_place_beside_from_which_a_known_wall_is_seen_through_is_not_found(
-    is_in_the_way: bool,
-) -> None:
-    rng, matcher = np.random.default_rng(38), SweepMatcher(OdometryConfig(), np.zeros(3))
-
-    def plate(x: float, half: float, count: int) -> F64:
-        return np.asarray(rng.uniform((x, -half, -1.2), (x, half, 1.0), (count, 3)))
-
-    def wall(count: int) -> F64:
-        return np.asarray(rng.uniform((-3.0, 1.5, -1.2), (4.0, 1.5, 1.0), (count, 3)))
-
-    def floor(count: int) -> F64:
-        return np.asarray(rng.uniform((-3.0, -2.0, -1.2), (4.0, 1.5, -1.2), (count, 3)))
-
-    plates = ((3.0, 1.5), (1.2, 0.5)) if is_in_the_way else ((3.0, 1.5),)
-    for _ in range(tuning.YOUNG_SWEEPS + 1):
-        points = np.vstack((floor(3000), wall(3000), *(plate(x, w, 1500) for x, w in plates)))
-        extended(matcher, points + rng.normal(0.0, 0.005, points.shape))
-    cloud = np.vstack((floor(80) * (0.3, 1.0, 1.0), wall(80) * (0.3, 1.0, 1.0)))
-    cloud = np.vstack((cloud, plate(2.4, 0.5, 120)))  # 0.6 m nearer than it is
-    left = beside(matcher, cloud + PLACE, -PLACE)
-    assert (left is not None) == (not is_in_the_way)
+def test_no_place_is_found_from_which_a_known_wall_is_seen_through(is_in_the_way: bool) -> None:
+    rng = np.random.default_rng(38)
+    plates = [(3.0, 1.5), (1.2, 0.5)][: 1 + is_in_the_way]
+    matcher = alley_with(rng, *plates)
+    # the far plate 0.6 m nearer than it is
+    cloud = np.vstack((alley(rng, 80, 4.0), plate(rng, 2.4, 0.5, 120)))
+    assert (relocalized(matcher, cloud + PLACE, -PLACE) is None) == is_in_the_way
 
 
-def test_places_beside_are_no_farther_apart_than_their_number_allows() -> None:
-    """However uncertain the place is, the search takes no longer."""
+def test_however_uncertain_a_place_is_no_more_others_are_tried() -> None:
     rng = np.random.default_rng(37)
     basis = level_basis(np.array([0.1, -0.2, -9.8]))
     for sigma in (0.01, 0.4, 3.0, 1e6):
         root = rng.normal(0.0, sigma, (3, 3))
         shifts = level_grid(root @ root.T, basis)
         np.testing.assert_array_equal(shifts[0], 0.0)
-        assert 1 <= len(shifts) <= 1.3 * tuning.BESIDE_PLACES
+        assert 1 <= len(shifts) <= 1.3 * tuning.RELOCALIZE_PLACES
         np.testing.assert_allclose(shifts @ [0.1, -0.2, -9.8], 0.0, atol=1e-9)
         assert np.linalg.norm(shifts, axis=1).max() <= tuning.SEARCH_RADIUS_M[1] + 1e-9
         apart = np.linalg.norm(shifts[:, None] - shifts[None, :], axis=2)
-        assert len(shifts) == 1 or apart[apart > 0.0].min() >= tuning.BESIDE_STEP_M - 1e-9
+        assert len(shifts) == 1 or apart[apart > 0.0].min() >= tuning.RELOCALIZE_STEP_M - 1e-9
