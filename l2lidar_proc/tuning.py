@@ -18,7 +18,10 @@ IMU_PERIOD_S: Final = 0.004  # [s] derived: 250 Hz; the noise parameters are sta
 MAX_RATE: Final = 100.0  # [rad/s] derived: no gyro measures more
 MAX_FORCE: Final = 5000.0  # [m/s^2] derived: no accelerometer measures more
 MAX_SAMPLES: Final = 100_000  # in a buffer; derived: 25 s at 4 kHz
-TREND_SAMPLES: Final = 5  # averaged at the edge of a gap; one alone is too noisy
+# Distance of samples, in periods, from which on some are missing and what is between is uncertain.
+# Derived: two lost; stamps of ROS drivers jitter by half a period and more
+SPARSE_PERIODS: Final = 2.5
+TREND_SAMPLES: Final = 5  # that count at either edge of a gap; one alone is too noisy
 GAP_STEP_NS: Final = 20_000_000  # [ns] knots in a gap; rotation in one stays below 0.1 rad at 5/s
 GAP_KNOTS: Final = 64  # at most in one gap, however long: bounds work and memory
 TIME_JUMP_NS: Final = 10_000_000_000  # [ns] a longer step of time starts a new time line

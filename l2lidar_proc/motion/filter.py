@@ -223,6 +223,9 @@ def predict(
     gyro2 = (1.0 - blind) * measured + blind * unmeasured.gyro2
     measured = noise.accel**2 + (noise.accel_share * accelerations) ** 2
     accel2 = (1.0 - blind) * measured + blind * unmeasured.accel2
+    # errors of interpolation do not change sign within their interval: they add up as they are
+    gyro2 = gyro2 + np.add.reduceat(imu.rate_errors[:knot] * spans * 1e-9, first) ** 2 / dt
+    accel2 = accel2 + np.add.reduceat(imu.force_errors[:knot] * spans * 1e-9, first) ** 2 / dt
     if blind_forces:
         accel2 = np.full_like(accel2, tuning.BLIND_ACCEL**2)
     q = process_noise(gyro2, accel2, noise, dt)

@@ -31,12 +31,17 @@ class ImuSegment:
         Angular velocity [rad/s] and specific force [m/s^2] at the knots; linear between them.
     missing : ndarray, shape (K - 1,), bool
         Intervals inside a gap: their rates are assumed and their forces mean nothing.
+    rate_errors, force_errors : ndarray, shape (K - 1,)
+        By which rates [rad/s] and forces [m/s^2] may be off throughout an interval, 1 sigma,
+        because some samples are missing there, though not enough for a gap; else 0.
     """
 
     stamps: I64
     rates: F64
     forces: F64
     missing: NDArray[np.bool_]
+    rate_errors: F64
+    force_errors: F64
 
     def knot(self, stamp: HostNs) -> int:
         """Return the index of the first knot not before an instant."""
@@ -81,7 +86,8 @@ def segment(
     count = len(knots)
     if not len(samples):
         nothing = np.zeros((count, 3))
-        return ImuSegment(knots, nothing + steady_rate, nothing, np.ones(count - 1, np.bool_))
+        gap, no_error = np.ones(count - 1, np.bool_), np.zeros(count - 1)
+        return ImuSegment(knots, nothing + steady_rate, nothing, gap, no_error, no_error)
     forces = _interpolated(knots, stamps, samples["linear_acceleration"])
     rates = _interpolated(knots, stamps, samples["angular_velocity"])
     middles = knots[:-1] + (knots[1:] - knots[:-1]) // 2
@@ -92,7 +98,41 @@ def segment(
     missing = np.where(inside, since + until > gap_ns, np.minimum(abs(since), abs(until)) > hold)
     rates[(knots < stamps[0] - hold) | (knots > stamps[-1] + hold)] = steady_rate
     _bridge(rates, knots, samples, gap_ns)
-    return ImuSegment(knots, rates, forces, missing)
+    is_sparse = inside & ~missing & (since + until > _sparse_ns(stamps))
+    rate_errors, force_errors = (
+        _interpolation_errors(samples[name], after, is_sparse)
+        for name in ("angular_velocity", "linear_acceleration")
+    )
+    return ImuSegment(knots, rates, forces, missing, rate_errors, force_errors)
+
+
+def _sparse_ns(stamps: I64) -> float:
+    """Return the distance of two samples [ns] from which on some are missing between them."""
+    if len(stamps) < 3:
+        return np.inf
+    return tuning.SPARSE_PERIODS * float(np.median(np.diff(stamps)))
+
+
+def _interpolation_errors(values: F64, after: I64, is_sparse: NDArray[np.bool_]) -> F64:
+    """Return what values interpolated in some intervals (N,) may be off by, 0 in the others.
+
+    That is the standard deviation of the samples around, of all axes together: a blow shows there,
+    though both ends may be at the same height of it.
+
+    Parameters
+    ----------
+    values : ndarray, shape (M, 3)
+        Of the samples.
+    after : ndarray, shape (N,)
+        The sample after each interval.
+    is_sparse : ndarray, shape (N,)
+    """
+    errors = np.zeros(len(after))
+    for place in np.flatnonzero(is_sparse).tolist():
+        first = max(int(after[place]) - tuning.TREND_SAMPLES, 0)
+        around = values[first : after[place] + tuning.TREND_SAMPLES]
+        errors[place] = np.sqrt(around.var(axis=0).sum())
+    return errors
 
 
 def _with_gap_knots(known: I64, gap_ns: int, hold_ns: int) -> I64:

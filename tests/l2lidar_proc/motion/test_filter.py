@@ -111,6 +111,25 @@ def test_the_covariance_is_that_of_one_step_after_the_other() -> None:
     np.testing.assert_allclose(found, p, rtol=1e-9, atol=1e-12)
 
 
+def at_rest() -> InertialState:
+    state = some_state()
+    return dataclasses.replace(
+        state,
+        rotation=np.eye(3),
+        velocity=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        accel_bias=np.zeros(3),
+        gravity=np.array([0.0, 0.0, -G]),
+    )
+
+
+def blow(t: F64) -> F64:
+    """Return the accelerations [m/s^2] of a push by a centimeter and back, in 0.12 s at 0.2 s."""
+    u = np.clip((t - 0.2) / 0.06, -1.0, 1.0)
+    bump = np.polynomial.Polynomial([1.0, 0.0, -1.0]) ** 5
+    return np.asarray(0.01 * bump.deriv(2)(u) / 0.06**2)
+
+
 def sigmas_after_gap(lasted: float, motion: Motion) -> tuple[float, float]:
     """Return the sigmas of attitude [rad] and velocity [m/s] that 0.3 s with a gap in them add."""
     samples = motion.imu(0.0, 0.31)
@@ -133,6 +152,30 @@ def sigmas_after_gap(lasted: float, motion: Motion) -> tuple[float, float]:
     found = eskf.predict(state, nothing, imu, sums, knot, Noise(0.0, 0.0, 0.0, 0.0))[1]
     turned, moved = np.linalg.eigvalsh(found[eskf.ROTATION, eskf.ROTATION]), found[8, 8]
     return float(np.sqrt(turned[-1])), float(np.sqrt(moved))
+
+
+def test_a_blow_between_two_samples_is_within_the_covariance() -> None:
+    """For 36 ms too few samples are missing for a gap, and in them the force turns by 50 m/s^2."""
+    stamps = np.arange(0.0, 0.4, 0.004)
+    normalized = []
+    for first in np.arange(0.12, 0.24, 0.004):
+        samples = np.zeros(len(stamps), IMU_SAMPLE)
+        samples["stamp"] = [at(instant) for instant in stamps.tolist()]
+        samples["linear_acceleration"][:, 0] = blow(stamps)
+        samples["linear_acceleration"][:, 2] = G
+        lost = (stamps > first + 1e-4) & (stamps < first + 0.036 - 1e-4)
+        state = at_rest()
+        imu = segment(samples[~lost], [at(0.0), at(0.36)], 50_000_000, np.zeros(3))
+        sums = integrate(
+            imu, 0, gyro_bias=np.zeros(3), accel_bias=np.zeros(3), rest_force=state.rest_force
+        )
+        nothing, knot = np.zeros((eskf.ERRORS, eskf.ERRORS)), len(imu.stamps) - 1
+        noise = Noise(0.0, 0.0, 0.0, 0.0)
+        end, p = eskf.predict(state, nothing, imu, sums, knot, noise)
+        variance = p[eskf.VELOCITY, eskf.VELOCITY][0, 0]
+        normalized.append(end.velocity[0] ** 2 / variance)  # a blow leaves no velocity behind
+    assert max(normalized) < 3.0**2
+    assert 0.1 < np.mean(normalized) < 2.0
 
 
 def test_in_a_short_gap_a_carrier_goes_on_as_around_it() -> None:
