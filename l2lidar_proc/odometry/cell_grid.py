@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +80,7 @@ class CellGrid:
         cell[0] = np.arange(len(groups.keys))
         edges = [0, len(groups.keys)]
         for keys, where in zip(coarser, cell[1:], strict=True):
-            distinct, number = _distinct(keys)
+            distinct, number = _distinct(keys, kind="stable")
             np.add(number, edges[-1], out=where)
             found.append(distinct)
             edges.append(edges[-1] + len(distinct))
@@ -109,12 +109,13 @@ class Cells(NamedTuple):
     edges: list[int]
 
 
-def _distinct(keys: I64) -> tuple[I64, I64]:
+def _distinct(keys: I64, kind: Literal["quicksort", "stable"] = "quicksort") -> tuple[I64, I64]:
     """Return the distinct keys, ascending, and the number (N,) of each; N > 0.
 
-    As ``numpy.unique`` with ``return_inverse``, in two thirds of the time.
+    As ``numpy.unique`` with ``return_inverse``, in two thirds of the time. Keys that mostly ascend
+    are sorted four times as fast by the stable kind.
     """
-    order = np.argsort(keys)
+    order = np.argsort(keys, kind=kind)
     ascending = keys[order]
     begins = np.empty(len(keys), np.bool_)
     begins[0] = True

@@ -168,7 +168,7 @@ class Correspondences:
     @property
     def support(self) -> Support:
         """Sweeps that were the first where the surfaces are, and their shares of the weight."""
-        return _support(self.born, self.weights)
+        return support_of(self.born, self.weights)
 
     def settled(self, age: int) -> NDArray[np.bool_]:
         """Return which surfaces are in the map for so many sweeps already, shape (M,)."""
@@ -186,17 +186,28 @@ class Correspondences:
         levers : ndarray, shape (M,)
             Derivatives of the residuals along the direction.
         """
-        return _support(self.opened, self.weights * levers**2)
+        return support_of(self.opened, self.weights * levers**2)
 
     def places_along(self, levers: F64) -> Support:
         """Return the sweeps that were the first where the surfaces are which hold a direction."""
-        return _support(self.born, self.weights * levers**2)
+        return support_of(self.born, self.weights * levers**2)
 
 
-def _support(sweeps: I64, weights: F64) -> Support:
-    numbers, place = np.unique(sweeps, return_inverse=True)
+def support_of(sweeps: I64, weights: F64) -> Support:
+    """Return which sweeps surfaces come from, and the share of the weight that each has.
+
+    Parameters
+    ----------
+    sweeps, weights : ndarray, shape (M,)
+        Of the surfaces.
+    """
+    if not len(sweeps):
+        return sweeps, weights
+    first = sweeps.min()
+    places = sweeps - first  # few different ones: counting takes a fifth of the time of sorting
+    numbers = np.flatnonzero(np.bincount(places))
     total = max(float(weights.sum()), 1e-12)
-    return numbers, np.bincount(place, weights, len(numbers)) / total
+    return numbers + first, np.bincount(places, weights)[numbers] / total
 
 
 def correspondences(

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
@@ -23,6 +24,7 @@ from l2lidar_proc.odometry.correspondences import (
     correspondences,
     pose_jacobian,
     residual_jacobian,
+    support_of,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.weak_directions import WeakAxes, WeakDirections, weak_axes
@@ -200,6 +202,18 @@ def test_the_sweeps_that_opened_what_fixes_the_least_fixed_direction_are_named()
     assert shares[sweeps >= 4].sum() > 0.9
     sweeps, shares = found.support
     assert shares[sweeps < 4].sum() > 0.7
+
+
+@given(st.lists(st.tuples(st.integers(0, 2000), st.floats(0.0, 1e6)), max_size=30))
+def test_shares_of_the_support_are_those_of_the_weights(surfaces: list[tuple[int, float]]) -> None:
+    expected: dict[int, float] = {}
+    for sweep, weight in surfaces:
+        expected[sweep] = expected.get(sweep, 0.0) + weight
+    total = max(sum(expected.values()), 1e-12)
+    given_sweeps = np.array([sweep for sweep, _ in surfaces], np.int64)
+    sweeps, shares = support_of(given_sweeps, np.array([weight for _, weight in surfaces]))
+    assert sweeps.tolist() == sorted(expected)
+    np.testing.assert_allclose(shares, [expected[n] / total for n in sweeps.tolist()], atol=1e-12)
 
 
 def test_all_is_kept_where_the_scene_fixes_the_pose() -> None:
