@@ -160,14 +160,8 @@ class OdometryEstimate:
         return dataclasses.replace(self, points=points[:0], status=(Status.REFUSED,))
 
     def map_covariance(self, place: F64) -> F64:
-        """Return what the map adds to the covariance (6, 6) at a place (3,) of the IMU [m].
-
-        Only where every direction was observed of late is the unit as good as its clouds show.
-        """
-        if self.map_error is None:
-            return np.zeros((6, 6))
-        is_observed = self.quality.variance_factor < 1.0
-        return (self.map_error.reported_at if is_observed else self.map_error.at)(place)
+        """Return what the map adds to the covariance (6, 6) at a place (3,) of the IMU [m]."""
+        return np.zeros((6, 6)) if self.map_error is None else self.map_error.reported_at(place)
 
     @property
     def tilt(self) -> float:

@@ -306,7 +306,13 @@ class SweepMatcher:
             places = across @ places @ across
         return bool(np.linalg.eigvalsh(places)[-1] > tuning.LOOSE_POSITION**2)
 
-    def extend(self, moved: NDArray[np.void], motion: SweepMotion, guess: InertialState) -> float:
+    def extend(
+        self,
+        moved: NDArray[np.void],
+        motion: SweepMotion,
+        guess: InertialState,
+        expected_share: float = 1.0,
+    ) -> float:
         """Add the deskewed points (N,) of a sweep to the maps.
 
         Return the share of them that fell where there was no map before.
@@ -318,11 +324,13 @@ class SweepMatcher:
             The one that deskewed them.
         guess : InertialState
             What was predicted: from it KISS-ICP learns how good predictions are.
+        expected_share : float
+            Of the covariance of the pose, for the drift of the map.
         """
         state = motion.state
         points = xyz(moved) - self.lever
         placed = (state.rotation @ points.T + state.position[:, None]).T
-        self.drift.record(self._sweeps, state.position, pose_covariance(motion))
+        self.drift.record(self._sweeps, state.position, pose_covariance(motion), expected_share)
         apart = self.drift.more_certain(state.position)
         # what is ahead of a carrier that drives was seen from afar first, and tells its way:
         # points from nearby, which the errors of that way have moved, must not take its place
@@ -371,12 +379,12 @@ class SweepMatcher:
         if not free.size:
             self.drift.meet(found.support, found.state.position, found.weakly, found.strongly)
             return
-        speeds = np.einsum("ik,ij,jk->k", free, found.covariance[VELOCITY, VELOCITY], free)
         self.drift.meet_partly(
             found.support,
             found.state.position,
             free,
-            np.sqrt(speeds) * seconds,
+            found.covariance[VELOCITY, VELOCITY],
+            seconds,
             found.strongly,
         )
 

@@ -257,7 +257,8 @@ class Odometry:
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
         if found is not None or uncharted or Status.LOST in status:
-            fresh = self.matcher.extend(estimate.points, motion, guess)
+            share = self._innovations.drift_factor
+            fresh = self.matcher.extend(estimate.points, motion, guess, share)
             self._anchor_anew(fresh)
         return estimate
 
@@ -329,6 +330,8 @@ class Odometry:
         is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)
         if is_suspect and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
+        velocity = eskf.VELOCITY, eskf.VELOCITY
+        self.matcher.drift.correct_velocity(predicted.covariance[velocity], bounded[1][velocity])
         return predicted.with_state(*bounded)
 
     def _skip(self, sweep: Sweep) -> OdometryEstimate | None:
@@ -617,7 +620,7 @@ class Odometry:
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
         xi, beta = self._beams.correction.tolist()
-        self.matcher.drift.beam_sigmas = self._beams.sigmas
+        self.matcher.drift.beam_sigmas = self._beams.sigmas or tuning.OTHER_BEAM_SIGMAS
         self._last = estimate_of(
             motion,
             self._lever,

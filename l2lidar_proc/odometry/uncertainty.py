@@ -43,11 +43,12 @@ class MapError:
 
     Attributes
     ----------
-    drift : ndarray, shape (6, 6)
-        Covariance of a shift and a turn of the map about its origin [m, rad], its axes.
+    drift, expected_drift : ndarray, shape (6, 6)
+        Covariance of a shift and a turn of the map about its origin [m, rad], its axes: as large
+        as it has to be allowed for, and as it is expected to be.
     behind : float
         Way on which the surfaces were opened that hold the latest sweep [m].
-    beam_sigmas : tuple of float, optional
+    beam_sigmas : tuple of float
         As of :class:`MapDrift`.
     beam_began : float
         The better of them when the surroundings of the origin were mapped [rad].
@@ -62,8 +63,9 @@ class MapError:
     """
 
     drift: F64
+    expected_drift: F64
     behind: float
-    beam_sigmas: tuple[float, float] | None
+    beam_sigmas: tuple[float, float]
     beam_began: float
     swung: float
     lean: F64
@@ -83,9 +85,8 @@ class MapError:
         share = max(tuning.UNIT_SHARE * away, tuning.UNIT_WAY_SHARE * self.behind)
         shift = (tuning.UNIT_SHIFT * left) ** 2 + share**2
         bend = tuning.MAP_BEND**2 * max(away, self.behind)
-        return self._with(
-            place, np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
-        )
+        unit = np.diag([shift] * 3 + [(tuning.UNIT_TURN * left) ** 2 + bend] * 3)
+        return self._with(place, unit, self.drift)
 
     def reported_at(self, place: F64) -> F64:
         """Return what the map is expected to add to the covariance (6, 6) of a pose, to report it.
@@ -94,19 +95,15 @@ class MapError:
         the halves of the fan apart turn the map against its first pose at once. Those that do not,
         and hence are hardly known, turn it about the vertical as it grows, and bend the way by
         that; gravity and the ground do not let it lean. What a scale of the ranges is wrong by
-        moves places along the line from the origin, and nothing else. Where nothing estimates the
-        beam angles it is as in :meth:`at`.
-
-        That holds where surfaces fix every direction. What only the IMU holds errs as that does.
+        moves places along the line from the origin, and nothing else. What only the IMU holds is
+        part of the drift.
         """
-        if self.beam_sigmas is None:
-            return self.at(place)
         better, worse = self.beam_sigmas
         away = float(np.linalg.norm(place))
         way = max(away, self.behind)
         left = 1.0 - np.exp(-way / tuning.UNIT_FROM_M)
         turn = (tuning.MAP_TURN * left) ** 2 + tuning.MAP_TURN_BEND**2 * way
-        turn += (tuning.BEAM_TURN * max(better, self.beam_began) * left) ** 2
+        first = tuning.BEAM_TURN * max(better, self.beam_began) * left
         shift = (tuning.MAP_SHIFT * left) ** 2 + (tuning.MAP_SHARE * way) ** 2
         swing = (tuning.BEAM_SWING * max(self.swung, worse * away)) ** 2
         up = np.eye(3) if self.up is None else np.outer(self.up, self.up)
@@ -115,44 +112,58 @@ class MapError:
         unit[:3, :3] += swing * way**2 * level  # as if all of it had come about at the beginning
         unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
         unit[3:, 3:] += swing * up
-        return self._with(place, unit)
+        return self._with(place, unit, self.expected_drift, first)
 
-    def _with(self, place: F64, unit: F64) -> F64:
-        """Return the covariance (6, 6) of the map at a place with that of a unit's faults."""
+    def _with(self, place: F64, unit: F64, drift: F64, first: float = 0.0) -> F64:
+        """Return the covariance (6, 6) at a place of a map with a drift and of a unit's faults.
+
+        ``first`` is by what these turn the first pose against the map, 1 sigma [rad].
+        """
         moved = _carried(place)
         begun = np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3) * self.begun_in_motion
+        begun[3:] += first**2
         unit[3:, 3:] += np.outer(self.lean, self.lean)
-        return np.asarray(moved @ (self.drift + np.diag(begun)) @ moved.T + unit)
+        return np.asarray(moved @ (drift + np.diag(begun)) @ moved.T + unit)
+
+
+_ALLOWED, _EXPECTED = 0, 1
+"""Of the two drifts, the one that has to be allowed for and the one that is expected."""
 
 
 class MapDrift:
     """Uncertainty of the map in use, as a small motion of the whole map.
 
     Covariances (6, 6) are of a shift and a turn of the map about its origin [m, rad], in its axes.
+    There are two of everything. One is as large as has to be allowed for, for decisions: poses err
+    as their covariances say, and the velocity along a free direction always alike. The other is as
+    large as is expected, to be reported: poses err as the innovations show, and the velocity until
+    something corrects it.
 
     Attributes
     ----------
     begun_in_motion : bool
         The first sweeps were deskewed with a velocity and a gyro bias that were hardly known, so
         the first pose is shifted and turned against the map that followed.
-    beam_sigmas : tuple of float, optional
+    beam_sigmas : tuple of float
         What the beam angles of the sweeps to come may be wrong by, 1 sigma [rad], along their
-        best known direction and the other; None where nothing estimates them.
+        best known direction and the other.
     """
 
     def __init__(self) -> None:
-        self._history = np.zeros((64, 6, 6), np.float32)
+        self._history = np.zeros((64, 2, 6, 6), np.float32)
         self._ways = np.zeros(64)  # on which they were [m]
         self._swings = np.zeros(64)  # the worse of the beam angles, added up along it [rad m]
-        self.beam_sigmas: tuple[float, float] | None = (tuning.BEAM_SIGMA, tuning.BEAM_SIGMA)
+        self.beam_sigmas = tuning.BEAM_SIGMA, tuning.BEAM_SIGMA
         self.clear()
 
     def clear(self) -> None:
         """Forget everything: a new map begins, without error by definition."""
         self.begun_in_motion = False
         self._known = 0
-        self._current = np.zeros((6, 6))
-        self._reported = np.zeros((6, 6))  # the same, but falling over some sweeps
+        self._current: F64 = np.zeros((2, 6, 6))
+        self._reported: F64 = np.zeros((2, 6, 6))  # the same, but falling over some sweeps
+        # covariance of place and velocity [m^2/s], map axes
+        self._with_velocity: F64 = np.zeros((3, 3))
         self._way, self._before = 0.0, np.zeros(3)
         self._swing = 0.0
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
@@ -183,6 +194,7 @@ class MapDrift:
         strongly : tuple of tuple of ndarray and Support
             Likewise other directions, orthogonal to it.
         """
+        self._with_velocity = np.zeros((3, 3))  # errs like the surfaces, whatever the velocity
         sweeps, shares = support
         if not len(sweeps) or not self._known:
             return
@@ -205,16 +217,16 @@ class MapDrift:
         A single sweep may seem to match old surfaces although the next one does not.
         """
         strength, axes = np.linalg.eigh(self._reported - self._current)
-        left = tuning.DRIFT_FALL * np.maximum(strength, 0.0)
-        self._reported = self._current + (axes * left) @ axes.T
+        left = tuning.DRIFT_FALL * np.maximum(strength, 0.0)[:, None]
+        self._reported = self._current + (axes * left) @ np.swapaxes(axes, 1, 2)
 
     def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
 
     def _combine(self, place: F64, most: F64, some: F64, along: F64) -> F64:
-        """Let the error be ``some`` along a projection (6, 6) of a place, else ``most``.
+        """Let errors (2, 6, 6) be ``some`` along a projection (6, 6) of a place, else ``most``.
 
-        Return what it is there.
+        Return what they are there.
         """
         moved, back = _carried(place), _carried(-place)
         across = np.eye(6) - along
@@ -227,13 +239,16 @@ class MapDrift:
         support: Support,
         place: F64,
         free: F64,
-        ways: F64,
+        velocity: F64,
+        seconds: float,
         strongly: tuple[tuple[F64, Support], ...] = (),
     ) -> None:
         """Take surfaces that leave some directions free: along these nothing is held.
 
         What is registered along them is where the sensor is relative to what the last sweeps put
-        into the map with the same wrong velocity: that error adds up linearly, not by chance.
+        into the map with the same wrong velocity. So the place errs by the sum of the errors of
+        the velocity. These are expected to last until something corrects it
+        (:meth:`correct_velocity`).
 
         Parameters
         ----------
@@ -243,25 +258,48 @@ class MapDrift:
             Of the sensor, map frame [m].
         free : ndarray, shape (3, K)
             The directions, orthonormal, map axes.
-        ways : ndarray, shape (K,)
-            By how much the place may have run away along each since the sweep before, 1 sigma [m].
+        velocity : ndarray, shape (3, 3)
+            Covariance of the velocity, map axes [m^2/s^2].
+        seconds : float
+            Since the sweep before.
         strongly : tuple of tuple of ndarray and Support
             As in :meth:`meet`.
         """
-        before, reported = self._current, self._reported
+        before, reported, shared = self._current, self._reported, self._with_velocity
         self.meet(support, place, None, strongly)
         self._reported = reported
         along = np.zeros((6, 6))
         along[:3, :3] = free @ free.T
         now = self._combine(place, self._current, before, along)
-        for direction, way in zip(free.T, ways.tolist(), strict=True):
-            sigma = float(np.sqrt(max(direction @ now[:3, :3] @ direction, 0.0)))
-            now[:3, :3] += (2.0 * sigma + way) * way * np.outer(direction, direction)
+        for direction in free.T:
+            way = seconds * float(np.sqrt(direction @ velocity @ direction))
+            sigma = float(np.sqrt(max(direction @ now[_ALLOWED, :3, :3] @ direction, 0.0)))
+            now[_ALLOWED, :3, :3] += (2.0 * sigma + way) * way * np.outer(direction, direction)
+        grown = (shared + shared.T) * seconds + velocity * seconds**2
+        strength, axes = np.linalg.eigh(free.T @ grown @ free)
+        axes = np.asarray(free @ axes)
+        now[_EXPECTED, :3, :3] += (axes * np.maximum(strength, 0.0)) @ axes.T
+        self._with_velocity = shared + along[:3, :3] @ velocity * seconds
         back = _carried(-place)
         self._current = back @ now @ back.T
         self._fall()
 
-    def record(self, sweep: int, place: F64, covariance: F64) -> None:
+    def correct_velocity(self, prior: F64, posterior: F64) -> None:
+        """Let an error of the place depend less on a velocity that was corrected.
+
+        With the gain K of the correction, ``I - K`` of the velocity's error is left, and of its
+        covariance with anything else.
+
+        Parameters
+        ----------
+        prior, posterior : ndarray, shape (3, 3)
+            Covariances of the velocity, map axes [m^2/s^2].
+        """
+        if self._with_velocity.any():
+            left = np.linalg.solve(prior, posterior)  # the transpose of I - K
+            self._with_velocity = np.asarray(self._with_velocity @ left)
+
+    def record(self, sweep: int, place: F64, covariance: F64, expected_share: float = 1.0) -> None:
         """Remember how uncertain the pose was that added a sweep.
 
         Parameters
@@ -272,16 +310,18 @@ class MapDrift:
             Where it was, map frame [m].
         covariance : ndarray, shape (6, 6)
             Of place and turn relative to the surfaces around, map axes [m, rad].
+        expected_share : float
+            Of that covariance.
         """
         row = sweep // tuning.DRIFT_GROUP
         if row >= len(self._history):
-            grown = np.zeros((2 * row, 6, 6), np.float32)
+            grown = np.zeros((2 * row, 2, 6, 6), np.float32)
             grown[: len(self._history)] = self._history
             more = np.zeros(2 * row - len(self._ways))
             self._ways = np.concatenate((self._ways, more))
             self._swings = np.concatenate((self._swings, more))
             self._history = grown
-        better, worse = self.beam_sigmas or (0.0, 0.0)
+        better, worse = self.beam_sigmas
         if self._known:
             step = float(np.linalg.norm(place - self._before))
             self._way += step
@@ -292,11 +332,14 @@ class MapDrift:
         self._ways[self._known : row + 1] = self._way
         self._swings[self._known : row + 1] = self._swing
         moved = _carried(-place)
-        found = self._current + moved @ covariance @ moved.T
-        here = _carried(place)[:3]
+        added = moved @ covariance @ moved.T
+        found = self._current + np.stack((added, expected_share * added))
         # of sweeps that share an entry, the least certain: sight may have been lost in between
-        if row < self._known and np.trace(here @ (found - self._history[row]) @ here.T) > 0.0:
-            self._history[row] = found
+        if row < self._known:
+            here = _carried(place)[:3]
+            more = here @ (found - self._history[row]) @ here.T
+            is_less_certain = np.trace(more, axis1=1, axis2=2) > 0.0
+            self._history[row][is_less_certain] = found[is_less_certain]
         self._history[self._known : row + 1] = found
         self._known = max(self._known, row + 1)
 
@@ -307,7 +350,7 @@ class MapDrift:
         """
         if not self._known:
             return None
-        latest = self._history[self._known - 1].astype(np.float64)
+        latest = self._history[self._known - 1, _ALLOWED].astype(np.float64)
         return self._surer(place, latest, tuning.APART_LEAST)
 
     def more_certain_than_held(self, place: F64) -> NDArray[np.bool_] | None:
@@ -315,7 +358,7 @@ class MapDrift:
 
         None where that is certain enough, so that no other surfaces need be looked for.
         """
-        return self._surer(place, self._reported, tuning.REVISIT_FROM_SIGMA)
+        return self._surer(place, self._reported[_ALLOWED], tuning.REVISIT_FROM_SIGMA)
 
     def _surer(self, place: F64, drift: F64, least: float) -> NDArray[np.bool_] | None:
         """Return which sweeps (S,) were surer of a place than a drift (6, 6) of at least so much.
@@ -326,7 +369,7 @@ class MapDrift:
         squared = float(np.trace(here @ drift @ here.T))
         if squared < least**2:
             return None
-        history = self._history[: self._known].astype(np.float64)
+        history = self._history[: self._known, _ALLOWED].astype(np.float64)
         all_squared = np.einsum("jk,njk->n", here.T @ here, history)
         return np.repeat(all_squared < tuning.APART_SHARE**2 * squared, tuning.DRIFT_GROUP)
 
@@ -359,7 +402,8 @@ class MapDrift:
     def error(self) -> MapError:
         """What it amounts to by now; it stays as it is when more sweeps come."""
         return MapError(
-            drift=self._reported,
+            drift=self._reported[_ALLOWED],
+            expected_drift=self._reported[_EXPECTED],
             behind=self._behind,
             beam_sigmas=self.beam_sigmas,
             beam_began=self._began,
@@ -554,14 +598,32 @@ class InnovationTest:
         return float(total @ np.linalg.solve(allowed, total)) / 3.0
 
     @property
+    def _ratio(self) -> float | None:
+        """What variances are to those assumed; None while there are few corrections."""
+        if len(self._recent) < tuning.NIS_LEAST:
+            return None
+        return max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
+
+    @property
+    def drift_factor(self) -> float:
+        """Factor on the variances of poses, at most 1, for the drift that they add to the map.
+
+        Also where a direction is not measured: along it the drift is that of the velocity.
+        """
+        found = self._ratio
+        if found is None:
+            return 1.0
+        return min(max(tuning.NIS_DRIFT_MARGIN * found, 1.0 / tuning.NIS_MOST), 1.0)
+
+    @property
     def variance_factor(self) -> float:
         """Factor by which variances are to be reported larger, or smaller where below 1.
 
         Smaller only where every direction was measured throughout the window.
         """
-        if len(self._recent) < tuning.NIS_LEAST:
+        found = self._ratio
+        if found is None:
             return 1.0
-        found = max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
         if found >= 1.0:
             return min(found, tuning.NIS_MOST)
         newest, unobserved = self._recent[-1].stamp, self._unobserved

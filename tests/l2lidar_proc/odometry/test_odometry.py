@@ -172,11 +172,9 @@ def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
     assert (factors[(seconds > -2.0) & (seconds < 0.0)] < 0.5).all()
     assert (factors[(seconds >= 0.0) & (seconds < since)] == 1.0).all()
     assert (factors[seconds > since + 0.2] < 0.5).all()
-    # nor is anything less allowed for the unit
+    # what its calibration may be wrong by has not become more
     turns = np.array([item.covariance[5, 5] for item in estimates]) / tuning.UNIT_TURN**2
-    assert (turns[(seconds > -2.0) & (seconds < 0.0)] < 0.3).all()
-    assert (turns[(seconds >= 0.0) & (seconds < since)] > 0.9).all()
-    assert (turns[seconds > since + 0.2] < 0.3).all()
+    assert (turns[seconds > -2.0] < 0.3).all()
 
 
 @pytest.mark.parametrize("blow", [1.0, 3.0, 12.0])
@@ -257,7 +255,7 @@ def test_the_vertical_of_a_map_begun_in_motion_is_found() -> None:
 
     assert off(0, [0.0, 0.0, 1.0]) > 1.0  # what it was taken for
     # errors relative to the first pose, which the first sweeps were hardly deskewed for
-    assert np.sqrt(estimates[0].covariance[5, 5]) > 0.01
+    assert np.sqrt(estimates[0].covariance[5, 5]) > 0.9 * tuning.BEGUN_IN_MOTION[1]
     assert np.sqrt(driven("room", "walk")[0].covariance[5, 5]) < 0.001
     last = estimates[-1]
     assert off(-1, -last.gravity) < 0.5
@@ -346,7 +344,8 @@ def test_skipped_sweeps_are_carried_by_the_imu() -> None:
     found = errors(run, estimates)
     sigma = np.array([np.sqrt(np.trace(item.covariance[:3, :3])) for item in estimates])
     assert found.max() < 0.03
-    assert (found < 3.0 * sigma).all()
+    # the first pose has no error by definition; found is relative to the whole way
+    assert (found < 3.0 * sigma + found[0]).all()
     traces = [np.trace(item.covariance[:3, :3]) for item in estimates[12:16]]
     assert all(later > earlier for earlier, later in pairwise(traces))
 

@@ -189,21 +189,21 @@ def test_a_map_is_turned_by_beam_angles_that_its_first_pose_did_not_know(
     drift.record(1, 5.0 * way, np.zeros((6, 6)))
     added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
     turn = (tuning.BEAM_TURN * max(first, now)) ** 2
-    np.testing.assert_allclose(added, np.diag([0.0] * 3 + [turn] * 3), rtol=1e-6, atol=1e-15)
+    expected = np.diag([0.0, 25.0 * turn, 25.0 * turn, turn, turn, turn])
+    expected[1, 5] = expected[5, 1] = 5.0 * turn  # what is turned about the origin moves
+    expected[2, 4] = expected[4, 2] = -5.0 * turn
+    np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-15)
     drift.clear()
     drift.record(0, ZERO, np.zeros((6, 6)))
     added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
     assert added[3, 3] == pytest.approx((tuning.BEAM_TURN * now) ** 2)
 
 
-def test_nothing_less_than_for_any_unit_is_reported_where_nothing_shows_the_beams() -> None:
+def test_no_more_is_reported_than_any_unit_is_allowed() -> None:
     drift, place = upright(0.001, 0.001), np.array([20.0, -3.0, 1.0])
     drift.record(0, ZERO, SURE)
     drift.meet(held_by(0))
     assert np.linalg.eigvalsh(drift.at(place) - drift.reported_at(place)).min() > 0.0
-    drift.beam_sigmas = None
-    drift.record(1, place, SURE)  # does no harm
-    np.testing.assert_array_equal(drift.reported_at(place), drift.at(place))
 
 
 def test_what_is_reported_drifts_and_leans_like_the_map() -> None:
@@ -218,6 +218,70 @@ def test_what_is_reported_drifts_and_leans_like_the_map() -> None:
     lean = (0.1 - tuning.LEAN_FROM) ** 2
     expected = [0.04 + shift, shift, shift, lean + turn, turn, turn]
     np.testing.assert_allclose(drift.reported_at(ZERO) - alone, np.diag(expected), rtol=0.01)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.02, 0.3])
+def test_the_drift_of_a_velocity_that_is_corrected_is_as_large_as_its_errors(gain: float) -> None:
+    """The velocity is estimated by a Kalman filter in equilibrium, its error added up (NEES)."""
+    rng = np.random.default_rng(5)
+    along, seconds, steps, runs = np.array([0.6, 0.8, 0.0]), 0.1, 200, 400
+    prior = 0.05**2
+    posterior = (1.0 - gain) * prior
+    measured = prior * posterior / (prior - posterior) if gain else 0.0  # noise variance
+    drift = MapDrift()
+    drift.record(0, ZERO, SURE)
+    drift.meet(held_by(0))
+    start = drift.reported_at(ZERO)
+    speed = rng.normal(0.0, np.sqrt(prior), runs)
+    place = np.zeros(runs)
+    for _ in range(steps):
+        place += speed * seconds
+        drift.meet_partly(held_by(0), ZERO, along[:, None], prior * np.eye(3), seconds)
+        drift.correct_velocity(prior * np.eye(3), posterior * np.eye(3))
+        speed = (1.0 - gain) * speed - gain * rng.normal(0.0, np.sqrt(measured), runs)
+        speed += rng.normal(0.0, np.sqrt(prior - posterior), runs)  # what the motion adds
+    gained = (drift.reported_at(ZERO) - start)[:3, :3]
+    variance = along @ gained @ along
+    assert np.mean(place**2) / variance == pytest.approx(1.0, abs=0.15)
+    # all of it along the free direction, and none of it lasts where surfaces hold the place
+    np.testing.assert_allclose(gained, variance * np.outer(along, along), atol=1e-9)
+    drift.meet(held_by(0))
+    before = drift.reported_at(ZERO)
+    drift.meet_partly(held_by(0), ZERO, along[:, None], prior * np.eye(3), seconds)
+    settle(drift, held_by(0))
+    assert np.trace(drift.reported_at(ZERO)) <= np.trace(before)
+
+
+def test_a_velocity_that_is_right_at_once_adds_nothing() -> None:
+    """However uncertain it was before: only what it errs by from now on adds up."""
+    drift, free, known = MapDrift(), np.eye(3)[:, :1], 1e-10 * np.eye(3)
+    drift.record(0, ZERO, SURE)
+    drift.meet(held_by(0))
+    for _ in range(10):
+        drift.meet_partly(held_by(0), ZERO, free, np.eye(3), 0.1)
+    before = drift.reported_at(ZERO)
+    drift.correct_velocity(np.eye(3), known)
+    for _ in range(100):
+        drift.meet_partly(held_by(0), ZERO, free, known, 0.1)
+    np.testing.assert_allclose(drift.reported_at(ZERO), before, rtol=1e-6, atol=1e-12)
+
+
+def test_decisions_allow_for_all_of_a_covariance_and_reports_for_what_is_expected() -> None:
+    drift, doubt, place = upright(), np.diag([0.04] * 3 + [1e-4] * 3), np.array([5.0, 0.0, 0.0])
+    drift.record(0, place, doubt, 0.25)
+    drift.meet(held_by(0))
+    unit = upright()
+    np.testing.assert_allclose(drift.at(place) - unit.at(place), doubt, rtol=1e-6, atol=1e-9)
+    expected = drift.reported_at(place) - unit.reported_at(place)
+    np.testing.assert_allclose(expected, 0.25 * doubt, rtol=1e-6, atol=1e-9)
+    # of sweeps that share an entry the least certain counts, in either sense
+    drift.clear()
+    drift.record(0, place, doubt, 0.25)
+    drift.record(1, place, 0.5 * doubt, 1.0)
+    drift.meet(held_by(1))
+    np.testing.assert_allclose(drift.at(place) - unit.at(place), doubt, rtol=1e-6, atol=1e-9)
+    expected = drift.reported_at(place) - unit.reported_at(place)
+    np.testing.assert_allclose(expected, 0.5 * doubt, rtol=1e-6, atol=1e-9)
 
 
 def test_chains_of_new_places_add_up_and_a_new_map_forgets() -> None:
@@ -262,7 +326,7 @@ def test_along_a_direction_that_nothing_holds_the_errors_of_a_velocity_add_up() 
     drift.meet(held_by(0))
     before = drift.at(place)
     for number in range(1, 101):  # 10 s with an error of 5 cm/s
-        drift.meet_partly(held_by(0), place, free, np.array([0.005]))
+        drift.meet_partly(held_by(0), place, free, 0.05**2 * np.eye(3), 0.1)
         drift.record(number * tuning.DRIFT_GROUP, place, SURE)
     gained = (drift.at(place) - before)[:3, :3]
     assert np.sqrt(free[:, 0] @ gained @ free[:, 0]) == pytest.approx(0.5, rel=0.02)
@@ -355,6 +419,21 @@ def test_small_ones_tell_that_variances_are_too_large() -> None:
     assert alike.nis < 0.5 * alike.velocity_nis / tuning.NIS_CHANCE < 1.0
     expected = tuning.NIS_MARGIN * alike.velocity_nis / tuning.NIS_CHANCE
     assert alike.variance_factor == pytest.approx(min(expected, 1.0))
+
+
+def test_what_poses_add_to_the_drift_is_lowered_with_a_margin_of_its_own() -> None:
+    found = run(0.3)
+    assert found.drift_factor == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
+    found.note_unobserved(at(5.0))
+    assert found.drift_factor == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
+    assert run(0.9).drift_factor == run(100.0).drift_factor == 1.0  # never raised
+    assert run(0.01).drift_factor == 1.0 / tuning.NIS_MOST
+    assert run(0.3, seconds=0.7).drift_factor == 1.0  # too few to say so
+    alike = run(0.2, drift=0.005)  # here the sum decides
+    assert alike.nis < 0.8 * alike.velocity_nis / tuning.NIS_CHANCE
+    expected = tuning.NIS_DRIFT_MARGIN * alike.velocity_nis / tuning.NIS_CHANCE
+    assert expected < 0.9
+    assert alike.drift_factor == pytest.approx(expected)
 
 
 def test_variances_are_not_lowered_while_a_direction_was_unobserved() -> None:
