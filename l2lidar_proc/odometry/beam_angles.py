@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from l2lidar_node import records
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.fan_halves import angles_at_rest, between_halves, halves, levers
+from l2lidar_proc.motion.head_line import HeadAngle
+from l2lidar_proc.odometry.fan_halves import (
+    Halves,
+    angles_at_rest,
+    between_halves,
+    halves,
+    levers,
+)
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
 _PRIOR: Final = np.eye(2) / tuning.BEAM_SIGMA**2  # information of units [1/rad^2]
@@ -44,7 +51,25 @@ class BeamAngles:
         self._failures = 0
         self._sweeps = 0
         self._rested_ns = 0  # of the sweeps at rest that were compared last
+        self._seen: tuple[Sweep, Halves | None] | None = None  # the latest sweep
         self._latest: tuple[Sweep, F64, F64] | None = None  # its halves, and what corrected it
+
+    def head(self, sweep: Sweep) -> HeadAngle | None:
+        """Return the angle of the head in a sweep, None where its points do not show it."""
+        found = self._halves_of(sweep)
+        return None if found is None else HeadAngle(sweep.start, found.angle, found.rate)
+
+    def _halves_of(self, sweep: Sweep) -> Halves | None:
+        if self._failures >= _GIVE_UP:
+            return None
+        if self._seen is None or self._seen[0] is not sweep:
+            found = halves(sweep.points, self._rate)
+            if found is not None:
+                self._failures, self._rate = 0, found.rate
+            elif self._rate is None:
+                self._failures += 1
+            self._seen = sweep, found
+        return self._seen[1]
 
     def corrected(self, sweep: Sweep) -> Sweep:
         """Return a sweep as the unit would have measured it with the corrected angles.
@@ -57,13 +82,11 @@ class BeamAngles:
         self._latest = None
         self._sweeps += 1
         is_due = self._teaches()
-        if self._failures >= _GIVE_UP or not (is_due or self.correction.any()):
+        if not (is_due or self.correction.any()):
             return sweep
-        found = halves(sweep.points, self._rate)
+        found = self._halves_of(sweep)
         if found is None:
-            self._failures += self._rate is None
             return sweep
-        self._failures, self._rate = 0, found.rate
         if self.correction.any():
             points = sweep.points.copy()
             for name, line in zip("xy", levers(points, found.sign), strict=True):

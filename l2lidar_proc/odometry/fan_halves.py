@@ -44,10 +44,13 @@ class Halves(NamedTuple):
         1 where the elevation rises with time, -1 where it falls.
     rate : float
         Of the head [rad/s].
+    angle : float
+        Azimuth of the half that rises, at time 0 of the points [rad].
     """
 
     sign: F64
     rate: float
+    angle: float
 
 
 def halves(points: NDArray[np.void], rate: float | None = None) -> Halves | None:
@@ -84,7 +87,8 @@ def halves(points: NDArray[np.void], rate: float | None = None) -> Halves | None
     share = np.count_nonzero(sign > 0.0) / len(sign)
     if not _HALF_LEAST < share < 1.0 - _HALF_LEAST:
         return None
-    return Halves(sign * np.sign(rises.mean()), found)
+    angle = 0.5 * float(np.angle(means[best])) + np.pi * float(rises.mean() < 0.0)
+    return Halves(sign * np.sign(rises.mean()), found, angle)
 
 
 class Gaps(NamedTuple):

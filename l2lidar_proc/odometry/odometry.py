@@ -148,6 +148,9 @@ class Odometry:
                 status.append(Status.RESTARTED)
         sweep = cropped(sweep, self.config.min_range, self.config.max_range)
         self._reported = sweep  # as the unit reports it, for what is mapped again
+        head = self._beams.head(sweep)
+        if head is not None:
+            self._predictor.note_head(head, sweep.end)
         if self.config.correct_beams:
             sweep = self._beams.corrected(sweep)
         if self.phase is Phase.INITIALIZING:

@@ -22,6 +22,7 @@ from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import GYRO_BIAS, VELOCITY, InertialState, Noise
+from l2lidar_proc.motion.head_line import HeadAngle, HeadLine
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.static import noise_spectrum
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
@@ -68,14 +69,24 @@ class Predictor:
         self.steady_rate: F64 = np.zeros(3)
         self.gyro_noise = self.config.inertial.gyro_noise
         self._rest: tuple[F64, int] = np.zeros(3), 0  # mean squares of the gyro at rest, samples
+        self._line = HeadLine()
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
         self._imu.push(turned(samples, self._turn))
 
     def samples(self, start: int, end: int) -> Samples:
-        """Return the samples of a span with a neighbor on either side, cloud axes."""
-        return self._imu.between(HostNs(start), HostNs(end))
+        """Return the samples of a span with a neighbor on either side, cloud axes.
+
+        Without the line of the head, as far as it is known.
+        """
+        return self._line.removed(self._imu.between(HostNs(start), HostNs(end)))
+
+    def note_head(self, head: HeadAngle, end: HostNs) -> None:
+        """Take the angle of the head, and learn its line from the turn that ends at an instant."""
+        self._line.head = head
+        if self._line.is_due(end):
+            self._line.learn(self._imu.between(HostNs(end - head.turn_ns), end))
 
     def reference(self, sweep: Sweep) -> HostNs:
         """Return the instant of a sweep whose pose is estimated."""

@@ -408,12 +408,12 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
         ]
         reached = list(bench_odometry_hard.targets(rows))
         assert bench_odometry_hard.write(rows, reached) == page
-    assert "seeds 49 to 50, some used for tuning" in pages[0].read_text()
+    assert f"seeds {last} to {last + 1}, some used for tuning" in pages[0].read_text()
     later = [{**row, "seed": 101} for row in rows]
     assert bench_odometry_hard.write(later, reached) == pages[0]
     unseen = pages[1].read_text()
-    assert "seeds 50 to 51, which were not used for tuning" in unseen
-    assert 'BENCH_ARGS="--full --first-seed 50 --page"' in unseen
+    assert f"seeds {last + 1} to {last + 2}, which were not used for tuning" in unseen
+    assert f'BENCH_ARGS="--full --first-seed {last + 1} --page"' in unseen
     assert "other methods" not in unseen
     alone = 1e3 * figures["scale_ate_m"]
     assert f"Off by 0.2 %, it makes an ATE by itself: {alone:.1f} mm in room." in unseen

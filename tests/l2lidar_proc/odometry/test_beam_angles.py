@@ -116,6 +116,24 @@ def test_the_half_of_every_point_is_found(rate: float, number: int) -> None:
     assert np.mean((again.sign == true[: len(half)])[radius[: len(half)] > 0.5]) > 0.995
 
 
+def test_the_angle_of_the_head_is_known_for_the_whole_turn() -> None:
+    """Not but for half a turn: the half that rises is on the other side by then."""
+    beams, offsets = BeamAngles(), []
+    for number in range(18):
+        sweep = turn(UNIT, number)[0]
+        head = beams.head(sweep)
+        assert head is not None
+        assert head.stamp == sweep.start
+        assert beams.head(sweep) == head
+        offsets.append(head.angle - (1.7 + 0.37 * number))
+    # a rate that is 0.4 % off moves the angle at the beginning by half of that in a turn
+    assert np.ptp(np.unwrap(offsets)) < 0.03
+    room = sweep.points.copy()
+    rng = np.random.default_rng(1)
+    room["x"], room["y"] = rng.permutation(room["x"]), rng.permutation(room["y"])
+    assert BeamAngles().head(dataclasses.replace(sweep, points=room)) is None
+
+
 @pytest.mark.parametrize("at_rest", [True, False])
 @pytest.mark.parametrize("unit", [UNIT, (-0.4, 0.4), (0.5, 0.1)])
 def test_what_moves_the_halves_apart_is_found(unit: Any, at_rest: bool) -> None:

@@ -13,6 +13,7 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.head_line import HeadAngle
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, Predictor
@@ -273,6 +274,31 @@ def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> No
     # white noise vibrates as well: 3.5 ms of its standard deviation above 15 Hz
     assert loud.gyro_vibration == pytest.approx(0.3 * 0.0035, rel=0.3)
     assert loud.accel_vibration == pytest.approx(0.7 * 0.0035, rel=0.3)
+
+
+def test_samples_are_without_the_line_of_the_head_once_turns_have_shown_it() -> None:
+    rate, turn_ns = 27.2, round(2e9 * np.pi / 27.2)
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    imu = Motion().imu(0, 4)
+    since = (imu["stamp"] - imu["stamp"][0]) * 1e-9
+    line = 0.3 * np.sin(0.7 + rate * since)
+    measured = imu.copy()
+    measured["angular_velocity"][:, 1] += line
+    predictor.imu(measured)
+    first = HostNs(int(imu["stamp"][0]))
+    for number in range(10):
+        start = HostNs(first + number * turn_ns)
+        head = HeadAngle(start, 0.7 + rate * (start - first) * 1e-9, rate)
+        end = HostNs(start + turn_ns)
+        found = predictor.samples(start, end)
+        kept = measured[np.isin(measured["stamp"], found["stamp"])]
+        if number < 4:
+            np.testing.assert_array_equal(found, kept)
+        predictor.note_head(head, end)
+    true = imu[np.isin(imu["stamp"], found["stamp"])]
+    np.testing.assert_allclose(found["angular_velocity"], true["angular_velocity"], atol=1e-3)
+    predictor.reset()
+    np.testing.assert_array_equal(predictor.samples(start, end), kept)
 
 
 _KNOWN = np.r_[eskf.ROTATION, eskf.VELOCITY]
