@@ -52,6 +52,30 @@ class HeadAngle(NamedTuple):
         return np.asarray(self.angle + self.rate * 1e-9 * (stamps - self.stamp))
 
 
+class LineRates(NamedTuple):
+    """What the gyro measures too much at an angle of the head.
+
+    Attributes
+    ----------
+    head : HeadAngle
+    amplitudes : ndarray, shape (4, 3)
+        Of each cloud axis: cosine and sine of either harmonic [rad/s].
+    """
+
+    head: HeadAngle
+    amplitudes: F64
+
+    def at(self, stamps: I64) -> F64:
+        """Return the rates (N, 3) at instants (N,) [ns], cloud axes [rad/s]; nearby only."""
+        return np.asarray(_basis(self.head, stamps) @ self.amplitudes)
+
+
+def _basis(head: HeadAngle, stamps: I64) -> F64:
+    """Return cosine and sine of both harmonics, (N, 4), at instants (N,) [ns]."""
+    phases = np.outer(head.at(stamps), _HARMONICS)
+    return np.stack((np.cos(phases), np.sin(phases)), axis=2).reshape(-1, 4)
+
+
 class _Turn(NamedTuple):
     end: int  # stamp of the last sample
     # of each axis, cosine and sine of either harmonic, the mean, and half of the change from the
@@ -108,7 +132,7 @@ class HeadLine:
             return None
         count = len(stamps)
         trend = np.linspace(-1.0, 1.0, count)
-        basis = np.column_stack((self._basis(stamps), np.ones(count), trend))
+        basis = np.column_stack((_basis(self.head, stamps), np.ones(count), trend))
         inverse = np.linalg.inv(basis.T @ basis)
         fitted = inverse @ basis.T @ rates
         left = np.square(rates - basis @ fitted).sum(axis=0) / (count - len(fitted))
@@ -134,9 +158,9 @@ class HeadLine:
 
     @property
     def amplitudes(self) -> F64:
-        """Amplitudes (4, 3) [rad/s] of each axis: cosine and sine of either harmonic.
+        """Amplitudes as of :class:`LineRates`: as much of the means as is not chance.
 
-        As much of the means as is not chance (a Wiener filter).
+        That is a Wiener filter.
         """
         if self._turns < tuning.HEAD_LINE_LEAST_TURNS:
             return np.zeros((4, 3))
@@ -147,19 +171,21 @@ class HeadLine:
         known = 1.0 - chance / np.maximum(power, 1e-18)
         return np.asarray(self._mean * np.repeat(np.maximum(known, 0.0), 2, axis=0))
 
+    @property
+    def rates(self) -> LineRates | None:
+        """What is to be removed, None before it is known."""
+        amplitudes = self.amplitudes
+        if self.head is None or not amplitudes.any():
+            return None
+        return LineRates(self.head, amplitudes)
+
     def removed(self, samples: Samples) -> Samples:
         """Return samples (N,), dtype IMU_SAMPLE, in cloud axes, without the line."""
-        amplitudes = self.amplitudes
-        if self.head is None or not len(samples) or not amplitudes.any():
+        rates = self.rates
+        if rates is None or not len(samples):
             return samples
-        if abs(samples["stamp"][-1] - self.head.stamp) > tuning.HEAD_LINE_AGE_NS:
+        if abs(samples["stamp"][-1] - rates.head.stamp) > tuning.HEAD_LINE_AGE_NS:
             return samples  # the head may be anywhere
         found = samples.copy()
-        found["angular_velocity"] -= self._basis(samples["stamp"]) @ amplitudes
+        found["angular_velocity"] -= rates.at(samples["stamp"])
         return found
-
-    def _basis(self, stamps: I64) -> F64:
-        """Return cosine and sine of both harmonics, (N, 4), at instants (N,) [ns]."""
-        assert self.head is not None
-        phases = np.outer(self.head.at(stamps), _HARMONICS)
-        return np.stack((np.cos(phases), np.sin(phases)), axis=2).reshape(-1, 4)

@@ -14,6 +14,7 @@ from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
+from l2lidar_proc.motion.head_line import LineRates
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift, MapError
 from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
@@ -137,6 +138,8 @@ class OdometryEstimate:
     late : ndarray, shape (3,)
         Error of the velocity for stamps of IMU samples that are off, 1 sigma, cloud axes [m/s].
         Part of ``twist_covariance``, but it does not last: it is the velocity of another instant.
+    gyro_line : LineRates, optional
+        What the gyro measures too much in step with the head; None where that is not known.
     """
 
     stamp: HostNs
@@ -154,6 +157,7 @@ class OdometryEstimate:
     gyro_bias_covariance: F64 = field(default_factory=lambda: np.zeros((9, 3)))
     map_error: MapError | None = None
     late: F64 = field(default_factory=lambda: np.zeros(3))
+    gyro_line: LineRates | None = None
 
     def refusing(self, points: NDArray[np.void]) -> OdometryEstimate:
         """Return the same again for a sweep with points (N,) that was refused."""

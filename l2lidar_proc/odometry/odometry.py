@@ -181,7 +181,7 @@ class Odometry:
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
         nothing, noise = self._last.points[:0], self._predictor.gyro_noise
         quality = AlignmentQuality(variance_factor=self._last.quality.variance_factor)
-        return estimate_of(
+        found = estimate_of(
             motion,
             self._lever,
             nothing,
@@ -191,6 +191,7 @@ class Odometry:
             self._jump,
             self.matcher.drift,
         )
+        return dataclasses.replace(found, gyro_line=self._predictor.gyro_line)
 
     def map_points(self) -> F64:
         """Return the points of KISS-ICP's local map [m], shape (N, 3), map frame."""
@@ -624,7 +625,7 @@ class Odometry:
             status.append(Status.GRAVITY_UNTRUSTED)
         xi, beta = self._beams.correction.tolist()
         self.matcher.drift.beam_sigmas = self._beams.sigmas or tuning.OTHER_BEAM_SIGMAS
-        self._last = estimate_of(
+        found = estimate_of(
             motion,
             self._lever,
             self.matcher.deskewed(sweep, motion),
@@ -634,4 +635,5 @@ class Odometry:
             self._jump,
             self.matcher.drift,
         )
+        self._last = dataclasses.replace(found, gyro_line=self._predictor.gyro_line)
         return self._last

@@ -22,7 +22,7 @@ from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import GYRO_BIAS, VELOCITY, InertialState, Noise
-from l2lidar_proc.motion.head_line import HeadAngle, HeadLine
+from l2lidar_proc.motion.head_line import HeadAngle, HeadLine, LineRates
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.static import noise_spectrum
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
@@ -81,6 +81,11 @@ class Predictor:
         Without the line of the head, as far as it is known.
         """
         return self._line.removed(self._imu.between(HostNs(start), HostNs(end)))
+
+    @property
+    def gyro_line(self) -> LineRates | None:
+        """The line of the head in the gyro; None before it is known."""
+        return self._line.rates
 
     def note_head(self, head: HeadAngle, end: HostNs) -> None:
         """Take the angle of the head, and learn its line from the turn that ends at an instant."""
@@ -265,11 +270,14 @@ class DeadReckoning:
             return None
         if before is None or before[0] != self.stamp:
             before = (self.stamp, measured[0])
-        steps = [later - earlier for earlier, later in pairwise((before[0], *stamps))]
+        at = (before[0], *stamps)
+        steps = [later - earlier for earlier, later in pairwise(at)]
         if stamps[-1] - anchor.stamp > LONGEST_NS or max(steps) > _MAX_GAP_NS:
             self._anchor = None
             return None
         knots = np.vstack((before[1], measured))
+        if anchor.gyro_line is not None:
+            knots[:, :3] -= anchor.gyro_line.at(np.array(at))
         # the mean over time of what is linear between the samples
         mean = np.array(steps) / sum(steps) @ (0.5 * (knots[1:] + knots[:-1]))
         rate, force = mean[:3] - anchor.gyro_bias, mean[3:] - anchor.accel_bias
@@ -368,7 +376,7 @@ def _grown(
     place = found[:3, :3]
     lasting = anchor.twist_covariance[:3, :3] - np.outer(anchor.late, anchor.late)
     speed = rotation @ lasting @ rotation.T * seconds**2
-    ratio = float(np.sqrt(np.trace(speed) / max(float(np.trace(place)), 1e-12)))
+    ratio = np.sqrt(max(float(np.trace(speed)), 0.0) / max(float(np.trace(place)), 1e-12))
     if ratio > 0.0:
         found[:3, :3] = (1.0 + ratio) * place + (1.0 + 1.0 / ratio) * speed
     with_bias, bias = anchor.gyro_bias_covariance[:6], anchor.gyro_bias_covariance[6:]

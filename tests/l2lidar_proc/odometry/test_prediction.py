@@ -13,7 +13,7 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
-from l2lidar_proc.motion.head_line import HeadAngle
+from l2lidar_proc.motion.head_line import HeadAngle, LineRates
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, Predictor
@@ -98,7 +98,10 @@ def test_what_the_next_sweep_corrects_is_within_the_reported_sigma(
 
 @pytest.fixture(scope="module")
 def estimate() -> Any:
-    return track("room", "walk")[5][0]
+    """Return an estimate without a line of the head, as that of another sensor."""
+    found = track("room", "walk")[5][0]
+    assert found.gyro_line is not None
+    return dataclasses.replace(found, gyro_line=None)
 
 
 def samples(start: Any, count: Any, **fields: Any) -> Any:
@@ -299,6 +302,28 @@ def test_samples_are_without_the_line_of_the_head_once_turns_have_shown_it() -> 
     np.testing.assert_allclose(found["angular_velocity"], true["angular_velocity"], atol=1e-3)
     predictor.reset()
     np.testing.assert_array_equal(predictor.samples(start, end), kept)
+
+
+def test_dead_reckoning_does_not_follow_the_line_of_the_head(estimate: Any) -> None:
+    head = HeadAngle(estimate.stamp, 0.7, 27.2)
+    amplitudes = np.zeros((4, 3))
+    amplitudes[0] = 0.3, -0.2, 0.1
+    amplitudes[3] = 0.1, 0.2, -0.1
+    line = LineRates(head, amplitudes)
+    true, found, other = (DeadReckoning(np.eye(4)) for _ in range(3))
+    true.reset(estimate)
+    found.reset(dataclasses.replace(estimate, gyro_line=line))
+    other.reset(estimate)
+    worst = 0.0
+    for n in range(10):
+        step = samples(estimate.stamp + 20_000_000 * n, 5)
+        measured = step.copy()
+        measured["angular_velocity"] += line.at(step["stamp"])
+        expected = carry(true, step).T_map_lidar
+        np.testing.assert_allclose(carry(found, measured).T_map_lidar, expected, atol=1.5e-3)
+        followed = carry(other, measured).T_map_lidar
+        worst = max(worst, float(np.abs(followed - expected).max()))
+    assert worst > 0.008
 
 
 _KNOWN = np.r_[eskf.ROTATION, eskf.VELOCITY]
