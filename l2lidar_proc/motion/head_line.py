@@ -5,8 +5,8 @@ integrate to 1 to 10 mrad. Clouds that are deskewed with them are distorted alik
 narrow views bend their map, and the gyro's bias comes out wrong. But the clouds show the head's
 angle, so the line can be measured and removed.
 
-It is measured in turns that are like the turn before, at rest or in smooth motion. Steps are not
-in step with the head, but a harmonic of theirs may be for a minute.
+It is measured in turns that are like those before them, at rest or in smooth motion. While a
+carrier walks nothing is measured: a harmonic of its steps may be near the line.
 
 Where a mount really rocks in step with the head, the clouds show the same as wrong beam angles,
 which are estimated as well (:mod:`l2lidar_proc.odometry.beam_angles`). Without the line it is left

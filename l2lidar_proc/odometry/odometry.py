@@ -261,8 +261,8 @@ class Odometry:
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
         if found is not None or uncharted or Status.LOST in status:
-            share = self._innovations.drift_factor
-            fresh = self.matcher.extend(estimate.points, motion, guess, share)
+            expected_share = self._innovations.expected_share
+            fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
             self._anchor_anew(fresh)
         return estimate
 

@@ -605,8 +605,8 @@ class InnovationTest:
         return max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
 
     @property
-    def drift_factor(self) -> float:
-        """Factor on the variances of poses, at most 1, for the drift that they add to the map.
+    def expected_share(self) -> float:
+        """Share of the variances of poses that they are expected to add to the map's drift.
 
         Also where a direction is not measured: along it the drift is that of the velocity.
         """

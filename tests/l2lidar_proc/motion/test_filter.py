@@ -136,10 +136,7 @@ def sigmas_after_gap(lasted: float, motion: Motion) -> tuple[float, float]:
     begin = 0.1 + 1e-4  # between two samples
     samples = samples[(samples["stamp"] < at(begin)) | (samples["stamp"] > at(begin + lasted))]
     imu = segment(samples, [at(0.0), at(0.3)], 50_000_000, np.zeros(3))
-    state = dataclasses.replace(
-        some_state(), gyro_bias=np.zeros(3), accel_bias=np.zeros(3), gravity=np.array([0, 0, -G])
-    )
-    state = dataclasses.replace(state, rotation=motion.rotation(np.zeros(1)).as_matrix()[0])
+    state = dataclasses.replace(at_rest(), rotation=motion.rotation(np.zeros(1)).as_matrix()[0])
     sums = integrate(
         imu,
         0,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -105,9 +107,8 @@ def test_nothing_is_removed_before_turns_are_alike_or_without_the_head() -> None
         lambda t: 0.5 * t**2,  # begins to turn
     ],
 )
-def test_motion_is_not_taken_for_the_line(motion: object) -> None:
+def test_motion_is_not_taken_for_the_line(motion: Callable[[F64], F64]) -> None:
     line = HeadLine()
-    assert callable(motion)
     for number in range(40):
         start = number * TURN_S
         line.head = HeadAngle(HostNs(EPOCH + round(start * 1e9)), 1.3 + RATE * start, RATE)

@@ -423,17 +423,17 @@ def test_small_ones_tell_that_variances_are_too_large() -> None:
 
 def test_what_poses_add_to_the_drift_is_lowered_with_a_margin_of_its_own() -> None:
     found = run(0.3)
-    assert found.drift_factor == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
+    assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
     found.note_unobserved(at(5.0))
-    assert found.drift_factor == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
-    assert run(0.9).drift_factor == run(100.0).drift_factor == 1.0  # never raised
-    assert run(0.01).drift_factor == 1.0 / tuning.NIS_MOST
-    assert run(0.3, seconds=0.7).drift_factor == 1.0  # too few to say so
+    assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
+    assert run(0.9).expected_share == run(100.0).expected_share == 1.0  # never raised
+    assert run(0.01).expected_share == 1.0 / tuning.NIS_MOST
+    assert run(0.3, seconds=0.7).expected_share == 1.0  # too few to say so
     alike = run(0.2, drift=0.005)  # here the sum decides
     assert alike.nis < 0.8 * alike.velocity_nis / tuning.NIS_CHANCE
     expected = tuning.NIS_DRIFT_MARGIN * alike.velocity_nis / tuning.NIS_CHANCE
     assert expected < 0.9
-    assert alike.drift_factor == pytest.approx(expected)
+    assert alike.expected_share == pytest.approx(expected)
 
 
 def test_variances_are_not_lowered_while_a_direction_was_unobserved() -> None:
