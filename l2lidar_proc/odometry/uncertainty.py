@@ -246,8 +246,9 @@ class MapDrift:
         """Take surfaces that leave some directions free: along these nothing is held.
 
         What is registered along them is where the sensor is relative to what the last sweeps put
-        into the map with the same wrong velocity. So the place errs by the sum of the errors of
-        the velocity. These are expected to last until something corrects it
+        into the map with the same wrong velocity. So the place errs by what was reported of it
+        before, also if the sweep before seemed to be held, and by the sum of the errors of the
+        velocity. These are expected to last until something corrects it
         (:meth:`correct_velocity`).
 
         Parameters
@@ -265,12 +266,12 @@ class MapDrift:
         strongly : tuple of tuple of ndarray and Support
             As in :meth:`meet`.
         """
-        before, reported, shared = self._current, self._reported, self._with_velocity
+        reported, shared = self._reported, self._with_velocity
         self.meet(support, place, None, strongly)
         self._reported = reported
         along = np.zeros((6, 6))
         along[:3, :3] = free @ free.T
-        now = self._combine(place, self._current, before, along)
+        now = self._combine(place, self._current, reported, along)
         for direction in free.T:
             way = seconds * float(np.sqrt(direction @ velocity @ direction))
             sigma = float(np.sqrt(max(direction @ now[_ALLOWED, :3, :3] @ direction, 0.0)))

@@ -339,6 +339,26 @@ def test_along_a_direction_that_nothing_holds_the_errors_of_a_velocity_add_up() 
     np.testing.assert_allclose(drift.at(place), before, atol=1e-5)
 
 
+@pytest.mark.parametrize("meets", [1, 3])
+def test_few_sweeps_that_seem_to_be_held_do_not_make_a_free_direction_known(meets: int) -> None:
+    """Along it the place is as uncertain as was reported of the sweep before."""
+    drift, free = MapDrift(), np.eye(3)[:, :1]
+    drift.record(0, ZERO, SURE)
+    drift.meet(held_by(0))
+    for number in range(1, 101):  # 10 s with an error of 5 cm/s
+        drift.meet_partly(held_by(0), ZERO, free, 0.05**2 * np.eye(3), 0.1)
+        drift.record(number * tuning.DRIFT_GROUP, ZERO, SURE)
+    lost = np.array([drift.at(ZERO)[0, 0], drift.reported_at(ZERO)[0, 0]])
+    for _ in range(meets):
+        drift.meet(held_by(0))
+    kept = np.array([drift.at(ZERO)[0, 0], drift.reported_at(ZERO)[0, 0]])
+    np.testing.assert_allclose(kept, tuning.DRIFT_FALL**meets * lost, rtol=0.01)
+    for _ in range(20):
+        drift.meet_partly(held_by(0), ZERO, free, 1e-12 * np.eye(3), 0.1)
+    now = np.array([drift.at(ZERO)[0, 0], drift.reported_at(ZERO)[0, 0]])
+    np.testing.assert_allclose(now, kept, rtol=0.01)
+
+
 def corrected(covariance: np.ndarray, measured: slice = slice(0, 9)) -> np.ndarray:
     """Return the posterior of a measurement that is as sure as the prior."""
     out = covariance.copy()
