@@ -37,7 +37,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.matcher import SweepMatcher
-from l2lidar_proc.odometry.pose_hypotheses import level_basis
+from l2lidar_proc.odometry.pose_hypotheses import is_explained_by_drift, level_basis
 from l2lidar_proc.odometry.uncertainty import FrameJump
 
 
@@ -220,16 +220,19 @@ class MapRevisit:
         stamp, place = int(motion.state.stamp), motion.state.position
         older = part.matcher
         uncertain = _kept_level(motion.state, older.drift.at(place))
+        expected = older.drift.reported_at(place)[:3, :3]
         found = None
         if part.is_due:
             drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
             found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
-            if found is not None and not _is_elsewhere(found, motion, len(source.points)):
+            if found is not None and not _is_elsewhere(
+                found, motion, len(source.points), expected
+            ):
                 found = None
         if found is None and _is_loose_on_level(motion.state, uncertain):
             loose = with_loose_pose(motion.state, motion.covariance, uncertain)
             freed = dataclasses.replace(motion, covariance=loose)
-            found = older.relocalize(source, freed, uncertain[:3, :3])
+            found = older.relocalize(source, freed, uncertain[:3, :3], expected)
         if found is None:
             if stamp < self._met_until:
                 self._next_search = stamp + 1
@@ -275,14 +278,17 @@ def _is_loose_on_level(state: InertialState, uncertain: F64) -> bool:
     return bool(np.linalg.eigvalsh(level)[-1] > tuning.RELOCALIZE_FROM_SIGMA**2)
 
 
-def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int) -> bool:
+def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int, expected: F64) -> bool:
     """Return whether a sweep is explained by a map, at another place than that of its motion.
 
-    Where the two agree the younger part of the map is not wrong, and worth more than a jump.
+    Where the two agree the younger part of the map is not wrong, and worth more than a jump. Where
+    they are farther apart than the covariance (3, 3) of the drift explains, something else looks
+    alike.
     """
-    way = float(np.linalg.norm(found.state.position - motion.state.position))
+    move = found.state.position - motion.state.position
     return (
-        way > tuning.REVISIT_LEAST_M
+        float(np.linalg.norm(move)) > tuning.REVISIT_LEAST_M
+        and is_explained_by_drift(move, expected)
         and found.matched > tuning.REVISIT_MATCHED * points
         and found.inlier_ratio > tuning.REVISIT_INLIERS
     )

@@ -41,6 +41,7 @@ from l2lidar_proc.odometry.estimate import AlignmentQuality
 from l2lidar_proc.odometry.free_space import rays_through
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.pose_hypotheses import (
+    is_explained_by_drift,
     level_hypotheses,
     pose_hypotheses,
     rotation_is_loose,
@@ -217,21 +218,25 @@ class SweepMatcher:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         return self._believed(best)
 
-    def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
+    def relocalize(
+        self, source: Source, motion: SweepMotion, places: F64, expected: F64
+    ) -> Alignment | None:
         """Return how a sweep fits the map at another place on its level, None if it does not.
 
         For a place that has drifted while no surface fixed it. Of the first surface that fixes it
         again few points are seen, and all others fit anywhere along their walls. So the places
         tried are close together, and only points in the finest cells count. There must be one
-        such place only, and on the same level: a step of a stair looks like the next.
+        such place only, on the same level, as a step of a stair looks like the next, and no
+        farther away than drift explains: what lies beside it may be another door in the same wall.
 
         Parameters
         ----------
         source : Source
         motion : SweepMotion
             The one that deskewed the source; its pose is loose.
-        places : ndarray, shape (3, 3)
-            How uncertain the place is in this map, map axes [m^2].
+        places, expected : ndarray, shape (3, 3)
+            How uncertain the place in this map has to be allowed to be, and is expected to be, map
+            axes [m^2].
         """
         state = motion.state
         if not state.gravity.any() or len(source.points) < tuning.FAR_MATCHED:
@@ -242,7 +247,8 @@ class SweepMatcher:
         best = max(good, key=lambda one: one.fine_inliers, default=None)
         if best is None or any(_are_apart(one, best) for one in good):
             return None
-        return best
+        move = best.state.position - state.position
+        return best if is_explained_by_drift(move, expected) else None
 
     def _is_relocalized(
         self, found: Alignment, source: Source, motion: SweepMotion, places: F64
@@ -255,8 +261,7 @@ class SweepMatcher:
             np.linalg.norm(gravity)
         ):
             return False
-        allowed = places + tuning.RELOCALIZE_FLOOR_M**2 * np.eye(3)
-        if float(move @ np.linalg.solve(allowed, move)) > tuning.RELOCALIZE_SIGMAS**2:
+        if not is_explained_by_drift(move, places):
             return False
         inliers, fine_inliers = tuning.RELOCALIZE_INLIERS
         if found.inlier_ratio < inliers or found.fine_ratio < fine_inliers:

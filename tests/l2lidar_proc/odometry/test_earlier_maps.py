@@ -227,6 +227,20 @@ def test_a_meeting_that_explains_too_little_does_not_count(
     assert searched(revisit, drifted, seen(rng), later(at, 1.1)) is None
 
 
+@pytest.mark.parametrize(("known", "counts"), [(0.25, True), (0.2, False)])
+def test_a_meeting_farther_away_than_drift_explains_does_not_count(
+    known: float, counts: bool
+) -> None:
+    """It is 0.47 m away, 1.8 or 2.3 sigma: what is met there is something that looks alike."""
+    matcher, revisit = drifted_matcher(known), MapRevisit()
+    rng = np.random.default_rng(43)
+    assert searched(revisit, matcher, view(rng), AT) is None
+    part = revisit.part_due(matcher, later(AT, 1.1).state)
+    assert part is not None
+    back = revisit.search(view(rng), part, later(AT, 1.1), FrameJump())
+    assert (back is not None) == counts
+
+
 def test_a_meeting_with_something_else_does_not_count_even_if_sweeps_match_no_better_of_late() -> (
     None
 ):

@@ -477,15 +477,20 @@ def relocalized(
     drift: F64 = DRIFTED,
     sigma: F64 = DRIFT_SIGMA,
     gravity: float = 1.0,
+    expected: F64 | None = None,
 ) -> F64 | None:
-    """Return the drift that remains when points are relocalized, None where they are not."""
+    """Return the drift that remains when points are relocalized, None where they are not.
+
+    ``sigma`` is what has to be allowed for, and unless it is given also what is expected [m].
+    """
     at = motion(TIGHT, PLACE + drift)
     places = np.diag(sigma**2)
     covariance = at.covariance.copy()
     covariance[eskf.POSITION, eskf.POSITION] = places
     state = dataclasses.replace(at.state, gravity=gravity * at.state.gravity)
     loose = dataclasses.replace(at, covariance=covariance, state=state)
-    found = matcher.relocalize(source(points - PLACE), loose, places)
+    expected = places if expected is None else np.diag(expected**2)
+    found = matcher.relocalize(source(points - PLACE), loose, places, expected)
     return None if found is None else found.state.position - PLACE
 
 
@@ -523,6 +528,16 @@ def test_only_places_that_drift_explains_are_found(
 ) -> None:
     points = corner(np.random.default_rng(33))
     assert relocalized(grown, points, np.array(drift), np.array(sigma)) is None
+
+
+@pytest.mark.parametrize(("along", "found"), [(0.3, True), (0.22, False)])
+def test_a_place_that_is_allowed_for_but_not_expected_is_not_found(
+    grown: SweepMatcher, along: float, found: bool
+) -> None:
+    """What fits there may be another corner: 0.55 m are 2.4 or 1.8 sigma."""
+    expected = np.array([along, 0.05, 0.2])
+    points = corner(np.random.default_rng(39))
+    assert (relocalized(grown, points, expected=expected) is not None) == found
 
 
 def unknown(rng: np.random.Generator, count: int) -> F64:
@@ -593,6 +608,19 @@ def test_the_place_found_is_the_only_one_that_fits(plates: tuple[float, ...], fo
     cloud = np.vstack((alley(rng, 150, 4.0), plate(rng, 2.0, 1.5, 40)))
     at = np.array([0.6, 0.0, 0.0])
     assert (relocalized(matcher, cloud + PLACE, at - PLACE) is not None) == found
+
+
+@pytest.mark.parametrize(("plates", "found"), [((2.32,), True), ((2.0, 2.32), False)])
+def test_two_places_that_fit_are_none_even_if_only_one_is_expected(
+    plates: tuple[float, ...], found: bool
+) -> None:
+    """They are 0.28 and 0.6 m away, 1.4 and 2.9 sigma."""
+    rng = np.random.default_rng(36)
+    matcher = alley_with(rng, *((x, 1.5) for x in plates))
+    cloud = np.vstack((alley(rng, 150, 4.0), plate(rng, 2.0, 1.5, 40)))
+    at, expected = np.array([0.6, 0.0, 0.0]), np.array([0.2, 0.05, 0.2])
+    left = relocalized(matcher, cloud + PLACE, at - PLACE, expected=expected)
+    assert (left is not None) == found
 
 
 @pytest.mark.parametrize("is_in_the_way", [False, True])
