@@ -608,6 +608,9 @@ RELOCALIZE_FROM_SIGMA: Final = 0.35  # [m] 1 sigma
 # how far the pose may jump, of the expected drift. Tuned on: cones of 70 degrees in flats, where
 # right places were up to 1.4 away, and other corners that look alike 2.2 to 3.4
 RELOCALIZE_SIGMAS: Final = 2.0
+# A drift so likely that one sweep counts; the next may show nothing. Tuned on: as above, where 15
+# of 15 such places were right, and what showed three of them was in sight for one sweep only
+RELOCALIZE_LIKELY: Final = 1.0
 RELOCALIZE_STEP_M: Final = 0.1  # [m] between the places; the robust kernel reaches as far
 RELOCALIZE_PLACES: Final = (
     600  # at most; farther apart where these do not suffice. Bounds the time

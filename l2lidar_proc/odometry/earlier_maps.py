@@ -10,7 +10,8 @@ than a second.
 
 When a sweep meets such a map, the odometry goes on in it and the pose jumps back. A wrong jump is
 worse than none, so a meeting counts only if it fixes the place in every direction and the next one
-says the same.
+says the same. What shows where the pose is on its level may be in sight for one sweep only: there,
+one that is likely counts by itself.
 """
 
 from __future__ import annotations
@@ -161,6 +162,7 @@ class MapRevisit:
         self._next_search = int(stamp)
         self._met_until = int(stamp)  # until then a meeting may be confirmed
         self._in_sight_until = int(stamp)  # until then relocalization is tried with each sweep
+        self._returned_until = int(stamp)  # until then the latest return may have been wrong
         self._certain_at = None
         self._meetings.clear()
 
@@ -204,6 +206,7 @@ class MapRevisit:
     ) -> Return | None:
         """Return the way back into the older part of the map if two sweeps meet it.
 
+        One is enough where it relocalizes the pose by a likely drift, unless it has just returned.
         What drifted away since is not in that part. A wrong velocity moved the pose, so the
         velocity is as uncertain as that makes it.
 
@@ -221,7 +224,7 @@ class MapRevisit:
         older = part.matcher
         uncertain = _kept_level(motion.state, older.drift.at(place))
         expected = older.drift.reported_at(place)[:3, :3]
-        found = None
+        found, is_likely = None, False
         if part.is_due:
             drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
             found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
@@ -233,16 +236,22 @@ class MapRevisit:
             loose = with_loose_pose(motion.state, motion.covariance, uncertain)
             freed = dataclasses.replace(motion, covariance=loose)
             found = older.relocalize(source, freed, uncertain[:3, :3], expected)
+            is_likely = found is not None and is_explained_by_drift(
+                found.state.position - place, expected, tuning.RELOCALIZE_LIKELY
+            )
         if found is None:
             if stamp < self._met_until:
                 self._next_search = stamp + 1
             else:
                 self._meetings.clear()
             return None
-        if not self._meetings.confirm(None, _moves(motion.state, found.state)):
+        is_likely &= stamp >= self._returned_until
+        if not (self._meetings.confirm(None, _moves(motion.state, found.state)) or is_likely):
             self._met_until = stamp + tuning.REVISIT_MET_NS
             self._next_search = stamp + 1
             return None
+        self._meetings.clear()
+        self._returned_until = stamp + tuning.REVISIT_MET_NS
         covariance = found.covariance.copy()
         speed = float(np.linalg.norm(found.state.position - place)) / tuning.REVISIT_DRIFT_S
         covariance[VELOCITY, VELOCITY] += speed**2 * np.eye(3)

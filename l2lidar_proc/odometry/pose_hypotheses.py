@@ -82,10 +82,12 @@ def level_basis(gravity: F64) -> F64:
     return np.asarray(np.linalg.svd(gravity[None])[2][1:].T)
 
 
-def is_explained_by_drift(move: F64, places: F64) -> bool:
-    """Return whether a move (3,) [m] is within a covariance (3, 3) of the place [m^2], nearly."""
+def is_explained_by_drift(
+    move: F64, places: F64, sigmas: float = tuning.RELOCALIZE_SIGMAS
+) -> bool:
+    """Return whether a move (3,) [m] is within so many sigma of a place (3, 3) [m^2], nearly."""
     covariance = places + tuning.RELOCALIZE_FLOOR_M**2 * np.eye(3)
-    return float(move @ np.linalg.solve(covariance, move)) <= tuning.RELOCALIZE_SIGMAS**2
+    return float(move @ np.linalg.solve(covariance, move)) <= sigmas**2
 
 
 def _distinct(errors: F64, scores: NDArray[np.int64], apart: float, count: int) -> list[F64]:

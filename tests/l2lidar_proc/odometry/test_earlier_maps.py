@@ -346,7 +346,7 @@ ALONG = np.array([0.5, 0.0, 0.0])  # the wall that fills the view
 
 @pytest.fixture(scope="module")
 def drifted_along() -> SweepMatcher:
-    return drifted_matcher(0.5, drift=ALONG)
+    return drifted_matcher(0.45, drift=ALONG)
 
 
 def corner_view(rng: np.random.Generator) -> Source:
@@ -373,6 +373,27 @@ def test_a_corner_that_comes_into_sight_again_takes_the_pose_back(
     speed = np.linalg.norm(ALONG) / tuning.REVISIT_DRIFT_S
     sigmas = np.sqrt(np.diag(back.alignment.covariance)[VELOCITY])
     np.testing.assert_allclose(sigmas, speed, rtol=0.1)
+
+
+def test_one_sweep_relocalizes_a_pose_by_a_likely_drift_unless_it_has_just_returned() -> None:
+    """It is 0.5 m away, 0.8 sigma."""
+    revisit, matcher = MapRevisit(), drifted_matcher(0.6, drift=ALONG)
+    seen = corner_view(np.random.default_rng(44))
+    back = searched(revisit, matcher, seen, AWAY)
+    assert back is not None
+    np.testing.assert_allclose(back.alignment.state.position, PLACE, atol=0.02)
+    # if that was wrong after all, the next return has to be sure
+    for seconds, counts in ((0.2, False), (0.4, True), (2.3, False), (2.5, True), (4.6, True)):
+        revisit.note_unobserved(later(AWAY, seconds).state.stamp)
+        again = searched(revisit, matcher, seen, later(AWAY, seconds))
+        assert (again is not None) == counts
+
+
+@pytest.mark.parametrize("known", [0.4, 0.6])
+def test_what_is_met_at_once_with_all_of_the_map_has_to_be_confirmed(known: float) -> None:
+    rng, revisit, matcher = np.random.default_rng(45), MapRevisit(), drifted_matcher(known)
+    assert searched(revisit, matcher, view(rng), AT) is None
+    assert searched(revisit, matcher, view(rng), later(AT, 0.2)) is not None
 
 
 def test_each_sweep_is_tried_for_two_seconds_after_one_that_left_a_direction_free(
