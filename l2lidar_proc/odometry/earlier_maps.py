@@ -220,42 +220,52 @@ class MapRevisit:
         jump : FrameJump
             Of the map in use.
         """
-        stamp, place = int(motion.state.stamp), motion.state.position
-        older = part.matcher
-        uncertain = _kept_level(motion.state, older.drift.at(place))
-        expected = older.drift.reported_at(place)[:3, :3]
-        found, is_likely = None, False
-        if part.is_due:
-            drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
-            found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
-            if found is not None and not _is_elsewhere(
-                found, motion, len(source.points), expected
-            ):
-                found = None
-        if found is None and _is_loose_on_level(motion.state, uncertain):
-            loose = with_loose_pose(motion.state, motion.covariance, uncertain)
-            freed = dataclasses.replace(motion, covariance=loose)
-            found = older.relocalize(source, freed, uncertain[:3, :3], expected)
-            is_likely = found is not None and is_explained_by_drift(
-                found.state.position - place, expected, tuning.RELOCALIZE_LIKELY
-            )
+        found, is_likely = _found_in(part, source, motion)
+        stamp = int(motion.state.stamp)
         if found is None:
             if stamp < self._met_until:
                 self._next_search = stamp + 1
             else:
                 self._meetings.clear()
             return None
-        is_likely &= stamp >= self._returned_until
-        if not (self._meetings.confirm(None, _moves(motion.state, found.state)) or is_likely):
+        is_confirmed = self._meetings.confirm(None, _moves(motion.state, found.state))
+        if not (is_confirmed or (is_likely and stamp >= self._returned_until)):
             self._met_until = stamp + tuning.REVISIT_MET_NS
             self._next_search = stamp + 1
             return None
         self._meetings.clear()
         self._returned_until = stamp + tuning.REVISIT_MET_NS
+        way = float(np.linalg.norm(found.state.position - motion.state.position))
         covariance = found.covariance.copy()
-        speed = float(np.linalg.norm(found.state.position - place)) / tuning.REVISIT_DRIFT_S
-        covariance[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
-        return Return(EarlierMap(older, jump), dataclasses.replace(found, covariance=covariance))
+        covariance[VELOCITY, VELOCITY] += (way / tuning.REVISIT_DRIFT_S) ** 2 * np.eye(3)
+        found = dataclasses.replace(found, covariance=covariance)
+        return Return(EarlierMap(part.matcher, jump), found)
+
+
+def _found_in(
+    part: OlderPart, source: Source, motion: SweepMotion
+) -> tuple[Alignment | None, bool]:
+    """Return how a sweep meets the older part of the map, and whether it needs no confirmation.
+
+    It needs none where it relocalizes the pose by a likely drift.
+    """
+    older, place = part.matcher, motion.state.position
+    uncertain = _kept_level(motion.state, older.drift.at(place))
+    expected = older.drift.reported_at(place)[:3, :3]
+    if part.is_due:
+        drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
+        found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
+        if found is not None and _is_elsewhere(found, motion, len(source.points), expected):
+            return found, False
+    if not _is_loose_on_level(motion.state, uncertain):
+        return None, False
+    loose = with_loose_pose(motion.state, motion.covariance, uncertain)
+    freed = dataclasses.replace(motion, covariance=loose)
+    found = older.relocalize(source, freed, uncertain[:3, :3], expected)
+    if found is None:
+        return None, False
+    move = found.state.position - place
+    return found, is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
 
 
 def _kept_level(state: InertialState, uncertain: F64) -> F64:
