@@ -60,8 +60,9 @@ class Match(NamedTuple):
     alignment : Alignment or None
         The one that can be believed.
     uncharted : bool
-        There is none because the map has only just begun and has no surfaces here yet; the
-        prediction is good enough to add the sweep where it is.
+        There is none because the map has no surfaces here. It has only just begun, and the
+        prediction is good enough to add the sweep where it is; or the place is not known well,
+        and most of a rich view is where the map is empty.
     """
 
     alignment: Alignment | None
@@ -216,6 +217,8 @@ class SweepMatcher:
             best = self._placed(source, motion, np.inf)
         elif best is None and young and found is None:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
+        if best is None and strict and self._is_uncharted(source, motion.state):
+            return Match(None, True)
         return self._believed(best)
 
     def relocalize(
@@ -537,6 +540,14 @@ class SweepMatcher:
             usual = max(1.0 - tuning.USUAL_OUTLIERS * (1.0 - usual), tuning.USUAL_LEAST)
             needed = min(needed, usual)
         return needed
+
+    def _is_uncharted(self, source: Source, state: InertialState) -> bool:
+        """Return whether a sweep with many points sees little that the map knows, from a state."""
+        points = source.points
+        if len(points) < tuning.UNCHARTED_POINTS:
+            return False
+        known = self.surfaces.are_known(points @ state.rotation.T + state.position)
+        return bool(np.mean(known) < tuning.UNCHARTED_KNOWN)
 
     def _believed(self, found: Alignment | None) -> Match:
         """Return a match, and learn from it what share of inliers is usual here."""

@@ -108,6 +108,7 @@ class Odometry:
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0
+        self._was_blind = False  # since the latest match
         self._next_check = 0  # stamp from which on a sweep that fits badly is aligned again
         self._walls = WallVelocity()
         self._jump = FrameJump()
@@ -219,7 +220,7 @@ class Odometry:
     def _enter_map(self, begun: Begun) -> None:
         """Go on from a map that has just begun."""
         self._keep(begun.motions[-1])
-        self._unmatched_ns = 0
+        self._unmatched_ns, self._was_blind = 0, False
         at_rest = self._zero_velocity.anchor is not None
         self.phase = Phase.STATIONARY if at_rest else Phase.TRACKING
         self._first_sweeps = begun.sweeps[begun.seed :] if at_rest else []
@@ -246,7 +247,11 @@ class Odometry:
             posterior = found.state, found.covariance
         motion = self._constrained(predicted, *posterior, status)
         self._walls.correct(posterior[0], motion.state)
-        if self._unmatched_ns >= tuning.LOST_NS:
+        is_young = self.matcher.is_young
+        # after a blind stretch, a view that the map does not hold will not match later either, and
+        # the prediction drifts; without such a stretch something may be in the way
+        is_elsewhere = uncharted and self._was_blind and not is_young
+        if self._unmatched_ns >= (tuning.UNCHARTED_NS if is_elsewhere else tuning.LOST_NS):
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
         guess = predicted.state
@@ -260,7 +265,7 @@ class Odometry:
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
-        if found is not None or uncharted or Status.LOST in status:
+        if found is not None or (uncharted and is_young) or Status.LOST in status:
             expected_share = self._innovations.expected_share
             fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
             self._anchor_anew(fresh)
@@ -396,13 +401,14 @@ class Odometry:
         few = points < self.config.min_points
         status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
         self._unmatched_ns += 0 if few else sweep.end - sweep.start
+        self._was_blind |= points < tuning.UNCHARTED_POINTS
         self._zero_velocity.clear()
 
     def _note_aligned(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> None:
         """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
         state, covariance = found.state, found.covariance
         self._innovations.take(predicted.state, predicted.covariance, state, covariance)
-        self._unmatched_ns = 0
+        self._unmatched_ns, self._was_blind = 0, False
         samples = self._predictor.samples(sweep.end - tuning.STILL_TEST_NS, sweep.end)
         rests = self._zero_velocity.watch(state, covariance, samples)
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
@@ -423,7 +429,7 @@ class Odometry:
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
         self._walls.clear()
-        self._unmatched_ns = 0
+        self._unmatched_ns, self._was_blind = 0, False
         self._innovations.clear()
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
@@ -452,7 +458,7 @@ class Odometry:
         self._zero_velocity.clear()
         self._walls.clear()
         self._innovations.clear()
-        self._unmatched_ns = 0
+        self._unmatched_ns, self._was_blind = 0, False
         self.phase = Phase.TRACKING
         return motion.with_state(back.alignment.state, back.alignment.covariance)
 

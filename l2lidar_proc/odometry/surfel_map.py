@@ -345,6 +345,10 @@ class SurfelMap:
             continued[some] = self._cells["weight"][rows] > enough[some]
         return continued
 
+    def are_known(self, points: F64) -> NDArray[np.bool_]:
+        """Return which points (N, 3) [m], map frame, lie in coarsest cells with points."""
+        return self._index.find(self._grid.keys(points, slice(-1, None))[0]) > 0
+
     def are_along(self, points: F64, direction: F64) -> NDArray[np.bool_]:
         """Return which points lie on thin flat surfaces that run along a direction.
 

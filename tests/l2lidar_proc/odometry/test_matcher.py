@@ -215,6 +215,30 @@ def test_a_map_that_has_only_just_begun_is_uncharted_elsewhere(seen: Source) -> 
     assert not len(matcher.surfaces)
 
 
+@pytest.mark.parametrize(
+    ("count", "share_known", "known", "uncharted"),
+    [
+        (1500, 0.15, LOOSE, True),
+        (1500, 0.4, LOOSE, False),  # it may be the same place, off by some surfaces
+        (1500, 0.15, TIGHT, False),  # as after somebody has rearranged the place
+        (tuning.UNCHARTED_POINTS - 1, 0.15, LOOSE, False),
+    ],
+)
+def test_a_rich_view_from_a_loose_place_is_uncharted_where_the_map_is_empty(
+    grown: SweepMatcher,
+    count: int,
+    share_known: float,
+    known: tuple[float, float],
+    uncharted: bool,
+) -> None:
+    rng = np.random.default_rng(17)
+    within = rng.uniform((-3.9, -2.9, -1.1), (-3.4, -2.4, 1.6), (round(share_known * count), 3))
+    beyond = rng.uniform((10.0, -5.0, -1.0), (20.0, 5.0, 2.0), (count - len(within), 3))
+    assert np.mean(grown.surfaces.are_known(within)) > 0.0
+    cloud = source(np.vstack((within, beyond)))
+    assert grown.match(cloud, motion(known, np.zeros(3))) == (None, uncharted)
+
+
 def bushes(rng: np.random.Generator, count: int) -> F64:
     """Return points of leaves that sway by 10 cm: the same each time, no surface anywhere."""
     leaves = np.random.default_rng(15).uniform((-6.0, -6.0, -1.0), (6.0, 6.0, 2.0), (count, 3))

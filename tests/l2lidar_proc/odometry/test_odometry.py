@@ -508,6 +508,28 @@ def test_lost_elsewhere_it_begins_a_new_map_and_returns_into_the_old_one() -> No
     assert [item for item in estimates if Status.RETURNED in item.status] == [estimates[back]]
 
 
+@pytest.mark.parametrize("is_blind", [True, False])
+def test_what_is_seen_after_a_blind_stretch_and_is_not_in_the_map_begins_one_in_a_second(
+    is_blind: bool,
+) -> None:
+    """Without the blind stretch the view may be blocked, and what the map holds is awaited."""
+    room, yard = recording("room", "walk", 11.5), recording("yard", "walk", 11.5)
+    dark = sweep_epoch(room) + 3_300_000_000
+    light = dark + 3_000_000_000 * is_blind
+    some = [one for one in sweeps(room, "turn") if one.end < dark]
+    some += [
+        dataclasses.replace(one, points=one.points[:20])
+        for one in sweeps(room, "turn")
+        if dark <= one.start < light
+    ]
+    some += [one for one in sweeps(yard, "turn") if one.start >= light]
+    estimates = feed(Odometry(OdometryConfig(), T_CLOUD_IMU), room, some)
+    lost = next(k for k, item in enumerate(estimates) if Status.LOST in item.status)
+    late = estimates[lost].stamp - light
+    assert late < 1_500_000_000 if is_blind else late > 4_500_000_000
+    assert any(item.is_aligned for item in estimates[lost + 1 :])
+
+
 def test_the_old_map_is_searched_again_after_the_clock_has_gone_back() -> None:
     room, yard = recording("room", "walk", 10.5), recording("yard", "walk", 10.5)
     epoch, hour = sweep_epoch(room), 3_600_000_000_000
