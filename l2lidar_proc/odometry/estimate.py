@@ -210,6 +210,7 @@ def estimate_of(
     status: tuple[Status, ...],
     quality: AlignmentQuality,
     gyro_noise: float,
+    gyro_line: LineRates | None,
     jump: FrameJump,
     drift: MapDrift,
 ) -> OdometryEstimate:
@@ -227,6 +228,8 @@ def estimate_of(
     quality : AlignmentQuality
     gyro_noise : float
         Of an angular velocity [rad/s].
+    gyro_line : LineRates, optional
+        As in :class:`OdometryEstimate`.
     jump : FrameJump
     drift : MapDrift
         What the map's own place, and its own error, add to the covariance.
@@ -261,6 +264,7 @@ def estimate_of(
         gyro_bias_covariance=np.vstack((pose @ p, p[GYRO_BIAS]))[:, GYRO_BIAS],
         map_error=drift.error,
         late=late,
+        gyro_line=gyro_line,
     )
     of_map = found.map_covariance(state.position)
     return dataclasses.replace(found, covariance=found.covariance + of_map)

@@ -107,8 +107,8 @@ class Odometry:
         self._beams = BeamAngles()
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
         self._peak_speed = 0.0  # of this carrier [m/s]
-        self._unmatched_ns = 0
-        self._was_blind = False  # since the latest match
+        self._unmatched_ns = 0  # of sweeps with enough points since the latest match
+        self._was_blind = False  # a sweep since then had few
         self._next_check = 0  # stamp from which on a sweep that fits badly is aligned again
         self._walls = WallVelocity()
         self._jump = FrameJump()
@@ -182,17 +182,17 @@ class Odometry:
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
         nothing, noise = self._last.points[:0], self._predictor.gyro_noise
         quality = AlignmentQuality(variance_factor=self._last.quality.variance_factor)
-        found = estimate_of(
+        return estimate_of(
             motion,
             self._lever,
             nothing,
             (Status.PREDICTED,),
             quality,
             noise,
+            self._predictor.gyro_line,
             self._jump,
             self.matcher.drift,
         )
-        return dataclasses.replace(found, gyro_line=self._predictor.gyro_line)
 
     def map_points(self) -> F64:
         """Return the points of KISS-ICP's local map [m], shape (N, 3), map frame."""
@@ -220,7 +220,7 @@ class Odometry:
     def _enter_map(self, begun: Begun) -> None:
         """Go on from a map that has just begun."""
         self._keep(begun.motions[-1])
-        self._unmatched_ns, self._was_blind = 0, False
+        self._forget_unmatched()
         at_rest = self._zero_velocity.anchor is not None
         self.phase = Phase.STATIONARY if at_rest else Phase.TRACKING
         self._first_sweeps = begun.sweeps[begun.seed :] if at_rest else []
@@ -404,11 +404,15 @@ class Odometry:
         self._was_blind |= points < tuning.UNCHARTED_POINTS
         self._zero_velocity.clear()
 
+    def _forget_unmatched(self) -> None:
+        """Begin to count anew: the pose is known relative to the map in use."""
+        self._unmatched_ns, self._was_blind = 0, False
+
     def _note_aligned(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> None:
         """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
         state, covariance = found.state, found.covariance
         self._innovations.take(predicted.state, predicted.covariance, state, covariance)
-        self._unmatched_ns, self._was_blind = 0, False
+        self._forget_unmatched()
         samples = self._predictor.samples(sweep.end - tuning.STILL_TEST_NS, sweep.end)
         rests = self._zero_velocity.watch(state, covariance, samples)
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
@@ -429,7 +433,7 @@ class Odometry:
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
         self._walls.clear()
-        self._unmatched_ns, self._was_blind = 0, False
+        self._forget_unmatched()
         self._innovations.clear()
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
@@ -458,7 +462,7 @@ class Odometry:
         self._zero_velocity.clear()
         self._walls.clear()
         self._innovations.clear()
-        self._unmatched_ns, self._was_blind = 0, False
+        self._forget_unmatched()
         self.phase = Phase.TRACKING
         return motion.with_state(back.alignment.state, back.alignment.covariance)
 
@@ -631,15 +635,15 @@ class Odometry:
             status.append(Status.GRAVITY_UNTRUSTED)
         xi, beta = self._beams.correction.tolist()
         self.matcher.drift.beam_sigmas = self._beams.sigmas or tuning.OTHER_BEAM_SIGMAS
-        found = estimate_of(
+        self._last = estimate_of(
             motion,
             self._lever,
             self.matcher.deskewed(sweep, motion),
             tuple(status),
             dataclasses.replace(quality, beam_correction=(xi, beta)),
             self._predictor.gyro_noise,
+            self._predictor.gyro_line,
             self._jump,
             self.matcher.drift,
         )
-        self._last = dataclasses.replace(found, gyro_line=self._predictor.gyro_line)
         return self._last

@@ -234,7 +234,8 @@ def test_a_rich_view_from_a_loose_place_is_uncharted_where_the_map_is_empty(
     rng = np.random.default_rng(17)
     within = rng.uniform((-3.9, -2.9, -1.1), (-3.4, -2.4, 1.6), (round(share_known * count), 3))
     beyond = rng.uniform((10.0, -5.0, -1.0), (20.0, 5.0, 2.0), (count - len(within), 3))
-    assert np.mean(grown.surfaces.are_known(within)) > 0.0
+    assert np.mean(grown.surfaces.are_known(within)) > 0.9
+    assert not grown.surfaces.are_known(beyond).any()
     cloud = source(np.vstack((within, beyond)))
     assert grown.match(cloud, motion(known, np.zeros(3))) == (None, uncharted)
 
