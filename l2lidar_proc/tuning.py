@@ -579,9 +579,9 @@ LOST_NS: Final = 5_000_000_000  # [ns] of sweeps without a match
 # Sooner where a view, after a blind stretch, holds little that the map knows. Tuned on: a cone of
 # 70 degrees that turned from a wall into a room, where 0.1 to 0.2 of 1,500 points were in known
 # cells, and predictions were off by 0.1 m after a second, by 1.2 m after five
-UNCHARTED_NS: Final = 1_000_000_000  # [ns] of sweeps without a match
-UNCHARTED_POINTS: Final = 300  # of a sweep, at least; with fewer it is blind
-UNCHARTED_KNOWN: Final = 0.25  # share of these in known cells of the coarsest size, at most
+UNMAPPED_NS: Final = 1_000_000_000  # [ns] of sweeps without a match
+UNMAPPED_POINTS: Final = 300  # of a sweep, at least; with fewer it is blind
+UNMAPPED_KNOWN: Final = 0.25  # share of these in known cells of the coarsest size, at most
 UNSEEN_POSITION: Final = 0.5  # [m] a clock that went back may hide such a step,
 UNSEEN_ROTATION: Final = 0.5  # [rad] such a turn,
 UNSEEN_S: Final = 2.0  # [s] and going on for so long

@@ -21,7 +21,7 @@ from l2lidar_proc.motion.filter import POSITION, InertialState
 from l2lidar_proc.motion.static import InitialState, initial_state
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
-from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
@@ -222,9 +222,10 @@ class MapInitializer:
             if motions:
                 source = matcher.source(sweep, motion)
                 trial = motion.at_rest(state, free_pose())
-                found, uncharted = matcher.match(source, trial, initial=True)
+                found, status = matcher.match(source, trial, initial=True)
                 met |= found is not None
-                if not (uncharted if found is None else self._zero_velocity.stays(found)):
+                is_new = status is MatchStatus.NEW_MAP
+                if not (is_new if found is None else self._zero_velocity.stays(found)):
                     return Trial([], False)
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
@@ -284,11 +285,11 @@ class MapInitializer:
         for sweep in sweeps[1:]:
             motion = self._predictor.over_sweep(sweep, motions[-1].state, motions[-1].covariance)
             source = matcher.source(sweep, motion)
-            found, uncharted = matcher.match(source, motion, initial=True)
+            found, status = matcher.match(source, motion, initial=True)
             if found is not None:
                 motion = motion.with_state(found.state, found.covariance)
                 met, last = True, found
-            elif not (uncharted and initial.at_rest):
+            elif not (status is MatchStatus.NEW_MAP and initial.at_rest):
                 return Trial([], False)
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections import deque
+from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
@@ -52,21 +53,27 @@ from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
 from l2lidar_proc.odometry.wall_profile import Spots, extract_spots
 
 
+class MatchStatus(Enum):
+    """Whether a sweep was aligned, and if not, why."""
+
+    ALIGNED = auto()
+    REJECTED = auto()  # too few points meet a surface, or they do not fit as they should
+    NEW_MAP = auto()  # it has just begun, and has no surface here: the prediction is good enough
+    UNMAPPED = auto()  # the place is not known well, and a rich view is where the map is empty
+
+
 class Match(NamedTuple):
     """Result of matching a sweep with the map.
 
     Attributes
     ----------
     alignment : Alignment or None
-        The one that can be believed.
-    uncharted : bool
-        There is none because the map has no surfaces here. It has only just begun, and the
-        prediction is good enough to add the sweep where it is; or the place is not known well,
-        and most of a rich view is where the map is empty.
+        The one that can be believed; None unless the status is ALIGNED.
+    status : MatchStatus
     """
 
     alignment: Alignment | None
-    uncharted: bool
+    status: MatchStatus
 
 
 class SweepMatcher:
@@ -184,7 +191,7 @@ class SweepMatcher:
             later.
         """
         if len(source.points) < self.config.min_points or not len(self.surfaces):
-            return Match(None, False)
+            return Match(None, MatchStatus.REJECTED)
         motion = self._with_turned_way(motion)
         loose = self._place_is_loose(motion.covariance) or rotation_is_loose(motion.covariance)
         young = self.is_young
@@ -195,7 +202,8 @@ class SweepMatcher:
         if is_good and (not loose or (strict and near)):
             return self._believed(found)
         if not loose:
-            return Match(None, young and found is None)
+            is_new = young and found is None
+            return Match(None, MatchStatus.NEW_MAP if is_new else MatchStatus.REJECTED)
         starts = [self._registered(source, motion.state)]
         if strict:
             starts += pose_hypotheses(motion.state, motion.covariance, source, self.surfaces)
@@ -217,8 +225,8 @@ class SweepMatcher:
             best = self._placed(source, motion, np.inf)
         elif best is None and young and found is None:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
-        if best is None and strict and self._is_uncharted(source, motion.state):
-            return Match(None, True)
+        if best is None and strict and self._is_unmapped(source, motion.state):
+            return Match(None, MatchStatus.UNMAPPED)
         return self._believed(best)
 
     def relocalize(
@@ -541,13 +549,13 @@ class SweepMatcher:
             needed = min(needed, usual)
         return needed
 
-    def _is_uncharted(self, source: Source, state: InertialState) -> bool:
+    def _is_unmapped(self, source: Source, state: InertialState) -> bool:
         """Return whether a sweep with many points sees little that the map knows, from a state."""
         points = source.points
-        if len(points) < tuning.UNCHARTED_POINTS:
+        if len(points) < tuning.UNMAPPED_POINTS:
             return False
         known = self.surfaces.are_known(points @ state.rotation.T + state.position)
-        return bool(np.mean(known) < tuning.UNCHARTED_KNOWN)
+        return bool(np.mean(known) < tuning.UNMAPPED_KNOWN)
 
     def _believed(self, found: Alignment | None) -> Match:
         """Return a match, and learn from it what share of inliers is usual here."""
@@ -555,7 +563,7 @@ class SweepMatcher:
             usual, sweeps = self._inliers
             blend = max(tuning.USUAL_BLEND, 1.0 / (sweeps + 1))
             self._inliers = usual + blend * (found.inlier_ratio - usual), sweeps + 1
-        return Match(found, False)
+        return Match(found, MatchStatus.REJECTED if found is None else MatchStatus.ALIGNED)
 
     def _align(
         self, source: Source, motion: SweepMotion, start: InertialState

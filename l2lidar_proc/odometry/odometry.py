@@ -29,7 +29,7 @@ from l2lidar_proc.odometry.estimate import (
     gaps_in,
 )
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
-from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.uncertainty import (
     FrameJump,
@@ -233,7 +233,7 @@ class Odometry:
         state, covariance = self._belief
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         source = self.matcher.source(sweep, predicted)
-        found, uncharted = self.matcher.match(source, predicted)
+        found, matched = self.matcher.match(source, predicted)
         if found is not None:
             predicted, found = self._checked(source, predicted, found, status)
         status += gaps_in(predicted)
@@ -247,11 +247,10 @@ class Odometry:
             posterior = found.state, found.covariance
         motion = self._constrained(predicted, *posterior, status)
         self._walls.correct(posterior[0], motion.state)
-        is_young = self.matcher.is_young
         # after a blind stretch, a view that the map does not hold will not match later either, and
         # the prediction drifts; without such a stretch something may be in the way
-        is_elsewhere = uncharted and self._was_blind and not is_young
-        if self._unmatched_ns >= (tuning.UNCHARTED_NS if is_elsewhere else tuning.LOST_NS):
+        is_elsewhere = matched is MatchStatus.UNMAPPED and self._was_blind
+        if self._unmatched_ns >= (tuning.UNMAPPED_NS if is_elsewhere else tuning.LOST_NS):
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
         guess = predicted.state
@@ -265,7 +264,7 @@ class Odometry:
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
-        if found is not None or (uncharted and is_young) or Status.LOST in status:
+        if found is not None or matched is MatchStatus.NEW_MAP or Status.LOST in status:
             expected_share = self._innovations.expected_share
             fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
             self._anchor_anew(fresh)
@@ -401,7 +400,7 @@ class Odometry:
         few = points < self.config.min_points
         status += [Status.PREDICTED, Status.SPARSE if few else Status.UNMATCHED]
         self._unmatched_ns += 0 if few else sweep.end - sweep.start
-        self._was_blind |= points < tuning.UNCHARTED_POINTS
+        self._was_blind |= points < tuning.UNMAPPED_POINTS
         self._zero_velocity.clear()
 
     def _forget_unmatched(self) -> None:

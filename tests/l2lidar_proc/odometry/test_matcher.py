@@ -15,7 +15,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.matcher import Match, SweepMatcher
+from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.pose_hypotheses import level_basis, level_grid
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
@@ -55,7 +55,7 @@ def off(match: Match) -> float:
 def test_a_good_prediction_is_corrected(grown: SweepMatcher, seen: Source) -> None:
     found = grown.match(seen, motion(TIGHT, PLACE + 0.015))
     assert off(found) < 0.005
-    assert not found.uncharted
+    assert found.status is MatchStatus.ALIGNED
     assert found.alignment is not None
     quality = grown.quality(len(seen.points), found.alignment)
     assert (quality.points, quality.matched) == (len(seen.points), found.alignment.matched)
@@ -198,38 +198,40 @@ def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
     rng = np.random.default_rng(13)
     cloud = source(rng.uniform((-3.5, -2.5, -1.0), (3.5, 2.5, 1.5), (1500, 3)))
     for known in (TIGHT, LOOSE):
-        assert grown.match(cloud, motion(known, PLACE)) == (None, False)
+        assert grown.match(cloud, motion(known, PLACE)) == (None, MatchStatus.REJECTED)
     few = cloud.some(np.arange(OdometryConfig().min_points - 1))
-    assert grown.match(few, motion(TIGHT, PLACE)) == (None, False)
+    assert grown.match(few, motion(TIGHT, PLACE)) == (None, MatchStatus.REJECTED)
 
 
-def test_a_map_that_has_only_just_begun_is_uncharted_elsewhere(seen: Source) -> None:
+def test_a_map_that_has_only_just_begun_has_no_surface_elsewhere(seen: Source) -> None:
     matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
-    assert matcher.match(seen, motion(TIGHT, PLACE)) == (None, False)  # there is no map
+    without_map = matcher.match(seen, motion(TIGHT, PLACE))
+    assert without_map == (None, MatchStatus.REJECTED)
     extended(matcher, room(np.random.default_rng(14), 4000))
     assert matcher.is_young
     far = motion(TIGHT, PLACE + 50.0)
-    assert matcher.match(seen, far) == (None, True)
-    assert matcher.match(seen, motion((0.0, 0.5), far.state.position)).uncharted is False
+    assert matcher.match(seen, far) == (None, MatchStatus.NEW_MAP)
+    loose = matcher.match(seen, motion((0.0, 0.5), far.state.position))
+    assert loose.status is MatchStatus.ALIGNED  # where KISS-ICP puts it
     matcher.clear()
     assert not len(matcher.surfaces)
 
 
 @pytest.mark.parametrize(
-    ("count", "share_known", "known", "uncharted"),
+    ("count", "share_known", "known", "status"),
     [
-        (1500, 0.15, LOOSE, True),
-        (1500, 0.4, LOOSE, False),  # it may be the same place, off by some surfaces
-        (1500, 0.15, TIGHT, False),  # as after somebody has rearranged the place
-        (tuning.UNCHARTED_POINTS - 1, 0.15, LOOSE, False),
+        (1500, 0.15, LOOSE, MatchStatus.UNMAPPED),
+        (1500, 0.4, LOOSE, MatchStatus.REJECTED),  # it may be the same place, off by some surfaces
+        (1500, 0.15, TIGHT, MatchStatus.REJECTED),  # as after somebody has rearranged the place
+        (tuning.UNMAPPED_POINTS - 1, 0.15, LOOSE, MatchStatus.REJECTED),
     ],
 )
-def test_a_rich_view_from_a_loose_place_is_uncharted_where_the_map_is_empty(
+def test_a_rich_view_from_a_loose_place_is_unmapped_where_the_map_is_empty(
     grown: SweepMatcher,
     count: int,
     share_known: float,
     known: tuple[float, float],
-    uncharted: bool,
+    status: MatchStatus,
 ) -> None:
     rng = np.random.default_rng(17)
     within = rng.uniform((-3.9, -2.9, -1.1), (-3.4, -2.4, 1.6), (round(share_known * count), 3))
@@ -237,7 +239,7 @@ def test_a_rich_view_from_a_loose_place_is_uncharted_where_the_map_is_empty(
     assert np.mean(grown.surfaces.are_known(within)) > 0.9
     assert not grown.surfaces.are_known(beyond).any()
     cloud = source(np.vstack((within, beyond)))
-    assert grown.match(cloud, motion(known, np.zeros(3))) == (None, uncharted)
+    assert grown.match(cloud, motion(known, np.zeros(3))) == (None, status)
 
 
 def bushes(rng: np.random.Generator, count: int) -> F64:
