@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from l2lidar_node import records
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
+from l2lidar_proc.odometry.cell_grid import begins_of_runs, distinct_in_runs
 from l2lidar_proc.odometry.principal_axes import principal_axes, products
 
 _HEAD_HZ: Final = np.arange(3.0, 8.0, 0.05)  # units were measured from 4.3 to 5.6
@@ -265,9 +266,10 @@ def _seen_by_both(
     swept = []
     numbers = []
     for half in (rising, ~rising):
-        pairs = np.unique(cell[half] * lines + line[half])
-        swept.append(np.bincount(pairs // lines, minlength=count))
-        numbers.append(np.bincount(cell[half], minlength=count))
+        cells = cell[half]
+        pairs = np.sort(cells * lines + line[half])
+        swept.append(np.bincount(pairs[begins_of_runs(pairs)] // lines, minlength=count))
+        numbers.append(np.bincount(cells, minlength=count))
     both = (np.min(numbers, axis=0) >= tuning.BEAM_REST_POINTS) & (
         np.min(swept, axis=0) >= tuning.BEAM_REST_LINES
     )
@@ -305,21 +307,17 @@ def _compared(values: F64, cell: I64, rising: NDArray[np.bool_]) -> tuple[F64, F
     spread, axes : ndarray, shape (C, 3) and (C, 3, 3)
         Of the points about the mean of their half, as :func:`principal_axes` returns them.
     """
-    halves_of = rising, ~rising
-    numbers = np.stack([np.bincount(cell[some]) for some in halves_of])
-    means = np.stack([
-        [np.bincount(cell[some], line[some]) for line in values] / number
-        for some, number in zip(halves_of, numbers, strict=True)
-    ])  # fmt: skip
-    around = values[:3] - np.where(rising, means[0, :3][:, cell], means[1, :3][:, cell])
-    total = numbers.sum(axis=0)
+    half = 2 * cell + rising
+    numbers = np.bincount(half)
+    means = np.stack([np.bincount(half, line) for line in values]) / numbers
+    around = values[:3] - means[:3, half]
+    total = numbers[::2] + numbers[1::2]
     covariance = [np.bincount(cell, line) / total for line in products(*around)]
     spread, axes = principal_axes(np.stack(covariance))
-    return means[0] - means[1], spread, axes
+    return means[:, 1::2] - means[:, ::2], spread, axes
 
 
 def _cells(at: F64, shift: float) -> I64:
     """Return the number of the cell of each point (3, N), from 0 on; the grid may be shifted."""
     x, y, z = np.floor(at / tuning.BEAM_CELL + shift).astype(np.int64)
-    _, cell = np.unique((x << 40) + (y << 20) + z, return_inverse=True)
-    return cell
+    return distinct_in_runs((x << 40) + (y << 20) + z)[1]
