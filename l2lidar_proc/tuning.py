@@ -22,6 +22,7 @@ MAX_SAMPLES: Final = 100_000  # in a buffer; derived: 25 s at 4 kHz
 # Derived: two lost; stamps of ROS drivers jitter by half a period and more
 SPARSE_PERIODS: Final = 2.5
 TREND_SAMPLES: Final = 5  # that count at either edge of a gap; one alone is too noisy
+AROUND_SAMPLES: Final = 25  # on either side of a gap: more than a blow of 0.12 s lasts
 GAP_STEP_NS: Final = 20_000_000  # [ns] knots in a gap; rotation in one stays below 0.1 rad at 5/s
 GAP_KNOTS: Final = 64  # at most in one gap, however long: bounds work and memory
 TIME_JUMP_NS: Final = 10_000_000_000  # [ns] a longer step of time starts a new time line

@@ -219,13 +219,19 @@ def predict(
     turning = np.abs(means).max(axis=1)  # a vibration turns nothing
     measured = noise.gyro**2 + (noise.gyro_share * turning) ** 2
     accelerations = np.linalg.norm(forces - back @ state.rest_force, axis=1)
-    unmeasured = _unmeasured(blind * dt, blind == 0.0, held, means, accelerations)
+    gaps = imu.missing[:knot]
+    around = (
+        float(imu.rate_errors[:knot].max(initial=0.0, where=gaps)),
+        float(imu.force_errors[:knot].max(initial=0.0, where=gaps)),
+    )
+    unmeasured = _unmeasured(blind * dt, blind == 0.0, held, means, accelerations, around)
     gyro2 = (1.0 - blind) * measured + blind * unmeasured.gyro2
     measured = noise.accel**2 + (noise.accel_share * accelerations) ** 2
     accel2 = (1.0 - blind) * measured + blind * unmeasured.accel2
     # errors of interpolation do not change sign within their interval: they add up as they are
-    gyro2 = gyro2 + np.add.reduceat(imu.rate_errors[:knot] * spans * 1e-9, first) ** 2 / dt
-    accel2 = accel2 + np.add.reduceat(imu.force_errors[:knot] * spans * 1e-9, first) ** 2 / dt
+    sparse = np.where(gaps, 0.0, spans * 1e-9)
+    gyro2 = gyro2 + np.add.reduceat(imu.rate_errors[:knot] * sparse, first) ** 2 / dt
+    accel2 = accel2 + np.add.reduceat(imu.force_errors[:knot] * sparse, first) ** 2 / dt
     if blind_forces:
         accel2 = np.full_like(accel2, tuning.BLIND_ACCEL**2)
     q = process_noise(gyro2, accel2, noise, dt)
@@ -247,12 +253,18 @@ class _Unmeasured(NamedTuple):
 
 
 def _unmeasured(
-    blind: F64, is_measured: NDArray[np.bool_], held: F64, rates: F64, accelerations: F64
+    blind: F64,
+    is_measured: NDArray[np.bool_],
+    held: F64,
+    rates: F64,
+    accelerations: F64,
+    around: tuple[float, float],
 ) -> _Unmeasured:
     """Return how much the motion may change where samples are missing.
 
-    In a gap of a few samples a carrier goes on as in the samples around it: rates and
-    accelerations spread by what they do there, and not beyond.
+    In a gap of a few samples a carrier goes on as in the steps before and after: rates and
+    accelerations spread by what they do there. A blow is shorter than a step, and shows in the
+    samples next to the gap.
 
     Parameters
     ----------
@@ -266,14 +278,17 @@ def _unmeasured(
         Mean angular velocity [rad/s].
     accelerations : ndarray, shape (S,)
         Size of the mean acceleration [m/s^2].
+    around : tuple of float
+        By which rates [rad/s] and forces [m/s^2] spread next to the gaps.
     """
     gyro2 = tuning.BLIND_GYRO**2 + (tuning.BLIND_GYRO_SHARE * held) ** 2
     lasted = float(blind.sum())
     if lasted > tuning.BLIND_SHORT_S or np.count_nonzero(is_measured) < tuning.BLIND_STEPS:
         return _Unmeasured(gyro2, tuning.BLIND_ACCEL**2)
     least_rate, least_acceleration = tuning.BLIND_SHORT_SPREAD
-    spread = float(rates[is_measured].var(axis=0).max()) + least_rate**2
-    change = float(np.square(accelerations[is_measured]).mean()) + least_acceleration**2
+    spread = max(float(rates[is_measured].var(axis=0).max()), around[0] ** 2) + least_rate**2
+    change = float(np.square(accelerations[is_measured]).mean())
+    change = max(change, around[1] ** 2) + least_acceleration**2
     # a rate that is off throughout the gap errs by spread * lasted, not by its root
     return _Unmeasured(
         np.full_like(gyro2, lasted * spread), min(tuning.BLIND_ACCEL**2, lasted * change)

@@ -33,7 +33,8 @@ class ImuSegment:
         Intervals inside a gap: their rates are assumed and their forces mean nothing.
     rate_errors, force_errors : ndarray, shape (K - 1,)
         By which rates [rad/s] and forces [m/s^2] may be off throughout an interval, 1 sigma,
-        because some samples are missing there, though not enough for a gap; else 0.
+        because some samples are missing there: the spread of those around. 0 where none are
+        missing, or so many that those around do not tell.
     """
 
     stamps: I64
@@ -98,7 +99,8 @@ def segment(
     missing = np.where(inside, since + until > gap_ns, np.minimum(abs(since), abs(until)) > hold)
     rates[(knots < stamps[0] - hold) | (knots > stamps[-1] + hold)] = steady_rate
     _bridge(rates, knots, samples, gap_ns)
-    is_sparse = inside & ~missing & (since + until > _sparse_ns(stamps))
+    apart = since + until
+    is_sparse = inside & (apart > _sparse_ns(stamps)) & (apart <= tuning.BLIND_SHORT_S * 1e9)
     rate_errors, force_errors = (
         _interpolation_errors(samples[name], after, is_sparse)
         for name in ("angular_velocity", "linear_acceleration")
@@ -116,8 +118,8 @@ def _sparse_ns(stamps: I64) -> float:
 def _interpolation_errors(values: F64, after: I64, is_sparse: NDArray[np.bool_]) -> F64:
     """Return what values interpolated in some intervals (N,) may be off by, 0 in the others.
 
-    That is the standard deviation of the samples around, of all axes together: a blow shows there,
-    though both ends may be at the same height of it.
+    That is by how much the samples next to them differ from the mean of those farther around, of
+    all axes together: a blow shows there, though both ends may be at the same height of it.
 
     Parameters
     ----------
@@ -129,9 +131,11 @@ def _interpolation_errors(values: F64, after: I64, is_sparse: NDArray[np.bool_])
     """
     errors = np.zeros(len(after))
     for place in np.flatnonzero(is_sparse).tolist():
-        first = max(int(after[place]) - tuning.TREND_SAMPLES, 0)
-        around = values[first : after[place] + tuning.TREND_SAMPLES]
-        errors[place] = np.sqrt(around.var(axis=0).sum())
+        near, around = (
+            values[max(int(after[place]) - count, 0) : int(after[place]) + count]
+            for count in (tuning.TREND_SAMPLES, tuning.AROUND_SAMPLES)
+        )
+        errors[place] = np.sqrt(np.square(near - around.mean(axis=0)).mean(axis=0).sum())
     return errors
 
 
