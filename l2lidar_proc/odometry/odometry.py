@@ -280,7 +280,13 @@ class Odometry:
         """
         prior = predicted.state
         wide = inflated_prior(prior, predicted.covariance, found.state, found.covariance)
-        is_due = prior.stamp >= self._next_check and self.matcher.fits_badly(found)
+        fits_badly = self.matcher.fits_badly(found)
+        if (wide is not None or fits_badly) and self._is_deskewed_badly(predicted):
+            # what the alignment makes of the blur is not the motion of the sensor
+            status.append(Status.SUSPECT)
+            covariance = predicted.covariance if wide is None else wide
+            return dataclasses.replace(predicted, covariance=covariance), None
+        is_due = prior.stamp >= self._next_check and fits_badly
         if wide is None and not is_due:
             return predicted, found
         self._next_check = prior.stamp + tuning.DOUBT_PAUSE_NS
@@ -298,6 +304,19 @@ class Odometry:
         if other is not None and found.fits_better_than(other, len(source.points)):
             return predicted, found
         return loose, other
+
+    def _is_deskewed_badly(self, predicted: SweepMotion) -> bool:
+        """Return whether the IMU does not tell how the sensor moved within a sweep.
+
+        After a hit, or in a gap of its samples, the velocity becomes uncertain all at once, and
+        the parts of the sweep before and after do not fit together.
+        """
+        assert self._belief is not None
+        if predicted.imu.missing.all():
+            return False
+        velocity = eskf.VELOCITY, eskf.VELOCITY
+        added = predicted.covariance[velocity] - self._belief[1][velocity]
+        return bool(np.linalg.eigvalsh(added)[-1] > tuning.BLUR_SPEED**2)
 
     def _with_wall_velocity(
         self, sweep: Sweep, predicted: SweepMotion, found: Alignment

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 
 from l2lidar_node.calibration.file import CalibrationFile
 from l2lidar_node.driver.geometry import Projector
+from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import Motion
-from l2lidar_node.emulator.physics import PhysicsConfig, assemble
+from l2lidar_node.emulator.physics import Physics, PhysicsConfig, assemble
+from l2lidar_node.emulator.unit.inertial import Inertial
+from l2lidar_node.emulator.unit.scanner import Scanner
+from l2lidar_node.emulator.unit.units import unit as named_unit
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs, Sweep
 
@@ -66,6 +70,7 @@ def record(
     *,
     speed: float = 0.0,
     since: float = 0.0,
+    hits: Sequence[float] = (),
 ) -> Run:
     """Return a recording of a built-in motion in a built-in scene.
 
@@ -83,10 +88,15 @@ def record(
         [m/s], 0 = the motion's own.
     since : float
         When the recording begins [s].
+    hits : sequence of float
+        Instants of blows [s].
     """
-    physics = assemble(
-        PhysicsConfig(world=scene, motion=motion, speed=speed, seed=seed, mount=mount, unit=unit)
+    config = PhysicsConfig(
+        world=scene, motion=motion, speed=speed, seed=seed, mount=mount, unit=unit
     )
+    physics = assemble(config)
+    if hits:
+        physics = _hit(physics, config, trajectories.hit(physics.motion, seconds + 1, hits, seed))
     used = None if calibration is None else calibration.corrected
     projector = Projector(wire.PacketType.POINTS_3D)
     begin = int(since / physics.scanner.period_s)
@@ -120,6 +130,13 @@ def record(
         imu,
         physics.motion,
     )
+
+
+def _hit(physics: Physics, config: PhysicsConfig, motion: Motion) -> Physics:
+    """Return physics with another motion."""
+    unit = named_unit(config.unit, config.power_up)
+    scanner = Scanner(physics.world, motion, unit, config.ranges, config.seed)
+    return Physics(physics.world, motion, scanner, Inertial(motion, config.imu, config.seed, unit))
 
 
 def sweeps(run: Run, cut: str) -> Iterator[Sweep]:
