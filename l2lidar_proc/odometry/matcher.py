@@ -606,8 +606,13 @@ class SweepMatcher:
 
 
 def is_far(found: Alignment, motion: SweepMotion) -> bool:
-    """Return whether an alignment ended farther away than the robust kernel reaches."""
+    """Return whether an alignment ended farther away than the robust kernel reaches.
+
+    Along directions that it does not fix, the place only follows what the prior ties to it.
+    """
     turn, way = np.split(found.state.boxminus(motion.state)[POSE], 2)
+    free = unobserved_directions(found.information[POSITION, POSITION])
+    way = way - free @ (free.T @ way)
     return bool(np.linalg.norm(way) >= tuning.FAR_MOVE or np.linalg.norm(turn) >= tuning.FAR_TURN)
 
 

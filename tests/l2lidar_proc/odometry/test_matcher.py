@@ -15,7 +15,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher
+from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher, is_far
 from l2lidar_proc.odometry.pose_hypotheses import level_basis, level_grid
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
@@ -192,6 +192,24 @@ def test_a_place_from_which_a_known_wall_is_seen_through_is_not_believed(
     else:
         assert found is not None
         assert found.state.position[0] == pytest.approx(0.8, abs=0.01)
+
+
+def test_what_an_alignment_leaves_free_does_not_make_its_place_far(
+    grown: SweepMatcher, seen: Source
+) -> None:
+    at = motion(LOOSE, PLACE)
+    found = grown.match(seen, at).alignment
+    assert found is not None
+    corridor = found.information.copy()
+    corridor[eskf.POSITION, eskf.POSITION] = np.diag((0.0, 1e5, 1e5))
+    for axis, is_known, far in ((0, True, True), (0, False, False), (1, False, True)):
+        place = at.state.position + 2.0 * tuning.FAR_MOVE * np.eye(3)[axis]
+        moved = dataclasses.replace(
+            found,
+            state=dataclasses.replace(at.state, position=place),
+            information=found.information if is_known else corridor,
+        )
+        assert is_far(moved, at) == far
 
 
 def test_what_fits_nowhere_is_not_believed(grown: SweepMatcher) -> None:
