@@ -43,6 +43,21 @@ class Trial(NamedTuple):
     met: bool
     last: Alignment | None = None
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the sweeps do not fit together as they do at the right velocity."""
+        last = self.last
+        return not self.motions or (
+            last is not None and last.inlier_ratio < tuning.INITIAL_INLIERS
+        )
+
+    def fits_closer(self, other: Trial) -> bool:
+        """Return whether the last sweep of this trial fits closer than that of a doubtful one."""
+        if not (self.motions and other.motions):
+            return not other.motions
+        assert other.last is not None
+        return self.last is not None and self.last.inlier_ratio > other.last.inlier_ratio
+
     def fits_better(self, other: Trial) -> bool:
         """Return whether this trial fits better than another one, and fixes the place far better.
 
@@ -158,17 +173,20 @@ class MapInitializer:
         initial = self._initial(sweeps, since, may_rest)
         start = self._at_cloud_origin(initial)
         self._zero_velocity.clear()
-        if initial.at_rest:
-            if self._zero_velocity.anchored(start, self._samples(sweeps, since)):
-                trial = self._at_rest(sweeps, since, start, initial.covariance)
-                if trial.motions:
-                    return trial.motions if trial.met or late else None
-                self._zero_velocity.clear()
-            trial = self._in_motion(sweeps, since, initial)
+        if initial.at_rest and self._zero_velocity.anchored(start, self._samples(sweeps, since)):
+            trial = self._at_rest(sweeps, since, start, initial.covariance)
             if trial.motions:
                 return trial.motions if trial.met or late else None
-            initial = self._initial(sweeps, since, may_rest=False)
+            self._zero_velocity.clear()
         trial = self._in_motion(sweeps, since, initial)
+        if initial.at_rest and trial.is_doubtful:
+            # a quiet IMU may also be that of a carrier that glides: the sweeps decide
+            moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
+            if moving.fits_closer(trial):
+                trial = moving
+            else:  # the maps are those of the latest one
+                initial = self._initial(sweeps, since, may_rest)
+                trial = self._in_motion(sweeps, since, initial)
         return trial.motions if trial.met or late or not trial.motions else None
 
     def begin_again_at_rest(
