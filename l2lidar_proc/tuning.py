@@ -458,6 +458,7 @@ DOUBT_MANY: Final = 300  # points, where not. Tuned on: a cone, 134 at a wrong p
 # [m/s] that the IMU leaves open after a sweep, 1 sigma, from which on the points are blurred.
 # Observed: 0.01 to 0.11 in the hard runs, up to 0.18 in gaps; 0.23 and more where a blow spoils it
 BLUR_SPEED: Final = 0.15
+BLUR_SHARE: Final = 0.5  # of what the IMU leaves open, that an aligned sweep leaves open as well
 DOUBT_PAUSE_NS: Final = 1_000_000_000  # [ns]
 NIS_MOST: Final = 25.0  # by which variances are raised at most, or lowered
 # Variances are lowered to so many times what the window shows. Tuned on: velocities of the hard

@@ -236,6 +236,9 @@ class Odometry:
         found, matched = self.matcher.match(source, predicted)
         if found is not None:
             predicted, found = self._checked(source, predicted, found, status)
+        blur = self._blur(predicted)
+        if blur is not None:
+            self._innovations.clear()
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
@@ -245,6 +248,8 @@ class Odometry:
             self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
             posterior = found.state, found.covariance
+            if blur is not None:
+                posterior = found.state, found.covariance + blur
         motion = self._constrained(predicted, *posterior, status)
         self._walls.correct(posterior[0], motion.state)
         # after a blind stretch, a view that the map does not hold will not match later either, and
@@ -281,7 +286,7 @@ class Odometry:
         prior = predicted.state
         wide = inflated_prior(prior, predicted.covariance, found.state, found.covariance)
         fits_badly = self.matcher.fits_badly(found)
-        if (wide is not None or fits_badly) and self._is_deskewed_badly(predicted):
+        if (wide is not None or fits_badly) and self._blur(predicted) is not None:
             # what the alignment makes of the blur is not the motion of the sensor
             status.append(Status.SUSPECT)
             covariance = predicted.covariance if wide is None else wide
@@ -305,18 +310,28 @@ class Odometry:
             return predicted, found
         return loose, other
 
-    def _is_deskewed_badly(self, predicted: SweepMotion) -> bool:
-        """Return whether the IMU does not tell how the sensor moved within a sweep.
+    def _blur(self, predicted: SweepMotion) -> F64 | None:
+        """Return by what the IMU does not tell how the sensor moved within a sweep, if by much.
 
-        After a hit, or in a gap of its samples, the velocity becomes uncertain all at once, and
-        the parts of the sweep before and after do not fit together.
+        After a hit, or in a gap of its samples, attitude and velocity become uncertain all at
+        once, and the parts of the sweep before and after do not fit together. The sweep then tells
+        the motion of one part or a mean of both.
+
+        Returns
+        -------
+        ndarray, shape (18, 18), or None
+            Covariance of attitude and velocity.
         """
         assert self._belief is not None
         if predicted.imu.missing.all():
-            return False
-        velocity = eskf.VELOCITY, eskf.VELOCITY
-        added = predicted.covariance[velocity] - self._belief[1][velocity]
-        return bool(np.linalg.eigvalsh(added)[-1] > tuning.BLUR_SPEED**2)
+            return None
+        added = predicted.covariance - self._belief[1]
+        blur = np.zeros_like(added)
+        for errors in (eskf.ROTATION, eskf.VELOCITY):
+            most = float(np.linalg.eigvalsh(added[errors, errors])[-1])
+            blur[errors, errors] = tuning.BLUR_SHARE * max(most, 0.0) * np.eye(3)
+        speed = np.trace(blur[eskf.VELOCITY, eskf.VELOCITY]) / (3.0 * tuning.BLUR_SHARE)
+        return blur if speed > tuning.BLUR_SPEED**2 else None
 
     def _with_wall_velocity(
         self, sweep: Sweep, predicted: SweepMotion, found: Alignment

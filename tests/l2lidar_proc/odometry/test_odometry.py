@@ -222,6 +222,37 @@ def test_blows_during_which_the_imu_is_silent_are_survived(
     assert found[-3:].max() < 0.01
 
 
+@pytest.mark.parametrize(("scene", "seed"), [("room", 4), ("yard", 5), ("warehouse", 4)])
+def test_after_a_blow_in_a_gap_a_covered_sensor_knows_how_far_off_it_may_be(
+    scene: str, seed: int
+) -> None:
+    """The last points come from before the blow, and tell nothing about what follows it."""
+    blow, covered = 7.0, 3.0
+    run = record(scene, "walk", seed, 12.0, hits=(blow,))
+    since = (run.imu["stamp"] - sweep_epoch(run)) * 1e-9
+    lost = (since > blow - 0.02) & (since < blow + 0.024)
+    some = []
+    for sweep in sweeps(run, "turn"):
+        instants = (sweep.start - sweep_epoch(run)) * 1e-9 + sweep.points["time"]
+        seen = (instants < blow - 0.02) | (instants > blow + covered)
+        some.append(dataclasses.replace(sweep, points=sweep.points[seen]))
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    estimates = feed(odometry, run, some, run.imu[~lost])
+    stamps = np.array([item.stamp for item in estimates])
+    places, quaternions = truth(run, stamps)
+    turn = estimates[0].T_map_lidar[:3, :3] @ rotations.matrices(quaternions[0]).T
+    moved = np.array([item.T_map_lidar[:3, 3] for item in estimates])
+    off = moved - moved[0] - (places - places[0]) @ turn.T
+    within = np.array([item.covariance[:3, :3] for item in estimates])
+    nees = (off * np.linalg.solve(within, off[..., None])[..., 0]).sum(axis=1)
+    after = (stamps - sweep_epoch(run)) * 1e-9 - blow
+    blind = (after > 0.0) & (after < covered - 0.05)
+    assert blind.sum() > 10
+    assert np.linalg.norm(off[blind], axis=1).max() > 0.5
+    assert nees[blind].mean() < 6.0  # 3 on average; 5 to 17 where the blow passed for known
+    assert np.linalg.norm(off[-3:], axis=1).max() < 0.02
+
+
 def test_a_carrier_that_glides_from_the_first_sweep_on_does_not_rest() -> None:
     """Its IMU is as quiet as one at rest: the first sweeps tell."""
     run = record("street_block", "drone", 2, 5.0, since=7.0)
