@@ -16,7 +16,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
 from l2lidar_proc.motion.head_line import LineRates
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift, MapError
+from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift, MapError, observed_scale
 from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
 
 
@@ -77,6 +77,11 @@ class AlignmentQuality:
     variance_factor : float
         Factor on the variances of pose and velocity for that: above 1 where predictions are worse
         than their covariance says, below where they are better and every direction was observed.
+    velocity_factor : float
+        Further factor, at most 1, on the variances of the velocity in the directions that all
+        these alignments observed.
+    unobserved : tuple of tuple of float
+        The other directions, orthonormal, map axes.
     beam_correction : tuple of float
         What was added to the unit's ``xi_angle`` and ``beta_angle`` [rad].
     """
@@ -92,6 +97,8 @@ class AlignmentQuality:
     nis: float = 0.0
     velocity_nis: float = 0.0
     variance_factor: float = 1.0
+    velocity_factor: float = 1.0
+    unobserved: tuple[tuple[float, float, float], ...] = ()
     beam_correction: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -241,7 +248,9 @@ def estimate_of(
     pose[:3, POSITION] = np.eye(3)
     pose[3:, ROTATION] = state.rotation
     twist = np.zeros((6, 18))
-    twist[:3, VELOCITY] = state.rotation.T
+    unobserved = np.reshape(quality.unobserved, (-1, 3)).T
+    scale = observed_scale(p[VELOCITY, VELOCITY], quality.velocity_factor, unobserved)
+    twist[:3, VELOCITY] = state.rotation.T @ scale
     twist[3:, GYRO_BIAS] = np.eye(3)
     twist_covariance = twist @ p @ twist.T
     twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)

@@ -16,7 +16,7 @@ from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
-from l2lidar_proc.odometry.alignment import Alignment
+from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
@@ -181,7 +181,12 @@ class Odometry:
             return None
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
         nothing, noise = self._last.points[:0], self._predictor.gyro_noise
-        quality = AlignmentQuality(variance_factor=self._last.quality.variance_factor)
+        last = self._last.quality
+        quality = AlignmentQuality(
+            variance_factor=last.variance_factor,
+            velocity_factor=last.velocity_factor,
+            unobserved=last.unobserved,
+        )
         return estimate_of(
             motion,
             self._lever,
@@ -265,7 +270,7 @@ class Odometry:
             status.append(Status.RETURNED)
         self._keep(motion)
         quality = self.matcher.quality(len(source.points), found)
-        quality = self._consistency(quality, motion.state.stamp)
+        quality = self._consistency(quality, found, motion.state.stamp)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
@@ -393,7 +398,7 @@ class Odometry:
             self._walls.correct(predicted.state, motion.state)
             self._keep(motion)
         quality = self.matcher.quality(len(sweep.points), None)
-        quality = self._consistency(quality, motion.state.stamp)
+        quality = self._consistency(quality, None, motion.state.stamp)
         return self._estimate(sweep, motion, status, quality)
 
     def _is_suspect(self, motion: SweepMotion) -> bool:
@@ -403,17 +408,26 @@ class Odometry:
         # without a gyro its bias stands for the change of the rate
         return not (motion.imu.missing.all() or carrier_priors.biases_are_plausible(motion.state))
 
-    def _consistency(self, quality: AlignmentQuality, stamp: HostNs) -> AlignmentQuality:
+    def _consistency(
+        self, quality: AlignmentQuality, aligned: Alignment | None, stamp: HostNs
+    ) -> AlignmentQuality:
         """Return the quality of the alignment at an instant with what the innovations say."""
         found = self._innovations
         if not quality.observes_all:
-            found.note_unobserved(stamp)
+            directions = np.eye(3)
+            if aligned is not None and aligned.matched:
+                directions = unobserved_directions(
+                    aligned.information[eskf.POSITION, eskf.POSITION]
+                )
+            found.note_unobserved(stamp, directions)
             self._revisit.note_unobserved(stamp)
         return dataclasses.replace(
             quality,
             nis=found.nis,
             velocity_nis=found.velocity_nis,
             variance_factor=found.variance_factor,
+            velocity_factor=found.velocity_factor,
+            unobserved=tuple((x, y, z) for x, y, z in found.unobserved.T.tolist()),
         )
 
     def _anchor_anew(self, fresh: float) -> None:

@@ -506,6 +506,34 @@ def _correction(
     )
 
 
+def _lowered(ratio: float, most: float) -> float:
+    """Return the factor, at most 1, on variances that are to those assumed as a ratio shows."""
+    return min(max(tuning.NIS_MARGIN * ratio, 1.0 / most), 1.0)
+
+
+def observed_scale(covariance: F64, factor: float, unobserved: F64) -> F64:
+    """Return the matrix (3, 3) that scales a vector's errors, but not along some directions.
+
+    The variance along these directions stays, and what of the other errors they explain; the rest
+    is multiplied by a factor. With G the regression of the errors on those along the directions,
+    G + sqrt(factor) (I - G) does so, as G v and (I - G) v are not correlated.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (3, 3)
+        Of the vector.
+    factor : float
+        At most 1.
+    unobserved : ndarray, shape (3, K)
+        Orthonormal.
+    """
+    if factor >= 1.0:
+        return np.eye(3)
+    along = covariance @ unobserved
+    regression = along @ np.linalg.solve(unobserved.T @ along, unobserved.T)
+    return np.asarray(regression + np.sqrt(factor) * (np.eye(3) - regression))
+
+
 def inflated_prior(
     prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
 ) -> F64 | None:
@@ -557,11 +585,22 @@ class InnovationTest:
     def clear(self) -> None:
         """Forget everything, as after a rest or a loss."""
         self._recent: deque[_Correction] = deque()
-        self._unobserved: int | None = None  # stamp of the latest sweep without some direction
+        self._unobserved: deque[tuple[int, F64]] = deque()  # stamps, and directions (3, K)
 
-    def note_unobserved(self, stamp: int) -> None:
-        """Note that the sweep of a stamp [ns] did not observe the position in every direction."""
-        self._unobserved = stamp
+    def note_unobserved(self, stamp: int, directions: F64) -> None:
+        """Note that a sweep did not observe the position in every direction.
+
+        Parameters
+        ----------
+        stamp : int
+            Of the sweep [ns].
+        directions : ndarray, shape (3, K)
+            In which it did not, orthonormal, map axes.
+        """
+        noted = self._unobserved
+        noted.append((stamp, directions))
+        while stamp - noted[0][0] > tuning.NIS_WINDOW_NS:
+            noted.popleft()
 
     def take(
         self,
@@ -627,10 +666,31 @@ class InnovationTest:
             return 1.0
         if found >= 1.0:
             return min(found, tuning.NIS_MOST)
-        newest, unobserved = self._recent[-1].stamp, self._unobserved
-        if unobserved is not None and newest - unobserved <= tuning.NIS_WINDOW_NS:
+        return 1.0 if self.unobserved.size else _lowered(found, tuning.NIS_MOST)
+
+    @property
+    def velocity_factor(self) -> float:
+        """Further factor, at most 1, on the variances of the velocity where they are measured.
+
+        Of use where some direction was not measured throughout the window: along the others the
+        velocity is known as well as the innovations show. Poses are not: in narrow views they err
+        with the surfaces that they have put into the map themselves.
+        """
+        found = self._ratio
+        if found is None or self.unobserved.shape[1] not in (1, 2):
             return 1.0
-        return min(max(tuning.NIS_MARGIN * found, 1.0 / tuning.NIS_MOST), 1.0)
+        return _lowered(found, tuning.NIS_PARTLY_MOST)
+
+    @property
+    def unobserved(self) -> F64:
+        """Directions (3, K), orthonormal, map axes, not measured throughout the window."""
+        first = self._recent[-1].stamp - tuning.NIS_WINDOW_NS if self._recent else 0
+        found = [directions for stamp, directions in self._unobserved if stamp >= first]
+        if not found:
+            return np.zeros((3, 0))
+        together = np.concatenate(found, axis=1)
+        strength, axes = np.linalg.eigh(together @ together.T)
+        return np.asarray(axes[:, strength > tuning.NIS_UNOBSERVED**2 * len(found)])
 
     @property
     def contradicts(self) -> bool:

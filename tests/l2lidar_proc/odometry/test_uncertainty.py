@@ -11,15 +11,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSE, POSITION, VELOCITY, InertialState
-from l2lidar_proc.odometry.uncertainty import InnovationTest, MapDrift, inflated_prior
+from l2lidar_proc.odometry.uncertainty import (
+    InnovationTest,
+    MapDrift,
+    inflated_prior,
+    observed_scale,
+)
 from tests.l2lidar_proc.motion.analytic import at
 
 ZERO = np.zeros(3)
 SURE = np.diag([1e-6] * 6)
 BEFORE = np.diag(np.full(ERRORS, 0.02**2))
+ALONG = np.eye(3)[:, :1]
 STILL = InertialState(
     at(0.0), np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
 )
@@ -444,7 +451,7 @@ def test_small_ones_tell_that_variances_are_too_large() -> None:
 def test_what_poses_add_to_the_drift_is_lowered_with_a_margin_of_its_own() -> None:
     found = run(0.3)
     assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
-    found.note_unobserved(at(5.0))
+    found.note_unobserved(at(5.0), ALONG)
     assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
     assert run(0.9).expected_share == run(100.0).expected_share == 1.0  # never raised
     assert run(0.01).expected_share == 1.0 / tuning.NIS_MOST
@@ -460,15 +467,68 @@ def test_variances_are_not_lowered_while_a_direction_was_unobserved() -> None:
     last = round(5.0 / 0.23) - 1
     for before, lowered in ((0.0, False), (2.9, False), (3.1, True)):
         found = run(0.3)
-        found.note_unobserved(at(0.23 * last - before))
+        found.note_unobserved(at(0.23 * last - before), ALONG)
         assert (found.variance_factor < 1.0) == lowered, before
+        assert (found.velocity_factor < 1.0) != lowered, before
+        assert (found.unobserved.size == 0) == lowered, before
     found = run(2.0)
-    found.note_unobserved(at(0.23 * last))
+    found.note_unobserved(at(0.23 * last), ALONG)
     assert found.variance_factor == pytest.approx(4.0, rel=0.3)  # raised all the same
+    assert found.velocity_factor == 1.0
     forgotten = InnovationTest()
-    forgotten.note_unobserved(at(0.23 * last))
+    forgotten.note_unobserved(at(0.23 * last), ALONG)
     forgotten.clear()
     assert run(0.3, test=forgotten).variance_factor < 1.0
+
+
+def test_the_velocity_is_lowered_by_less_in_the_directions_that_were_observed() -> None:
+    last = round(5.0 / 0.23) - 1
+    for scale in (0.6, 0.01):
+        found = run(scale)
+        found.note_unobserved(at(0.23 * last), ALONG)
+        expected = max(tuning.NIS_MARGIN * found.nis, 1.0 / tuning.NIS_PARTLY_MOST)
+        assert found.velocity_factor == pytest.approx(expected)
+    assert run(0.01).velocity_factor == 1.0  # all were: the variance factor says it
+    few = run(0.3, seconds=0.7)
+    few.note_unobserved(at(0.23 * 2), ALONG)
+    assert few.velocity_factor == 1.0
+    found.note_unobserved(at(0.23 * last), np.eye(3))
+    assert found.velocity_factor == 1.0  # none was
+
+
+def test_directions_that_hardly_differ_are_one() -> None:
+    last = round(5.0 / 0.23) - 1
+    found = run(0.3)
+    for turn in (0.0, 0.05):
+        axis = np.array([[np.cos(turn)], [np.sin(turn)], [0.0]])
+        found.note_unobserved(at(0.23 * last - turn), axis)
+    assert found.unobserved.shape == (3, 1)
+    assert abs(found.unobserved[0, 0]) > 0.999
+    found.note_unobserved(at(0.23 * last), np.eye(3)[:, 1:2])
+    assert found.unobserved.shape == (3, 2)
+    np.testing.assert_allclose(found.unobserved[2], 0.0, atol=1e-12)
+
+
+@given(seed=st.integers(0, 1000), free=st.integers(0, 3), factor=st.floats(0.01, 1.0))
+def test_what_unobserved_directions_explain_is_not_scaled(
+    seed: int, free: int, factor: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((3, 3)) * 10.0 ** rng.uniform(-2.0, 0.0, 3)
+    covariance = root @ root.T + 1e-6 * np.eye(3)
+    along = np.linalg.qr(rng.standard_normal((3, 3)))[0][:, :free]
+    scale = observed_scale(covariance, factor, along)
+    scaled = scale @ covariance @ scale.T
+    explained = np.zeros((3, 3))
+    if free:
+        gain = covariance @ along @ np.linalg.inv(along.T @ covariance @ along)
+        explained = gain @ along.T @ covariance
+    expected = explained + factor * (covariance - explained)
+    tolerance = 1e-7 * float(np.trace(covariance))
+    np.testing.assert_allclose(scaled, expected, atol=tolerance)
+    np.testing.assert_allclose(
+        along.T @ scaled @ along, along.T @ covariance @ along, atol=tolerance
+    )
 
 
 def test_small_ones_that_are_all_alike_contradict_the_accelerometer() -> None:
