@@ -239,11 +239,12 @@ class Odometry:
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         source = self.matcher.source(sweep, predicted)
         found, matched = self.matcher.match(source, predicted)
-        if found is not None:
-            predicted, found = self._checked(source, predicted, found, status)
         blur = self._blur(predicted)
         if blur is not None:
             self._innovations.clear()
+        if found is not None:
+            blurred = blur is not None
+            predicted, found = self._checked(source, predicted, found, status, blurred=blurred)
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
@@ -281,7 +282,13 @@ class Odometry:
         return estimate
 
     def _checked(
-        self, source: Source, predicted: SweepMotion, found: Alignment, status: list[Status]
+        self,
+        source: Source,
+        predicted: SweepMotion,
+        found: Alignment,
+        status: list[Status],
+        *,
+        blurred: bool,
     ) -> tuple[SweepMotion, Alignment | None]:
         """Return prediction and alignment, found anew if the two contradict each other.
 
@@ -291,7 +298,7 @@ class Odometry:
         prior = predicted.state
         wide = inflated_prior(prior, predicted.covariance, found.state, found.covariance)
         fits_badly = self.matcher.fits_badly(found)
-        if (wide is not None or fits_badly) and self._blur(predicted) is not None:
+        if (wide is not None or fits_badly) and blurred:
             # what the alignment makes of the blur is not the motion of the sensor
             status.append(Status.SUSPECT)
             covariance = predicted.covariance if wide is None else wide
