@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -188,6 +188,60 @@ SHORT: Final = (
 """Families of the short version."""
 
 
+MIXED: Final = "mixed"
+"""Name of the family whose runs differ in everything, as :func:`mixed` draws it."""
+
+_PLACES: Final = (
+    ("flat", "look"),
+    ("office_corridor", "drive"),
+    ("hall", "walk"),
+    ("hall", "trot"),
+    ("hall", "drone"),
+    ("room", "walk"),
+    ("room", "trot"),
+    ("room", "drone"),
+    ("yard", "walk"),
+    ("yard", "trot"),
+    ("yard", "drone"),
+    ("wood", "walk"),
+    ("wood", "trot"),
+    ("atrium", "look"),
+    ("stairwell", "climb"),
+    ("wood", "drone"),
+    ("room", "shake"),
+    ("hall", "spin"),
+)
+
+
+def mixed(seed: int, seconds: float) -> Scenario:
+    """Return a run in which what the families show one by one comes together as it happens.
+
+    What nobody thought of when the families were made: a hit in the moment in which something
+    covers the sensor, in a gap of the IMU's samples.
+    """
+    random = np.random.default_rng((seed, 77))
+    scene, motion = _PLACES[random.integers(len(_PLACES))]
+
+    def drawn(values: Sequence[Any], chances: Sequence[float]) -> Any:
+        return values[random.choice(len(values), p=chances)]
+
+    return Scenario(
+        family=MIXED,
+        seed=seed,
+        seconds=seconds,
+        scene=scene,
+        motion=motion,
+        mount=drawn(("upright", "forward", "tilted"), (0.6, 0.2, 0.2)),
+        sector_deg=drawn((360.0, 200.0, 140.0), (0.6, 0.25, 0.15)),
+        people=drawn((0, 4, 12), (0.6, 0.2, 0.2)),
+        particles=drawn((0.0, 0.02), (0.8, 0.2)),
+        covers=drawn((0, 1, 2), (0.7, 0.2, 0.1)),
+        hits=drawn((0, 2, 4), (0.5, 0.25, 0.25)),
+        rest_s=drawn((2.0, 0.0), (0.75, 0.25)),
+        imperfect=drawn((True, False), (0.7, 0.3)),
+    )
+
+
 def scenario(family: str, seed: int, seconds: float) -> Scenario:
     """Return one run of a family.
 
@@ -196,6 +250,8 @@ def scenario(family: str, seed: int, seconds: float) -> Scenario:
     KeyError
         For a family that is not known.
     """
+    if family == MIXED:
+        return mixed(seed, seconds)
     return replace(FAMILIES[family], family=family, seed=seed, seconds=seconds)
 
 

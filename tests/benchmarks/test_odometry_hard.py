@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -14,6 +15,7 @@ from benchmarks import bench_odometry_hard, hard_recordings
 from benchmarks.hard_recordings import EPOCH, Recording, recording
 from benchmarks.hard_scenarios import (
     FAMILIES,
+    MIXED,
     SCENES,
     SHORT,
     Imperfections,
@@ -335,6 +337,31 @@ def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
         replace(some[-1], start=HostNs(some[-1].start - hour), end=HostNs(some[-1].end - hour))
     )
     assert len(odometry._walls._lines) == 0
+
+
+def test_mixed_runs_differ_in_everything_and_can_be_drawn_again() -> None:
+    drawn = [scenario(MIXED, seed, 4.0) for seed in range(200)]
+    assert drawn == [scenario(MIXED, seed, 4.0) for seed in range(200)]
+    for name, values in (("scene", 8), ("motion", 8), ("mount", 3), ("sector_deg", 3)):
+        assert len({getattr(one, name) for one in drawn}) == values
+    for name in ("people", "particles", "covers", "hits", "rest_s", "imperfect"):
+        shares = np.mean([bool(getattr(one, name)) for one in drawn])
+        assert 0.1 < shares < 0.9, name
+
+
+def test_a_mixed_run_is_measured_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--families", MIXED, "--runs", "1", "--first-seed", "3", "--seconds", "4"]
+    assert bench_odometry_hard.main([*arguments, "--methods", "ours"]) in (0, 1)
+    rows = json.loads(Path("out/bench/odometry_hard.json").read_text())["rows"]
+    assert [(row["family"], row["seed"]) for row in rows] == [(MIXED, 3)]
+    assert rows[0]["poses"] > 0.9
+    assert f"{MIXED}, 3" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        bench_odometry_hard.main(["--families", "nothing"])
+    assert MIXED in capsys.readouterr().err
 
 
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:
