@@ -194,10 +194,9 @@ def test_gravity_keeps_a_narrow_view_level_that_returns(
     track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
     assert track is not None
     found = errors(given, track)
-    back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
-    lean = np.linalg.norm(found.turn[back:, :2], axis=1)
+    lean = np.linalg.norm(found.turn[:, :2], axis=1)
     assert np.degrees(lean.max()) < 1.5
-    assert np.linalg.norm(found.position[back:], axis=1).max() < 0.3
+    assert np.linalg.norm(found.position, axis=1).max() < 0.3
 
 
 def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
@@ -225,7 +224,7 @@ def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
     restarted = next(k for k, status in enumerate(names) if "RESTARTED" in status)
     poses = np.array([item.T_map_lidar for item in found])
     off = np.linalg.norm(errors(narrow, Track(np.array(stamps), poses, 1.0)).position, axis=1)
-    assert off[restarted:].max() > 0.3
+    assert off[restarted:].max() > 0.2  # it had drifted
     assert off[-1] < 0.1
     assert "RETURNED" in set().union(*names[restarted:])
 

@@ -377,7 +377,7 @@ def test_unobserved_heights_draw_the_vertical_velocity_only() -> None:
     up = -gravity / np.linalg.norm(gravity)
     ahead = np.array([-up[2], 0.0, up[0]])
     start = dataclasses.replace(some_state(), gravity=gravity, velocity=0.5 * ahead + 0.1 * up)
-    sigma = 1.5 * tuning.RISE_FLOOR
+    sigma = 1.4 * tuning.RISE_FLOOR
     loose = np.eye(eskf.ERRORS) * sigma**2
     assert carrier_priors.apply_zero_velocity_prior(start, loose, 0.1, 1.2)[0] is start
     noise = tuning.RISE_SPEED**2 / 0.1
