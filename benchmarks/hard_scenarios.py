@@ -218,6 +218,13 @@ def mixed(seed: int, seconds: float) -> Scenario:
 
     What nobody thought of when the families were made: a hit in the moment in which something
     covers the sensor, in a gap of the IMU's samples.
+
+    Parameters
+    ----------
+    seed : int
+        Draws the conditions as well as what follows from them.
+    seconds : float
+        Length of the run [s].
     """
     random = np.random.default_rng((seed, 77))
     scene, motion = _PLACES[random.integers(len(_PLACES))]

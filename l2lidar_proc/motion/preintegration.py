@@ -96,10 +96,10 @@ def segment(
     since = middles - stamps[np.maximum(after - 1, 0)]
     until = stamps[np.minimum(after, len(stamps) - 1)] - middles
     inside = (after > 0) & (after < len(stamps))
-    missing = np.where(inside, since + until > gap_ns, np.minimum(abs(since), abs(until)) > hold)
+    apart = since + until
+    missing = np.where(inside, apart > gap_ns, np.minimum(abs(since), abs(until)) > hold)
     rates[(knots < stamps[0] - hold) | (knots > stamps[-1] + hold)] = steady_rate
     _bridge(rates, knots, samples, gap_ns)
-    apart = since + until
     is_sparse = inside & (apart > _sparse_ns(stamps)) & (apart <= tuning.BLIND_SHORT_S * 1e9)
     rate_errors, force_errors = (
         _interpolation_errors(samples[name], after, is_sparse)

@@ -30,7 +30,7 @@ from l2lidar_proc.odometry.estimate import (
 )
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
-from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.prediction import Predictor, blur_of
 from l2lidar_proc.odometry.uncertainty import (
     FrameJump,
     InnovationTest,
@@ -239,7 +239,7 @@ class Odometry:
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         source = self.matcher.source(sweep, predicted)
         found, matched = self.matcher.match(source, predicted)
-        blur = self._blur(predicted)
+        blur = blur_of(predicted, covariance)
         if blur is not None:
             self._innovations.clear()
         if found is not None:
@@ -321,29 +321,6 @@ class Odometry:
         if other is not None and found.fits_better_than(other, len(source.points)):
             return predicted, found
         return loose, other
-
-    def _blur(self, predicted: SweepMotion) -> F64 | None:
-        """Return by what the IMU does not tell how the sensor moved within a sweep, if by much.
-
-        After a hit, or in a gap of its samples, attitude and velocity become uncertain all at
-        once, and the parts of the sweep before and after do not fit together. The sweep then tells
-        the motion of one part or a mean of both.
-
-        Returns
-        -------
-        ndarray, shape (18, 18), or None
-            Covariance of attitude and velocity.
-        """
-        assert self._belief is not None
-        if predicted.imu.missing.all():
-            return None
-        added = predicted.covariance - self._belief[1]
-        blur = np.zeros_like(added)
-        for errors in (eskf.ROTATION, eskf.VELOCITY):
-            most = float(np.linalg.eigvalsh(added[errors, errors])[-1])
-            blur[errors, errors] = tuning.BLUR_SHARE * max(most, 0.0) * np.eye(3)
-        speed = np.trace(blur[eskf.VELOCITY, eskf.VELOCITY]) / (3.0 * tuning.BLUR_SHARE)
-        return blur if speed > tuning.BLUR_SPEED**2 else None
 
     def _with_wall_velocity(
         self, sweep: Sweep, predicted: SweepMotion, found: Alignment

@@ -21,7 +21,7 @@ from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
-from l2lidar_proc.motion.filter import GYRO_BIAS, VELOCITY, InertialState, Noise
+from l2lidar_proc.motion.filter import GYRO_BIAS, ROTATION, VELOCITY, InertialState, Noise
 from l2lidar_proc.motion.head_line import HeadAngle, HeadLine, LineRates
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
 from l2lidar_proc.motion.static import noise_spectrum
@@ -200,6 +200,38 @@ class Predictor:
             gyro.vibration,
             accel.vibration,
         )
+
+
+def blur_of(predicted: SweepMotion, before: F64) -> F64 | None:
+    """Return by what the IMU does not tell how the sensor moved within a sweep, if by much.
+
+    After a hit, or in a gap of its samples, attitude and velocity become uncertain all at once,
+    and the parts of the sweep before and after do not fit together. The sweep then tells the
+    motion of one part, or a mean of both.
+
+    Parameters
+    ----------
+    predicted : SweepMotion
+    before : ndarray, shape (18, 18)
+        Covariance of the state from which it was predicted.
+
+    Returns
+    -------
+    ndarray, shape (18, 18), or None
+        Covariance of attitude and velocity; None without an IMU, where the sweep alone tells.
+    """
+    if predicted.imu.missing.all():
+        return None
+    added = predicted.covariance - before
+    turn, speed = (
+        float(np.linalg.eigvalsh(added[errors, errors])[-1]) for errors in (ROTATION, VELOCITY)
+    )
+    if speed <= tuning.BLUR_SPEED**2:
+        return None
+    blur = np.zeros_like(added)
+    blur[ROTATION, ROTATION] = tuning.BLUR_SHARE * max(turn, 0.0) * np.eye(3)
+    blur[VELOCITY, VELOCITY] = tuning.BLUR_SHARE * speed * np.eye(3)
+    return blur
 
 
 class DeadReckoning:
