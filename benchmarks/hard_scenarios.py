@@ -191,6 +191,9 @@ SHORT: Final = (
 MIXED: Final = "mixed"
 """Name of the family whose runs differ in everything, as :func:`mixed` draws it."""
 
+STARTS: Final = "starts"
+"""Name of the family whose runs begin in motion, as :func:`starts` draws it."""
+
 _PLACES: Final = (
     ("flat", "look"),
     ("office_corridor", "drive"),
@@ -249,6 +252,19 @@ def mixed(seed: int, seconds: float) -> Scenario:
     )
 
 
+def starts(seed: int, seconds: float) -> Scenario:
+    """Return a mixed run that is in motion from the first sweep on, and nothing more happens.
+
+    Parameters
+    ----------
+    seed : int
+    seconds : float
+        Length of the run [s]; 12 show whether it has begun well.
+    """
+    drawn = mixed(seed, seconds)
+    return replace(drawn, family=STARTS, rest_s=0.0, covers=0, hits=0)
+
+
 def scenario(family: str, seed: int, seconds: float) -> Scenario:
     """Return one run of a family.
 
@@ -259,6 +275,8 @@ def scenario(family: str, seed: int, seconds: float) -> Scenario:
     """
     if family == MIXED:
         return mixed(seed, seconds)
+    if family == STARTS:
+        return starts(seed, seconds)
     return replace(FAMILIES[family], family=family, seed=seed, seconds=seconds)
 
 
