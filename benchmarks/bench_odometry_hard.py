@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks import odometry_methods as methods
 from benchmarks.hard_recordings import Recording, recording
-from benchmarks.hard_scenarios import FAMILIES, MIXED, SHORT, STARTS, Imperfections, scenario
+from benchmarks.hard_scenarios import DRAWN, FAMILIES, SHORT, Imperfections, scenario
 from benchmarks.hard_scores import Track, score
 from benchmarks.odometry_methods import Rows
 from benchmarks.results import FOLDER, Target, at_least, at_most, keep, measured_on, verdicts
@@ -242,7 +242,7 @@ def main(arguments: list[str] | None = None) -> int:
         methods.install_referees()
     families = tuple(FAMILIES if given.full else SHORT)
     if given.families:
-        known = (*FAMILIES, MIXED, STARTS)
+        known = (*FAMILIES, *DRAWN)
         families = tuple(name for name in known if any(part in name for part in given.families))
         if not families:
             parser.error(f"--families: none of {', '.join(known)}")

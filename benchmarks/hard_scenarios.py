@@ -265,6 +265,10 @@ def starts(seed: int, seconds: float) -> Scenario:
     return replace(drawn, family=STARTS, rest_s=0.0, covers=0, hits=0)
 
 
+DRAWN: Final[dict[str, Callable[[int, float], Scenario]]] = {MIXED: mixed, STARTS: starts}
+"""Families whose seed draws the scenario itself, with what draws it from seed and length [s]."""
+
+
 def scenario(family: str, seed: int, seconds: float) -> Scenario:
     """Return one run of a family.
 
@@ -273,10 +277,8 @@ def scenario(family: str, seed: int, seconds: float) -> Scenario:
     KeyError
         For a family that is not known.
     """
-    if family == MIXED:
-        return mixed(seed, seconds)
-    if family == STARTS:
-        return starts(seed, seconds)
+    if family in DRAWN:
+        return DRAWN[family](seed, seconds)
     return replace(FAMILIES[family], family=family, seed=seed, seconds=seconds)
 
 
