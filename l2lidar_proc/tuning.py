@@ -117,7 +117,7 @@ START_VELOCITY_SIGMA: Final = (0.02, 1.0)  # [m/s]
 # [rad/s] in motion: a third of the zero-rate levels of data sheets (MOST_GYRO_BIAS) on average
 START_GYRO_BIAS_SIGMA: Final = (0.01, 0.025)
 START_ACCEL_BIAS_SIGMA: Final = (0.02, 0.15)  # [m/s^2]
-START_GRAVITY_SIGMA: Final = ((0.01, 0.01, 0.01), (0.7, 0.7, 0.01))  # [m/s^2] x, y, z of the map
+START_GRAVITY_SIGMA: Final = ((0.01, 0.01, 0.01), (0.7, 0.7, 0.05))  # [m/s^2] x, y, z of the map
 GRAVITY_SIZE_SIGMA: Final = 0.01  # [m/s^2] of its size, which is known to 0.1 %
 ACCEL_BIAS_SIGMA: Final = 0.15  # [m/s^2] of units; source: IMUs of this class
 
