@@ -7,6 +7,7 @@ the reference, and whatever exceeds its spread by several times is motion.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -314,6 +315,18 @@ class InitialState:
     covariance: F64
     at_rest: bool
     gravity_trusted: bool
+
+    def leveled(self, up: F64) -> InitialState:
+        """Return the first state in a map whose vertical is another unit vector (3,) of this one.
+
+        How well that is known, is the same for all: :data:`tuning.VERTICAL_SIGMA`.
+        """
+        turn = rotations.matrices(rotations.between(up, (0.0, 0.0, 1.0)))
+        state = dataclasses.replace(self.state, rotation=turn @ self.state.rotation)
+        covariance = self.covariance.copy()
+        sigma = np.array([tuning.VERTICAL_SIGMA, tuning.VERTICAL_SIGMA, tuning.GRAVITY_SIZE_SIGMA])
+        covariance[GRAVITY, GRAVITY] = np.diag(sigma**2)
+        return dataclasses.replace(self, state=state, covariance=covariance)
 
 
 def initial_state(samples: Samples, stamp: HostNs, may_rest: bool = True) -> InitialState:

@@ -255,6 +255,22 @@ def log_likelihood(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
     return found
 
 
+def are_walls(spots: Spots, axes: F64) -> bool:
+    """Return whether most of the spots (N,) are those of walls along the way, on one side or both.
+
+    Other than for their profile, something may stand before them.
+    """
+    if len(spots) < tuning.PROFILE_SIDE:
+        return False
+    place, beside = spots["place"] @ axes.T, spots["sight"] @ axes[1]
+    on_wall = np.zeros(len(spots), np.bool_)
+    for side in (beside > 0.0, beside <= 0.0):
+        if side.sum() >= tuning.WALLS_LEAST:
+            off = _without_trend(place[side, 1], place[side, 0])
+            on_wall[side] = np.abs(off) < tuning.WALLS_THICKNESS
+    return bool(on_wall.mean() > tuning.WALLS_MOST)
+
+
 def _samples(spots: Spots, now: int, axes: F64) -> NDArray[np.void]:
     """Return what spots (N,) of walls say about their profiles, dtype _SAMPLE."""
     place, sight = spots["place"] @ axes.T, spots["sight"] @ axes.T

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.static import (
@@ -112,6 +113,26 @@ def test_the_first_state_is_level_and_calls_the_excess_over_gravity_bias() -> No
     excess = 1.0 - STANDARD_GRAVITY / 9.9
     np.testing.assert_allclose(found.state.accel_bias, excess * force, atol=1e-9)
     np.testing.assert_allclose(found.state.gyro_bias, BIAS, atol=1e-3)
+
+
+def test_a_start_can_be_leveled_by_another_vertical() -> None:
+    samples = noisy(Motion().imu(0, 1.0, BIAS), 0.001, 0.001, 0.0)
+    samples["linear_acceleration"] += (1.2, 0.0, 9.81)
+    found = initial_state(samples, HostNs(int(samples["stamp"][-1])), may_rest=False)
+    up = np.array([-0.12, 0.03, 0.0])
+    up[2] = np.sqrt(1.0 - up @ up)
+    level = found.leveled(up)
+    np.testing.assert_allclose(
+        level.state.rotation @ found.state.rotation.T @ up, (0.0, 0.0, 1.0), atol=1e-12
+    )
+    np.testing.assert_array_equal(level.state.gravity, found.state.gravity)
+    # which way is forward has not changed
+    turn = rotations.log(rotations.from_matrix(level.state.rotation @ found.state.rotation.T))
+    assert abs(turn[2]) < 1e-9
+    before, after = (np.sqrt(np.diag(one.covariance)) for one in (found, level))
+    assert (before[15:17] > 0.6).all()
+    np.testing.assert_allclose(after[15:], (0.17, 0.17, 0.01))
+    np.testing.assert_array_equal(after[:15], before[:15])
 
 
 def test_the_spectrum_shows_white_noise_alone_as_it_is() -> None:

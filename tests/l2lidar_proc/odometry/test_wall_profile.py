@@ -375,6 +375,22 @@ def test_what_stands_before_a_wall_rules_it_out(share: float, depth: float, is_w
     assert (len(wall_profile._samples(spots, int(spots["stamp"].max()), AXES)) > 0) == is_wall
 
 
+@pytest.mark.parametrize(
+    ("share", "depth", "are"),
+    [(0.0, 0.0, True), (0.25, -0.6, True), (0.25, 0.5, True), (0.6, -0.6, False)],
+)
+def test_most_spots_of_a_wall_make_one_whatever_stands_before_it(
+    share: float, depth: float, are: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    spots = swept(rng, 2.0, (), 0.0)
+    some = rng.random(len(spots)) < share
+    spots["place"][some, 1] += depth * np.sign(spots["sight"][some, 1])
+    spots["place"][some, 1] += 0.1 * rng.standard_normal(int(some.sum()))
+    assert wall_profile.are_walls(spots, AXES) == are
+    assert not wall_profile.are_walls(spots[: tuning.PROFILE_SIDE - 1], AXES)
+
+
 def test_scattered_things_are_no_wall() -> None:
     spots = passed(13, (), 0.0)
     rng = np.random.default_rng(13)
