@@ -28,6 +28,7 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.surfels import YoungSurfaces
 
 Support = tuple[I64, F64]
 """Numbers of sweeps (N,), ascending, and the share of the weight that each has (N,)."""
@@ -104,6 +105,8 @@ class Correspondences:
         Likewise in the finest cells.
     latest : int
         Number of the sweep that was added to the map last.
+    young : YoungSurfaces
+        Of that map.
     """
 
     index: I64
@@ -122,6 +125,7 @@ class Correspondences:
     met: int
     met_fine: int
     latest: int
+    young: YoungSurfaces = YoungSurfaces.TRUSTED
 
     def part(self, first: int, last: int, met: int, met_fine: int) -> Correspondences:
         """Return those of the points from one index to another, counted from the first."""
@@ -143,6 +147,7 @@ class Correspondences:
             met,
             met_fine,
             self.latest,
+            self.young,
         )
 
     @property
@@ -170,9 +175,13 @@ class Correspondences:
         """Sweeps that were the first where the surfaces are, and their shares of the weight."""
         return support_of(self.born, self.weights)
 
-    def settled(self, age: int) -> NDArray[np.bool_]:
-        """Return which surfaces are in the map for so many sweeps already, shape (M,)."""
-        age = min(age, self.latest // 2)  # a young map has no old ones
+    def settled(self, age: int, *, strict: bool = False) -> NDArray[np.bool_]:
+        """Return which surfaces are in the map for so many sweeps already, shape (M,).
+
+        A young map has no old ones: there half of its age is enough, unless that is strict.
+        """
+        if not strict:
+            age = min(age, self.latest // 2)
         return np.asarray(self.latest - self.opened >= age)
 
     def support_along(self, levers: F64) -> Support:
@@ -315,6 +324,7 @@ def correspondences_of(
         len(matches.index),
         int(np.count_nonzero(matches.is_fine)),
         surfaces.latest,
+        surfaces.young,
     )
     if is_single:
         return [found]

@@ -36,6 +36,7 @@ from l2lidar_proc.odometry.surfels import (
     PLANE,
     Candidates,
     Matches,
+    YoungSurfaces,
     are_behind,
     are_within,
     fit,
@@ -67,6 +68,8 @@ class SurfelMap:
     ----------
     latest : int
         Number of the sweep that was added last.
+    young : YoungSurfaces
+        Of a map that has only just begun.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class SurfelMap:
         self._least = least
         self._capacity = capacity
         self.latest = 0
+        self.young = YoungSurfaces.TRUSTED
         self._index = CellIndex()
         # row 0 is that of all places without a cell
         self._cells: NDArray[np.void] = np.zeros(1, CELL)
@@ -435,6 +439,7 @@ class SurfelMap:
             capacity=self._capacity,
         )
         part.latest = self.latest
+        part.young = self.young
         born = self._planes["born"][1 : len(self) + 1]
         part._take(self, sweeps[np.minimum(born, len(sweeps) - 1)])
         return part

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -45,6 +46,17 @@ _NO_SIDE, _ONE_SIDE, _BOTH_SIDES = 0, 1, 2
 
 FLAT: Final = 3
 """Kind of a flat cell; that of others is the number of axes along which their points lie close."""
+
+
+class YoungSurfaces(Enum):
+    """What a map that has only just begun, and has no other surfaces, tells of weak directions.
+
+    The rims of the view are surfaces as well, and move along with the sensor.
+    """
+
+    TRUSTED = "trusted"  # as surfaces that are in the map for long
+    APART = "apart"  # weak directions of the place are told apart from all others
+    IGNORED = "ignored"  # the same, and nothing is told about them
 
 
 @dataclass(frozen=True, slots=True, eq=False)

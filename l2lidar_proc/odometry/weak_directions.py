@@ -56,6 +56,7 @@ from l2lidar_proc.odometry.correspondences import (
     robust_weights,
 )
 from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.surfels import YoungSurfaces
 
 Views = Sequence[tuple[InertialState, NDArray[np.int64]]]
 """States, and which of the source's points are seen from each."""
@@ -82,12 +83,15 @@ class WeakAxes:
     scatter : ndarray, shape (3, 3), optional
         Of the walls' normals, map axes, in this sweep and those before; None where the carrier
         does not drive along the weakest direction.
+    free : int
+        How many of them, the first ones, are directions of the place that nothing faces.
     """
 
     scale: F64
     axes: F64
     surfaces: SurfelMap
     scatter: F64 | None = None
+    free: int = 0
 
     def levers(self, state: InertialState, found: Correspondences) -> F64:
         """Return the derivatives (M, K) of the residuals by the directions."""
@@ -116,7 +120,9 @@ class WeakAxes:
             Derivatives of the residuals along the direction.
         """
         age = tuning.WEAK_AGE if self.scatter is None else tuning.DRIVING_AGE
-        faces = (np.abs(levers) > tuning.WEAK_FACING) & found.settled(age)
+        is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
+        settled = found.settled(age, strict=is_ignored)
+        faces = (np.abs(levers) > tuning.WEAK_FACING) & settled
         if self.scatter is None:
             return faces
         some = np.flatnonzero(faces)
@@ -159,7 +165,8 @@ def weak_axes(
         return None
     axes = axes[:, weak]
     if scatter is None or not _is_way(axes[:, 0], state.gravity):
-        return WeakAxes(scale, _free_first(axes, found), surfaces)
+        axes, free = _free_first(axes, found)
+        return WeakAxes(scale, axes, surfaces, free=free)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
     axes = _along_walls(axes, levers, weights)
@@ -167,7 +174,7 @@ def weak_axes(
     return WeakAxes(scale, axes, surfaces, scatter)
 
 
-def _free_first(axes: F64, found: Correspondences) -> F64:
+def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     """Return weak directions (6, K) with those of the place first that no surface faces.
 
     Parameters
@@ -178,21 +185,24 @@ def _free_first(axes: F64, found: Correspondences) -> F64:
 
     Returns
     -------
-    ndarray, shape (6, L)
+    axes : ndarray, shape (6, L)
         Orthonormal. They span the given directions as far as those of the place leave them.
+    free : int
+        How many of them are those of the place.
     """
     normals = found.normals
     strength, places = np.linalg.eigh((normals * found.weights[:, None]).T @ normals)
     places = places[:, strength < tuning.WEAK_SHARE * strength[-1]]
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
-    faces &= found.settled(tuning.WEAK_AGE)[:, None]
+    strict = found.young is not YoungSurfaces.TRUSTED
+    faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
-        return axes
+        return axes, 0
     free = np.concatenate((np.zeros_like(places), places))
     others, lengths, _ = np.linalg.svd(axes - free @ (free.T @ axes), full_matrices=False)
     others = others[:, lengths > tuning.FREE_LEFT]
-    return np.column_stack((free, others[:, ::-1]))
+    return np.column_stack((free, others[:, ::-1])), free.shape[1]
 
 
 def _is_way(axis: F64, gravity: F64) -> bool:

@@ -15,6 +15,7 @@ from l2lidar_proc.odometry.alignment import Alignment, align
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import Source, correspondences
 from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.surfels import YoungSurfaces
 from l2lidar_proc.odometry.weak_directions import WeakAxes, weak_axes
 
 SIZES = (0.15, 0.3, 0.6, 1.5)
@@ -363,3 +364,30 @@ def test_a_few_points_that_face_a_way_do_not_tell_it(facing: bool) -> None:
     weak = weak_in(surfaces, np.vstack((wall, patch[:count])), None)
     is_free = np.abs(weak.axes[3]) > 0.999
     assert bool(is_free.any()) != facing
+
+
+@pytest.mark.parametrize("young", YoungSurfaces)
+def test_rims_of_a_map_that_has_only_just_begun_may_be_ignored(young: YoungSurfaces) -> None:
+    """Apart, they still tell the place along the walls; ignored, they do not. All else stays."""
+    rng = np.random.default_rng(8)
+    surfaces = SurfelMap(SIZES)
+    for number in range(4):
+        surfaces.add(np.vstack((walls(rng, 4000), reveals(rng, 300))), number)
+    surfaces.young = young
+    points = np.vstack((walls(rng, 1500), reveals(rng, 150)))
+    state = at(0.02, 0.0, 0.0)
+    found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    weak = weak_axes(state, found, surfaces)
+    assert weak is not None
+    facing = weak.facing(state, found)[:, 0]
+    assert weak.free == (young is not YoungSurfaces.TRUSTED)
+    assert facing.any() == (young is not YoungSurfaces.IGNORED)
+    if young is not YoungSurfaces.TRUSTED:
+        assert np.linalg.norm(weak.axes[:3, 0]) == 0.0  # nothing of a turn is mixed with it
+        assert abs(weak.axes[3, 0]) > 0.99
+    for number in range(4, 4 + 2 * tuning.WEAK_AGE):
+        surfaces.add(walls(rng, 100), number)
+    found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    old = weak_axes(state, found, surfaces)
+    assert old is not None
+    assert old.facing(state, found)[:, 0].any()  # whatever was said of it when it was young
