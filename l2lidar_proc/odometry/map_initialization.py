@@ -4,26 +4,37 @@ Half a turn of the head does not meet what the other half saw, and a map whose f
 taken for still is smeared if the sensor moved. So the first sweeps are tried as those of a sensor
 at rest, where the IMU allows it, and otherwise in rounds: the velocity that the later sweeps show
 deskews the first one better.
+
+In motion the accelerometer does not show the vertical. What is built does, so the map begins again
+with that. Where the sweeps leave the velocity open, it is left open:
+:mod:`~l2lidar_proc.odometry.start_velocity` finds it out within seconds.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import records
-from l2lidar_node.types import F64, HostNs, Sweep
+from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import POSITION, InertialState
+from l2lidar_proc.motion.filter import ERRORS, POSITION, VELOCITY, InertialState
 from l2lidar_proc.motion.static import InitialState, initial_state
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.surfels import YoungSurfaces
+from l2lidar_proc.odometry.vertical_direction import Vertical, vertical_direction
+from l2lidar_proc.odometry.wall_profile import are_walls
+from l2lidar_proc.odometry.wall_velocity import level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
+
+UP: Final = np.array([0.0, 0.0, 1.0])
+"""Of a map whose first attitude is that of the accelerometer."""
 
 
 class Trial(NamedTuple):
@@ -58,6 +69,12 @@ class Trial(NamedTuple):
         assert other.last is not None
         return self.last is not None and self.last.inlier_ratio > other.last.inlier_ratio
 
+    def fits_clearly_closer(self, other: Trial) -> bool:
+        """Return whether the last sweep of this trial fits closer, by more than chance does."""
+        if self.last is None or other.last is None:
+            return self.last is not None
+        return self.last.inlier_ratio > other.last.inlier_ratio + tuning.INITIAL_CLOSER
+
     def fits_better(self, other: Trial) -> bool:
         """Return whether this trial fits better than another one, and fixes the place far better.
 
@@ -73,6 +90,20 @@ class Trial(NamedTuple):
         )
 
 
+class MovingStart(NamedTuple):
+    """A start in motion.
+
+    Attributes
+    ----------
+    initial : InitialState
+    open_axes : ndarray, shape (K, 3)
+        Directions along which the first sweeps do not tell the velocity, map axes.
+    """
+
+    initial: InitialState
+    open_axes: F64
+
+
 class Begun(NamedTuple):
     """A map that has begun.
 
@@ -84,11 +115,14 @@ class Begun(NamedTuple):
         Those held, short ones joined.
     seed : int
         The first of them in the map; those before it were not whole.
+    since : HostNs
+        The first motion reaches back to it.
     """
 
     motions: list[SweepMotion]
     sweeps: list[Sweep]
     seed: int
+    since: HostNs
 
 
 class MapInitializer:
@@ -108,6 +142,9 @@ class MapInitializer:
     ----------
     held : list of Sweep
         Sweeps without an estimate so far, oldest first.
+    moving : MovingStart or None
+        What the map began with, where the sensor was in motion; None where it was at rest, and
+        where gravity is not trusted.
     """
 
     def __init__(
@@ -122,6 +159,7 @@ class MapInitializer:
         self._zero_velocity = zero_velocity
         self._min_points = min_points
         self.held: list[Sweep] = []
+        self.moving: MovingStart | None = None
 
     def add(self, sweep: Sweep) -> Begun | None:
         """Hold a sweep; return the map if it can begin now."""
@@ -148,7 +186,7 @@ class MapInitializer:
         if not motions:
             del held[0]
             return None
-        return Begun([motions[0]] * seed + motions, whole, seed)
+        return Begun([motions[0]] * seed + motions, whole, seed, held[0].start)
 
     def begin(
         self, sweeps: list[Sweep], since: HostNs, may_rest: bool = True
@@ -169,6 +207,8 @@ class MapInitializer:
             One for each sweep; empty if they do not fit; None while it is too early to tell, as
             where little comes back and it takes many sweeps at rest before one meets another.
         """
+        self._matcher.surfaces.young = YoungSurfaces.TRUSTED
+        self.moving = None
         late = sweeps[-1].end - since >= tuning.INITIAL_MAX_NS
         initial = self._initial(sweeps, since, may_rest)
         start = self._at_cloud_origin(initial)
@@ -179,12 +219,15 @@ class MapInitializer:
                 return trial.motions if trial.met or late else None
             self._zero_velocity.clear()
         trial = self._in_motion(sweeps, since, initial)
-        if initial.at_rest and trial.is_doubtful:
-            # a quiet IMU may also be that of a carrier that glides: the sweeps decide
+        is_tilted = initial.at_rest and self._is_tilted(initial)
+        if is_tilted or (initial.at_rest and trial.is_doubtful):
+            # a quiet IMU may also be that of a carrier that glides, or that speeds up evenly
             moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
-            if moving.fits_closer(trial):
+            if is_tilted or moving.fits_closer(trial):
                 trial = moving
             else:  # the maps are those of the latest one
+                self.moving = None
+                self._matcher.surfaces.young = YoungSurfaces.TRUSTED
                 initial = self._initial(sweeps, since, may_rest)
                 trial = self._in_motion(sweeps, since, initial)
         return trial.motions if trial.met or late or not trial.motions else None
@@ -249,7 +292,136 @@ class MapInitializer:
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
         return Trial(motions, met)
 
+    def begin_with(
+        self, sweeps: list[Sweep], since: HostNs, start: InertialState, covariance: F64
+    ) -> list[SweepMotion]:
+        """Begin the map of a start in motion again, with what has been found out since.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            Those since the start.
+        since : HostNs
+            As for :meth:`begin`.
+        start : InertialState
+            At the reference of the first sweep; its pose does not count.
+        covariance : ndarray, shape (18, 18)
+
+        Returns
+        -------
+        list of SweepMotion
+            As :meth:`begin` returns it.
+        """
+        assert self.moving is not None
+        self._matcher.surfaces.young = YoungSurfaces.IGNORED
+        first = self._at_cloud_origin(self.moving.initial)
+        start = dataclasses.replace(start, rotation=first.rotation, position=first.position)
+        known = self.moving.initial.covariance.copy()
+        found = slice(VELOCITY.start, ERRORS)
+        known[found, found] = covariance[found, found]
+        initial = dataclasses.replace(self.moving.initial, covariance=known)
+        return self._round(sweeps, since, start, initial).motions
+
     def _in_motion(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
+        """Begin the map in motion: level where it is built, and with its velocity left open.
+
+        The velocity is open where the first sweeps fit at many, as in a hall or between walls.
+        """
+        trial = self._with_walks(sweeps, since, initial)
+        if initial.at_rest or not (initial.gravity_trusted and trial.motions):
+            return trial
+        initial, trial = self._leveled(sweeps, since, initial, trial)
+        self.moving = MovingStart(initial, np.zeros((0, 3)))
+        if trial.last is None:
+            return trial
+        strengths, axes = np.linalg.eigh(trial.last.information[POSITION, POSITION])
+        shares = strengths / max(float(strengths[-1]), 1e-9)
+        is_open = shares < tuning.START_FIXED
+        young = YoungSurfaces.APART
+        if shares[0] < tuning.INITIAL_FIXED and self._is_beside_walls(sweeps, trial, axes[:, 0]):
+            # what faces the way between bare walls are the rims of the view
+            young, is_open[0] = YoungSurfaces.IGNORED, True
+        if not is_open.any():
+            return trial
+        self._matcher.surfaces.young = young
+        apart = self._with_open_velocity(sweeps, since, initial, trial)
+        if not apart.motions:
+            self._matcher.surfaces.young = YoungSurfaces.TRUSTED
+            return self._with_walks(sweeps, since, initial)
+        self.moving = MovingStart(initial, axes[:, is_open].T)
+        return apart
+
+    def _with_open_velocity(
+        self, sweeps: list[Sweep], since: HostNs, initial: InitialState, trial: Trial
+    ) -> Trial:
+        """Begin the map from rest, or from the velocity of a trial that fits clearly closer then.
+
+        Young surfaces do not tell the velocity here, so it stays near the one to begin with.
+        """
+        start = self._at_cloud_origin(initial)
+        found, begun = self._rounds(sweeps, since, start, initial)
+        if self._matcher.surfaces.young is YoungSurfaces.IGNORED:
+            return found
+        walking = dataclasses.replace(start, velocity=trial.motions[0].state.velocity)
+        other, _ = self._rounds(sweeps, since, walking, initial)
+        if not found.motions or (other.motions and other.fits_clearly_closer(found)):
+            return other
+        return self._round(sweeps, since, begun, initial)
+
+    def _leveled(
+        self, sweeps: list[Sweep], since: HostNs, initial: InitialState, trial: Trial
+    ) -> tuple[InitialState, Trial]:
+        """Return the start with the vertical that its map shows, and the map begun with that.
+
+        A wrong vertical smears the map, and a smeared map hides the vertical: where some surfaces
+        agree on one, more may do so once the map has begun with it.
+        """
+        found = self._vertical()
+        if found is None or found.agreement < tuning.VERTICAL_TRY:
+            return initial, trial
+        level = initial.leveled(found.direction)
+        again = self._with_walks(sweeps, since, level)
+        better = self._vertical() if again.motions else None
+        is_certain = found.is_certain or (better is not None and better.is_certain)
+        if again.motions and is_certain:
+            return level, again
+        return initial, self._with_walks(sweeps, since, initial)
+
+    def _vertical(self) -> Vertical | None:
+        """Return the vertical that the surfaces of the map show, map axes."""
+        return vertical_direction(*self._normals(), UP)
+
+    def _is_tilted(self, initial: InitialState) -> bool:
+        """Return whether the map shows another vertical than the accelerometer does."""
+        found = self._vertical() if initial.gravity_trusted else None
+        if found is None or not found.is_certain:
+            return False
+        sine = tuning.VERTICAL_TILTED * tuning.VERTICAL_SIGMA / STANDARD_GRAVITY
+        return float(np.linalg.norm(found.direction[:2])) > sine
+
+    def _is_beside_walls(self, sweeps: list[Sweep], trial: Trial, direction: F64) -> bool:
+        """Return whether the map shows bare walls along a direction (3,), and nothing across."""
+        gravity = trial.motions[-1].state.gravity
+        axes = level_axes(direction, gravity)
+        normals, areas = self._normals()
+        upright = areas * (np.abs(normals @ axes[2]) < tuning.WEAK_FACING)
+        across = upright * (np.abs(normals @ axes[0]) > tuning.WALLS_FACING)
+        if across.sum() > tuning.WALLS_ACROSS * upright.sum():
+            return False
+        spots = [
+            self._matcher.beside_walls(sweep, motion, axes)[0]
+            for sweep, motion in zip(sweeps, trial.motions, strict=True)
+        ]
+        return are_walls(records.joined(spots), axes)
+
+    def _normals(self) -> tuple[F64, F64]:
+        """Return the normals (N, 3) of the surfaces of the map, and their areas (N,) [m^2]."""
+        levels = self._matcher.surfaces.flat_cells()
+        normals = np.concatenate([normals for *_, normals in levels])
+        areas = [np.full(len(places), size**2) for size, places, *_ in levels]
+        return normals, np.concatenate(areas)
+
+    def _with_walks(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
         """Begin the map in rounds, each with the velocity that the round before has shown.
 
         Where the first sweeps hardly fix a direction, as in a corridor, rounds that begin at rest

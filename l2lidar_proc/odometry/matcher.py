@@ -404,11 +404,12 @@ class SweepMatcher:
             found.strongly,
         )
 
-    def driving_direction(self, found: Alignment) -> F64 | None:
+    def driving_direction(self, found: Alignment, *, is_open: bool = False) -> F64 | None:
         """Return the direction (3,) along which a carrier drives while its place is free.
 
         None unless an alignment leaves exactly one direction of the place free, which is level,
-        and the carrier drives: by what it has shown before, or by its present velocity.
+        and the carrier drives: by what it has shown before, or by its present velocity, or since
+        that is open.
         """
         free = unobserved_directions(found.information[POSITION, POSITION])
         if free.shape[1] != 1:
@@ -418,7 +419,7 @@ class SweepMatcher:
             return None
         sigma = float(np.sqrt(along @ found.covariance[VELOCITY, VELOCITY] @ along))
         least = abs(float(along @ found.state.velocity)) - sigma
-        return along if self.driving or is_driving_speed(least) else None
+        return along if is_open or self.driving or is_driving_speed(least) else None
 
     def beside_walls(self, sweep: Sweep, motion: SweepMotion, axes: F64) -> tuple[Spots, Lines]:
         """Return what a sweep sees beside the way: spots of walls, and vertical lines elsewhere.

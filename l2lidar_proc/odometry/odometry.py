@@ -31,6 +31,7 @@ from l2lidar_proc.odometry.estimate import (
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor, blur_of
+from l2lidar_proc.odometry.start_velocity import StartVelocity
 from l2lidar_proc.odometry.uncertainty import (
     FrameJump,
     InnovationTest,
@@ -106,6 +107,7 @@ class Odometry:
         self._first_sweeps: list[Sweep] = []
         self._beams = BeamAngles()
         self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
+        self._start = StartVelocity(self._lever)
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0  # of sweeps with enough points since the latest match
         self._was_blind = False  # a sweep since then had few
@@ -229,6 +231,13 @@ class Odometry:
         at_rest = self._zero_velocity.anchor is not None
         self.phase = Phase.STATIONARY if at_rest else Phase.TRACKING
         self._first_sweeps = begun.sweeps[begun.seed :] if at_rest else []
+        moving = self._initializer.moving
+        self._start.clear()
+        if moving is not None and not at_rest:
+            seed = begun.seed
+            self._start.begin(
+                begun.sweeps[seed:], begun.motions[seed:], begun.since, moving.open_axes
+            )
 
     # ---- tracking
 
@@ -269,17 +278,53 @@ class Odometry:
         if back is not None:
             found, motion, guess = back.alignment, self._return(back, motion), motion.state
             status.append(Status.RETURNED)
+        motion, is_mapped = self._with_start_velocity(sweep, motion, found, status)
         self._keep(motion)
         quality = self.matcher.quality(len(source.points), found)
         quality = self._consistency(quality, found, motion.state.stamp)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._beams.learn(sweep, estimate.points, at_rest=False)
-        if found is not None or matched is MatchStatus.NEW_MAP or Status.LOST in status:
+        is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
+        if not is_mapped and (found is not None or is_new):
             expected_share = self._innovations.expected_share
             fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
             self._anchor_anew(fresh)
         return estimate
+
+    def _with_start_velocity(
+        self, sweep: Sweep, motion: SweepMotion, found: Alignment | None, status: list[Status]
+    ) -> tuple[SweepMotion, bool]:
+        """Return the motion with the velocity that the sweeps since a start in motion show.
+
+        After it comes whether the map has begun again with that velocity, and has the sweep.
+        """
+        start = self._start
+        if not start.sweeps:
+            return motion, False
+        start.note(sweep, motion)
+        if found is None or not start.is_due(sweep.end):
+            return motion, False
+        state, covariance, span = motion.state, motion.covariance, (start.since, sweep.end)
+        whole = self._predictor.over(state, covariance, span, state.stamp)
+        better = start.search(whole, found.information[eskf.POSITION, eskf.POSITION])
+        motions: list[SweepMotion] = []
+        if better is not None and better.is_news:
+            self._walls.correct(state, better.state)
+            motion = motion.with_state(better.state, better.covariance)
+            if start.is_first:
+                first = whole.with_state(better.state, better.covariance).state_at(start.reference)
+                motions = self._initializer.begin_with(
+                    start.sweeps, start.since, first, better.covariance
+                )
+        if motions:
+            start.replace(start.sweeps, motions)
+            motion = motions[-1]
+            self._walls.clear()
+            self._innovations.clear()
+            status.append(Status.STARTING)
+        start.end_search(sweep.end)
+        return motion, bool(motions)
 
     def _checked(
         self,
@@ -327,12 +372,17 @@ class Odometry:
     ) -> Alignment:
         """Return an alignment with what walls tell of the velocity that surfaces leave free."""
         self._walls.correct(predicted.state, found.state)
-        direction = self.matcher.driving_direction(found)
+        is_open = self._start.is_open
+        if self._start.is_awaited:
+            return found
+        direction = self.matcher.driving_direction(found, is_open=is_open)
         if direction is None:
             return found
         axes = level_axes(direction, found.state.gravity)
         motion = predicted.with_state(found.state, found.covariance)
         spots, lines = self.matcher.beside_walls(sweep, motion, axes)
+        if is_open:
+            lines = lines[:0]  # nothing tells false votes from right ones
         state, covariance = self._walls.update(found.state, found.covariance, spots, lines, axes)
         return dataclasses.replace(found, state=state, covariance=covariance)
 
@@ -347,8 +397,14 @@ class Odometry:
             self._peak_speed, after, covariance, lasted
         )
         height = self.matcher.observes_height
+        peak = self._peak_speed
+        if self._start.is_open:
+            # the prior of the start has said already how fast carriers are
+            peak = max(peak, tuning.START_VELOCITY_SIGMA[1])
+            speeds = np.linalg.eigvalsh(covariance[eskf.VELOCITY, eskf.VELOCITY])
+            self._start.note_velocity(float(np.sqrt(speeds[-1])))
         posterior = carrier_priors.apply_zero_velocity_prior(
-            after, covariance, lasted, self._peak_speed, height_observed=height
+            after, covariance, lasted, peak, height_observed=height
         )
         self.matcher.driving = carrier_priors.is_driving_speed(self._peak_speed)
         posterior = carrier_priors.with_gravity_of_known_size(*posterior)
@@ -450,6 +506,7 @@ class Odometry:
         if rests:
             self._innovations.clear()
             self._walls.clear()
+            self._start.clear()
 
     def _begin_new_map(self, motion: SweepMotion) -> SweepMotion:
         """Begin a new map at the predicted pose; keep the one before, it may be seen again."""
@@ -464,6 +521,7 @@ class Odometry:
             self.matcher = SweepMatcher(self.config, self._lever)
             self._initializer = self._new_initializer()
         self._walls.clear()
+        self._start.clear()
         self._forget_unmatched()
         self._innovations.clear()
         self.phase = Phase.LOST
@@ -492,6 +550,7 @@ class Odometry:
         self.matcher.meet(back.alignment, 0.0)
         self._zero_velocity.clear()
         self._walls.clear()
+        self._start.clear()
         self._innovations.clear()
         self._forget_unmatched()
         self.phase = Phase.TRACKING
@@ -612,7 +671,8 @@ class Odometry:
                     continue
                 way = float(np.linalg.norm(motions[-1].state.position))
                 if way < tuning.RETRY_FARTHEST_M:
-                    self._enter_map(Begun(motions, first, len(first)))
+                    self._enter_map(Begun(motions, first, 0, first[0].start))
+                    self._first_sweeps = []
                     quality = self.matcher.quality(len(sweep.points), None)
                     return self._estimate(sweep, motions[-1], [*status, Status.STARTING], quality)
             # the map of a rest that was none is of no use
@@ -647,6 +707,7 @@ class Odometry:
         self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
         self._zero_velocity.clear()
         self._walls.clear()
+        self._start.clear()
         self._innovations.clear()
         self._next_check = int(reference)
         self._earlier.restart(reference)

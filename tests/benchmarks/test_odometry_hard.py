@@ -242,6 +242,28 @@ def end_of(some: Recording) -> float:
     return score(some, track)["end_m"]
 
 
+@pytest.mark.parametrize(
+    ("seed", "most", "first"),
+    [
+        (2, 0.2, 2.0),  # a room, shaken: 97 m off where 0.7 m/s^2 bounded the tilt of gravity
+        (77, 0.3, 2.0),  # a hall: 10 m where its rims told the velocity
+        (195, 1.0, 1.0),  # a corridor, speeding up: 93 m where that passed for a tilt
+        (215, 0.5, 2.0),  # a walk in a hall: 10 m
+    ],
+)
+def test_what_begins_in_motion_does_not_run_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, most: float, first: float
+) -> None:
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(STARTS, seed, 12.0))
+    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
+    assert track is not None
+    found = errors(given, track)
+    assert np.linalg.norm(found.position[-1]) < most
+    # gravity is that of the place from the first pose on
+    assert np.degrees(np.linalg.norm(found.turn[-10:, :2], axis=1).max()) < first
+
+
 def test_walls_measure_the_velocity_along_a_corridor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -312,7 +312,7 @@ def test_the_vertical_of_a_map_begun_in_motion_is_found() -> None:
         true = estimates[index].T_map_lidar[:3, :3] @ rotations.matrices(turns[index])[2]
         return float(np.degrees(np.arccos(true @ vertical / np.linalg.norm(vertical))))
 
-    assert off(0, [0.0, 0.0, 1.0]) > 1.0  # what it was taken for
+    assert off(0, [0.0, 0.0, 1.0]) < 0.5  # floor and walls show it, and the IMU by 1.2 degrees not
     # errors relative to the first pose, which the first sweeps were hardly deskewed for
     assert np.sqrt(estimates[0].covariance[5, 5]) > 0.9 * tuning.BEGUN_IN_MOTION[1]
     assert np.sqrt(driven("room", "walk")[0].covariance[5, 5]) < 0.001
