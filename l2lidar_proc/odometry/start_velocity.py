@@ -165,7 +165,10 @@ class StartVelocity:
             self.note(sweep, motion)
 
     def note(self, sweep: Sweep, motion: SweepMotion) -> None:
-        """Take a sweep with its motion."""
+        """Take a sweep with its motion; where none has been searched for long, begin no more."""
+        if sweep.end - self.since > 2 * tuning.START_NS:
+            self.clear()
+            return
         state = motion.state
         position = state.position - state.rotation @ self._lever
         self._passed.append(Passed(sweep, state.stamp, position))

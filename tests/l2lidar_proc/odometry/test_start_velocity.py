@@ -322,3 +322,15 @@ def test_searches_follow_each_other_and_end(passing: list[Sweep]) -> None:
     start.end_search(HostNs(EPOCH + tuning.START_WATCHED_NS + 1))
     assert not start.sweeps
     assert not start.is_due(HostNs(EPOCH + 10 * tuning.START_WATCHED_NS))
+
+
+def test_a_start_that_was_interrupted_is_forgotten(passing: list[Sweep]) -> None:
+    """Covered for seconds, the sensor is not where the IMU has carried it; nor is memory spent."""
+    start = begun(passing, SPEED, known_to(1.0), X)
+    motion = motion_at(SPEED, known_to(1.0))
+    for late, count in ((2 * tuning.START_NS, SWEEPS + 1), (2 * tuning.START_NS + 1, 0)):
+        end = HostNs(EPOCH + late)
+        start.note(dataclasses.replace(passing[-1], end=end), motion)
+        assert len(start.sweeps) == count
+    assert not start.is_open
+    assert not start.is_due(HostNs(EPOCH + tuning.START_WATCHED_NS))
