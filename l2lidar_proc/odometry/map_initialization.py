@@ -62,6 +62,10 @@ class Trial(NamedTuple):
             last is not None and last.inlier_ratio < tuning.INITIAL_INLIERS
         )
 
+    def leaves_open(self, share: float) -> bool:
+        """Return whether the last sweep fixes a direction less than a share of the strongest."""
+        return self.last is not None and weak_axis(self.last.information)[0] < share
+
     def fits_closer(self, other: Trial) -> bool:
         """Return whether the last sweep of this trial fits closer than that of a doubtful one."""
         if not (self.motions and other.motions):
@@ -213,17 +217,22 @@ class MapInitializer:
         initial = self._initial(sweeps, since, may_rest)
         start = self._at_cloud_origin(initial)
         self._zero_velocity.clear()
-        if initial.at_rest and self._zero_velocity.anchored(start, self._samples(sweeps, since)):
+        is_static = initial.at_rest and self._zero_velocity.anchored(
+            start, self._samples(sweeps, since)
+        )
+        if is_static:
             trial = self._at_rest(sweeps, since, start, initial.covariance)
             if trial.motions:
                 return trial.motions if trial.met or late else None
             self._zero_velocity.clear()
         trial = self._in_motion(sweeps, since, initial)
-        is_tilted = initial.at_rest and self._is_tilted(initial)
-        if is_tilted or (initial.at_rest and trial.is_doubtful):
+        # a rest that neither the IMU nor the sweeps prove
+        is_assumed = not is_static and trial.leaves_open(tuning.START_FIXED)
+        moves = initial.at_rest and (is_assumed or self._is_tilted(initial))
+        if moves or (initial.at_rest and trial.is_doubtful):
             # a quiet IMU may also be that of a carrier that glides, or that speeds up evenly
             moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
-            if is_tilted or moving.fits_closer(trial):
+            if (moves and moving.motions) or moving.fits_closer(trial):
                 trial = moving
             else:  # the maps are those of the latest one
                 self.moving = None
@@ -336,7 +345,7 @@ class MapInitializer:
             return trial
         strengths, axes = np.linalg.eigh(trial.last.information[POSITION, POSITION])
         shares = strengths / max(float(strengths[-1]), 1e-9)
-        is_open = shares < tuning.START_FIXED
+        is_open = shares < (tuning.INITIAL_FIXED if trial.is_doubtful else tuning.START_FIXED)
         young = YoungSurfaces.APART
         if shares[0] < tuning.INITIAL_FIXED and self._is_beside_walls(sweeps, trial, axes[:, 0]):
             # what faces the way between bare walls are the rims of the view

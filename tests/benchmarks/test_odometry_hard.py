@@ -249,6 +249,7 @@ def end_of(some: Recording) -> float:
         (77, 0.3, 2.0),  # a hall: 10 m where its rims told the velocity
         (195, 1.0, 1.0),  # a corridor, speeding up: 93 m where that passed for a tilt
         (215, 0.5, 2.0),  # a walk in a hall: 10 m
+        (415, 0.5, 2.0),  # a walk in a wood: 33 m where a quiet IMU proved a rest by itself
     ],
 )
 def test_what_begins_in_motion_does_not_run_away(
