@@ -125,7 +125,7 @@ class Correspondences:
     met: int
     met_fine: int
     latest: int
-    young: YoungSurfaces = YoungSurfaces.TRUSTED
+    young: YoungSurfaces
 
     def part(self, first: int, last: int, met: int, met_fine: int) -> Correspondences:
         """Return those of the points from one index to another, counted from the first."""

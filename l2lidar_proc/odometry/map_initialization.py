@@ -66,18 +66,20 @@ class Trial(NamedTuple):
         """Return whether the last sweep fixes a direction less than a share of the strongest."""
         return self.last is not None and weak_axis(self.last.information)[0] < share
 
-    def fits_closer(self, other: Trial) -> bool:
-        """Return whether the last sweep of this trial fits closer than that of a doubtful one."""
+    def fits_closer(self, other: Trial, margin: float = 0.0) -> bool:
+        """Return whether the last sweep of this trial fits closer than that of a doubtful one.
+
+        Parameters
+        ----------
+        other : Trial
+        margin : float
+            By so much, as a share of the inliers.
+        """
         if not (self.motions and other.motions):
             return not other.motions
         assert other.last is not None
-        return self.last is not None and self.last.inlier_ratio > other.last.inlier_ratio
-
-    def fits_clearly_closer(self, other: Trial) -> bool:
-        """Return whether the last sweep of this trial fits closer, by more than chance does."""
-        if self.last is None or other.last is None:
-            return self.last is not None
-        return self.last.inlier_ratio > other.last.inlier_ratio + tuning.INITIAL_CLOSER
+        least = other.last.inlier_ratio + margin
+        return self.last is not None and self.last.inlier_ratio > least
 
     def fits_better(self, other: Trial) -> bool:
         """Return whether this trial fits better than another one, and fixes the place far better.
@@ -164,6 +166,7 @@ class MapInitializer:
         self._min_points = min_points
         self.held: list[Sweep] = []
         self.moving: MovingStart | None = None
+        self._young = YoungSurfaces.TRUSTED  # of the map that begins in motion
 
     def add(self, sweep: Sweep) -> Begun | None:
         """Hold a sweep; return the map if it can begin now."""
@@ -211,7 +214,7 @@ class MapInitializer:
             One for each sweep; empty if they do not fit; None while it is too early to tell, as
             where little comes back and it takes many sweeps at rest before one meets another.
         """
-        self._matcher.surfaces.young = YoungSurfaces.TRUSTED
+        self._young = YoungSurfaces.TRUSTED
         self.moving = None
         late = sweeps[-1].end - since >= tuning.INITIAL_MAX_NS
         initial = self._initial(sweeps, since, may_rest)
@@ -236,7 +239,7 @@ class MapInitializer:
                 trial = moving
             else:  # the maps are those of the latest one
                 self.moving = None
-                self._matcher.surfaces.young = YoungSurfaces.TRUSTED
+                self._young = YoungSurfaces.TRUSTED
                 initial = self._initial(sweeps, since, may_rest)
                 trial = self._in_motion(sweeps, since, initial)
         return trial.motions if trial.met or late or not trial.motions else None
@@ -322,7 +325,7 @@ class MapInitializer:
             As :meth:`begin` returns it.
         """
         assert self.moving is not None
-        self._matcher.surfaces.young = YoungSurfaces.IGNORED
+        self._young = YoungSurfaces.IGNORED
         first = self._at_cloud_origin(self.moving.initial)
         start = dataclasses.replace(start, rotation=first.rotation, position=first.position)
         known = self.moving.initial.covariance.copy()
@@ -352,10 +355,10 @@ class MapInitializer:
             young, is_open[0] = YoungSurfaces.IGNORED, True
         if not is_open.any():
             return trial
-        self._matcher.surfaces.young = young
+        self._young = young
         apart = self._with_open_velocity(sweeps, since, initial, trial)
         if not apart.motions:
-            self._matcher.surfaces.young = YoungSurfaces.TRUSTED
+            self._young = YoungSurfaces.TRUSTED
             return self._with_walks(sweeps, since, initial)
         self.moving = MovingStart(initial, axes[:, is_open].T)
         return apart
@@ -369,11 +372,11 @@ class MapInitializer:
         """
         start = self._at_cloud_origin(initial)
         found, begun = self._rounds(sweeps, since, start, initial)
-        if self._matcher.surfaces.young is YoungSurfaces.IGNORED:
+        if self._young is YoungSurfaces.IGNORED:
             return found
         walking = dataclasses.replace(start, velocity=trial.motions[0].state.velocity)
         other, _ = self._rounds(sweeps, since, walking, initial)
-        if not found.motions or (other.motions and other.fits_clearly_closer(found)):
+        if other.fits_closer(found, tuning.INITIAL_CLOSER):
             return other
         return self._round(sweeps, since, begun, initial)
 
@@ -476,6 +479,7 @@ class MapInitializer:
     ) -> Trial:
         matcher = self._matcher
         matcher.clear()
+        matcher.surfaces.young = self._young
         matcher.drift.begun_in_motion = not initial.at_rest
         first = self._predictor.over_sweep(sweeps[0], start, initial.covariance, since)
         motions = [first]

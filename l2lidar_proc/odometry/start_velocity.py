@@ -23,7 +23,6 @@ from l2lidar_node import records, rotations
 from l2lidar_node.types import F64, I64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
-    ACCEL_BIAS,
     ERRORS,
     GRAVITY,
     POSITION,
@@ -36,8 +35,9 @@ from l2lidar_proc.odometry.wall_profile import (
     Spots,
     are_walls,
     extract_spots,
+    likelihood_of,
     log_likelihood,
-    velocity_likelihood,
+    velocity_jacobian,
 )
 from l2lidar_proc.odometry.wall_velocity import level_axes
 
@@ -195,7 +195,7 @@ class StartVelocity:
         weak = directions[:, strengths < tuning.START_SHARE * strengths[-1]]
         if self.is_awaited:
             weak = np.column_stack((weak, self._open_axes.T))
-        axes = level_basis(weak, motion.state.gravity)
+        axes = level_span(weak, motion.state.gravity)
         if not len(axes):
             return None
         lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
@@ -226,7 +226,7 @@ class StartVelocity:
             self.since = self._passed[0].sweep.start
 
 
-def level_basis(directions: F64, gravity: F64) -> F64:
+def level_span(directions: F64, gravity: F64) -> F64:
     """Return orthonormal level axes (K, 3) along directions (3, M), as far as these are level."""
     up = gravity / np.linalg.norm(gravity)
     flat = directions - np.outer(up, up @ directions)
@@ -322,9 +322,7 @@ def _measured(
     left = np.atleast_2d(np.cov(errors.T, aweights=weights, bias=True))
     left += tuning.START_NOISE**2 * np.eye(len(axes))
     age = 0.5e-9 * (now - int(seen["stamp"].min()))
-    h = np.zeros((len(axes), ERRORS))
-    h[:, VELOCITY], h[:, GRAVITY] = axes, -age * axes
-    h[:, ACCEL_BIAS] = age * (axes @ state.rotation)
+    h = np.stack([velocity_jacobian(state, age, axis) for axis in axes])
     cross = covariance @ h.T
     prior = h @ cross
     if np.trace(left) > tuning.START_BETTER * np.trace(prior):
@@ -361,8 +359,9 @@ def log_likelihoods(seen: Seen, now: int, axes: F64, errors: F64, gravity: F64) 
     if len(axes) == 1:  # walls fix the place across them
         spots = _spots(seen, along)
         if are_walls(spots, along):
-            clear = np.ptp(log_likelihood(spots, now, along, errors[:, 0])) > tuning.START_PROFILE
-            return np.log(velocity_likelihood(spots, now, along, errors[:, 0])) if clear else None
+            logs = log_likelihood(spots, now, along, errors[:, 0])
+            has_edges = np.ptp(logs) > tuning.START_PROFILE
+            return np.log(likelihood_of(logs, errors[:, 0])) if has_edges else None
     posts = upright(seen, gravity)
     if len(posts) < tuning.START_POSTS:
         return None

@@ -100,6 +100,7 @@ class SurfelMap:
         """Forget everything."""
         used = len(self) + 1
         self.latest = 0
+        self.young = YoungSurfaces.TRUSTED
         self._index.clear()
         # the arrays stay for the next map: memory freed and asked for again comes back in pieces
         self._cells[:used] = np.zeros(1, CELL)

@@ -152,7 +152,7 @@ class WallProfile(PassedPlaces):
         if span < tuning.PROFILE_SPAN_NS:
             return state, covariance
         self._measured = now
-        h = _mean_velocity(state, 0.5e-9 * span, axes[0])
+        h = velocity_jacobian(state, 0.5e-9 * span, axes[0])
         cross = covariance @ h
         variance = float(h @ cross)
         if variance < tuning.PROFILE_SURE**2:
@@ -172,7 +172,7 @@ class WallProfile(PassedPlaces):
         return after, covariance + np.outer(gain, gain) * (left - variance)
 
 
-def _mean_velocity(state: InertialState, age: float, along: F64) -> F64:
+def velocity_jacobian(state: InertialState, age: float, along: F64) -> F64:
     """Return the derivatives (18,) of the velocity along a direction, some seconds ago."""
     h = np.zeros(ERRORS)
     h[VELOCITY] = along
@@ -201,7 +201,12 @@ def velocity_likelihood(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
     axes : ndarray, shape (3, 3)
     errors : ndarray, shape (M,)
     """
-    logs = log_likelihood(spots, now, axes, errors) / tuning.PROFILE_DEPENDENT
+    return likelihood_of(log_likelihood(spots, now, axes, errors), errors)
+
+
+def likelihood_of(logs: F64, errors: F64) -> F64:
+    """Return what :func:`velocity_likelihood` makes of logarithms (M,) for some errors (M,)."""
+    logs = logs / tuning.PROFILE_DEPENDENT
     apart = (errors[:, None] - errors) / tuning.PROFILE_NOISE
     kernel = np.exp(-0.5 * apart * apart)
     likelihood = kernel @ np.exp(logs - logs.max()) / kernel.sum(axis=1)

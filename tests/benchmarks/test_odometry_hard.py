@@ -243,7 +243,7 @@ def end_of(some: Recording) -> float:
 
 
 @pytest.mark.parametrize(
-    ("seed", "most", "first"),
+    ("seed", "most", "turned"),
     [
         (2, 0.2, 2.0),  # a room, shaken: 97 m off where 0.7 m/s^2 bounded the tilt of gravity
         (77, 0.3, 2.0),  # a hall: 10 m where its rims told the velocity
@@ -253,7 +253,7 @@ def end_of(some: Recording) -> float:
     ],
 )
 def test_what_begins_in_motion_does_not_run_away(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, most: float, first: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, most: float, turned: float
 ) -> None:
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     given = recording(scenario(STARTS, seed, 12.0))
@@ -261,8 +261,7 @@ def test_what_begins_in_motion_does_not_run_away(
     assert track is not None
     found = errors(given, track)
     assert np.linalg.norm(found.position[-1]) < most
-    # gravity is that of the place from the first pose on
-    assert np.degrees(np.linalg.norm(found.turn[-10:, :2], axis=1).max()) < first
+    assert np.degrees(np.linalg.norm(found.turn[-10:, :2], axis=1).max()) < turned
 
 
 def test_walls_measure_the_velocity_along_a_corridor(

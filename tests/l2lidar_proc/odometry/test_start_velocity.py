@@ -19,7 +19,7 @@ from l2lidar_proc.odometry.start_velocity import (
     Seen,
     StartVelocity,
     doubted,
-    level_basis,
+    level_span,
     log_likelihoods,
     placed,
     upright,
@@ -213,12 +213,12 @@ def test_a_spot_counts_once_in_each_sweep_and_far_ones_do_not() -> None:
 
 def test_axes_are_level_and_orthonormal() -> None:
     leaning = np.array([[0.9, 0.1, 0.3], [0.0, 0.05, 1.0]]).T
-    axes = level_basis(leaning, GRAVITY)
+    axes = level_span(leaning, GRAVITY)
     assert axes @ axes.T == pytest.approx(np.eye(1))
     assert abs(axes[0, 2]) < 1e-12
     assert abs(axes[0] @ np.array([0.9, 0.1, 0.0])) == pytest.approx(np.hypot(0.9, 0.1))
-    assert level_basis(np.eye(3), GRAVITY).shape == (2, 3)
-    assert level_basis(np.zeros((3, 0)), GRAVITY).shape == (0, 3)
+    assert level_span(np.eye(3), GRAVITY).shape == (2, 3)
+    assert level_span(np.zeros((3, 0)), GRAVITY).shape == (0, 3)
 
 
 def test_doubt_leaves_what_is_fixed_as_it_is() -> None:

@@ -528,7 +528,7 @@ def test_the_velocity_is_that_of_the_middle() -> None:
         sensed = state.rotation @ (force - one.accel_bias) + one.gravity
         return float(along @ (one.velocity - age * sensed))
 
-    h = wall_profile._mean_velocity(state, age, along)
+    h = wall_profile.velocity_jacobian(state, age, along)
     for k in range(eskf.ERRORS):
         if k in range(*eskf.ROTATION.indices(eskf.ERRORS)):
             continue
