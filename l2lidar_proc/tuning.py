@@ -566,13 +566,20 @@ VERTICAL_BOUND: Final = 0.052  # [rad] nearer surfaces agree with a vertical
 VERTICAL_TRY: Final = 0.5  # share with which the map is begun again, to see whether more agree
 # Share of the area that has to. Observed: 0.76 to 0.97 in buildings, 0.1 to 0.7 in woods
 VERTICAL_AGREE: Final = 0.75
+# With less, but this share, it is up to 4 degrees off (slopes of woods), and the accelerometer up
+# to 3. Where the two differ by more than the sine below, it was the accelerometer that was off: 5
+# shaken and driven starts by 8 to 24 degrees
+VERTICAL_LIKELY: Final = 0.6
+VERTICAL_CONTRADICTS: Final = 0.1
 # Information about the tilt that is known worse, by that of level surfaces alone. One wall leaves
 # a tilt open: 3.5 degrees off at 0.03 to 0.11
 VERTICAL_FIXED: Final = 0.12
 VERTICAL_ROUNDS: Final = 15
 VERTICAL_CONVERGED: Final = 1e-5  # [rad]
-# [m/s^2] sigma of gravity's direction then: one degree. Buildings are truer, ramps are not level
+# [m/s^2] sigma of gravity's direction then: one degree. Buildings are truer, ramps are not level.
+# And of one that is likely
 VERTICAL_SIGMA: Final = 0.17
+VERTICAL_LIKELY_SIGMA: Final = 0.4
 VERTICAL_TILTED: Final = 3.0  # sigmas: farther off, the accelerometer does not show the vertical
 
 # ---- odometry: velocity of a start in motion. Tuned on: family `starts`, seeds 0 to 431

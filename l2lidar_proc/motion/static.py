@@ -316,16 +316,16 @@ class InitialState:
     at_rest: bool
     gravity_trusted: bool
 
-    def leveled(self, up: F64) -> InitialState:
+    def leveled(self, up: F64, sigma: float) -> InitialState:
         """Return the first state in a map whose vertical is another unit vector (3,) of this one.
 
-        How well that is known, is the same for all: :data:`tuning.VERTICAL_SIGMA`.
+        How well that is known, is said by the sigma of gravity's level components [m/s^2].
         """
         turn = rotations.matrices(rotations.between(up, (0.0, 0.0, 1.0)))
         state = dataclasses.replace(self.state, rotation=turn @ self.state.rotation)
         covariance = self.covariance.copy()
-        sigma = np.array([tuning.VERTICAL_SIGMA, tuning.VERTICAL_SIGMA, tuning.GRAVITY_SIZE_SIGMA])
-        covariance[GRAVITY, GRAVITY] = np.diag(sigma**2)
+        sigmas = np.array([sigma, sigma, tuning.GRAVITY_SIZE_SIGMA])
+        covariance[GRAVITY, GRAVITY] = np.diag(sigmas**2)
         return dataclasses.replace(self, state=state, covariance=covariance)
 
 

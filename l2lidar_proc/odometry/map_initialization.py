@@ -386,17 +386,20 @@ class MapInitializer:
         """Return the start with the vertical that its map shows, and the map begun with that.
 
         A wrong vertical smears the map, and a smeared map hides the vertical: where some surfaces
-        agree on one, more may do so once the map has begun with it.
+        agree on one, more may do so once the map has begun with it. Where fewer do, one that the
+        accelerometer contradicts strongly is still nearer than the accelerometer.
         """
         found = self._vertical()
         if found is None or found.agreement < tuning.VERTICAL_TRY:
             return initial, trial
-        level = initial.leveled(found.direction)
+        level = initial.leveled(found.direction, tuning.VERTICAL_SIGMA)
         again = self._with_walks(sweeps, since, level)
         better = self._vertical() if again.motions else None
-        is_certain = found.is_certain or (better is not None and better.is_certain)
-        if again.motions and is_certain:
+        if again.motions and (found.is_certain or (better is not None and better.is_certain)):
             return level, again
+        is_contradicted = found.is_beyond(tuning.VERTICAL_CONTRADICTS, UP)
+        if is_contradicted and better is not None and better.is_likely:
+            initial = initial.leveled(found.direction, tuning.VERTICAL_LIKELY_SIGMA)
         return initial, self._with_walks(sweeps, since, initial)
 
     def _vertical(self) -> Vertical | None:
@@ -409,7 +412,7 @@ class MapInitializer:
         if found is None or not found.is_certain:
             return False
         sine = tuning.VERTICAL_TILTED * tuning.VERTICAL_SIGMA / STANDARD_GRAVITY
-        return float(np.linalg.norm(found.direction[:2])) > sine
+        return found.is_beyond(sine, UP)
 
     def _is_beside_walls(self, sweeps: list[Sweep], trial: Trial, direction: F64) -> bool:
         """Return whether the map shows bare walls along a direction (3,), and nothing across."""

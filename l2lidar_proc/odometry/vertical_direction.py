@@ -39,6 +39,15 @@ class Vertical(NamedTuple):
         """Whether so many surfaces agree that the place is built."""
         return self.agreement >= tuning.VERTICAL_AGREE
 
+    @property
+    def is_likely(self) -> bool:
+        """Whether it is nearer than an accelerometer that contradicts it."""
+        return self.agreement >= tuning.VERTICAL_LIKELY
+
+    def is_beyond(self, sine: float, vertical: F64) -> bool:
+        """Return whether its angle to another vertical (3,), a unit vector, has a larger sine."""
+        return float(np.linalg.norm(np.cross(self.direction, vertical))) > sine
+
 
 def vertical_direction(normals: F64, weights: F64, guess: F64) -> Vertical | None:
     """Return the vertical that most surfaces agree on; None where they leave a tilt open.

@@ -121,7 +121,7 @@ def test_a_start_can_be_leveled_by_another_vertical() -> None:
     found = initial_state(samples, HostNs(int(samples["stamp"][-1])), may_rest=False)
     up = np.array([-0.12, 0.03, 0.0])
     up[2] = np.sqrt(1.0 - up @ up)
-    level = found.leveled(up)
+    level = found.leveled(up, 0.25)
     np.testing.assert_allclose(
         level.state.rotation @ found.state.rotation.T @ up, (0.0, 0.0, 1.0), atol=1e-12
     )
@@ -131,7 +131,7 @@ def test_a_start_can_be_leveled_by_another_vertical() -> None:
     assert abs(turn[2]) < 1e-9
     before, after = (np.sqrt(np.diag(one.covariance)) for one in (found, level))
     assert (before[15:17] > 0.6).all()
-    np.testing.assert_allclose(after[15:], (0.17, 0.17, 0.01))
+    np.testing.assert_allclose(after[15:], (0.25, 0.25, 0.01))
     np.testing.assert_array_equal(after[:15], before[:15])
 
 

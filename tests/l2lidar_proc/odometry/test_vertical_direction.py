@@ -8,7 +8,7 @@ import pytest
 from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.vertical_direction import vertical_direction
+from l2lidar_proc.odometry.vertical_direction import Vertical, vertical_direction
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -99,3 +99,23 @@ def test_a_few_surfaces_show_none() -> None:
     count = tuning.VERTICAL_SURFACES - 1
     assert vertical_direction(floor(count), np.ones(count), UP) is None
     assert vertical_direction(floor(count + 1), np.ones(count + 1), UP) is not None
+
+
+def test_how_far_verticals_are_apart_does_not_depend_on_their_sense() -> None:
+    degrees = np.array([4.0, 10.0])
+    for tilt in degrees:
+        found = Vertical(tilted(tilt, 0.7) @ UP, 0.7)
+        for vertical in (UP, -UP):
+            beyond = [found.is_beyond(sine, vertical) for sine in np.sin(np.radians((3.0, 7.0)))]
+            assert beyond == [True, tilt > 7.0]
+
+
+@pytest.mark.parametrize(
+    ("agreement", "likely", "certain"),
+    [(0.5, False, False), (0.6, True, False), (0.7, True, False), (0.75, True, True)],
+)
+def test_a_vertical_is_likely_before_it_is_certain(
+    agreement: float, likely: bool, certain: bool
+) -> None:
+    found = Vertical(UP, agreement)
+    assert (found.is_likely, found.is_certain) == (likely, certain)
