@@ -619,6 +619,18 @@ START_ROW: Final = 0.5  # [m] and up
 # Cells more for one unit of the logarithm, by the square root of the points. With it, a gap of
 # 5 units to the next best velocity was right to 0.3 m/s in 85 of 90 searches
 START_SCALE: Final = 0.3
+# Yaw rate of such a start, searched over the same points. Observed in 70 searches: 9 rates were
+# wrong by 1 to 4 degrees per second. All that were found with so much more on the logarithm were
+# right to 0.4, but for one of 1.2 and one where gravity was off. At later searches it was wrong in
+# 4 starts and right in 2
+START_YAW_SIGMA: Final = 0.04  # [rad/s] of what is known before, at least
+START_YAW_REACH: Final = 0.105  # [rad/s] of the search,
+START_YAW_STEP: Final = 0.0175  # [rad/s] in steps that are 0.4 m at 10 m in the time of the points
+START_YAW_FINER: Final = 0.0045  # [rad/s] and then about the best one
+START_YAW_VELOCITY_STEP: Final = 0.3  # [m/s] between velocities compared at each
+START_YAW_MOST: Final = 3000  # points of the first search, with the two coarser cells. Bounds time
+START_YAW_BETTER: Final = 4.0  # by the logarithm, than no change
+START_YAW_NOISE: Final = 0.004  # [rad/s] error besides, 1 sigma: half of the finer steps
 
 # ---- odometry: initialization of the map. Tuned on: starts at rest and in motion, all scenes
 

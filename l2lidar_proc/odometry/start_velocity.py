@@ -9,6 +9,10 @@ synthetic aperture. Only upright things count: floors and ceilings look the same
 Beside bare walls the fewest cells are those of a sensor at rest, since the rims of the view move
 along with it. There the profile of the walls tells the velocity
 (:mod:`~l2lidar_proc.odometry.wall_profile`).
+
+In a hall, a wrong velocity moves what is far ahead to the side, as a turn does. So the first
+sweeps may have learned a wrong yaw rate with it, of 4 degrees per second. That smears the map at
+any velocity, so the yaw rate is searched first.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
     ERRORS,
     GRAVITY,
+    GYRO_BIAS,
     POSITION,
     VELOCITY,
     InertialState,
@@ -198,12 +203,14 @@ class StartVelocity:
         axes = level_span(weak, motion.state.gravity)
         if not len(axes):
             return None
+        turned = self._with_yaw_rate(motion, axes) if self.is_first else None
+        motion = turned or motion
         lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
         covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
         seen = placed(self._passed, motion, self._lever, axes)
         found = _measured(seen, motion.state, covariance, axes)
         if found is None:
-            return None
+            return FoundVelocity(motion.state, covariance, is_news=True) if turned else None
         state, posterior, sigmas = found
         change = float(np.linalg.norm(state.velocity - motion.state.velocity))
         before = axes @ motion.covariance[VELOCITY, VELOCITY] @ axes.T
@@ -212,7 +219,28 @@ class StartVelocity:
             # the sweeps since have told much more
             is_news &= change < tuning.START_MOST_CHANGE
         is_news |= float(np.linalg.eigvalsh(before)[-1]) > tuning.START_OPEN**2
-        return FoundVelocity(state, posterior, is_news)
+        return FoundVelocity(state, posterior, is_news or turned is not None)
+
+    def _with_yaw_rate(self, motion: SweepMotion, axes: F64) -> SweepMotion | None:
+        """Return the motion with the yaw rate that the sweeps show; None where it shows before."""
+        state = motion.state
+        found = yaw_rate_error(
+            placed(self._passed, motion, self._lever, axes), int(state.stamp), axes, state.gravity
+        )
+        if found is None:
+            return None
+        error, sigma = found
+        # the rate is faster by what the bias is smaller
+        h = np.zeros(ERRORS)
+        h[GYRO_BIAS] = state.rotation.T @ (state.gravity / np.linalg.norm(state.gravity))
+        covariance = motion.covariance.copy()
+        # what the registrations have told about it is the echo of a wrong velocity
+        more = max(tuning.START_YAW_SIGMA**2 - float(h @ covariance @ h), 0.0)
+        covariance += more * np.outer(h, h)
+        prior = float(h @ covariance @ h)
+        gain = covariance @ h / prior
+        after = state.boxplus(gain * error)
+        return motion.with_state(after, covariance - (prior - sigma**2) * np.outer(gain, gain))
 
     def end_search(self, end: HostNs) -> None:
         """Wait until the next search, with the sweeps that it will need."""
@@ -333,11 +361,93 @@ def _measured(
     return after, posterior, float(np.sqrt(mean @ np.linalg.solve(left, mean)))
 
 
-def _candidates(sigma: float) -> list[float]:
+def _candidates(sigma: float, step: float = tuning.START_STEP) -> list[float]:
     """Return the errors of the velocity to compare along one axis [m/s]."""
     reach = min(tuning.START_SIGMAS * sigma, tuning.START_REACH)
-    count = max(int(np.ceil(reach / tuning.START_STEP)), 2)
-    return [float(error) for error in np.linspace(-reach, reach, 2 * count + 1)]
+    return _steps(reach, step)
+
+
+def _steps(reach: float, step: float) -> list[float]:
+    """Return values from -reach to reach, no farther apart than a step, and 0 among them."""
+    count = max(int(np.ceil(reach / step)), 2)
+    return [float(value) for value in np.linspace(-reach, reach, 2 * count + 1)]
+
+
+def yaw_rate_error(seen: Seen, now: int, axes: F64, gravity: F64) -> tuple[float, float] | None:
+    """Return what has to be added to the yaw rate, and its sigma [rad/s]; None where nothing is.
+
+    It is the one with which upright points occupy the fewest cells, at the velocity with which
+    they then do so.
+
+    Parameters
+    ----------
+    seen : ndarray, shape (N,), dtype SEEN
+    now : int
+        Instant at which the heading is right [ns].
+    axes : ndarray, shape (K, 3)
+        Level, orthonormal, along which the velocity may be wrong; K is 1 or 2.
+    gravity : ndarray, shape (3,)
+        [m/s^2]
+    """
+    frame = level_axes(axes[0], gravity)
+    if len(axes) == 1 and are_walls(_spots(seen, frame), frame):
+        return None  # they show the heading
+    posts = upright(seen, gravity)
+    if len(posts) < tuning.START_POSTS:
+        return None
+    moves = axes @ frame.T
+    steps = _candidates(tuning.START_PRIOR, tuning.START_YAW_VELOCITY_STEP)
+    errors = np.array([*itertools.product(steps, repeat=len(axes))]) @ moves
+    rates = np.array(_steps(tuning.START_YAW_REACH, tuning.START_YAW_STEP))
+    some = records.decimated(posts, tuning.START_YAW_MOST)
+    logs, best = _sharpest(some, now, frame, rates, errors, tuning.START_CELLS[:2])
+    chosen, unchanged = int(np.argmax(logs)), len(rates) // 2
+    if logs[chosen] - logs[unchanged] < tuning.START_YAW_BETTER:
+        return None
+    near = _steps(tuning.START_YAW_VELOCITY_STEP, tuning.START_STEP)
+    errors = best[chosen] + np.array([*itertools.product(near, repeat=len(axes))]) @ moves
+    finer = _steps(tuning.START_YAW_STEP, tuning.START_YAW_FINER)
+    rates = rates[chosen] + np.array(finer)
+    logs, _ = _sharpest(posts, now, frame, rates, errors, tuning.START_CELLS)
+    weights = np.exp(logs - logs.max())
+    mean = float(np.average(rates, weights=weights))
+    variance = float(np.average((rates - mean) ** 2, weights=weights))
+    return mean, float(np.sqrt(variance + tuning.START_YAW_NOISE**2))
+
+
+def _sharpest(
+    posts: Seen, now: int, frame: F64, rates: F64, errors: F64, cells: tuple[float, ...]
+) -> tuple[F64, F64]:
+    """Return how likely errors of the yaw rate are (M,), as logarithms, each with its velocity.
+
+    Parameters
+    ----------
+    posts : ndarray, shape (N,), dtype SEEN
+    now : int
+    frame : ndarray, shape (3, 3)
+        Its rows are the axes that places are counted along.
+    rates : ndarray, shape (M,)
+        [rad/s]
+    errors : ndarray, shape (L, 3)
+        Of the velocity, along the axes of the frame [m/s]: one of them comes with each rate.
+    cells : tuple of float
+        Their sizes [m].
+    """
+    ages, sights = (posts["stamp"] - now) * 1e-9, posts["sight"] @ frame.T
+    moves = ages[:, None] * errors[:, None]
+    counts, best = np.zeros(len(rates)), np.zeros((len(rates), 3))
+    for number, rate in enumerate(rates.tolist()):
+        turned = _yawed(sights, rate * ages) + (posts["place"] @ frame.T - sights)
+        found = [_occupied(turned + move, cells) for move in moves]
+        best[number], counts[number] = errors[np.argmin(found)], min(found)
+    return (counts.min() - counts) / (tuning.START_SCALE * np.sqrt(len(posts))), best
+
+
+def _yawed(points: F64, angles: F64) -> F64:
+    """Return points (N, 3) turned about the third axis by angles (N,) [rad]."""
+    cosines, sines = np.cos(angles), np.sin(angles)
+    x, y, z = points.T
+    return np.column_stack((cosines * x - sines * y, sines * x + cosines * y, z))
 
 
 def log_likelihoods(seen: Seen, now: int, axes: F64, errors: F64, gravity: F64) -> F64 | None:
@@ -367,7 +477,9 @@ def log_likelihoods(seen: Seen, now: int, axes: F64, errors: F64, gravity: F64) 
         return None
     places, ages = posts["place"] @ along.T, (posts["stamp"] - now) * 1e-9
     moves = errors @ (axes @ along.T)
-    counts = np.array([_occupied(places + ages[:, None] * move) for move in moves])
+    counts = np.array(
+        [_occupied(places + ages[:, None] * move, tuning.START_CELLS) for move in moves]
+    )
     return np.asarray((counts.min() - counts) / (tuning.START_SCALE * np.sqrt(len(posts))))
 
 
@@ -413,10 +525,10 @@ def upright(seen: Seen, gravity: F64) -> Seen:
     return records.decimated(seen[first], tuning.START_MOST)
 
 
-def _occupied(places: F64) -> int:
-    """Return how many cells of all sizes places (N, 3) occupy; along, across and up."""
+def _occupied(places: F64, cells: tuple[float, ...]) -> int:
+    """Return how many cells of some sizes [m] places (N, 3) occupy; along, across and up."""
     found = 0
-    for size in tuning.START_CELLS:
+    for size in cells:
         edges = size, max(size, tuning.START_ACROSS), tuning.START_ROW
         keys = np.sort(_keys(*np.floor(places / edges).astype(np.int64).T))
         found += int(np.count_nonzero(keys[1:] != keys[:-1])) + 1

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
@@ -23,6 +24,7 @@ from l2lidar_proc.odometry.start_velocity import (
     log_likelihoods,
     placed,
     upright,
+    yaw_rate_error,
 )
 
 EPOCH = 1_700_000_000_000_000_000  # [ns]
@@ -49,14 +51,19 @@ def ground() -> F64:
     return np.column_stack((along.ravel(), across.ravel(), np.full(along.size, -1.0)))
 
 
-def motion_at(velocity: F64, covariance: F64) -> SweepMotion:
-    """Return the motion of a level sensor at constant speed, over all sweeps; it ends at zero."""
+def motion_at(velocity: F64, covariance: F64, yaw_rate: float = 0.0) -> SweepMotion:
+    """Return the motion of a level sensor at constant speed, over all sweeps; it ends at zero.
+
+    The gyro measures no turn; a bias of it makes the yaw rate [rad/s].
+    """
     end = EPOCH + SWEEPS * SWEEP_NS
     samples = np.zeros(SWEEPS * 55 + 3, IMU_SAMPLE)
     samples["stamp"] = EPOCH - 4_000_000 + 4_000_000 * np.arange(len(samples))
     samples["linear_acceleration"] = -GRAVITY
     zero = np.zeros(3)
-    state = InertialState(HostNs(EPOCH), np.eye(3), -2.2 * velocity, velocity, zero, zero, GRAVITY)
+    heading = rotations.matrices(rotations.exp(np.array([0.0, 0.0, -2.2 * yaw_rate])))
+    bias = np.array([0.0, 0.0, -yaw_rate])
+    state = InertialState(HostNs(EPOCH), heading, -2.2 * velocity, velocity, bias, zero, GRAVITY)
     found = predict_sweep(
         state,
         covariance,
@@ -178,6 +185,40 @@ def test_beside_bare_walls_nobody_can_tell() -> None:
     assert log_likelihoods(seen, now, X, grid(10), GRAVITY) is None
 
 
+@pytest.mark.parametrize("axes", [X, np.vstack((X, Y))], ids=["along", "both ways"])
+@pytest.mark.parametrize("yaw_rate", [0.07, -0.03, 0.0])
+def test_posts_are_sharpest_at_the_true_yaw_rate(
+    passing: list[Sweep], yaw_rate: float, axes: F64
+) -> None:
+    """Whatever the velocity."""
+    for off in (-0.5, 0.7):
+        wrong = SPEED + np.array([off, 0.0, 0.0])
+        motion = motion_at(wrong, np.eye(eskf.ERRORS), yaw_rate)
+        seen = placed(passed_at(passing, wrong), motion, np.zeros(3), axes)
+        found = yaw_rate_error(seen, int(motion.state.stamp), axes, GRAVITY)
+        if yaw_rate == 0.0:
+            assert found is None
+            continue
+        assert found is not None
+        error, sigma = found
+        assert error == pytest.approx(-yaw_rate, abs=0.01)
+        assert abs(error + yaw_rate) < 3.0 * sigma
+        assert sigma < 0.01
+
+
+def test_walls_and_few_points_show_no_yaw_rate(passing: list[Sweep]) -> None:
+    turning = motion_at(SPEED, np.eye(eskf.ERRORS), 0.07)
+    now = int(turning.state.stamp)
+    seen = placed(passed_at(passing, SPEED), turning, np.zeros(3), X)
+    assert yaw_rate_error(seen, now, X, GRAVITY) is not None
+    some = upright(seen, GRAVITY)[:: len(upright(seen, GRAVITY)) // tuning.START_POSTS + 1]
+    assert yaw_rate_error(some, now, X, GRAVITY) is None
+    speed = SPEED * [1.0, 0.0, 0.0]
+    walls = seen_from(np.random.default_rng(2), bare_walls, speed)
+    beside = placed(passed_at(walls, speed), motion_at(speed, np.eye(eskf.ERRORS)), np.zeros(3), X)
+    assert yaw_rate_error(beside, now, X, GRAVITY) is None
+
+
 def seen_at(places: F64, seconds: F64 | float = 0.0, sweep: int = 0) -> Seen:
     found = np.zeros(len(places), SEEN)
     found["place"] = found["sight"] = places
@@ -274,6 +315,26 @@ def test_a_wrong_velocity_of_a_start_is_corrected_however_certain(
     assert abs(error) < 2.0 * sigma
     assert sigma < 0.3
     assert found.state.velocity[1:] == pytest.approx(SPEED[1:], abs=1e-6)
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
+
+
+@pytest.mark.parametrize("claimed", [0.002, 0.05])
+def test_a_wrong_yaw_rate_of_a_start_is_corrected_however_certain(
+    passing: list[Sweep], claimed: float
+) -> None:
+    covariance = known_to(0.5)
+    covariance[eskf.GYRO_BIAS, eskf.GYRO_BIAS] = claimed**2 * np.eye(3)
+    wrong = SPEED - np.array([0.7, 0.0, 0.0])
+    start = begun(passing, wrong, covariance, X)
+    found = start.search(motion_at(wrong, covariance, 0.07), FREE)
+    assert found is not None
+    assert found.is_news
+    bias, sigma = found.state.gyro_bias[2], np.sqrt(found.covariance[11, 11])
+    assert abs(bias) < 0.01
+    assert abs(bias) < 3.0 * sigma
+    assert sigma < 0.01
+    assert found.state.velocity == pytest.approx(SPEED, abs=0.15)
+    assert found.covariance[9, 9] == pytest.approx(claimed**2)
     assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
 
 
