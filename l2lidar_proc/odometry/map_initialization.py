@@ -339,10 +339,10 @@ class MapInitializer:
 
         The velocity is open where the first sweeps fit at many, as in a hall or between walls.
         """
-        trial = self._with_walks(sweeps, since, initial)
+        trial, begun = self._with_walks(sweeps, since, initial)
         if initial.at_rest or not (initial.gravity_trusted and trial.motions):
             return trial
-        initial, trial = self._leveled(sweeps, since, initial, trial)
+        initial, begun, trial = self._leveled(sweeps, since, initial, begun, trial)
         self.moving = MovingStart(initial, np.zeros((0, 3)))
         if trial.last is None:
             return trial
@@ -359,7 +359,7 @@ class MapInitializer:
         apart = self._with_open_velocity(sweeps, since, initial, trial)
         if not apart.motions:
             self._young = YoungSurfaces.TRUSTED
-            return self._with_walks(sweeps, since, initial)
+            return self._round(sweeps, since, begun, initial)
         self.moving = MovingStart(initial, axes[:, is_open].T)
         return apart
 
@@ -381,8 +381,13 @@ class MapInitializer:
         return self._round(sweeps, since, begun, initial)
 
     def _leveled(
-        self, sweeps: list[Sweep], since: HostNs, initial: InitialState, trial: Trial
-    ) -> tuple[InitialState, Trial]:
+        self,
+        sweeps: list[Sweep],
+        since: HostNs,
+        initial: InitialState,
+        begun: InertialState,
+        trial: Trial,
+    ) -> tuple[InitialState, InertialState, Trial]:
         """Return the start with the vertical that its map shows, and the map begun with that.
 
         A wrong vertical smears the map, and a smeared map hides the vertical: where some surfaces
@@ -391,16 +396,18 @@ class MapInitializer:
         """
         found = self._vertical()
         if found is None or found.agreement < tuning.VERTICAL_TRY:
-            return initial, trial
+            return initial, begun, trial
         level = initial.leveled(found.direction, tuning.VERTICAL_SIGMA)
-        again = self._with_walks(sweeps, since, level)
+        again, better_begun = self._with_walks(sweeps, since, level)
         better = self._vertical() if again.motions else None
         if again.motions and (found.is_certain or (better is not None and better.is_certain)):
-            return level, again
+            return level, better_begun, again
         is_contradicted = found.is_beyond(tuning.VERTICAL_CONTRADICTS, UP)
         if is_contradicted and better is not None and better.is_likely:
-            initial = initial.leveled(found.direction, tuning.VERTICAL_LIKELY_SIGMA)
-        return initial, self._with_walks(sweeps, since, initial)
+            likely = initial.leveled(found.direction, tuning.VERTICAL_LIKELY_SIGMA)
+            trial, begun = self._with_walks(sweeps, since, likely)
+            return likely, begun, trial
+        return initial, begun, self._round(sweeps, since, begun, initial)
 
     def _vertical(self) -> Vertical | None:
         """Return the vertical that the surfaces of the map show, map axes."""
@@ -436,7 +443,9 @@ class MapInitializer:
         areas = [np.full(len(places), size**2) for size, places, *_ in levels]
         return normals, np.concatenate(areas)
 
-    def _with_walks(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
+    def _with_walks(
+        self, sweeps: list[Sweep], since: HostNs, initial: InitialState
+    ) -> tuple[Trial, InertialState]:
         """Begin the map in rounds, each with the velocity that the round before has shown.
 
         Where the first sweeps hardly fix a direction, as in a corridor, rounds that begin at rest
@@ -445,10 +454,10 @@ class MapInitializer:
         start = self._at_cloud_origin(initial)
         trial, begun = self._rounds(sweeps, since, start, initial)
         if initial.at_rest or trial.last is None:
-            return trial
+            return trial, begun
         strength, axis = weak_axis(trial.last.information)
         if strength >= tuning.WEAK_SHARE:
-            return trial
+            return trial, begun
         best, best_begun, latest = trial, begun, trial
         for speed in (tuning.INITIAL_SPEED, -tuning.INITIAL_SPEED):
             walking = dataclasses.replace(start, velocity=speed * axis)
@@ -457,7 +466,7 @@ class MapInitializer:
                 best, best_begun = latest, begun
         if best is not latest:  # the maps are those of the latest one
             best = self._round(sweeps, since, best_begun, initial)
-        return best
+        return best, best_begun
 
     def _rounds(
         self, sweeps: list[Sweep], since: HostNs, start: InertialState, initial: InitialState
