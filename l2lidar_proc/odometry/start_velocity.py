@@ -187,7 +187,7 @@ class StartVelocity:
         lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
         covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
         seen = placed(self._passed, motion, self._lever, axes)
-        found = _measured(seen, motion.state, covariance, axes)
+        found = _measured(seen, motion.state, covariance, axes, first=self.is_first)
         if found is None:
             return FoundVelocity(motion.state, covariance, is_news=True) if turned else None
         state, posterior, sigmas = found
@@ -309,7 +309,7 @@ def placed(passed: list[Passed], motion: SweepMotion, lever: F64, axes: F64) -> 
 
 
 def _measured(
-    seen: Seen, state: InertialState, covariance: F64, axes: F64
+    seen: Seen, state: InertialState, covariance: F64, axes: F64, *, first: bool
 ) -> tuple[InertialState, F64, float] | None:
     """Return the posterior of the velocity along axes, and by how many sigmas it was off.
 
@@ -324,6 +324,10 @@ def _measured(
     if logs is None:
         return None
     logs = logs - 0.5 * ((errors / sigmas) ** 2).sum(axis=1)
+    if first:
+        # posts at even distances look alike at several velocities, and carriers are not fast
+        speeds = axes @ state.velocity + errors
+        logs = logs - 0.5 * ((speeds / tuning.START_VELOCITY_SIGMA[1]) ** 2).sum(axis=1)
     weights = np.exp(logs - logs.max())
     mean = np.average(errors, axis=0, weights=weights)
     left = np.atleast_2d(np.cov(errors.T, aweights=weights, bias=True))
