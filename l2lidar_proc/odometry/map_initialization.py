@@ -394,12 +394,12 @@ class MapInitializer:
         agree on one, more may do so once the map has begun with it. Where fewer do, one that the
         accelerometer contradicts strongly is still nearer than the accelerometer.
         """
-        found = self._vertical()
+        found = self.vertical()
         if found is None or found.agreement < tuning.VERTICAL_TRY:
             return initial, begun, trial
         level = initial.leveled(found.direction, tuning.VERTICAL_SIGMA)
         again, better_begun = self._with_walks(sweeps, since, level)
-        better = self._vertical() if again.motions else None
+        better = self.vertical() if again.motions else None
         if again.motions and (found.is_certain or (better is not None and better.is_certain)):
             return level, better_begun, again
         is_contradicted = found.is_beyond(tuning.VERTICAL_CONTRADICTS, UP)
@@ -409,13 +409,13 @@ class MapInitializer:
             return likely, begun, trial
         return initial, begun, self._round(sweeps, since, begun, initial)
 
-    def _vertical(self) -> Vertical | None:
-        """Return the vertical that the surfaces of the map show, map axes."""
-        return vertical_direction(*self._normals(), UP)
+    def vertical(self, guess: F64 = UP) -> Vertical | None:
+        """Return the vertical that the surfaces of the map show, near a guess (3,), map axes."""
+        return vertical_direction(*self._normals(), guess)
 
     def _is_tilted(self, initial: InitialState) -> bool:
         """Return whether the map shows another vertical than the accelerometer does."""
-        found = self._vertical() if initial.gravity_trusted else None
+        found = self.vertical() if initial.gravity_trusted else None
         if found is None or not found.is_certain:
             return False
         sine = tuning.VERTICAL_TILTED * tuning.VERTICAL_SIGMA / STANDARD_GRAVITY

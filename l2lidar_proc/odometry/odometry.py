@@ -307,7 +307,11 @@ class Odometry:
             return motion, False
         state, covariance, span = motion.state, motion.covariance, (start.since, sweep.end)
         whole = self._predictor.over(state, covariance, span, state.stamp)
-        better = start.search(whole, found.information[eskf.POSITION, eskf.POSITION])
+        vertical = None
+        if self._predictor.trusts_gravity:
+            vertical = self._initializer.vertical(-state.gravity / np.linalg.norm(state.gravity))
+        information = found.information[eskf.POSITION, eskf.POSITION]
+        better = start.search(whole, information, vertical)
         motions: list[SweepMotion] = []
         if better is not None and better.is_news:
             self._walls.correct(state, better.state)

@@ -37,6 +37,8 @@ from l2lidar_proc.odometry.map_sharpness import (
     yaw_rate_error,
 )
 from l2lidar_proc.odometry.matcher import xyz
+from l2lidar_proc.odometry.pose_hypotheses import level_basis
+from l2lidar_proc.odometry.vertical_direction import Vertical
 from l2lidar_proc.odometry.wall_profile import velocity_jacobian
 
 
@@ -165,7 +167,9 @@ class StartVelocity:
         """Return whether it is time for a search, at the end of a sweep."""
         return len(self._passed) > 0 and end >= self._next
 
-    def search(self, motion: SweepMotion, information: F64) -> FoundVelocity | None:
+    def search(
+        self, motion: SweepMotion, information: F64, vertical: Vertical | None
+    ) -> FoundVelocity | None:
         """Return the state with the velocity that the sweeps show; None where they show none.
 
         Parameters
@@ -174,40 +178,47 @@ class StartVelocity:
             Of the latest sweep, reaching back to :attr:`since`.
         information : ndarray, shape (3, 3)
             About the place, of its alignment.
+        vertical : Vertical or None
+            That the map shows, map axes.
         """
+        before = motion
+        lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
+        if vertical is not None and vertical.is_certain:
+            motion = with_level_gravity(motion, vertical.direction, lasted)
         strengths, directions = np.linalg.eigh(information)
         weak = directions[:, strengths < tuning.START_SHARE * strengths[-1]]
         if self.is_awaited:
             weak = np.column_stack((weak, self._open_axes.T))
         axes = level_span(weak, motion.state.gravity)
         if not len(axes):
-            return None
-        turned = self._with_yaw_rate(motion, axes) if self.is_first else None
-        motion = turned or motion
-        lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
+            is_leveled = motion is not before
+            return FoundVelocity(motion.state, motion.covariance, True) if is_leveled else None
+        if self.is_first:
+            motion = self._with_yaw_rate(motion, axes)
+        is_news = motion is not before
         covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
         seen = placed(self._passed, motion, self._lever, axes)
         found = _measured(seen, motion.state, covariance, axes, first=self.is_first)
         if found is None:
-            return FoundVelocity(motion.state, covariance, is_news=True) if turned else None
+            return FoundVelocity(motion.state, covariance, True) if is_news else None
         state, posterior, sigmas = found
         change = float(np.linalg.norm(state.velocity - motion.state.velocity))
-        before = axes @ motion.covariance[VELOCITY, VELOCITY] @ axes.T
-        is_news = change > tuning.START_CHANGE and sigmas > tuning.START_SIGNIFICANT
+        prior = axes @ motion.covariance[VELOCITY, VELOCITY] @ axes.T
+        is_other = change > tuning.START_CHANGE and sigmas > tuning.START_SIGNIFICANT
         if not self.is_first:
             # the sweeps since have told much more
-            is_news &= change < tuning.START_MOST_CHANGE
-        is_news |= float(np.linalg.eigvalsh(before)[-1]) > tuning.START_OPEN**2
-        return FoundVelocity(state, posterior, is_news or turned is not None)
+            is_other &= change < tuning.START_MOST_CHANGE
+        was_open = float(np.linalg.eigvalsh(prior)[-1]) > tuning.START_OPEN**2
+        return FoundVelocity(state, posterior, is_news or is_other or was_open)
 
-    def _with_yaw_rate(self, motion: SweepMotion, axes: F64) -> SweepMotion | None:
-        """Return the motion with the yaw rate that the sweeps show; None where it shows before."""
+    def _with_yaw_rate(self, motion: SweepMotion, axes: F64) -> SweepMotion:
+        """Return the motion with the yaw rate that the sweeps show, the same if it has it."""
         state = motion.state
         found = yaw_rate_error(
             placed(self._passed, motion, self._lever, axes), int(state.stamp), axes, state.gravity
         )
         if found is None:
-            return None
+            return motion
         error, sigma = found
         # the rate is faster by what the bias is smaller
         h = np.zeros(ERRORS)
@@ -241,6 +252,46 @@ def level_span(directions: F64, gravity: F64) -> F64:
     return np.asarray(axes[:, lengths > tuning.START_LEVEL].T)
 
 
+def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> SweepMotion:
+    """Return a motion with gravity along the vertical of the place, the same if it is there.
+
+    It leaves it where a young map confirms a velocity that grows: the acceleration passes for a
+    tilt. The place is then more certain than what has been learned about gravity.
+
+    Parameters
+    ----------
+    motion : SweepMotion
+    vertical : ndarray, shape (3,)
+        Unit vector, map axes.
+    seconds : float
+        For how long gravity may have accelerated the state.
+    """
+    state, covariance = motion.state, motion.covariance
+    axes = level_basis(vertical).T
+    tilt = axes @ state.gravity
+    noise = tuning.START_LEVEL_SIGMA**2 * np.eye(2)
+    known = axes @ covariance[GRAVITY, GRAVITY] @ axes.T
+    if tilt @ np.linalg.solve(known + noise, tilt) < tuning.START_LEVEL_SIGMAS**2:
+        return motion
+    error = _accelerated(tilt @ axes, seconds)
+    covariance = covariance + np.outer(error, error)
+    h = np.zeros((2, ERRORS))
+    h[:, GRAVITY] = axes
+    cross = covariance @ h.T
+    innovation = h @ cross + noise
+    gain = np.linalg.solve(innovation, cross.T).T
+    after = state.boxplus(np.asarray(-gain @ tilt, np.float64))
+    return motion.with_state(after, covariance - gain @ innovation @ gain.T)
+
+
+def _accelerated(acceleration: F64, seconds: float) -> F64:
+    """Return the error of the state (18,) after an error of gravity (3,) [m/s^2]."""
+    error = np.zeros(ERRORS)
+    error[POSITION], error[VELOCITY] = 0.5 * seconds**2 * acceleration, seconds * acceleration
+    error[GRAVITY] = acceleration
+    return error
+
+
 def doubted(covariance: F64, axes: F64, seconds: float, *, first: bool) -> F64:
     """Return a covariance with velocity and acceleration along axes less known.
 
@@ -258,10 +309,8 @@ def doubted(covariance: F64, axes: F64, seconds: float, *, first: bool) -> F64:
     """
     out = covariance.copy()
     for axis in axes:
-        error = np.zeros(ERRORS)
-        error[POSITION], error[VELOCITY] = 0.5 * seconds**2 * axis, seconds * axis
-        error[GRAVITY] = axis
-        out += tuning.START_ACCELERATION**2 * np.outer(error, error)
+        error = _accelerated(tuning.START_ACCELERATION * axis, seconds)
+        out += np.outer(error, error)
     strengths, turn = np.linalg.eigh(axes @ out[VELOCITY, VELOCITY] @ axes.T)
     along = turn.T @ axes
     least = tuning.START_PRIOR if first else tuning.START_LATER

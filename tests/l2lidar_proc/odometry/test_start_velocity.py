@@ -10,7 +10,15 @@ import pytest
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
-from l2lidar_proc.odometry.start_velocity import StartVelocity, doubted, level_span, placed
+from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.start_velocity import (
+    StartVelocity,
+    doubted,
+    level_span,
+    placed,
+    with_level_gravity,
+)
+from l2lidar_proc.odometry.vertical_direction import Vertical
 from tests.support.passing_sweeps import (
     EPOCH,
     GRAVITY,
@@ -70,6 +78,60 @@ def test_doubt_leaves_what_is_fixed_as_it_is() -> None:
         assert found[gravity, eskf.POSITION.start] == pytest.approx(0.605 * acceleration)
 
 
+def tilted_motion(degrees: float, sigma: float, growing_s: float = 1.1) -> SweepMotion:
+    """Return a motion whose gravity is off by an angle about y, and its velocity accordingly.
+
+    The sigma is that of gravity's level components [m/s^2].
+    """
+    covariance = 1e-6 * np.eye(eskf.ERRORS)
+    covariance[15:17, 15:17] = sigma**2 * np.eye(2)
+    motion = motion_at(SPEED, covariance)
+    off = np.array([9.81 * np.sin(np.radians(degrees)), 0.0, 0.0])
+    state = dataclasses.replace(
+        motion.state, gravity=GRAVITY + off, velocity=SPEED + growing_s * off
+    )
+    return motion.with_state(state, covariance)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("degrees", [-4.0, 2.5])
+def test_gravity_that_has_run_away_returns_to_the_vertical_of_the_place(degrees: float) -> None:
+    """And so does the velocity that it has made meanwhile."""
+    motion = tilted_motion(degrees, 0.05)
+    found = with_level_gravity(motion, UP, 1.1)
+    assert found is not motion
+    gravity, sigmas = found.state.gravity, np.sqrt(np.diag(found.covariance))
+    assert np.abs(gravity[:2]).max() < 0.1
+    assert np.abs(gravity[:2] / sigmas[15:17]).max() < 2.0
+    assert sigmas[15] == pytest.approx(tuning.START_LEVEL_SIGMA, rel=0.2)
+    assert np.abs(found.state.velocity - SPEED).max() < 0.1
+    assert np.abs((found.state.velocity - SPEED) / sigmas[6:9]).max() < 2.0
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
+
+
+def test_gravity_within_its_sigma_is_left_alone() -> None:
+    for degrees, sigma in ((0.5, 0.05), (-2.5, 0.2)):
+        motion = tilted_motion(degrees, sigma)
+        assert with_level_gravity(motion, UP, 1.1) is motion
+    # down or up is the same axis
+    motion = tilted_motion(4.0, 0.05)
+    one, other = (with_level_gravity(motion, vertical, 1.1).state for vertical in (UP, -UP))
+    assert other.gravity == pytest.approx(one.gravity)
+
+
+def test_a_search_levels_gravity_by_a_certain_vertical(passing: list[Sweep]) -> None:
+    for agreement, is_leveled in ((0.9, True), (0.7, False)):
+        start = begun(passing, SPEED, known_to(0.05), np.zeros((0, 3)))
+        motion = tilted_motion(4.0, 0.05)
+        found = start.search(motion, np.eye(3), Vertical(UP, agreement))
+        assert (found is not None) == is_leveled
+        if found is not None:
+            assert found.is_news
+            assert abs(found.state.gravity[0]) < 0.1
+
+
 def begun(sweeps: list[Sweep], velocity: F64, covariance: F64, open_axes: F64) -> StartVelocity:
     """Return the search of a start whose sweeps a velocity has placed."""
     start = StartVelocity(np.zeros(3))
@@ -100,7 +162,7 @@ def test_a_wrong_velocity_of_a_start_is_corrected_however_certain(
     assert start.is_awaited
     assert not start.is_due(HostNs(end - 1))
     assert start.is_due(end)
-    found = start.search(motion_at(wrong, covariance), FREE)
+    found = start.search(motion_at(wrong, covariance), FREE, None)
     assert found is not None
     assert found.is_news
     error = (found.state.velocity - SPEED)[0]
@@ -120,7 +182,7 @@ def test_a_wrong_yaw_rate_of_a_start_is_corrected_however_certain(
     covariance[eskf.GYRO_BIAS, eskf.GYRO_BIAS] = claimed**2 * np.eye(3)
     wrong = SPEED - np.array([0.7, 0.0, 0.0])
     start = begun(passing, wrong, covariance, X)
-    found = start.search(motion_at(wrong, covariance, 0.07), FREE)
+    found = start.search(motion_at(wrong, covariance, 0.07), FREE, None)
     assert found is not None
     assert found.is_news
     bias, sigma = found.state.gyro_bias[2], np.sqrt(found.covariance[11, 11])
@@ -134,7 +196,7 @@ def test_a_wrong_yaw_rate_of_a_start_is_corrected_however_certain(
 
 def test_a_right_velocity_is_no_news(passing: list[Sweep]) -> None:
     covariance = known_to(0.05)
-    found = begun(passing, SPEED, covariance, X).search(motion_at(SPEED, covariance), FREE)
+    found = begun(passing, SPEED, covariance, X).search(motion_at(SPEED, covariance), FREE, None)
     assert found is not None
     assert not found.is_news
 
@@ -143,7 +205,7 @@ def test_where_all_is_fixed_nothing_is_searched(passing: list[Sweep]) -> None:
     covariance = known_to(0.05)
     start = begun(passing, SPEED, covariance, np.zeros((0, 3)))
     assert not start.is_open
-    assert start.search(motion_at(SPEED, covariance), np.eye(3)) is None
+    assert start.search(motion_at(SPEED, covariance), np.eye(3), None) is None
 
 
 def test_later_a_change_that_is_too_large_misleads(passing: list[Sweep]) -> None:
@@ -153,7 +215,7 @@ def test_later_a_change_that_is_too_large_misleads(passing: list[Sweep]) -> None
         wrong = SPEED - np.array([off, 0.0, 0.0])
         start = begun(passing, wrong, covariance, np.zeros((0, 3)))
         start.is_first = False
-        found = start.search(motion_at(wrong, covariance), FREE)
+        found = start.search(motion_at(wrong, covariance), FREE, None)
         assert found is None or found.is_news == is_news
         assert found is not None or not is_news
 
