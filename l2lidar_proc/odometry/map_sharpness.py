@@ -45,7 +45,7 @@ Seen = NDArray[np.void]
 """Points (N,), dtype SEEN."""
 
 
-def candidates(sigma: float, step: float = tuning.START_STEP) -> list[float]:
+def candidates(sigma: float, step: float) -> list[float]:
     """Return the errors of the velocity to compare along one axis [m/s].
 
     Parameters
@@ -61,7 +61,7 @@ def candidates(sigma: float, step: float = tuning.START_STEP) -> list[float]:
 
 def _steps(reach: float, step: float) -> list[float]:
     """Return values from -reach to reach, no farther apart than a step, and 0 among them."""
-    count = max(int(np.ceil(reach / step)), 2)
+    count = max(int(np.ceil(reach / step - 1e-6)), 2)
     return [float(value) for value in np.linspace(-reach, reach, 2 * count + 1)]
 
 
@@ -116,9 +116,9 @@ def yaw_rate_error(seen: Seen, now: int, axes: F64, gravity: F64) -> tuple[float
     gravity : ndarray, shape (3,)
         [m/s^2]
     """
-    frame = level_axes(axes[0], gravity)
-    if len(axes) == 1 and are_walls(_spots(seen, frame), frame):
+    if is_beside_walls(seen, axes, gravity):
         return None  # they show the heading
+    frame = level_axes(axes[0], gravity)
     posts = upright(seen, gravity)
     if len(posts) < tuning.START_POSTS:
         return None
@@ -175,6 +175,15 @@ def _yawed(points: F64, angles: F64) -> F64:
     cosines, sines = np.cos(angles), np.sin(angles)
     x, y, z = points.T
     return np.column_stack((cosines * x - sines * y, sines * x + cosines * y, z))
+
+
+def is_beside_walls(seen: Seen, axes: F64, gravity: F64) -> bool:
+    """Return whether points show bare walls along the only one of the axes (K, 3), which is level.
+
+    Then the rims of the view are what is sharpest, and the profile of the walls counts.
+    """
+    frame = level_axes(axes[0], gravity)
+    return len(axes) == 1 and are_walls(_spots(seen, frame), frame)
 
 
 def _spots(seen: Seen, axes: F64) -> Spots:

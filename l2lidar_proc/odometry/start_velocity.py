@@ -33,6 +33,7 @@ from l2lidar_proc.odometry.map_sharpness import (
     SEEN,
     Seen,
     candidates,
+    is_beside_walls,
     velocity_log_likelihoods,
     yaw_rate_error,
 )
@@ -367,13 +368,16 @@ def _measured(
     """
     strengths, turn = np.linalg.eigh(axes @ covariance[VELOCITY, VELOCITY] @ axes.T)
     axes, sigmas = turn.T @ axes, np.sqrt(strengths)
-    errors = np.array([*itertools.product(*(candidates(sigma) for sigma in sigmas.tolist()))])
+    is_profile = is_beside_walls(seen, axes, state.gravity)
+    step = tuning.PROFILE_STEP if is_profile else tuning.START_STEP
+    steps = (candidates(sigma, step) for sigma in sigmas.tolist())
+    errors = np.array([*itertools.product(*steps)])
     now = int(state.stamp)
     logs = velocity_log_likelihoods(seen, now, axes, errors, state.gravity)
     if logs is None:
         return None
     logs = logs - 0.5 * ((errors / sigmas) ** 2).sum(axis=1)
-    if first:
+    if first and not is_profile:
         # posts at even distances look alike at several velocities, and carriers are not fast
         speeds = axes @ state.velocity + errors
         logs = logs - 0.5 * ((speeds / tuning.START_VELOCITY_SIGMA[1]) ** 2).sum(axis=1)
