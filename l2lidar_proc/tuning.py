@@ -582,7 +582,7 @@ VERTICAL_SIGMA: Final = 0.17
 VERTICAL_LIKELY_SIGMA: Final = 0.4
 VERTICAL_TILTED: Final = 3.0  # sigmas: farther off, the accelerometer does not show the vertical
 
-# ---- odometry: velocity of a start in motion. Tuned on: family `starts`, seeds 0 to 431
+# ---- odometry: velocity of a start in motion. Tuned on: family `starts`, seeds 0 to 631
 
 START_NS: Final = 2_200_000_000  # [ns] of the points compared
 START_PAUSE_NS: Final = 1_100_000_000  # [ns] between searches
