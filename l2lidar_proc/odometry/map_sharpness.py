@@ -66,7 +66,7 @@ def _steps(reach: float, step: float) -> list[float]:
 
 
 def velocity_log_likelihoods(
-    seen: Seen, now: int, axes: F64, errors: F64, gravity: F64
+    seen: Seen, now: int, axes: F64, errors: F64, gravity: F64, walls: Spots | None
 ) -> F64 | None:
     """Return how likely errors of the velocity are, as logarithms (M,); None if nobody can tell.
 
@@ -81,14 +81,14 @@ def velocity_log_likelihoods(
         What has to be added to the velocity along each axis [m/s].
     gravity : ndarray, shape (3,)
         [m/s^2]
+    walls : ndarray, dtype SPOT, or None
+        As :func:`wall_spots` returns them.
     """
     along = level_axes(axes[0], gravity)
-    if len(axes) == 1:  # walls fix the place across them
-        spots = _spots(seen, along)
-        if are_walls(spots, along):
-            logs = log_likelihood(spots, now, along, errors[:, 0])
-            has_edges = np.ptp(logs) > tuning.START_PROFILE
-            return np.log(likelihood_of(logs, errors[:, 0])) if has_edges else None
+    if walls is not None:
+        logs = log_likelihood(walls, now, along, errors[:, 0])
+        has_edges = np.ptp(logs) > tuning.START_PROFILE
+        return np.log(likelihood_of(logs, errors[:, 0])) if has_edges else None
     posts = upright(seen, gravity)
     if len(posts) < tuning.START_POSTS:
         return None
@@ -116,7 +116,7 @@ def yaw_rate_error(seen: Seen, now: int, axes: F64, gravity: F64) -> tuple[float
     gravity : ndarray, shape (3,)
         [m/s^2]
     """
-    if is_beside_walls(seen, axes, gravity):
+    if wall_spots(seen, axes, gravity) is not None:
         return None  # they show the heading
     frame = level_axes(axes[0], gravity)
     posts = upright(seen, gravity)
@@ -177,13 +177,24 @@ def _yawed(points: F64, angles: F64) -> F64:
     return np.column_stack((cosines * x - sines * y, sines * x + cosines * y, z))
 
 
-def is_beside_walls(seen: Seen, axes: F64, gravity: F64) -> bool:
-    """Return whether points show bare walls along the only one of the axes (K, 3), which is level.
+def wall_spots(seen: Seen, axes: F64, gravity: F64) -> Spots | None:
+    """Return the spots of bare walls along the only level axis, None where there are none.
 
-    Then the rims of the view are what is sharpest, and the profile of the walls counts.
+    Beside them the rims of the view are what is sharpest, and the profile of the walls counts.
+
+    Parameters
+    ----------
+    seen : ndarray, shape (N,), dtype SEEN
+    axes : ndarray, shape (K, 3)
+        Level, orthonormal. With two of them, no walls fix the place across.
+    gravity : ndarray, shape (3,)
+        [m/s^2]
     """
+    if len(axes) != 1:
+        return None
     frame = level_axes(axes[0], gravity)
-    return len(axes) == 1 and are_walls(_spots(seen, frame), frame)
+    spots = _spots(seen, frame)
+    return spots if are_walls(spots, frame) else None
 
 
 def _spots(seen: Seen, axes: F64) -> Spots:

@@ -33,8 +33,8 @@ from l2lidar_proc.odometry.map_sharpness import (
     SEEN,
     Seen,
     candidates,
-    is_beside_walls,
     velocity_log_likelihoods,
+    wall_spots,
     yaw_rate_error,
 )
 from l2lidar_proc.odometry.matcher import xyz
@@ -194,11 +194,12 @@ class StartVelocity:
         if not len(axes):
             is_leveled = motion is not before
             return FoundVelocity(motion.state, motion.covariance, True) if is_leveled else None
-        if self.is_first:
-            motion = self._with_yaw_rate(motion, axes)
+        seen = placed(self._passed, motion, self._lever, axes)
+        turned = with_yaw_rate(motion, seen, axes) if self.is_first else motion
+        if turned is not motion:
+            motion, seen = turned, placed(self._passed, turned, self._lever, axes)
         is_news = motion is not before
         covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
-        seen = placed(self._passed, motion, self._lever, axes)
         found = _measured(seen, motion.state, covariance, axes, first=self.is_first)
         if found is None:
             return FoundVelocity(motion.state, covariance, True) if is_news else None
@@ -211,27 +212,6 @@ class StartVelocity:
             is_other &= change < tuning.START_MOST_CHANGE
         was_open = float(np.linalg.eigvalsh(prior)[-1]) > tuning.START_OPEN**2
         return FoundVelocity(state, posterior, is_news or is_other or was_open)
-
-    def _with_yaw_rate(self, motion: SweepMotion, axes: F64) -> SweepMotion:
-        """Return the motion with the yaw rate that the sweeps show, the same if it has it."""
-        state = motion.state
-        found = yaw_rate_error(
-            placed(self._passed, motion, self._lever, axes), int(state.stamp), axes, state.gravity
-        )
-        if found is None:
-            return motion
-        error, sigma = found
-        # the rate is faster by what the bias is smaller
-        h = np.zeros(ERRORS)
-        h[GYRO_BIAS] = state.rotation.T @ (state.gravity / np.linalg.norm(state.gravity))
-        covariance = motion.covariance.copy()
-        # what the registrations have told about it is the echo of a wrong velocity
-        more = max(tuning.START_YAW_SIGMA**2 - float(h @ covariance @ h), 0.0)
-        covariance += more * np.outer(h, h)
-        prior = float(h @ covariance @ h)
-        gain = covariance @ h / prior
-        after = state.boxplus(gain * error)
-        return motion.with_state(after, covariance - (prior - sigma**2) * np.outer(gain, gain))
 
     def end_search(self, end: HostNs) -> None:
         """Wait until the next search, with the sweeps that it will need."""
@@ -283,6 +263,35 @@ def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> Sw
     gain = np.linalg.solve(innovation, cross.T).T
     after = state.boxplus(np.asarray(-gain @ tilt, np.float64))
     return motion.with_state(after, covariance - gain @ innovation @ gain.T)
+
+
+def with_yaw_rate(motion: SweepMotion, seen: Seen, axes: F64) -> SweepMotion:
+    """Return a motion with the yaw rate that points show, the same if it has it.
+
+    Parameters
+    ----------
+    motion : SweepMotion
+    seen : ndarray, shape (N,), dtype SEEN
+        Placed by it.
+    axes : ndarray, shape (K, 3)
+        Level, orthonormal, along which the velocity may be wrong; K is 1 or 2.
+    """
+    state = motion.state
+    found = yaw_rate_error(seen, int(state.stamp), axes, state.gravity)
+    if found is None:
+        return motion
+    error, sigma = found
+    # the rate is faster by what the bias is smaller
+    h = np.zeros(ERRORS)
+    h[GYRO_BIAS] = state.rotation.T @ (state.gravity / np.linalg.norm(state.gravity))
+    covariance = motion.covariance.copy()
+    # what the registrations have told about it is the echo of a wrong velocity
+    more = max(tuning.START_YAW_SIGMA**2 - float(h @ covariance @ h), 0.0)
+    covariance += more * np.outer(h, h)
+    prior = float(h @ covariance @ h)
+    gain = covariance @ h / prior
+    after = state.boxplus(gain * error)
+    return motion.with_state(after, covariance - (prior - sigma**2) * np.outer(gain, gain))
 
 
 def _accelerated(acceleration: F64, seconds: float) -> F64:
@@ -368,16 +377,16 @@ def _measured(
     """
     strengths, turn = np.linalg.eigh(axes @ covariance[VELOCITY, VELOCITY] @ axes.T)
     axes, sigmas = turn.T @ axes, np.sqrt(strengths)
-    is_profile = is_beside_walls(seen, axes, state.gravity)
-    step = tuning.PROFILE_STEP if is_profile else tuning.START_STEP
+    walls = wall_spots(seen, axes, state.gravity)
+    step = tuning.START_STEP if walls is None else tuning.PROFILE_STEP
     steps = (candidates(sigma, step) for sigma in sigmas.tolist())
     errors = np.array([*itertools.product(*steps)])
     now = int(state.stamp)
-    logs = velocity_log_likelihoods(seen, now, axes, errors, state.gravity)
+    logs = velocity_log_likelihoods(seen, now, axes, errors, state.gravity, walls)
     if logs is None:
         return None
     logs = logs - 0.5 * ((errors / sigmas) ** 2).sum(axis=1)
-    if first and not is_profile:
+    if first and walls is None:
         # posts at even distances look alike at several velocities, and carriers are not fast
         speeds = axes @ state.velocity + errors
         logs = logs - 0.5 * ((speeds / tuning.START_VELOCITY_SIGMA[1]) ** 2).sum(axis=1)

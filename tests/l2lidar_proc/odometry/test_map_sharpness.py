@@ -13,6 +13,7 @@ from l2lidar_proc.odometry.map_sharpness import (
     Seen,
     upright,
     velocity_log_likelihoods,
+    wall_spots,
     yaw_rate_error,
 )
 from l2lidar_proc.odometry.start_velocity import placed
@@ -55,7 +56,9 @@ def test_posts_are_sharpest_at_the_true_velocity(passing: list[Sweep], error: fl
     motion = motion_at(wrong, np.eye(eskf.ERRORS))
     seen = placed(passed_at(passing, wrong), motion, np.zeros(3), X)
     errors = grid(20)
-    logs = velocity_log_likelihoods(seen, int(motion.state.stamp), X, errors, GRAVITY)
+    logs = velocity_log_likelihoods(
+        seen, int(motion.state.stamp), X, errors, GRAVITY, wall_spots(seen, X, GRAVITY)
+    )
     assert errors_of(logs, errors)[0] == pytest.approx(-error, abs=0.11)
 
 
@@ -65,7 +68,9 @@ def test_both_level_directions_are_found_at_once(passing: list[Sweep]) -> None:
     axes = np.vstack((X, Y))
     seen = placed(passed_at(passing, wrong), motion, np.zeros(3), axes)
     errors = grid(10, 10)
-    logs = velocity_log_likelihoods(seen, int(motion.state.stamp), axes, errors, GRAVITY)
+    logs = velocity_log_likelihoods(
+        seen, int(motion.state.stamp), axes, errors, GRAVITY, wall_spots(seen, axes, GRAVITY)
+    )
     assert errors_of(logs, errors) == pytest.approx([-0.6, 0.4], abs=0.21)
 
 
@@ -76,7 +81,10 @@ def test_beside_bare_walls_nobody_can_tell() -> None:
     motion = motion_at(wrong, np.eye(eskf.ERRORS))
     seen = placed(passed_at(sweeps, wrong), motion, np.zeros(3), X)
     now = int(motion.state.stamp)
-    assert velocity_log_likelihoods(seen, now, X, grid(10), GRAVITY) is None
+    assert (
+        velocity_log_likelihoods(seen, now, X, grid(10), GRAVITY, wall_spots(seen, X, GRAVITY))
+        is None
+    )
 
 
 @pytest.mark.parametrize("axes", [X, np.vstack((X, Y))], ids=["along", "both ways"])
