@@ -264,6 +264,43 @@ class MapInitializer:
             self._zero_velocity.clear()  # a sweep met nothing of those before it
         return agree
 
+    def begin_again_in_motion(
+        self, sweeps: list[Sweep], state: InertialState, covariance: F64
+    ) -> list[SweepMotion]:
+        """Begin the map of a short rest again as in motion, if its sweeps fit closer then.
+
+        A carrier whose motors shake the IMU may have glided.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            All those of the rest.
+        state : InertialState
+            At rest, at any stamp.
+        covariance : ndarray, shape (18, 18)
+
+        Returns
+        -------
+        list of SweepMotion
+            One for each sweep; empty if it was a rest, whose map is as before then.
+        """
+        since = sweeps[0].start
+        start = dataclasses.replace(state, stamp=self._predictor.reference(sweeps[0]))
+        self._zero_velocity.resume(start)
+        rest = self._at_rest(sweeps, since, start, covariance)
+        moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
+        if moving.motions and moving.fits_closer(rest, tuning.INITIAL_CLOSER):
+            speed = float(np.linalg.norm(moving.motions[0].state.velocity))
+            if speed > tuning.INITIAL_REST_SPEED:
+                self._zero_velocity.clear()
+                return moving.motions
+        self.moving = None
+        self._young = YoungSurfaces.TRUSTED
+        self._initial(sweeps, since, may_rest=True)
+        self._at_rest(sweeps, since, start, covariance)
+        self._zero_velocity.clear()
+        return []
+
     def _samples(self, sweeps: list[Sweep], since: HostNs) -> NDArray[np.void]:
         until = min(sweeps[-1].end, since + tuning.INITIAL_IMU_NS)
         return self._predictor.samples(since - tuning.INITIAL_NS, until)
@@ -286,7 +323,7 @@ class MapInitializer:
         matcher = self._matcher
         matcher.clear()
         motions: list[SweepMotion] = []
-        met = False
+        met, last = False, None
         for sweep in sweeps:
             before = motions[-1].state if motions else state
             reach = None if motions else since
@@ -296,13 +333,14 @@ class MapInitializer:
                 source = matcher.source(sweep, motion)
                 trial = motion.at_rest(state, free_pose())
                 found, status = matcher.match(source, trial, initial=True)
-                met |= found is not None
+                if found is not None:
+                    met, last = True, found
                 is_new = status is MatchStatus.NEW_MAP
                 if not (is_new if found is None else self._zero_velocity.stays(found)):
                     return Trial([], False)
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
-        return Trial(motions, met)
+        return Trial(motions, met, last)
 
     def begin_with(
         self, sweeps: list[Sweep], since: HostNs, start: InertialState, covariance: F64

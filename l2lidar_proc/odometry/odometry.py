@@ -564,7 +564,9 @@ class Odometry:
 
     def _hold(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Hold the pose; return None if IMU or sweep show motion, then the sweep is tracked."""
+        first = self._first_sweeps
         if not self._stays_at_rest(sweep):
+            self._begin_in_motion(first, status)
             return None
         assert self._belief is not None
         state, covariance = self._belief
@@ -659,6 +661,18 @@ class Odometry:
         self._first_sweeps = []
         self._at_rest.clear()
         self.phase = Phase.TRACKING
+
+    def _begin_in_motion(self, first: list[Sweep], status: list[Status]) -> None:
+        """Begin the map again with the sweeps of a first rest, if it was short and none."""
+        if not first or first[-1].end - first[0].start > tuning.RETRY_SHORT_NS:
+            return
+        assert self._belief is not None
+        motions = self._initializer.begin_again_in_motion(first, *self._belief)
+        if motions:
+            self._beams.forget()  # what it learned, it learned from a sensor that moved
+            self._mapped_with = self._beams.correction
+            self._enter_map(Begun(motions, first, 0, first[0].start))
+            status.append(Status.STARTING)
 
     def _retry_in_motion(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Begin the map again, as in motion, if the sensor was taken for still since its start."""

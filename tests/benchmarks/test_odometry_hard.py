@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -359,6 +359,25 @@ def test_beams_that_nobody_knows_yet_do_not_end_a_rest_between_trees(
     elif found.any():
         assert odometry._beams.sigmas is not None
         assert (np.abs(found - true) < 2.0 * np.degrees(odometry._beams.sigmas)).all()
+
+
+def test_a_glide_that_passed_for_a_rest_begins_again_when_the_imu_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drone's motors hid its motion, and two sweeps met by chance: it ended 165 m off."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(STARTS, 664, 5.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu)
+    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    held = list(takewhile(lambda item: np.linalg.norm(item.velocity) < 0.05, estimates))
+    assert len(held) > 1  # it was taken for a rest
+    after = estimates[len(held) :]
+    assert Status.STARTING in after[0].status
+    true = given.truth_at(np.array([item.stamp for item in after]))
+    for item, one in zip(after, true, strict=True):
+        seen = rotations.matrices(one["quaternion_wxyz"]).T @ one["velocity"]
+        assert np.linalg.norm(item.velocity - seen) < 0.3
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:

@@ -17,6 +17,7 @@ from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.map_initialization import MapInitializer
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, feed
@@ -160,6 +161,33 @@ def test_a_start_in_slow_motion_is_not_taken_for_wrong_beams(
     assert np.abs(gone[begun[-1] :]).max() < 0.02
     wrong = 0.4 if unit == "typical" else 0.0
     assert np.abs(np.degrees(odometry._beams.correction)).max() < wrong + 0.05
+
+
+@pytest.mark.parametrize("vibration", [0.0, 0.65])
+def test_a_rest_of_less_than_a_second_stays_one(tmp_path: Path, vibration: float) -> None:
+    """The map begins only once, although the IMU ends the rest while it may still be doubted."""
+    walk = creeping(tmp_path / "walk.tum", (0.6, 0.3, 0.0), 0.2)
+    since = RESTED + 1.0  # so long before it moves, less a second
+    run = record("room", walk, 1, 3.0, since=since)
+    odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
+    doubted = []
+    begin_again = MapInitializer.begin_again_in_motion
+
+    def counted(*given: Any) -> Any:
+        doubted.append(begin_again(*given))
+        return doubted[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MapInitializer, "begin_again_in_motion", counted)
+        shaken = dataclasses.replace(run, imu=vibrating(run.imu, vibration))
+        estimates = feed(odometry, shaken, list(sweeps(run, "turn")))
+    assert doubted == [[]]
+    starting = [Status.STARTING in item.status for item in estimates]
+    assert starting == sorted(starting, reverse=True)
+    true, _ = truth(run, np.array([one.stamp for one in estimates]))
+    gone = np.linalg.norm(true - true[0], axis=1)
+    assert gone.max() > 1.0
+    assert np.abs(way(estimates) - gone).max() < 0.02
 
 
 def test_a_shock_ends_rest_at_once() -> None:
