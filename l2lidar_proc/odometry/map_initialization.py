@@ -167,6 +167,8 @@ class MapInitializer:
         self.held: list[Sweep] = []
         self.moving: MovingStart | None = None
         self._young = YoungSurfaces.TRUSTED  # of the map that begins in motion
+        self._lead_s = 0.0  # from the first pose of all to that of the first sweep in the map
+        self._lead_velocity: F64 = np.zeros(3)  # with which that pose was estimated [m/s]
 
     def add(self, sweep: Sweep) -> Begun | None:
         """Hold a sweep; return the map if it can begin now."""
@@ -187,12 +189,15 @@ class MapInitializer:
         if seed == len(whole) - 1 and most:
             return None
         enough = most > self._min_points
+        lead = self._predictor.reference(whole[seed]) - self._predictor.reference(held[0])
+        self._lead_s = 1e-9 * lead
         motions = self.begin(whole[seed:], held[0].start) if enough else []
         if motions is None:
             return None
         if not motions:
             del held[0]
             return None
+        self._lead_velocity = motions[0].state.velocity
         return Begun([motions[0]] * seed + motions, whole, seed, held[0].start)
 
     def begin(
@@ -360,17 +365,19 @@ class MapInitializer:
         Returns
         -------
         list of SweepMotion
-            As :meth:`begin` returns it.
+            One for each sweep; the IMU alone carries it through one that fits nowhere.
         """
         assert self.moving is not None
         self._young = YoungSurfaces.IGNORED
         first = self._at_cloud_origin(self.moving.initial)
-        start = dataclasses.replace(start, rotation=first.rotation, position=first.position)
+        # the first pose of all stays where it is
+        position = first.position + self._lead_s * (start.velocity - self._lead_velocity)
+        start = dataclasses.replace(start, rotation=first.rotation, position=position)
         known = self.moving.initial.covariance.copy()
         found = slice(VELOCITY.start, ERRORS)
         known[found, found] = covariance[found, found]
         initial = dataclasses.replace(self.moving.initial, covariance=known)
-        return self._round(sweeps, since, start, initial).motions
+        return self._round(sweeps, since, start, initial, may_miss=True).motions
 
     def _in_motion(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
         """Begin the map in motion: level where it is built, and with its velocity left open.
@@ -525,12 +532,18 @@ class MapInitializer:
         return trial, begun
 
     def _round(
-        self, sweeps: list[Sweep], since: HostNs, start: InertialState, initial: InitialState
+        self,
+        sweeps: list[Sweep],
+        since: HostNs,
+        start: InertialState,
+        initial: InitialState,
+        *,
+        may_miss: bool = False,
     ) -> Trial:
+        """Begin the map with a first state; without motions if a sweep that may not fits nowhere."""
         matcher = self._matcher
         matcher.clear()
         matcher.surfaces.young = self._young
-        matcher.drift.begun_in_motion = not initial.at_rest
         first = self._predictor.over_sweep(sweeps[0], start, initial.covariance, since)
         motions = [first]
         matcher.extend(matcher.deskewed(sweeps[0], first), first, first.state)
@@ -542,11 +555,25 @@ class MapInitializer:
             if found is not None:
                 motion = motion.with_state(found.state, found.covariance)
                 met, last = True, found
+            elif may_miss:
+                motions.append(motion)
+                continue
             elif not (status is MatchStatus.NEW_MAP and initial.at_rest):
                 return Trial([], False)
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
+        if not initial.at_rest:
+            matcher.drift.first_pose = self._first_pose(motions[-1])
         return Trial(motions, met, last)
+
+    def _first_pose(self, last: SweepMotion) -> F64:
+        """Return the covariance (6, 6) of the first pose of all against the map, map axes.
+
+        The velocity is known as well as in the last of the sweeps with which the map began.
+        """
+        covariance = np.diag(np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3))
+        covariance[:3, :3] += self._lead_s**2 * last.covariance[VELOCITY, VELOCITY]
+        return covariance
 
 
 def weak_axis(information: F64) -> tuple[float, F64]:

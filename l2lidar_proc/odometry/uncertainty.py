@@ -58,7 +58,7 @@ class MapError:
         By which the map has bent since it was begun, as gravity shows [rad].
     up : ndarray, shape (3,), optional
         Unit, map axes; None while gravity does not show it.
-    begun_in_motion : bool
+    first_pose : ndarray, shape (6, 6)
         As of :class:`MapDrift`.
     """
 
@@ -70,7 +70,7 @@ class MapError:
     swung: float
     lean: F64
     up: F64 | None
-    begun_in_motion: bool
+    first_pose: F64
 
     def at(self, place: F64) -> F64:
         """Return what the map may add to the covariance (6, 6) of a pose at a place (3,) [m].
@@ -120,10 +120,10 @@ class MapError:
         ``first`` is by what these turn the first pose against the map, 1 sigma [rad].
         """
         moved = _carried(place)
-        begun = np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3) * self.begun_in_motion
-        begun[3:] += first**2
+        begun = drift + self.first_pose
+        begun[3:, 3:] += first**2 * np.eye(3)
         unit[3:, 3:] += np.outer(self.lean, self.lean)
-        return np.asarray(moved @ (drift + np.diag(begun)) @ moved.T + unit)
+        return np.asarray(moved @ begun @ moved.T + unit)
 
 
 _ALLOWED, _EXPECTED = 0, 1
@@ -141,9 +141,9 @@ class MapDrift:
 
     Attributes
     ----------
-    begun_in_motion : bool
-        The first sweeps were deskewed with a velocity and a gyro bias that were hardly known, so
-        the first pose is shifted and turned against the map that followed.
+    first_pose : ndarray, shape (6, 6)
+        Covariance of the first pose against the map that followed it [m, rad], map axes. Zero at
+        rest. In motion, velocity and gyro bias of the first sweeps were hardly known.
     beam_sigmas : tuple of float
         What the beam angles of the sweeps to come may be wrong by, 1 sigma [rad], along their
         best known direction and the other.
@@ -158,7 +158,7 @@ class MapDrift:
 
     def clear(self) -> None:
         """Forget everything: a new map begins, without error by definition."""
-        self.begun_in_motion = False
+        self.first_pose: F64 = np.zeros((6, 6))
         self._known = 0
         self._current: F64 = np.zeros((2, 6, 6))
         self._reported: F64 = np.zeros((2, 6, 6))  # the same, but falling over some sweeps
@@ -411,7 +411,7 @@ class MapDrift:
             swung=self._swung,
             lean=self._lean,
             up=self._up,
-            begun_in_motion=self.begun_in_motion,
+            first_pose=self.first_pose,
         )
 
     def at(self, place: F64) -> F64:

@@ -58,7 +58,7 @@ def test_the_first_pose_has_no_error_by_definition() -> None:
 
 def test_the_first_pose_of_a_map_begun_in_motion_may_be_turned_against_all_others() -> None:
     drift = MapDrift()
-    drift.begun_in_motion = True
+    drift.first_pose = np.diag(np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3))
     shift, turn = np.square(tuning.BEGUN_IN_MOTION)
     added = drift.at(np.array([10.0, 0.0, 0.0])) - unit_alone(np.array([10.0, 0.0, 0.0]))
     expected = np.diag([shift, shift + 100.0 * turn, shift + 100.0 * turn, turn, turn, turn])
@@ -216,7 +216,7 @@ def test_no_more_is_reported_than_any_unit_is_allowed() -> None:
 def test_what_is_reported_drifts_and_leans_like_the_map() -> None:
     drift = MapDrift()
     alone = drift.reported_at(ZERO)
-    drift.begun_in_motion = True
+    drift.first_pose = np.diag(np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3))
     drift.record(0, ZERO, np.diag([0.04, 0.0, 0.0, 0.0, 0.0, 0.0]))
     drift.meet(held_by(0))
     for lean in (0.0, 0.1):
