@@ -27,6 +27,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.start_velocity import FittedStart
 from l2lidar_proc.odometry.surfels import YoungSurfaces
 from l2lidar_proc.odometry.vertical_direction import Vertical, vertical_direction
 from l2lidar_proc.odometry.wall_profile import are_walls
@@ -367,8 +368,43 @@ class MapInitializer:
         list of SweepMotion
             One for each sweep; the IMU alone carries it through one that fits nowhere.
         """
-        assert self.moving is not None
         self._young = YoungSurfaces.IGNORED
+        return self._again(sweeps, since, start, covariance)
+
+    def begin_as_fitted(
+        self, sweeps: list[Sweep], since: HostNs, fitted: FittedStart, covariance: F64
+    ) -> list[SweepMotion]:
+        """Begin the map of a start in motion again, if it began with another velocity than fitted.
+
+        Otherwise the first pose is as uncertain as it is off the fit.
+
+        Parameters
+        ----------
+        sweeps, since, covariance
+            As for :meth:`begin_with`; the velocity is as certain as the fit.
+        fitted : FittedStart
+
+        Returns
+        -------
+        list of SweepMotion
+            As :meth:`begin_with` returns it; empty if the map stays.
+        """
+        if not fitted.is_other:
+            before = self._lead_s * (fitted.state.velocity - self._lead_velocity)
+            shift = fitted.shift + before
+            self._matcher.drift.first_pose[:3, :3] += np.outer(shift, shift)
+            return []
+        known = covariance.copy()
+        known[VELOCITY] = known[:, VELOCITY] = 0.0
+        known[VELOCITY, VELOCITY] = fitted.velocity_sigma**2 * np.eye(3)
+        self._young = YoungSurfaces.TRUSTED
+        return self._again(sweeps, since, fitted.state, known)
+
+    def _again(
+        self, sweeps: list[Sweep], since: HostNs, start: InertialState, covariance: F64
+    ) -> list[SweepMotion]:
+        """Begin the map of a start in motion again, with a state at the first reference."""
+        assert self.moving is not None
         first = self._at_cloud_origin(self.moving.initial)
         # the first pose of all stays where it is
         position = first.position + self._lead_s * (start.velocity - self._lead_velocity)
@@ -540,7 +576,10 @@ class MapInitializer:
         *,
         may_miss: bool = False,
     ) -> Trial:
-        """Begin the map with a first state; without motions if a sweep that may not fits nowhere."""
+        """Begin the map with a first state; without motions if a sweep fits nowhere.
+
+        Where one may, the IMU alone carries it.
+        """
         matcher = self._matcher
         matcher.clear()
         matcher.surfaces.young = self._young
@@ -563,16 +602,16 @@ class MapInitializer:
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
         if not initial.at_rest:
-            matcher.drift.first_pose = self._first_pose(motions[-1])
+            matcher.drift.first_pose = self._first_pose(motions[1])
         return Trial(motions, met, last)
 
-    def _first_pose(self, last: SweepMotion) -> F64:
+    def _first_pose(self, second: SweepMotion) -> F64:
         """Return the covariance (6, 6) of the first pose of all against the map, map axes.
 
-        The velocity is known as well as in the last of the sweeps with which the map began.
+        The velocity until the first sweep in the map is known as well as in the second one.
         """
         covariance = np.diag(np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3))
-        covariance[:3, :3] += self._lead_s**2 * last.covariance[VELOCITY, VELOCITY]
+        covariance[:3, :3] += self._lead_s**2 * second.covariance[VELOCITY, VELOCITY]
         return covariance
 
 

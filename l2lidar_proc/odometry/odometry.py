@@ -321,6 +321,12 @@ class Odometry:
                 motions = self._initializer.begin_with(
                     start.sweeps, start.since, first, better.covariance
                 )
+        elif start.is_first and not start.began_open:
+            fitted = start.fitted(whole)
+            if fitted is not None:
+                motions = self._initializer.begin_as_fitted(
+                    start.sweeps, start.since, fitted, covariance
+                )
         if motions:
             start.replace(start.sweeps, motions)
             motion = motions[-1]

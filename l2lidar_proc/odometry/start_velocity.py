@@ -12,6 +12,7 @@ any velocity, so the yaw rate is searched first.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -76,6 +77,27 @@ class FoundVelocity(NamedTuple):
     is_news: bool
 
 
+class FittedStart(NamedTuple):
+    """Beginning of a start as the poses since then show it.
+
+    Attributes
+    ----------
+    state : InertialState
+        At the reference of the first sweep; its pose is that of the estimate.
+    velocity_sigma : float
+        [m/s]
+    is_other : bool
+        Whether the map began with another velocity, as far as either is known.
+    shift : ndarray, shape (3,)
+        From where the first sweep was to where it was estimated [m], map axes.
+    """
+
+    state: InertialState
+    velocity_sigma: float
+    is_other: bool
+    shift: F64
+
+
 class StartVelocity:
     """The sweeps since a start in motion, which tell its velocity again and again.
 
@@ -95,6 +117,8 @@ class StartVelocity:
         Whether nothing has been searched so far.
     is_open : bool
         Whether the velocity was open at the start, and has not become known since.
+    began_open : bool
+        Whether it was open at the start.
     """
 
     def __init__(self, lever: F64) -> None:
@@ -105,10 +129,11 @@ class StartVelocity:
         """Forget all sweeps, and search no more."""
         self._passed: list[Passed] = []
         self._open_axes: F64 = np.zeros((0, 3))
+        self._begun_with: SweepMotion | None = None  # motion of the first sweep, as far as known
         self._next = self._last = 0
         self.since = HostNs(0)
         self.is_first = False
-        self.is_open = False
+        self.is_open = self.began_open = False
 
     @property
     def is_awaited(self) -> bool:
@@ -140,7 +165,10 @@ class StartVelocity:
             Directions along which they leave the velocity open.
         """
         self.clear()
-        self.since, self.is_first, self.is_open = since, True, len(open_axes) > 0
+        self.since, self.is_first = since, True
+        self.is_open = self.began_open = len(open_axes) > 0
+        # the first motion has the prior's covariance
+        self._begun_with = motions[0].with_state(motions[0].state, motions[1].covariance)
         self._open_axes = open_axes
         self._next, self._last = since + tuning.START_NS, since + tuning.START_WATCHED_NS
         self.replace(sweeps, motions)
@@ -212,6 +240,43 @@ class StartVelocity:
             is_other &= change < tuning.START_MOST_CHANGE
         was_open = float(np.linalg.eigvalsh(prior)[-1]) > tuning.START_OPEN**2
         return FoundVelocity(state, posterior, is_news or is_other or was_open)
+
+    def fitted(self, motion: SweepMotion) -> FittedStart | None:
+        """Return how the start began, as the poses after the first ones show it; None if too few.
+
+        The velocity with which the first sweeps fit together may be wrong although nothing leaves
+        it open: half turns that see a wall twice fit at two velocities. The sweeps after them then
+        show the right one, but the map holds the first ones where they were put. So the way of the
+        IMU is fitted to the later poses, with an error of the velocity and of the acceleration.
+
+        Parameters
+        ----------
+        motion : SweepMotion
+            Of the latest sweep, reaching back to :attr:`since`.
+        """
+        assert self._begun_with is not None
+        stamps = np.array([one.stamp for one in self._passed])
+        later = stamps >= stamps[0] + tuning.START_FITTED_NS
+        if np.count_nonzero(later) < tuning.START_FITTED_LEAST:
+            return None
+        off = _off(self._passed, motion, self._lever)
+        ages = (stamps - motion.state.stamp) * 1e-9
+        design = np.column_stack((np.ones_like(ages), ages, 0.5 * ages**2))
+        fit, *_ = np.linalg.lstsq(design[later], off[later], rcond=None)
+        left = off[later] - design[later] @ fit
+        variance = (left**2).sum() / (3 * (len(left) - 3))
+        slope = np.array([0.0, 1.0, ages[0]])
+        spread = slope @ np.linalg.solve(design[later].T @ design[later], slope)
+        state = motion.state_at(self.reference)
+        state = dataclasses.replace(state, velocity=state.velocity + slope @ fit)
+        sigma = max(float(np.sqrt(variance * spread)), tuning.START_FITTED_SIGMA)
+        change = state.velocity - self._begun_with.state.velocity
+        unknown = self._begun_with.covariance[VELOCITY, VELOCITY] + sigma**2 * np.eye(3)
+        is_other = (
+            float(np.linalg.norm(change)) > tuning.START_FITTED_CHANGE
+            and change @ np.linalg.solve(unknown, change) > tuning.START_SIGNIFICANT**2
+        )
+        return FittedStart(state, sigma, bool(is_other), off[0] - design[0] @ fit)
 
     def end_search(self, end: HostNs) -> None:
         """Wait until the next search, with the sweeps that it will need."""
@@ -346,9 +411,7 @@ def placed(passed: list[Passed], motion: SweepMotion, lever: F64, axes: F64) -> 
     """
     trajectory, state = motion.trajectory(lever), motion.state
     stamps = np.array([one.stamp for one in passed])
-    off = np.array([one.position for one in passed])
-    off -= state.position - state.rotation @ lever
-    off -= trajectory.poses(stamps)[1] @ state.rotation.T
+    off = _off(passed, motion, lever)
     off -= off @ axes.T @ axes
     parts = []
     for number, (sweep, *_) in enumerate(passed):
@@ -365,6 +428,15 @@ def placed(passed: list[Passed], motion: SweepMotion, lever: F64, axes: F64) -> 
         found["sweep"] = number
         parts.append(found)
     return records.joined(parts)
+
+
+def _off(passed: list[Passed], motion: SweepMotion, lever: F64) -> F64:
+    """Return how far from where the IMU carries the sensor sweeps were estimated (N, 3) [m]."""
+    state = motion.state
+    stamps = np.array([one.stamp for one in passed])
+    places = np.array([one.position for one in passed])
+    carried = motion.trajectory(lever).poses(stamps)[1] @ state.rotation.T
+    return places - (state.position - state.rotation @ lever) - carried
 
 
 def _measured(

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from itertools import islice, takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,9 +29,11 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
+from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status, cloud_pose
+from l2lidar_proc.odometry.map_initialization import MapInitializer
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.vertical_lines import LINE
 from l2lidar_proc.odometry.wall_profile import SPOT
@@ -378,6 +381,80 @@ def test_a_glide_that_passed_for_a_rest_begins_again_when_the_imu_ends_it(
     for item, one in zip(after, true, strict=True):
         seen = rotations.matrices(one["quaternion_wxyz"]).T @ one["velocity"]
         assert np.linalg.norm(item.velocity - seen) < 0.3
+
+
+def test_a_start_with_a_wrong_velocity_that_nothing_left_open_begins_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two sweeps of a yard fitted at 0.1 and at 0.7 m/s; all poses were 0.3 m off the first."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(STARTS, 225, 5.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu)
+    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    starting = [k for k, item in enumerate(estimates) if Status.STARTING in item.status]
+    assert starting[-1] > 7  # it began again when it had lasted 2.2 s
+    off = first_to_pose_errors(given, estimates)
+    assert np.linalg.norm(off[:7], axis=1).max() > 0.3
+    assert np.linalg.norm(off[starting[-1] :], axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("seed", [74, 118, 212])
+def test_the_first_pose_is_as_uncertain_as_the_velocity_until_the_map(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first sweep is not whole, so the map begins with the second one.
+
+    The second pose was 7 to 10 sigmas off the first one, with a velocity that is 0.8 m/s off.
+    """
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(STARTS, seed, 3.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu)
+    estimates: list[OdometryEstimate] = []
+    for sweep in given.sweeps():
+        estimates = estimates or odometry.register(sweep)
+    off = first_to_pose_errors(given, estimates)[1]
+    place = estimates[1].covariance[:3, :3]
+    assert np.linalg.norm(off) > 0.1
+    assert off @ np.linalg.solve(place, off) < 7.8
+
+
+def test_the_first_pose_stays_where_it_is_when_the_map_begins_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sensor was slower before: where the first whole sweep was put, it is 8 cm farther."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(STARTS, 209, 3.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    again: list[SweepMotion] = []
+    begin_with = MapInitializer.begin_with
+
+    def noted(*given: Any) -> list[SweepMotion]:
+        again.extend(begin_with(*given))
+        return again
+
+    monkeypatch.setattr(MapInitializer, "begin_with", noted)
+    odometry.imu(given.imu)
+    first, *_ = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    assert len(again) > 7
+    state = again[0].state_at(first.stamp)
+    lead = 1e-9 * (again[0].state.stamp - first.stamp)
+    assert lead * np.linalg.norm(state.rotation.T @ state.velocity - first.velocity) > 0.06
+    here = cloud_pose(state, given.T_cloud_imu[:3, 3])
+    assert np.linalg.norm(here[:3, 3] - first.T_map_lidar[:3, 3]) < 0.01
+
+
+def first_to_pose_errors(given: Recording, estimates: list[OdometryEstimate]) -> F64:
+    """Return how far places are off, (N, 3) [m], seen from the first pose."""
+    true = given.truth_at(np.array([item.stamp for item in estimates]))
+    T_world_first = np.eye(4)
+    T_world_first[:3, :3] = rotations.matrices(true["quaternion_wxyz"])[0]
+    T_world_first[:3, 3] = true["position"][0]
+    T_map_world = estimates[0].T_map_lidar @ np.linalg.inv(T_world_first)
+    found = np.array([item.T_map_lidar[:3, 3] for item in estimates])
+    expected = true["position"] @ T_map_world[:3, :3].T + T_map_world[:3, 3]
+    return np.asarray(found - expected)
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:

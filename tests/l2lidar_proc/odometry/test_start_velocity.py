@@ -251,3 +251,65 @@ def test_a_start_that_was_interrupted_is_forgotten(passing: list[Sweep]) -> None
         assert len(start.sweeps) == count
     assert not start.is_open
     assert not start.is_due(HostNs(EPOCH + tuning.START_WATCHED_NS))
+
+
+def with_wrong_beginning(
+    sweeps: list[Sweep], noise: float, velocity: F64 = 0.5 * SPEED, sigma: float = 0.05
+) -> StartVelocity:
+    """Return a start with a velocity, whose later poses are right but for noise [m]."""
+    covariance = known_to(sigma)
+    covariance[eskf.VELOCITY, eskf.VELOCITY] = sigma**2 * np.eye(3)
+    start = begun(sweeps, velocity, covariance, np.zeros((0, 3)))
+    true = motion_at(SPEED, known_to(0.05))
+    rng = np.random.default_rng(3)
+    motions = [true.anchored_at(one.stamp) for one in passed_at(sweeps, SPEED)]
+    for number, motion in enumerate(motions):
+        state, off = motion.state, noise * rng.standard_normal(3)
+        if number < 2:
+            off += 0.2 * X[0]
+        state = dataclasses.replace(state, position=state.position + off)
+        motions[number] = dataclasses.replace(motion, state=state)
+    start.replace(sweeps, motions)
+    return start
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.1])
+def test_later_poses_show_how_a_start_began(passing: list[Sweep], wrong: float) -> None:
+    """Also if the velocity of the end is wrong, or the acceleration since."""
+    start = with_wrong_beginning(passing, 0.003)
+    motion = motion_at(SPEED, known_to(0.05))
+    off = wrong * np.array([1.0, -1.0, 0.5])
+    state = dataclasses.replace(
+        motion.state, velocity=SPEED + off, gravity=motion.state.gravity + off
+    )
+    fitted = start.fitted(motion.with_state(state, motion.covariance))
+    assert fitted is not None
+    assert fitted.state.stamp == start.reference
+    assert fitted.velocity_sigma == tuning.START_FITTED_SIGMA
+    assert np.abs(fitted.state.velocity - SPEED).max() < 0.1
+    assert fitted.is_other
+    assert fitted.shift == pytest.approx(0.2 * X[0], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "sigma", "noise", "is_other"),
+    [
+        (SPEED, 0.05, 0.003, False),
+        (0.5 * SPEED, 0.05, 0.003, True),
+        (0.5 * SPEED, 0.5, 0.003, False),  # that it may be so wrong was known
+        (0.85 * SPEED, 0.01, 0.0, False),  # too little
+        (0.5 * SPEED, 0.05, 0.1, False),  # the poses are too uncertain to tell
+    ],
+)
+def test_a_start_began_with_another_velocity_as_far_as_either_is_known(
+    passing: list[Sweep], velocity: F64, sigma: float, noise: float, is_other: bool
+) -> None:
+    start = with_wrong_beginning(passing, noise, velocity, sigma)
+    fitted = start.fitted(motion_at(SPEED, known_to(0.05)))
+    assert fitted is not None
+    assert fitted.is_other == is_other
+
+
+def test_too_few_poses_show_no_beginning(passing: list[Sweep]) -> None:
+    start = with_wrong_beginning(passing[:6], 0.0)
+    assert start.fitted(motion_at(SPEED, known_to(0.05))) is None
