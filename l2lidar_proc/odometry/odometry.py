@@ -317,10 +317,8 @@ class Odometry:
             self._walls.correct(state, better.state)
             motion = motion.with_state(better.state, better.covariance)
             if start.is_first:
-                first = whole.with_state(better.state, better.covariance).state_at(start.reference)
-                motions = self._initializer.begin_with(
-                    start.sweeps, start.since, first, better.covariance
-                )
+                first = start.beginning(whole.with_state(better.state, better.covariance))
+                motions = self._initializer.begin_with(start.sweeps, start.since, *first)
         elif start.is_first and not start.began_open:
             fitted = start.fitted(whole)
             if fitted is not None:

@@ -241,6 +241,22 @@ class StartVelocity:
         was_open = float(np.linalg.eigvalsh(prior)[-1]) > tuning.START_OPEN**2
         return FoundVelocity(state, posterior, is_news or is_other or was_open)
 
+    def beginning(self, motion: SweepMotion) -> tuple[InertialState, F64]:
+        """Return the state (and its covariance, (18, 18)) at :attr:`reference`.
+
+        What gravity and the accelerometer's bias may be wrong by has accelerated it since; how its
+        attitude and place were known then, is not asked for.
+
+        Parameters
+        ----------
+        motion : SweepMotion
+            Of the latest sweep, reaching back to :attr:`since`.
+        """
+        age = 1e-9 * (motion.state.stamp - self.reference)
+        back = np.eye(ERRORS)
+        back[VELOCITY] = [velocity_jacobian(motion.state, age, axis) for axis in np.eye(3)]
+        return motion.state_at(self.reference), back @ motion.covariance @ back.T
+
     def fitted(self, motion: SweepMotion) -> FittedStart | None:
         """Return how the start began, as the poses after the first ones show it; None if too few.
 

@@ -313,3 +313,19 @@ def test_a_start_began_with_another_velocity_as_far_as_either_is_known(
 def test_too_few_poses_show_no_beginning(passing: list[Sweep]) -> None:
     start = with_wrong_beginning(passing[:6], 0.0)
     assert start.fitted(motion_at(SPEED, known_to(0.05))) is None
+
+
+def test_the_beginning_is_uncertain_by_what_has_accelerated_it_since(passing: list[Sweep]) -> None:
+    start = begun(passing, SPEED, known_to(0.05), np.zeros((0, 3)))
+    motion = motion_at(SPEED, known_to(0.05))
+    covariance = motion.covariance.copy()
+    covariance[eskf.GRAVITY, eskf.GRAVITY] = 0.1**2 * np.eye(3)
+    state, found = start.beginning(motion.with_state(motion.state, covariance))
+    assert state.stamp == start.reference
+    age = 1e-9 * (motion.state.stamp - start.reference)
+    assert age > 2.0
+    sigmas = np.sqrt(np.diag(found)[eskf.VELOCITY])
+    assert sigmas == pytest.approx([np.hypot(0.05, 0.1 * age), 0.1 * age, 0.1 * age], rel=1e-3)
+    # it was slower if gravity has accelerated it more
+    assert found[eskf.VELOCITY.start, eskf.GRAVITY.start] == pytest.approx(-0.01 * age)
+    assert np.linalg.eigvalsh(found)[0] > 0.0
