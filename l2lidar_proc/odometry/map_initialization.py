@@ -236,12 +236,14 @@ class MapInitializer:
             self._zero_velocity.clear()
         trial = self._in_motion(sweeps, since, initial)
         # a rest that neither the IMU nor the sweeps prove
-        is_assumed = not is_static and trial.leaves_open(tuning.START_FIXED)
-        moves = initial.at_rest and (is_assumed or self._is_tilted(initial))
-        if moves or (initial.at_rest and trial.is_doubtful):
+        is_assumed = initial.at_rest and not is_static
+        leaves_open = is_assumed and trial.leaves_open(tuning.START_FIXED)
+        moves = initial.at_rest and (leaves_open or self._is_tilted(initial))
+        if is_assumed or moves or (initial.at_rest and trial.is_doubtful):
             # a quiet IMU may also be that of a carrier that glides, or that speeds up evenly
             moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
-            if (moves and moving.motions) or moving.fits_closer(trial):
+            margin = 0.0 if trial.is_doubtful else tuning.INITIAL_CLOSER
+            if (moves and moving.motions) or moving.fits_closer(trial, margin):
                 trial = moving
             else:  # the maps are those of the latest one
                 self.moving = None
