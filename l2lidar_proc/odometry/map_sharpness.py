@@ -100,11 +100,13 @@ def velocity_log_likelihoods(
     return np.asarray((counts.min() - counts) / (tuning.START_SCALE * np.sqrt(len(posts))))
 
 
-def yaw_rate_error(seen: Seen, now: int, axes: F64, gravity: F64) -> tuple[float, float] | None:
+def yaw_rate_error(
+    seen: Seen, now: int, axes: F64, gravity: F64, velocity: F64
+) -> tuple[float, float] | None:
     """Return what has to be added to the yaw rate, and its sigma [rad/s]; None where nothing is.
 
     It is the one with which upright points occupy the fewest cells, at the velocity with which
-    they then do so.
+    they then do so. A slow one is likelier.
 
     Parameters
     ----------
@@ -115,6 +117,8 @@ def yaw_rate_error(seen: Seen, now: int, axes: F64, gravity: F64) -> tuple[float
         Level, orthonormal, along which the velocity may be wrong; K is 1 or 2.
     gravity : ndarray, shape (3,)
         [m/s^2]
+    velocity : ndarray, shape (3,)
+        As estimated [m/s], map axes.
     """
     if wall_spots(seen, axes, gravity) is not None:
         return None  # they show the heading
@@ -123,27 +127,48 @@ def yaw_rate_error(seen: Seen, now: int, axes: F64, gravity: F64) -> tuple[float
     if len(posts) < tuning.START_POSTS:
         return None
     moves = axes @ frame.T
+    along = velocity @ frame.T @ moves.T @ moves
     steps = candidates(tuning.START_PRIOR, tuning.START_YAW_VELOCITY_STEP)
     errors = np.array([*itertools.product(steps, repeat=len(axes))]) @ moves
     rates = np.array(_steps(tuning.START_YAW_REACH, tuning.START_YAW_STEP))
     some = records.decimated(posts, tuning.START_YAW_MOST)
-    logs, best = _sharpest(some, now, frame, rates, errors, tuning.START_CELLS[:2])
-    chosen, unchanged = int(np.argmax(logs)), len(rates) // 2
-    if logs[chosen] - logs[unchanged] < tuning.START_YAW_BETTER:
+    logs, best = _sharpest(some, now, frame, rates, errors, along, tuning.START_CELLS[:2])
+    unchanged = len(rates) // 2
+    others = np.delete(np.arange(len(rates)), unchanged)
+    other = others[np.argmax(logs[others])]
+    better = logs[other] - logs[unchanged]
+    if better < -tuning.START_YAW_BETTER:
         return None
-    near = _steps(tuning.START_YAW_VELOCITY_STEP, tuning.START_STEP)
-    errors = best[chosen] + np.array([*itertools.product(near, repeat=len(axes))]) @ moves
-    finer = _steps(tuning.START_YAW_STEP, tuning.START_YAW_FINER)
-    rates = rates[chosen] + np.array(finer)
-    logs, _ = _sharpest(posts, now, frame, rates, errors, tuning.START_CELLS)
+    near = np.array([*itertools.product(
+        _steps(tuning.START_YAW_VELOCITY_STEP, tuning.START_STEP), repeat=len(axes)
+    )]) @ moves  # fmt: skip
+    finer = np.array(_steps(tuning.START_YAW_STEP, tuning.START_YAW_FINER))
+
+    def refined(index: int) -> tuple[F64, F64]:
+        some = rates[index] + finer
+        about = best[index] + near
+        return some, _sharpest(posts, now, frame, some, about, along, tuning.START_CELLS)[0]
+
+    fine, logs = refined(other)
+    if better < tuning.START_YAW_BETTER:
+        # the coarse cells do not tell the two apart
+        better = logs.max() - refined(unchanged)[1].max()
+        if better < tuning.START_YAW_BETTER:
+            return None
     weights = np.exp(logs - logs.max())
-    mean = float(np.average(rates, weights=weights))
-    variance = float(np.average((rates - mean) ** 2, weights=weights))
+    mean = float(np.average(fine, weights=weights))
+    variance = float(np.average((fine - mean) ** 2, weights=weights))
     return mean, float(np.sqrt(variance + tuning.START_YAW_NOISE**2))
 
 
 def _sharpest(
-    posts: Seen, now: int, frame: F64, rates: F64, errors: F64, cells: tuple[float, ...]
+    posts: Seen,
+    now: int,
+    frame: F64,
+    rates: F64,
+    errors: F64,
+    velocity: F64,
+    cells: tuple[float, ...],
 ) -> tuple[F64, F64]:
     """Return how likely errors of the yaw rate are (M,), as logarithms, each with its velocity.
 
@@ -157,17 +182,24 @@ def _sharpest(
         [rad/s]
     errors : ndarray, shape (L, 3)
         Of the velocity, along the axes of the frame [m/s]: one of them comes with each rate.
+    velocity : ndarray, shape (3,)
+        To which they are added, as far as it may be wrong.
     cells : tuple of float
         Their sizes [m].
     """
     ages, sights = (posts["stamp"] - now) * 1e-9, posts["sight"] @ frame.T
     moves = ages[:, None] * errors[:, None]
-    counts, best = np.zeros(len(rates)), np.zeros((len(rates), 3))
+    # posts at even distances look alike at several velocities, and carriers are not fast
+    speeds = ((velocity + errors) ** 2).sum(axis=1)
+    prior = -0.5 * speeds / tuning.START_VELOCITY_SIGMA[1] ** 2
+    logs, best = np.zeros(len(rates)), np.zeros((len(rates), 3))
+    scale = tuning.START_SCALE * np.sqrt(len(posts))
     for number, rate in enumerate(rates.tolist()):
         turned = _yawed(sights, rate * ages) + (posts["place"] @ frame.T - sights)
-        found = [_occupied(turned + move, cells) for move in moves]
-        best[number], counts[number] = errors[np.argmin(found)], min(found)
-    return (counts.min() - counts) / (tuning.START_SCALE * np.sqrt(len(posts))), best
+        counts = np.array([_occupied(turned + move, cells) for move in moves])
+        found = prior - counts / scale
+        best[number], logs[number] = errors[np.argmax(found)], found.max()
+    return logs, best
 
 
 def _yawed(points: F64, angles: F64) -> F64:

@@ -358,7 +358,7 @@ def with_yaw_rate(motion: SweepMotion, seen: Seen, axes: F64) -> SweepMotion:
         Level, orthonormal, along which the velocity may be wrong; K is 1 or 2.
     """
     state = motion.state
-    found = yaw_rate_error(seen, int(state.stamp), axes, state.gravity)
+    found = yaw_rate_error(seen, int(state.stamp), axes, state.gravity, state.velocity)
     if found is None:
         return motion
     error, sigma = found

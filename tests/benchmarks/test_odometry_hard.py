@@ -383,6 +383,27 @@ def test_a_glide_that_passed_for_a_rest_begins_again_when_the_imu_ends_it(
         assert np.linalg.norm(item.velocity - seen) < 0.3
 
 
+@pytest.mark.parametrize(
+    "seed",
+    [
+        # the IMU passed for one at rest, its acceleration for a tilt: the start ended 29 m off
+        744,
+        # a yaw rate that was 1.8 degrees/s off looked like a velocity of 1.5 m/s: 27 m off
+        808,
+    ],
+)
+def test_starts_that_ran_away_are_right_within_seconds(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario(STARTS, seed, 5.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu)
+    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    off = np.linalg.norm(first_to_pose_errors(given, estimates), axis=1)
+    assert off[-5:].max() < 0.3
+
+
 def test_a_start_with_a_wrong_velocity_that_nothing_left_open_begins_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -97,7 +97,7 @@ def test_posts_are_sharpest_at_the_true_yaw_rate(
         wrong = SPEED + np.array([off, 0.0, 0.0])
         motion = motion_at(wrong, np.eye(eskf.ERRORS), yaw_rate)
         seen = placed(passed_at(passing, wrong), motion, np.zeros(3), axes)
-        found = yaw_rate_error(seen, int(motion.state.stamp), axes, GRAVITY)
+        found = yaw_rate_error(seen, int(motion.state.stamp), axes, GRAVITY, wrong)
         if yaw_rate == 0.0:
             assert found is None
             continue
@@ -112,13 +112,13 @@ def test_walls_and_few_points_show_no_yaw_rate(passing: list[Sweep]) -> None:
     turning = motion_at(SPEED, np.eye(eskf.ERRORS), 0.07)
     now = int(turning.state.stamp)
     seen = placed(passed_at(passing, SPEED), turning, np.zeros(3), X)
-    assert yaw_rate_error(seen, now, X, GRAVITY) is not None
+    assert yaw_rate_error(seen, now, X, GRAVITY, SPEED) is not None
     some = upright(seen, GRAVITY)[:: len(upright(seen, GRAVITY)) // tuning.START_POSTS + 1]
-    assert yaw_rate_error(some, now, X, GRAVITY) is None
+    assert yaw_rate_error(some, now, X, GRAVITY, SPEED) is None
     speed = SPEED * [1.0, 0.0, 0.0]
     walls = seen_from(np.random.default_rng(2), bare_walls, speed)
     beside = placed(passed_at(walls, speed), motion_at(speed, np.eye(eskf.ERRORS)), np.zeros(3), X)
-    assert yaw_rate_error(beside, now, X, GRAVITY) is None
+    assert yaw_rate_error(beside, now, X, GRAVITY, SPEED) is None
 
 
 def seen_at(places: F64, seconds: F64 | float = 0.0, sweep: int = 0) -> Seen:
