@@ -28,6 +28,7 @@ from l2lidar_proc.odometry.estimate import (
     estimate_of,
     gaps_in,
 )
+from l2lidar_proc.odometry.first_rest import FirstRest
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor, blur_of
@@ -103,10 +104,8 @@ class Odometry:
         self._zero_velocity = ZeroVelocityTest()
         self._innovations = InnovationTest()
         self._initializer = self._new_initializer()
-        # as measured, of a rest that may still turn out to be none
-        self._first_sweeps: list[Sweep] = []
         self._beams = BeamAngles()
-        self._mapped_with: F64 = np.zeros(2)  # the correction of the first sweeps in the map
+        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._beams)
         self._start = StartVelocity(self._lever)
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0  # of sweeps with enough points since the latest match
@@ -230,7 +229,7 @@ class Odometry:
         self._forget_unmatched()
         at_rest = self._zero_velocity.anchor is not None
         self.phase = Phase.STATIONARY if at_rest else Phase.TRACKING
-        self._first_sweeps = begun.sweeps[begun.seed :] if at_rest else []
+        self._first_rest.begin(begun.sweeps[begun.seed :] if at_rest else [])
         moving = self._initializer.moving
         self._start.clear()
         if moving is not None and not at_rest:
@@ -568,9 +567,14 @@ class Odometry:
 
     def _hold(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Hold the pose; return None if IMU or sweep show motion, then the sweep is tracked."""
-        first = self._first_sweeps
+        first = self._first_rest
+        sweeps = first.sweeps
         if not self._stays_at_rest(sweep):
-            self._begin_in_motion(first, status)
+            assert self._belief is not None
+            begun = first.begun_in_motion(sweeps, *self._belief)
+            if begun is not None:
+                self._enter_map(begun)
+                status.append(Status.STARTING)
             return None
         assert self._belief is not None
         state, covariance = self._belief
@@ -586,15 +590,16 @@ class Odometry:
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
         stays = self._zero_velocity.stays(found)
-        remapped = self._map_with_known_beams(still, doubted=not stays)
-        agree = remapped if remapped is not None else stays or self._unknown_beams_explain(still)
-        if not agree:
+        remapped = None
+        if self.config.correct_beams:
+            remapped = first.map_with_known_beams(still, doubted=not stays)
+            stays = stays or (remapped is None and first.unknown_beams_explain(still))
+        if not (stays if remapped is None else remapped):
             return self._retry_in_motion(sweep, status)
-        if self._first_sweeps and sweep.end - self._first_sweeps[0].start > tuning.RETRY_NS:
-            self._first_sweeps = []
+        first.end_doubt()
         back = self._way_back(sweep, still)
         if back is not None:
-            self._first_sweeps = []
+            first.end()
             still = self._return(back, still)
             status.append(Status.RETURNED)
         self._keep_at_rest(still)
@@ -605,46 +610,6 @@ class Odometry:
         if remapped is None:
             self.matcher.extend(estimate.points, still, still.state)
         return estimate
-
-    def _map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> bool | None:
-        """Begin the map of the first rest again, if the beams are known better than in it.
-
-        Parameters
-        ----------
-        still : SweepMotion
-            Of the latest sweep.
-        doubted : bool
-            The sweeps deviate: the beams are estimated now, whenever that was done last.
-
-        Returns
-        -------
-        bool or None
-            Whether the sweeps agree that the sensor rests; None where the map stays as it is.
-        """
-        first = self._first_sweeps
-        if not (first and self.config.correct_beams):
-            return None
-        if doubted or self._beams.is_due_at_rest(first):
-            self._beams.learn_at_rest(first)
-        if np.abs(self._beams.correction - self._mapped_with).max() <= tuning.BEAM_CHANGE:
-            return None
-        self._mapped_with = self._beams.correction
-        better = [self._beams.corrected(one) for one in first]
-        return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
-
-    def _unknown_beams_explain(self, still: SweepMotion) -> bool:
-        """Return whether unknown beams may be why sweeps at the first rest deviate.
-
-        The sensor is then at rest as before.
-        """
-        sigmas = self._beams.sigmas if self._first_sweeps else None
-        if not self.config.correct_beams or sigmas is None:
-            return False
-        turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
-        if not self._zero_velocity.has_drifted_within(turn, shift):
-            return False
-        self._zero_velocity.resume(still.state)
-        return True
 
     def _stays_at_rest(self, sweep: Sweep) -> bool:
         """Return whether the sensor rests and the IMU does not object; if it does, let go."""
@@ -657,46 +622,29 @@ class Odometry:
                 self._belief = self._at_rest[0]
             self._leave_rest()
             return False
-        if self._first_sweeps:
-            self._first_sweeps.append(self._reported)
+        self._first_rest.note(self._reported)
         return True
 
     def _leave_rest(self) -> None:
-        self._first_sweeps = []
+        self._first_rest.end()
         self._at_rest.clear()
         self.phase = Phase.TRACKING
-
-    def _begin_in_motion(self, first: list[Sweep], status: list[Status]) -> None:
-        """Begin the map again with the sweeps of a first rest, if it was short and none."""
-        if not first or first[-1].end - first[0].start > tuning.RETRY_SHORT_NS:
-            return
-        assert self._belief is not None
-        motions = self._initializer.begin_again_in_motion(first, *self._belief)
-        if motions:
-            self._beams.forget()  # what it learned, it learned from a sensor that moved
-            self._mapped_with = self._beams.correction
-            self._enter_map(Begun(motions, first, 0, first[0].start))
-            status.append(Status.STARTING)
 
     def _retry_in_motion(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Begin the map again, as in motion, if the sensor was taken for still since its start."""
         assert self._belief is not None
         state, covariance = self._belief
         self._belief = state, self._zero_velocity.widened(covariance)
-        first = self._first_sweeps
-        if first and self._zero_velocity.drifted:
-            self._beams.forget()  # what it learned, it learned from a sensor that moved
-            self._mapped_with = self._beams.correction
-            for may_rest in (False, True):
-                motions = self._initializer.begin(first, first[0].start, may_rest)
-                if not motions:
-                    continue
-                way = float(np.linalg.norm(motions[-1].state.position))
-                if way < tuning.RETRY_FARTHEST_M:
-                    self._enter_map(Begun(motions, first, 0, first[0].start))
-                    self._first_sweeps = []
-                    quality = self.matcher.quality(len(sweep.points), None)
-                    return self._estimate(sweep, motions[-1], [*status, Status.STARTING], quality)
+        sweeps = self._first_rest.end()
+        if sweeps and self._zero_velocity.drifted:
+            begun = self._first_rest.retried(sweeps)
+            if begun is not None:
+                self._enter_map(begun)
+                self._first_rest.end()
+                quality = self.matcher.quality(len(sweep.points), None)
+                return self._estimate(
+                    sweep, begun.motions[-1], [*status, Status.STARTING], quality
+                )
             # the map of a rest that was none is of no use
             self.matcher.clear()
             self._unmatched_ns = tuning.LOST_NS

@@ -1,0 +1,152 @@
+"""The rest with which a map may begin, as long as it may still turn out to be none.
+
+A carrier that glides while its motors shake the IMU passes for a sensor at rest, and so does one
+that creeps. So the sweeps of the first rest are kept for some seconds, as the unit reports them.
+If sweeps or IMU end it, the map may begin again with them, as in motion. It also begins again with
+them when the beam angles are known better than in the map.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from l2lidar_node.types import F64, Sweep
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.beam_angles import BeamAngles
+from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer
+from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
+
+
+class FirstRest:
+    """The sweeps of the first rest.
+
+    Parameters
+    ----------
+    initializer : MapInitializer
+        Begins the map again.
+    zero_velocity : ZeroVelocityTest
+    beams : BeamAngles
+
+    Attributes
+    ----------
+    sweeps : list of Sweep
+        As the unit reports them, oldest first; none if the map did not begin at rest, or so long
+        ago that the rest is beyond doubt.
+    """
+
+    def __init__(
+        self, initializer: MapInitializer, zero_velocity: ZeroVelocityTest, beams: BeamAngles
+    ) -> None:
+        self._initializer = initializer
+        self._zero_velocity = zero_velocity
+        self._beams = beams
+        self._mapped_with: F64 = np.zeros(2)  # the correction of the sweeps in the map
+        self.sweeps: list[Sweep] = []
+
+    def begin(self, sweeps: list[Sweep]) -> None:
+        """Take the sweeps with which a map has begun at rest."""
+        self.sweeps = sweeps
+
+    def note(self, sweep: Sweep) -> None:
+        """Take another sweep of this rest, if it is still the first one."""
+        if self.sweeps:
+            self.sweeps.append(sweep)
+
+    def end(self) -> list[Sweep]:
+        """Return the sweeps, and keep none."""
+        sweeps, self.sweeps = self.sweeps, []
+        return sweeps
+
+    def end_doubt(self) -> None:
+        """Keep no sweeps of a rest that has lasted so long that it was one."""
+        if self.sweeps and self.sweeps[-1].end - self.sweeps[0].start > tuning.RETRY_NS:
+            self.end()
+
+    def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> bool | None:
+        """Begin the map again, if the beams are known better than in it.
+
+        Parameters
+        ----------
+        still : SweepMotion
+            Of the latest sweep.
+        doubted : bool
+            The sweeps deviate: the beams are estimated now, whenever that was done last.
+
+        Returns
+        -------
+        bool or None
+            Whether the sweeps agree that the sensor rests; None where the map stays as it is.
+        """
+        if not self.sweeps:
+            return None
+        if doubted or self._beams.is_due_at_rest(self.sweeps):
+            self._beams.learn_at_rest(self.sweeps)
+        if np.abs(self._beams.correction - self._mapped_with).max() <= tuning.BEAM_CHANGE:
+            return None
+        self._mapped_with = self._beams.correction
+        better = [self._beams.corrected(one) for one in self.sweeps]
+        return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
+
+    def unknown_beams_explain(self, still: SweepMotion) -> bool:
+        """Return whether unknown beams may be why sweeps deviate; the sensor rests as before then.
+
+        Parameters
+        ----------
+        still : SweepMotion
+            Of the latest sweep.
+        """
+        sigmas = self._beams.sigmas if self.sweeps else None
+        if sigmas is None:
+            return False
+        turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
+        if not self._zero_velocity.has_drifted_within(turn, shift):
+            return False
+        self._zero_velocity.resume(still.state)
+        return True
+
+    def begun_in_motion(
+        self, sweeps: list[Sweep], state: InertialState, covariance: F64
+    ) -> Begun | None:
+        """Return the map begun again as in motion, if a rest was none that the IMU ended soon.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            All those of the rest, as :meth:`end` returns them.
+        state : InertialState
+            At rest, at any stamp.
+        covariance : ndarray, shape (18, 18)
+        """
+        if not sweeps or sweeps[-1].end - sweeps[0].start > tuning.RETRY_SHORT_NS:
+            return None
+        motions = self._initializer.begin_again_in_motion(sweeps, state, covariance)
+        if not motions:
+            return None
+        self._forget_beams()
+        return Begun(motions, sweeps, 0, sweeps[0].start)
+
+    def retried(self, sweeps: list[Sweep]) -> Begun | None:
+        """Return the map begun again, as in motion, with sweeps that have shown motion.
+
+        None if that does not fit, or leads too far away for what passed for a rest.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            All those of the rest, as :meth:`end` returns them.
+        """
+        self._forget_beams()
+        for may_rest in (False, True):
+            motions = self._initializer.begin(sweeps, sweeps[0].start, may_rest)
+            if motions:
+                way = float(np.linalg.norm(motions[-1].state.position))
+                if way < tuning.RETRY_FARTHEST_M:
+                    return Begun(motions, sweeps, 0, sweeps[0].start)
+        return None
+
+    def _forget_beams(self) -> None:
+        """Forget what the beams have shown of themselves: the sensor moved."""
+        self._beams.forget()
+        self._mapped_with = self._beams.correction
