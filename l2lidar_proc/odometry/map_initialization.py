@@ -68,7 +68,9 @@ class Trial(NamedTuple):
         return self.last is not None and weak_axis(self.last.information)[0] < share
 
     def fits_closer(self, other: Trial, margin: float = 0.0) -> bool:
-        """Return whether the last sweep of this trial fits closer than that of a doubtful one.
+        """Return whether the last sweep of this trial fits closer than that of another one.
+
+        Where no sweep of the other one met another, there is nothing to compare.
 
         Parameters
         ----------
@@ -78,9 +80,9 @@ class Trial(NamedTuple):
         """
         if not (self.motions and other.motions):
             return not other.motions
-        assert other.last is not None
-        least = other.last.inlier_ratio + margin
-        return self.last is not None and self.last.inlier_ratio > least
+        if self.last is None or other.last is None:
+            return False
+        return self.last.inlier_ratio > other.last.inlier_ratio + margin
 
     def fits_better(self, other: Trial) -> bool:
         """Return whether this trial fits better than another one, and fixes the place far better.
