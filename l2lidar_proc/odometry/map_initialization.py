@@ -241,7 +241,7 @@ class MapInitializer:
         is_assumed = initial.at_rest and not is_static
         leaves_open = is_assumed and trial.leaves_open(tuning.START_FIXED)
         moves = initial.at_rest and (leaves_open or self._is_tilted(initial))
-        if is_assumed or moves or (initial.at_rest and trial.is_doubtful):
+        if (is_assumed and trial.met) or moves or (initial.at_rest and trial.is_doubtful):
             # a quiet IMU may also be that of a carrier that glides, or that speeds up evenly
             moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
             margin = 0.0 if trial.is_doubtful else tuning.INITIAL_CLOSER
