@@ -27,7 +27,6 @@ from tests.support.passing_sweeps import (
     ground,
     motion_at,
     passed_at,
-    posts,
     seen_from,
 )
 
@@ -42,12 +41,6 @@ def grid(*axes: int) -> F64:
     """Return errors on a grid: for each axis, 2 m/s either way in so many steps."""
     lines = [np.linspace(-2.0, 2.0, 2 * count + 1) for count in axes]
     return np.array(np.meshgrid(*lines, indexing="ij")).reshape(len(axes), -1).T
-
-
-@pytest.fixture(scope="module")
-def passing() -> list[Sweep]:
-    """Return sweeps among posts on a ground."""
-    return seen_from(np.random.default_rng(1), posts, SPEED)
 
 
 @pytest.mark.parametrize("error", [-1.2, -0.4, 0.0, 0.8])

@@ -27,15 +27,7 @@ from tests.support.passing_sweeps import (
     X,
     motion_at,
     passed_at,
-    posts,
-    seen_from,
 )
-
-
-@pytest.fixture(scope="module")
-def passing() -> list[Sweep]:
-    """Return sweeps among posts on a ground."""
-    return seen_from(np.random.default_rng(1), posts, SPEED)
 
 
 def test_what_sweeps_measured_across_counts(passing: list[Sweep]) -> None:
