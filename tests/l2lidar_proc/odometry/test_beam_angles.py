@@ -194,9 +194,9 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
         odometry.register(turn(UNIT, k)[0])
     assert odometry._beams._rested_ns == 0
     assert odometry.motion is not None
-    odometry._map_with_known_beams(odometry.motion, doubted=False)
+    odometry._first_rest.map_with_known_beams(odometry.motion, doubted=False)
     assert odometry._beams._rested_ns == 0
-    odometry._map_with_known_beams(odometry.motion, doubted=True)
+    odometry._first_rest.map_with_known_beams(odometry.motion, doubted=True)
     assert odometry._beams._rested_ns > 600_000_000
 
 
