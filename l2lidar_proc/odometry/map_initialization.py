@@ -85,15 +85,16 @@ class Trial(NamedTuple):
         return self.last.inlier_ratio > other.last.inlier_ratio + margin
 
     def fits_better(self, other: Trial) -> bool:
-        """Return whether this trial fits better than another one, and fixes the place far better.
+        """Return whether a trial fits better than another one: far closer, or far more firmly.
 
         At the right velocity surfaces that face along the corridor agree with each other.
         """
         if self.last is None or other.last is None or not self.last.matched:
             return False
+        closer = self.last.inlier_ratio - other.last.inlier_ratio
         fixed, others = (weak_axis(trial.information)[0] for trial in (self.last, other.last))
-        return (
-            self.last.inlier_ratio > other.last.inlier_ratio
+        return closer > tuning.INITIAL_FAR_CLOSER or (
+            closer > 0.0
             and fixed > tuning.INITIAL_FIXED
             and fixed > tuning.INITIAL_BETTER * others
         )

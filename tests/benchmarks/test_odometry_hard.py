@@ -390,6 +390,8 @@ def test_a_glide_that_passed_for_a_rest_begins_again_when_the_imu_ends_it(
         744,
         # a yaw rate that was 1.8 degrees/s off looked like a velocity of 1.5 m/s: 27 m off
         808,
+        # rounds from rest fitted 81 % of the points, rounds from a walk 93 %: 3 m off
+        366,
     ],
 )
 def test_starts_that_ran_away_are_right_within_seconds(

@@ -66,6 +66,13 @@ def test_a_weak_direction_is_left_open() -> None:
     assert not trial(None).leaves_open(tuning.START_FIXED)
 
 
+def test_a_trial_is_better_if_it_fits_far_closer() -> None:
+    assert trial(0.93, 0.02).fits_better(trial(0.81, 0.2))
+    assert not trial(0.85, 0.02).fits_better(trial(0.81, 0.2))
+    assert not trial(0.81, 0.2).fits_better(trial(0.93, 0.02))
+    assert not trial(0.93).fits_better(FAILED)
+
+
 def test_a_trial_is_better_if_it_fixes_what_another_one_leaves_open() -> None:
     fixed, weak = trial(0.96, 0.5), trial(0.95, 0.01)
     assert fixed.fits_better(weak)
