@@ -300,7 +300,7 @@ class MapInitializer:
         self._zero_velocity.resume(start)
         rest = self._at_rest(sweeps, since, start, covariance)
         moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
-        if moving.motions and moving.fits_closer(rest, tuning.INITIAL_CLOSER):
+        if rest.motions and moving.fits_closer(rest, tuning.INITIAL_CLOSER):
             speed = float(np.linalg.norm(moving.motions[0].state.velocity))
             if speed > tuning.INITIAL_REST_SPEED:
                 self._zero_velocity.clear()
@@ -308,7 +308,7 @@ class MapInitializer:
         self.moving = None
         self._young = YoungSurfaces.TRUSTED
         self._initial(sweeps, since, may_rest=True)
-        self._at_rest(sweeps, since, start, covariance)
+        self._at_rest(sweeps, since, start, covariance, is_known=True)
         self._zero_velocity.clear()
         return []
 
@@ -328,9 +328,15 @@ class MapInitializer:
         return dataclasses.replace(initial.state, position=place)
 
     def _at_rest(
-        self, sweeps: list[Sweep], since: HostNs, state: InertialState, covariance: F64
+        self,
+        sweeps: list[Sweep],
+        since: HostNs,
+        state: InertialState,
+        covariance: F64,
+        *,
+        is_known: bool = False,
     ) -> Trial:
-        """Add sweeps to an empty map where they are at rest, as long as they agree."""
+        """Add sweeps to an empty map where they are at rest, as long as they agree, or all."""
         matcher = self._matcher
         matcher.clear()
         motions: list[SweepMotion] = []
@@ -340,7 +346,7 @@ class MapInitializer:
             reach = None if motions else since
             predicted = self._predictor.over_sweep(sweep, before, covariance, reach)
             motion = predicted.at_rest(state, covariance)
-            if motions:
+            if motions and not is_known:
                 source = matcher.source(sweep, motion)
                 trial = motion.at_rest(state, free_pose())
                 found, status = matcher.match(source, trial, initial=True)

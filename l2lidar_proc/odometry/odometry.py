@@ -581,21 +581,26 @@ class Odometry:
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         trial = predicted.at_rest(state, free_pose())
         source = self.matcher.source(sweep, trial)
-        found, _ = self.matcher.match(source, trial)
-        status = [*status, *gaps_in(predicted)]
-        if found is None:
+        found, matched = self.matcher.match(source, trial)
+        gaps = gaps_in(predicted)
+        status = [*status, *gaps]
+        if found is None and (gaps or matched is not MatchStatus.NEW_MAP):
             self._zero_velocity.clear()
             self._leave_rest()
             return None
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
-        stays = self._zero_velocity.stays(found)
         remapped = None
-        if self.config.correct_beams:
-            remapped = first.map_with_known_beams(still, doubted=not stays)
-            stays = stays or (remapped is None and first.unknown_beams_explain(still))
-        if not (stays if remapped is None else remapped):
-            return self._retry_in_motion(sweep, status)
+        if found is None:
+            # the IMU proves the rest, and so young a map contradicts nothing
+            status += [Status.PREDICTED, Status.UNMATCHED]
+        else:
+            stays = self._zero_velocity.stays(found)
+            if self.config.correct_beams:
+                remapped = first.map_with_known_beams(still, doubted=not stays)
+                stays = stays or (remapped is None and first.unknown_beams_explain(still))
+            if not (stays if remapped is None else remapped):
+                return self._retry_in_motion(sweep, status)
         first.end_doubt()
         back = self._way_back(sweep, still)
         if back is not None:

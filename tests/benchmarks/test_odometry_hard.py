@@ -34,7 +34,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status, cloud_pose
 from l2lidar_proc.odometry.map_initialization import MapInitializer
-from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.vertical_lines import LINE
 from l2lidar_proc.odometry.wall_profile import SPOT
 from l2lidar_proc.odometry.wall_velocity import WallVelocity
@@ -362,6 +362,39 @@ def test_beams_that_nobody_knows_yet_do_not_end_a_rest_between_trees(
     elif found.any():
         assert odometry._beams.sigmas is not None
         assert (np.abs(found - true) < 2.0 * np.degrees(odometry._beams.sigmas)).all()
+
+
+def test_a_rest_outlasts_a_sweep_that_meets_nothing_of_so_young_a_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between bare trunks it ended there, and the map turned by 20 mrad until the real start."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(scenario("bare trunks", 203, 3.0))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu)
+    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    rest = [item for item in estimates if item.stamp < given.imu["stamp"][0] + 2_000_000_000]
+    unmatched = [item for item in rest if Status.UNMATCHED in item.status]
+    assert len(rest) > 6
+    assert len(unmatched) == 1
+    assert Status.PREDICTED in unmatched[0].status
+    for item in rest:
+        np.testing.assert_allclose(item.T_map_lidar, rest[0].T_map_lidar, atol=1e-12)
+
+
+def test_a_rest_ends_where_neither_imu_nor_map_prove_it(given: Recording) -> None:
+    """Without samples, a sweep that meets nothing of a young map may be anywhere."""
+    some = list(islice(given.sweeps(), 5))
+    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
+    odometry.imu(given.imu[given.imu["stamp"] < some[3].end])
+    for sweep in some[:4]:
+        odometry.register(sweep)
+    assert odometry.phase is Phase.STATIONARY
+    points = some[4].points.copy()
+    for axis in "xyz":
+        points[axis] += 40.0
+    odometry.register(replace(some[4], points=points))
+    assert odometry.phase is not Phase.STATIONARY
 
 
 def test_a_glide_that_passed_for_a_rest_begins_again_when_the_imu_ends_it(
