@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import islice, takewhile
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
-from l2lidar_node.types import F64, HostNs
+from l2lidar_node.types import HostNs
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status, cloud_pose
@@ -238,11 +238,16 @@ def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
     assert "RETURNED" in set().union(*names[restarted:])
 
 
-def end_of(some: Recording) -> float:
-    """Return how far off the odometry ends [m]."""
+def tracked(some: Recording) -> Track:
+    """Return what the odometry says of a recording."""
     track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, some)
     assert track is not None
-    return score(some, track)["end_m"]
+    return track
+
+
+def end_of(some: Recording) -> float:
+    """Return how far off the odometry ends [m]."""
+    return score(some, tracked(some))["end_m"]
 
 
 @pytest.mark.parametrize(
@@ -255,11 +260,7 @@ def end_of(some: Recording) -> float:
         (300, 0.3, 1.0),  # a corridor, speeding up: 104 m where that passed for a tilt
         (215, 0.5, 2.0),  # a walk in a hall: 10 m
         (517, 0.3, 2.0),  # a room, shaken: 89 m where 0.7 of the surfaces were too few
-        (
-            352,
-            0.3,
-            2.0,
-        ),  # a turn in a hall: 16 m where a wrong yaw rate hid the velocity
+        (352, 0.3, 2.0),  # a turn in a hall: 16 m where a wrong yaw rate hid the velocity
         (415, 0.5, 2.0),  # a walk in a wood: 33 m where a quiet IMU proved a rest by itself
     ],
 )
@@ -268,9 +269,7 @@ def test_what_begins_in_motion_does_not_run_away(
 ) -> None:
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     given = recording(scenario(STARTS, seed, 12.0))
-    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
-    assert track is not None
-    found = errors(given, track)
+    found = errors(given, tracked(given))
     assert np.linalg.norm(found.position[-1]) < most
     assert np.degrees(np.linalg.norm(found.turn[-10:, :2], axis=1).max()) < turned
 
@@ -403,17 +402,13 @@ def test_a_glide_that_passed_for_a_rest_begins_again_when_the_imu_ends_it(
     """A drone's motors hid its motion, and two sweeps met by chance: it ended 165 m off."""
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     given = recording(scenario(STARTS, 664, 5.0))
-    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
-    odometry.imu(given.imu)
-    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
-    held = list(takewhile(lambda item: np.linalg.norm(item.velocity) < 0.05, estimates))
-    assert len(held) > 1  # it was taken for a rest
-    after = estimates[len(held) :]
-    assert Status.STARTING in after[0].status
-    true = given.truth_at(np.array([item.stamp for item in after]))
-    for item, one in zip(after, true, strict=True):
-        seen = rotations.matrices(one["quaternion_wxyz"]).T @ one["velocity"]
-        assert np.linalg.norm(item.velocity - seen) < 0.3
+    track = tracked(given)
+    assert track.velocities is not None
+    speeds = np.linalg.norm(track.velocities, axis=1)
+    moving = int(np.argmax(speeds > 0.05))
+    assert moving > 1  # it was taken for a rest
+    assert "STARTING" in track.status[moving]
+    assert np.linalg.norm(errors(given, track).velocity[moving:], axis=1).max() < 0.3
 
 
 @pytest.mark.parametrize(
@@ -432,10 +427,7 @@ def test_starts_that_ran_away_are_right_within_seconds(
 ) -> None:
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     given = recording(scenario(STARTS, seed, 5.0))
-    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
-    odometry.imu(given.imu)
-    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
-    off = np.linalg.norm(first_to_pose_errors(given, estimates), axis=1)
+    off = np.linalg.norm(errors(given, tracked(given)).position, axis=1)
     assert off[-5:].max() < 0.3
 
 
@@ -445,14 +437,12 @@ def test_a_start_with_a_wrong_velocity_that_nothing_left_open_begins_again(
     """Two sweeps of a yard fitted at 0.1 and at 0.7 m/s; all poses were 0.3 m off the first."""
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     given = recording(scenario(STARTS, 225, 5.0))
-    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
-    odometry.imu(given.imu)
-    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
-    starting = [k for k, item in enumerate(estimates) if Status.STARTING in item.status]
-    assert starting[-1] > 7  # it began again when it had lasted 2.2 s
-    off = first_to_pose_errors(given, estimates)
-    assert np.linalg.norm(off[:7], axis=1).max() > 0.3
-    assert np.linalg.norm(off[starting[-1] :], axis=1).max() < 0.1
+    track = tracked(given)
+    again = max(k for k, names in enumerate(track.status) if "STARTING" in names)
+    assert again > 7  # when it had lasted 2.2 s
+    off = np.linalg.norm(errors(given, track).position, axis=1)
+    assert off[:7].max() > 0.3
+    assert off[again:].max() < 0.1
 
 
 @pytest.mark.parametrize("seed", [74, 118, 212])
@@ -465,15 +455,11 @@ def test_the_first_pose_is_as_uncertain_as_the_velocity_until_the_map(
     """
     monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
     given = recording(scenario(STARTS, seed, 3.0))
-    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
-    odometry.imu(given.imu)
-    estimates: list[OdometryEstimate] = []
-    for sweep in given.sweeps():
-        estimates = estimates or odometry.register(sweep)
-    off = first_to_pose_errors(given, estimates)[1]
-    place = estimates[1].covariance[:3, :3]
+    track = tracked(given)
+    assert track.covariances is not None
+    off, place = errors(given, track).position[1], track.covariances[1, :3, :3]
     assert np.linalg.norm(off) > 0.1
-    assert off @ np.linalg.solve(place, off) < 7.8
+    assert off @ np.linalg.solve(place, off) < 7.8  # 95 % of three degrees of freedom
 
 
 def test_the_first_pose_stays_where_it_is_when_the_map_begins_again(
@@ -499,18 +485,6 @@ def test_the_first_pose_stays_where_it_is_when_the_map_begins_again(
     assert lead * np.linalg.norm(state.rotation.T @ state.velocity - first.velocity) > 0.06
     here = cloud_pose(state, given.T_cloud_imu[:3, 3])
     assert np.linalg.norm(here[:3, 3] - first.T_map_lidar[:3, 3]) < 0.01
-
-
-def first_to_pose_errors(given: Recording, estimates: list[OdometryEstimate]) -> F64:
-    """Return how far places are off, (N, 3) [m], seen from the first pose."""
-    true = given.truth_at(np.array([item.stamp for item in estimates]))
-    T_world_first = np.eye(4)
-    T_world_first[:3, :3] = rotations.matrices(true["quaternion_wxyz"])[0]
-    T_world_first[:3, 3] = true["position"][0]
-    T_map_world = estimates[0].T_map_lidar @ np.linalg.inv(T_world_first)
-    found = np.array([item.T_map_lidar[:3, 3] for item in estimates])
-    expected = true["position"] @ T_map_world[:3, :3].T + T_map_world[:3, 3]
-    return np.asarray(found - expected)
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
