@@ -223,10 +223,8 @@ class MapInitializer:
             One for each sweep; empty if they do not fit; None while it is too early to tell, as
             where little comes back and it takes many sweeps at rest before one meets another.
         """
-        self._young = YoungSurfaces.TRUSTED
-        self.moving = None
         late = sweeps[-1].end - since >= tuning.INITIAL_MAX_NS
-        initial = self._initial(sweeps, since, may_rest)
+        initial = self._begin_anew(sweeps, since, may_rest)
         start = self._at_cloud_origin(initial)
         self._zero_velocity.clear()
         is_static = initial.at_rest and self._zero_velocity.anchored(
@@ -249,9 +247,7 @@ class MapInitializer:
             if (moves and moving.motions) or moving.fits_closer(trial, margin):
                 trial = moving
             else:  # the maps are those of the latest one
-                self.moving = None
-                self._young = YoungSurfaces.TRUSTED
-                initial = self._initial(sweeps, since, may_rest)
+                initial = self._begin_anew(sweeps, since, may_rest)
                 trial = self._in_motion(sweeps, since, initial)
         return trial.motions if trial.met or late or not trial.motions else None
 
@@ -305,9 +301,7 @@ class MapInitializer:
             if speed > tuning.INITIAL_REST_SPEED:
                 self._zero_velocity.clear()
                 return moving.motions
-        self.moving = None
-        self._young = YoungSurfaces.TRUSTED
-        self._initial(sweeps, since, may_rest=True)
+        self._begin_anew(sweeps, since, may_rest=True)
         self._at_rest(sweeps, since, start, covariance, is_known=True)
         self._zero_velocity.clear()
         return []
@@ -315,6 +309,12 @@ class MapInitializer:
     def _samples(self, sweeps: list[Sweep], since: HostNs) -> NDArray[np.void]:
         until = min(sweeps[-1].end, since + tuning.INITIAL_IMU_NS)
         return self._predictor.samples(since - tuning.INITIAL_NS, until)
+
+    def _begin_anew(self, sweeps: list[Sweep], since: HostNs, may_rest: bool) -> InitialState:
+        """Forget what an attempt has found out of a motion; return the first state again."""
+        self.moving = None
+        self._young = YoungSurfaces.TRUSTED
+        return self._initial(sweeps, since, may_rest)
 
     def _initial(self, sweeps: list[Sweep], since: HostNs, may_rest: bool) -> InitialState:
         reference = self._predictor.reference(sweeps[0])

@@ -275,7 +275,7 @@ class StartVelocity:
         later = stamps >= stamps[0] + tuning.START_FITTED_NS
         if np.count_nonzero(later) < tuning.START_FITTED_LEAST:
             return None
-        off = _off(self._passed, motion, self._lever)
+        off = _deviations(self._passed, motion, self._lever)
         ages = (stamps - motion.state.stamp) * 1e-9
         design = np.column_stack((np.ones_like(ages), ages, 0.5 * ages**2))
         fit, *_ = np.linalg.lstsq(design[later], off[later], rcond=None)
@@ -427,7 +427,7 @@ def placed(passed: list[Passed], motion: SweepMotion, lever: F64, axes: F64) -> 
     """
     trajectory, state = motion.trajectory(lever), motion.state
     stamps = np.array([one.stamp for one in passed])
-    off = _off(passed, motion, lever)
+    off = _deviations(passed, motion, lever)
     off -= off @ axes.T @ axes
     parts = []
     for number, (sweep, *_) in enumerate(passed):
@@ -446,8 +446,8 @@ def placed(passed: list[Passed], motion: SweepMotion, lever: F64, axes: F64) -> 
     return records.joined(parts)
 
 
-def _off(passed: list[Passed], motion: SweepMotion, lever: F64) -> F64:
-    """Return how far from where the IMU carries the sensor sweeps were estimated (N, 3) [m]."""
+def _deviations(passed: list[Passed], motion: SweepMotion, lever: F64) -> F64:
+    """Return by how much estimated places deviate from the way of the IMU, (N, 3) [m]."""
     state = motion.state
     stamps = np.array([one.stamp for one in passed])
     places = np.array([one.position for one in passed])
