@@ -17,7 +17,7 @@ one that is likely counts by itself.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -143,17 +143,28 @@ class OlderPart(NamedTuple):
     matcher : SweepMatcher
     is_due : bool
         Whether all of it is to be searched, not only on the level of the predicted place.
+    is_contradicted : bool
+        Whether sweeps have seen through surfaces of the map where the pose puts them.
     """
 
     matcher: SweepMatcher
     is_due: bool
+    is_contradicted: bool
 
 
 class MapRevisit:
-    """Search of the older part of the map in use while the pose is less certain than that."""
+    """Search of the older part of the map in use while the pose is less certain than that.
+
+    Attributes
+    ----------
+    is_contradicted : bool
+        Whether the latest sweep sees through surfaces of the map where its pose puts it. Looked
+        at only while the pose is so uncertain.
+    """
 
     def __init__(self) -> None:
         self._certain_at: int | None = None  # stamp until which the pose was certain enough
+        self._is_uncertain = self.is_contradicted = False
         self._meetings = _Meetings()
         self.restart(HostNs(0))
 
@@ -163,6 +174,8 @@ class MapRevisit:
         self._met_until = int(stamp)  # until then a meeting may be confirmed
         self._in_sight_until = int(stamp)  # until then relocalization is tried with each sweep
         self._returned_until = int(stamp)  # until then the latest return may have been wrong
+        self._contradicted_until = int(stamp)  # until then the pose is known to be wrong,
+        self._contradicted_by = 0  # by surfaces that the sweeps before this one have opened
         self._certain_at = None
         self._meetings.clear()
 
@@ -170,36 +183,52 @@ class MapRevisit:
         """Note that the sweep of a stamp left a direction of the place free."""
         self._in_sight_until = int(stamp) + tuning.REVISIT_SIGHT_NS
 
-    def part_due(self, matcher: SweepMatcher, state: InertialState) -> OlderPart | None:
+    def part_due(
+        self, matcher: SweepMatcher, state: InertialState, source: Callable[[], Source]
+    ) -> OlderPart | None:
         """Return the older part of the map if it should be searched now.
 
         All of it is searched more and more rarely, to a limit; the level of the predicted place
-        also while a surface that fixes the place may come into sight.
+        also while a surface that fixes the place may come into sight, or the pose is contradicted.
 
         Parameters
         ----------
         matcher : SweepMatcher
             In use. Not that of a carrier that drives: one niche of a corridor looks like the next.
         state : InertialState
+        source : callable
+            Returns the points of the sweep; they are needed only where the place is uncertain.
         """
         stamp = int(state.stamp)
+        self.is_contradicted = False
         is_due = stamp >= self._next_search
-        if not is_due and stamp >= self._in_sight_until:
+        if not (is_due or self._is_uncertain or stamp < self._in_sight_until):
             return None
         older = matcher.drift.more_certain_than_held(state.position)
-        if older is None or matcher.is_young or matcher.driving:
+        self._is_uncertain = not (older is None or matcher.is_young or matcher.driving)
+        if older is None or not self._is_uncertain:
             self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
             self._meetings.clear()
             return None
-        if not is_due:
-            loose = _is_loose_on_level(state, matcher.drift.at(state.position))
-            return OlderPart(matcher.part_of(older), False) if loose else None
-        if self._certain_at is None:
-            self._certain_at = stamp
-        pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
-        pause = min(max(tuning.EARLIER_PAUSE_NS, pause), tuning.REVISIT_PAUSE_NS)
-        self._next_search = stamp + pause
-        return OlderPart(matcher.part_of(older), True)
+        seen = matcher.seen_through(source(), state)
+        self.is_contradicted = seen.share > tuning.RAYS_THROUGH
+        if self.is_contradicted:
+            self._contradicted_until = stamp + tuning.REVISIT_MET_NS
+            self._contradicted_by = 1 + int(np.quantile(seen.sweeps, tuning.REVISIT_SEEN))
+        of_late = stamp < self._contradicted_until
+        if of_late:
+            older[: self._contradicted_by] = True
+        if is_due:
+            if self._certain_at is None:
+                self._certain_at = stamp
+            pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
+            pause = min(max(tuning.EARLIER_PAUSE_NS, pause), tuning.REVISIT_PAUSE_NS)
+            self._next_search = stamp + pause
+        elif not (of_late or stamp < self._in_sight_until) or not _is_loose_on_level(
+            state, matcher.drift.at(state.position), contradicted=of_late
+        ):
+            return None
+        return OlderPart(matcher.part_of(older), is_due, of_late)
 
     def search(
         self, source: Source, part: OlderPart, motion: SweepMotion, jump: FrameJump
@@ -257,11 +286,12 @@ def _found_in(
         found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
         if found is not None and _is_elsewhere(found, motion, len(source.points), expected):
             return found, False
-    if not _is_loose_on_level(motion.state, uncertain):
+    if not _is_loose_on_level(motion.state, uncertain, contradicted=part.is_contradicted):
         return None, False
     loose = with_loose_pose(motion.state, motion.covariance, uncertain)
     freed = dataclasses.replace(motion, covariance=loose)
-    found = older.relocalize(source, freed, uncertain[:3, :3], expected)
+    allowed = uncertain[:3, :3]
+    found = older.relocalize(source, freed, allowed, allowed if part.is_contradicted else expected)
     if found is None:
         return None, False
     move = found.state.position - place
@@ -288,13 +318,14 @@ def _free_turns(gravity: F64) -> F64:
     return np.outer(gravity, gravity) / squared if squared else np.eye(3)
 
 
-def _is_loose_on_level(state: InertialState, uncertain: F64) -> bool:
-    """Return whether a place, so uncertain (6, 6), has drifted far on its level."""
+def _is_loose_on_level(state: InertialState, uncertain: F64, *, contradicted: bool) -> bool:
+    """Return whether a place, so uncertain (6, 6), may have drifted far on its level."""
     if not state.gravity.any():
         return False
     basis = level_basis(state.gravity)
     level = basis.T @ uncertain[:3, :3] @ basis
-    return bool(np.linalg.eigvalsh(level)[-1] > tuning.RELOCALIZE_FROM_SIGMA**2)
+    least = tuning.RELOCALIZE_FROM_SIGMA[contradicted]
+    return bool(np.linalg.eigvalsh(level)[-1] > least**2)
 
 
 def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int, expected: F64) -> bool:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
@@ -10,10 +13,23 @@ from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.surfels import are_within
 
 
-def rays_through(surfaces: SurfelMap, origin: F64, points: F64) -> float:
-    """Return the share of the rays to some points that pass through known surfaces.
+class SeenThrough(NamedTuple):
+    """Known surfaces through which the rays to the points of a sweep pass.
 
-    Many such rays mean a wrong pose, or a wrong map.
+    Attributes
+    ----------
+    share : float
+        Of the rays that do. Many mean a wrong pose, or a wrong map.
+    sweeps : ndarray of int64, shape (N,)
+        For each of these rays, the sweep that opened the surface.
+    """
+
+    share: float
+    sweeps: NDArray[np.int64]
+
+
+def seen_through(surfaces: SurfelMap, origin: F64, points: F64) -> SeenThrough:
+    """Return the known surfaces through which the rays to some points pass.
 
     Parameters
     ----------
@@ -42,4 +58,6 @@ def rays_through(surfaces: SurfelMap, origin: F64, points: F64) -> float:
         & (cells["count"] >= tuning.RAY_POINTS)
         & (cells["sweeps"] >= tuning.RAY_SWEEPS)
     )
-    return len(np.unique(ray[through])) / max(len(points), 1)
+    rays, first = np.unique(ray[through], return_index=True)
+    opened = planes["born"][through][first].astype(np.int64)
+    return SeenThrough(len(rays) / max(len(points), 1), opened)

@@ -39,7 +39,7 @@ from l2lidar_proc.odometry.alignment import (
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import AlignmentQuality
-from l2lidar_proc.odometry.free_space import rays_through
+from l2lidar_proc.odometry.free_space import SeenThrough, seen_through
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.pose_hypotheses import (
     is_explained_by_drift,
@@ -497,11 +497,14 @@ class SweepMatcher:
             return False
         return not (strict and is_far(found, motion) and self._sees_through(found, source))
 
+    def seen_through(self, source: Source, state: InertialState) -> SeenThrough:
+        """Return the known surfaces through which a sweep would see from a state."""
+        placed = source.points @ state.rotation.T + state.position
+        return seen_through(self.surfaces, state.position, placed)
+
     def _sees_through(self, found: Alignment, source: Source) -> bool:
         """Return whether the sweep would see through known surfaces where an alignment puts it."""
-        state = found.state
-        placed = source.points @ state.rotation.T + state.position
-        return rays_through(self.surfaces, state.position, placed) > tuning.RAYS_THROUGH
+        return self.seen_through(source, found.state).share > tuning.RAYS_THROUGH
 
     def fits_badly(self, found: Alignment) -> bool:
         """Return whether an alignment fits the map as wrong ones do, or as new places."""

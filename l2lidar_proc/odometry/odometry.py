@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import deque
 from enum import Enum
 from typing import Final
@@ -277,6 +278,8 @@ class Odometry:
         if back is not None:
             found, motion, guess = back.alignment, self._return(back, motion), motion.state
             status.append(Status.RETURNED)
+        elif self._revisit.is_contradicted and Status.SUSPECT not in status:
+            status.append(Status.SUSPECT)
         motion, is_mapped = self._with_start_velocity(sweep, motion, found, status)
         self._keep(motion)
         quality = self.matcher.quality(len(source.points), found)
@@ -538,16 +541,13 @@ class Odometry:
 
     def _way_back(self, sweep: Sweep, motion: SweepMotion) -> Return | None:
         """Search the earlier maps and the older part of this one, where it is time to."""
+        source = functools.cache(lambda: self.matcher.source(sweep, motion))
         if self._earlier.is_due(motion.state.stamp):
-            source = self.matcher.source(sweep, motion)
-            back = self._earlier.search(source, motion, self._jump)
+            back = self._earlier.search(source(), motion, self._jump)
             if back is not None:
                 return back
-        part = self._revisit.part_due(self.matcher, motion.state)
-        if part is None:
-            return None
-        source = self.matcher.source(sweep, motion)
-        return self._revisit.search(source, part, motion, self._jump)
+        part = self._revisit.part_due(self.matcher, motion.state, source)
+        return None if part is None else self._revisit.search(source(), part, motion, self._jump)
 
     def _return(self, back: Return, motion: SweepMotion) -> SweepMotion:
         """Go on in an earlier map; return the motion of the sweep that met it."""

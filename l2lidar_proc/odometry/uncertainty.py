@@ -355,11 +355,15 @@ class MapDrift:
         return self._surer(place, latest, tuning.APART_LEAST)
 
     def more_certain_than_held(self, place: F64) -> NDArray[np.bool_] | None:
-        """Return which sweeps (S,) were far more certain of a place than what holds it now is.
+        """Return which sweeps (S,) came before what holds a place (3,) [m] now became uncertain.
 
-        None where that is certain enough, so that no other surfaces need be looked for.
+        They are all up to the last that was far more certain of it. None where the place is
+        certain enough, so that no other surfaces need be looked for.
         """
-        return self._surer(place, self._reported[_ALLOWED], tuning.REVISIT_FROM_SIGMA)
+        surer = self._surer(place, self._reported[_ALLOWED], tuning.REVISIT_FROM_SIGMA)
+        if surer is not None and surer.any():
+            surer[: np.flatnonzero(surer)[-1]] = True
+        return surer
 
     def _surer(self, place: F64, drift: F64, least: float) -> NDArray[np.bool_] | None:
         """Return which sweeps (S,) were surer of a place than a drift (6, 6) of at least so much.

@@ -68,9 +68,10 @@ def extended(
     known: tuple[float, float] = TIGHT,
     *,
     imu: bool = True,
+    expected_share: float = 1.0,
 ) -> float:
     """Add points that are seen from the origin; return the share where there was no map."""
     cloud = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"])
     cloud["x"], cloud["y"], cloud["z"] = points.T
     at = motion(known, np.zeros(3), imu=imu)
-    return matcher.extend(cloud, at, at.state)
+    return matcher.extend(cloud, at, at.state, expected_share)

@@ -22,7 +22,13 @@ from l2lidar_proc.motion.filter import (
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return, moved
+from l2lidar_proc.odometry.earlier_maps import (
+    EarlierMaps,
+    MapRevisit,
+    OlderPart,
+    Return,
+    moved,
+)
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import FrameJump
@@ -86,18 +92,22 @@ DRIFT = np.array([0.4, -0.25, 0.0])
 
 
 def drifted_matcher(
-    known: float, sweeps: int = 14, drift: F64 = DRIFT, turn: float = TIGHT[0]
+    known: float,
+    sweeps: int = 14,
+    drift: F64 = DRIFT,
+    turn: float = TIGHT[0],
+    expected_share: float = 1.0,
 ) -> SweepMatcher:
     """Return a map of the room, and beside it what was seen later, off by a drift.
 
     The pose is held by the latter, whose place is known to ``known`` [m] and whose attitude to
-    ``turn`` [rad], 1 sigma.
+    ``turn`` [rad], 1 sigma; of that covariance, so much is expected.
     """
     rng, matcher = np.random.default_rng(21), SweepMatcher(OdometryConfig(), np.zeros(3))
     for _ in range(sweeps):
         extended(matcher, room(rng, 4000))
     for _ in range(sweeps):
-        extended(matcher, room(rng, 4000) + drift, (turn, known))
+        extended(matcher, room(rng, 4000) + drift, (turn, known), expected_share=expected_share)
     found = matcher.match(source(room(rng, 2000) - PLACE), motion(TIGHT, PLACE + drift)).alignment
     assert found is not None
     matcher.meet(found, 0.2)
@@ -118,6 +128,17 @@ def view(rng: np.random.Generator) -> Source:
     return source(room(rng, 2000) - PLACE)
 
 
+def known_share(surfaces: SurfelMap, points: F64) -> float:
+    """Return the share of points near a surface."""
+    found = surfaces.match(points)
+    return float(np.count_nonzero(np.abs(found.distances) < 0.05)) / len(points)
+
+
+def unseen() -> Source:
+    """Return what meets no surface, and is not seen through any."""
+    return source(RNG.uniform(*NOTHING, (1500, 3)) - PLACE)
+
+
 def later(sweep: SweepMotion, seconds: float) -> SweepMotion:
     """Return a motion with the same state, so much later."""
     stamp = HostNs(sweep.state.stamp + int(seconds * 1e9))
@@ -128,7 +149,7 @@ def searched(
     revisit: MapRevisit, matcher: SweepMatcher, seen: Source, sweep: SweepMotion
 ) -> Return | None:
     """Return what a search that is due finds."""
-    part = revisit.part_due(matcher, sweep.state)
+    part = revisit.part_due(matcher, sweep.state, lambda: seen)
     assert part is not None
     return revisit.search(seen, part, sweep, FrameJump())
 
@@ -140,7 +161,7 @@ def test_the_older_part_of_a_map_is_returned_to_once_two_sweeps_meet_it(
     jump = FrameJump(np.ones(3), np.eye(6))
     for number in (0, 1):
         sweep = later(AT, 0.2 * number)
-        part = revisit.part_due(drifted, sweep.state)
+        part = revisit.part_due(drifted, sweep.state, unseen)
         assert part is not None
         back = revisit.search(view(rng), part, sweep, jump)
         assert (back is not None) == bool(number)
@@ -154,14 +175,9 @@ def test_the_older_part_of_a_map_is_returned_to_once_two_sweeps_meet_it(
     # what was seen from the wrong place is not in the map any more
     points = room(rng, 4000)
     wall = points[points[:, 0] > 3.95] + DRIFT
-
-    def known(surfaces: SurfelMap, points: F64) -> float:
-        found = surfaces.match(points)
-        return float(np.count_nonzero(np.abs(found.distances) < 0.05)) / len(points)
-
     found = back.map.matcher.surfaces
-    assert known(found, points) > 0.9 * known(drifted.surfaces, points)
-    assert known(found, wall) < 0.1 < 0.9 < known(drifted.surfaces, wall)
+    assert known_share(found, points) > 0.9 * known_share(drifted.surfaces, points)
+    assert known_share(found, wall) < 0.1 < 0.9 < known_share(drifted.surfaces, wall)
     assert back.map.matcher.drift is drifted.drift
 
 
@@ -185,7 +201,7 @@ def test_a_meeting_waits_for_two_seconds_to_be_confirmed(
         assert searched(revisit, drifted, nothing, later(AT, seconds)) is None
     for seconds in np.arange(pause + 0.1, pause + 3.0, 0.2):
         sweep = later(AT, seconds)
-        part = revisit.part_due(drifted, sweep.state)
+        part = revisit.part_due(drifted, sweep.state, unseen)
         if part is not None:
             break
     assert part is not None
@@ -223,7 +239,8 @@ def test_a_meeting_that_explains_too_little_does_not_count(
     revisit, at = MapRevisit(), motion(TIGHT, place)
     rng = np.random.default_rng(26)
     assert searched(revisit, drifted, seen(rng), at) is None
-    assert revisit.part_due(drifted, later(at, 0.2).state) is None  # and there is a pause
+    part = revisit.part_due(drifted, later(at, 0.2).state, unseen)
+    assert part is None or not part.is_due  # and there is a pause
     assert searched(revisit, drifted, seen(rng), later(at, 1.1)) is None
 
 
@@ -235,7 +252,7 @@ def test_a_meeting_farther_away_than_drift_explains_does_not_count(
     matcher, revisit = drifted_matcher(known), MapRevisit()
     rng = np.random.default_rng(43)
     assert searched(revisit, matcher, view(rng), AT) is None
-    part = revisit.part_due(matcher, later(AT, 1.1).state)
+    part = revisit.part_due(matcher, later(AT, 1.1).state, unseen)
     assert part is not None
     back = revisit.search(view(rng), part, later(AT, 1.1), FrameJump())
     assert (back is not None) == counts
@@ -254,7 +271,7 @@ def test_a_meeting_with_something_else_does_not_count_even_if_sweeps_match_no_be
         backs = []
         for number in range(16):
             sweep = later(AT, 0.5 * number)
-            part = revisit.part_due(matcher, sweep.state)
+            part = revisit.part_due(matcher, sweep.state, unseen)
             if part is not None:
                 backs.append(revisit.search(seen(rng), part, sweep, FrameJump()))
         assert len(backs) >= 8
@@ -265,44 +282,44 @@ def test_a_meeting_before_the_pose_was_certain_again_does_not_count(drifted: Swe
     rng, revisit = np.random.default_rng(27), MapRevisit()
     certain = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA)
     assert searched(revisit, drifted, view(rng), AT) is None
-    assert revisit.part_due(certain, later(AT, 0.2).state) is None
+    assert revisit.part_due(certain, later(AT, 0.2).state, unseen) is None
     assert searched(revisit, drifted, view(rng), later(AT, 0.5)) is None
     assert searched(revisit, drifted, view(rng), later(AT, 0.7)) is not None
 
 
 def test_a_pose_as_certain_as_its_map_is_not_searched_for(drifted: SweepMatcher) -> None:
     matcher, revisit = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA), MapRevisit()
-    assert revisit.part_due(matcher, AT.state) is None
+    assert revisit.part_due(matcher, AT.state, unseen) is None
     # nor looked at again for a moment
     look = tuning.REVISIT_LOOK_NS * 1e-9
-    assert revisit.part_due(drifted, later(AT, 0.9 * look).state) is None
-    assert revisit.part_due(drifted, later(AT, 1.1 * look).state) is not None
+    assert revisit.part_due(drifted, later(AT, 0.9 * look).state, unseen) is None
+    assert revisit.part_due(drifted, later(AT, 1.1 * look).state, unseen) is not None
 
 
 def test_a_carrier_that_drives_is_not_searched_for(drifted: SweepMatcher) -> None:
     driving = drifted.part_of(np.ones(1, np.bool_))  # all of it
     driving.driving = True
-    assert MapRevisit().part_due(driving, AT.state) is None
-    assert MapRevisit().part_due(drifted, AT.state) is not None
+    assert MapRevisit().part_due(driving, AT.state, unseen) is None
+    assert MapRevisit().part_due(drifted, AT.state, unseen) is not None
 
 
 def test_a_map_that_has_only_just_begun_is_not_searched() -> None:
     young = drifted_matcher(LOOSE[1], sweeps=5)
     assert young.is_young
     assert young.drift.more_certain_than_held(AT.state.position) is not None
-    assert MapRevisit().part_due(young, AT.state) is None
+    assert MapRevisit().part_due(young, AT.state, unseen) is None
 
 
 def test_the_older_part_is_searched_every_three_seconds_at_least(drifted: SweepMatcher) -> None:
     """Where a narrow view comes by an old place, it sees it for a few seconds."""
     revisit = MapRevisit()
     certain = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA)
-    assert revisit.part_due(certain, AT.state) is None
+    assert revisit.part_due(certain, AT.state, unseen) is None
     nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
     times = []
     for number in range(400):
         sweep = later(AT, 0.2 * (number + 1))
-        part = revisit.part_due(drifted, sweep.state)
+        part = revisit.part_due(drifted, sweep.state, unseen)
         if part is not None:
             times.append(0.2 * (number + 1))
             assert revisit.search(nothing, part, sweep, FrameJump()) is None
@@ -333,11 +350,11 @@ def test_searches_go_on_when_the_clock_has_gone_back(drifted: SweepMatcher) -> N
     maps.keep(drifted, FrameJump(), AT.state.stamp)
     assert searched(revisit, drifted, source(RNG.uniform(*NOTHING, (1500, 3))), AT) is None
     back = later(AT, -3600.0).state
-    assert revisit.part_due(drifted, back) is None
+    assert revisit.part_due(drifted, back, unseen) is None
     assert not maps.is_due(back.stamp)
     revisit.restart(back.stamp)
     maps.restart(back.stamp)
-    assert revisit.part_due(drifted, back) is not None
+    assert revisit.part_due(drifted, back, unseen) is not None
     assert maps.is_due(back.stamp)
 
 
@@ -364,7 +381,7 @@ def test_a_corner_that_comes_into_sight_again_takes_the_pose_back(
     nothing = source(rng.uniform(*NOTHING, (1500, 3)))
     assert searched(revisit, drifted_along, nothing, AWAY) is None
     # not due for a second, unless a sweep has left a direction free
-    assert revisit.part_due(drifted_along, later(AWAY, 0.2).state) is None
+    assert revisit.part_due(drifted_along, later(AWAY, 0.2).state, unseen) is None
     revisit.note_unobserved(later(AWAY, 0.2).state.stamp)
     assert searched(revisit, drifted_along, corner_view(rng), later(AWAY, 0.4)) is None
     back = searched(revisit, drifted_along, corner_view(rng), later(AWAY, 0.6))
@@ -406,7 +423,7 @@ def test_each_sweep_is_tried_for_two_seconds_after_one_that_left_a_direction_fre
     tried, everywhere = [], []
     for number in range(1, 30):
         sweep = later(AWAY, 0.1 * number + 0.05)
-        part = revisit.part_due(drifted_along, sweep.state)
+        part = revisit.part_due(drifted_along, sweep.state, unseen)
         if part is not None:
             tried.append(number)
             everywhere += [number] * part.is_due
@@ -418,7 +435,7 @@ def test_each_sweep_is_tried_for_two_seconds_after_one_that_left_a_direction_fre
     revisit.note_unobserved(AWAY.state.stamp)
     revisit.restart(later(AWAY, -3600.0).state.stamp)
     assert searched(revisit, drifted_along, nothing, later(AWAY, -3600.0)) is None
-    assert revisit.part_due(drifted_along, later(AWAY, -3599.5).state) is None
+    assert revisit.part_due(drifted_along, later(AWAY, -3599.5).state, unseen) is None
 
 
 @pytest.mark.parametrize(("known", "tried"), [(0.5, True), (0.3, False)])
@@ -427,9 +444,97 @@ def test_only_a_place_that_is_loose_on_its_level_is_relocalized(known: float, tr
     nothing = source(RNG.uniform(*NOTHING, (1500, 3)))
     assert searched(revisit, matcher, nothing, AT) is None
     revisit.note_unobserved(AT.state.stamp)
-    assert (revisit.part_due(matcher, later(AT, 0.2).state) is not None) == tried
+    assert (revisit.part_due(matcher, later(AT, 0.2).state, unseen) is not None) == tried
     weightless = dataclasses.replace(later(AT, 0.2).state, gravity=np.zeros(3))
-    assert revisit.part_due(matcher, weightless) is None
+    assert revisit.part_due(matcher, weightless, unseen) is None
+
+
+def end_wall(rng: np.random.Generator) -> F64:
+    """Return points of the wall that shows the place along the other."""
+    return rng.uniform((4.0, 0.0, -1.2), (4.0, 3.0, 1.8), (300, 3))
+
+
+def wide_corner_view(rng: np.random.Generator) -> Source:
+    """Return a corner view with so much of the end wall that it is seen through from AWAY."""
+    return source(corner(rng, strip=200) - PLACE)
+
+
+def test_a_pose_from_which_walls_are_seen_through_goes_back_without_a_free_direction() -> None:
+    """Also where it is less uncertain than one that is relocalized without that: 0.26 m."""
+    rng, revisit, matcher = (
+        np.random.default_rng(46),
+        MapRevisit(),
+        drifted_matcher(0.26, drift=ALONG),
+    )
+    assert searched(revisit, matcher, unseen(), AWAY) is None
+    assert revisit.part_due(matcher, later(AWAY, 0.2).state, unseen) is None
+    assert not revisit.is_contradicted
+    assert searched(revisit, matcher, wide_corner_view(rng), later(AWAY, 0.4)) is None
+    assert revisit.is_contradicted
+    back = searched(revisit, matcher, wide_corner_view(rng), later(AWAY, 0.6))
+    assert back is not None
+    np.testing.assert_allclose(back.alignment.state.position, PLACE, atol=0.02)
+    # where it is back, nothing is seen through
+    there = motion(TIGHT, PLACE)
+    revisit.part_due(back.map.matcher, later(there, 0.8).state, lambda: wide_corner_view(rng))
+    assert not revisit.is_contradicted
+
+
+def test_each_sweep_is_tried_for_two_seconds_after_one_that_has_seen_through_walls() -> None:
+    rng, revisit, matcher = (
+        np.random.default_rng(47),
+        MapRevisit(),
+        drifted_matcher(0.26, drift=ALONG),
+    )
+    assert searched(revisit, matcher, wide_corner_view(rng), AWAY) is None
+    tried, contradicted = [], []
+    for number in range(1, 30):
+        sweep = later(AWAY, 0.1 * number + 0.05)
+        part = revisit.part_due(matcher, sweep.state, unseen)
+        assert not revisit.is_contradicted
+        if part is not None:
+            tried.append(number)
+            contradicted.append(part.is_contradicted)
+            assert revisit.search(unseen(), part, sweep, FrameJump()) is None
+    assert tried[:19] == list(range(1, 20))
+    assert contradicted == [number < 20 for number in tried]
+    # after a clock that went back, nothing has been seen through
+    assert searched(revisit, matcher, wide_corner_view(rng), later(AWAY, 9.0)) is None
+    revisit.restart(later(AWAY, -3600.0).state.stamp)
+    assert searched(revisit, matcher, unseen(), later(AWAY, -3600.0)) is None
+    assert revisit.part_due(matcher, later(AWAY, -3599.5).state, unseen) is None
+
+
+@pytest.mark.parametrize("contradicted", [True, False])
+def test_a_pose_that_is_wrong_goes_back_farther_than_drift_is_expected(contradicted: bool) -> None:
+    """It is 0.5 m away: 1.3 sigma of what has to be allowed for, 2.4 of what is expected."""
+    rng, revisit = np.random.default_rng(48), MapRevisit()
+    matcher = drifted_matcher(0.4, drift=ALONG, expected_share=0.25)
+    part = OlderPart(matcher.part_of(np.arange(28) < 14), False, contradicted)
+    assert revisit.search(wide_corner_view(rng), part, AWAY, FrameJump()) is None
+    back = revisit.search(wide_corner_view(rng), part, later(AWAY, 0.2), FrameJump())
+    assert (back is not None) == contradicted
+
+
+def test_surfaces_that_are_seen_through_are_older_however_uncertain_they_were() -> None:
+    """Only a part of the floor was seen while the pose was certain."""
+    rng, matcher = np.random.default_rng(49), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(14):
+        floor = rng.uniform((-4.0, -3.0, -1.2), (-2.0, -2.0, -1.2), (400, 3))
+        extended(matcher, floor)
+    for known, drift in ((0.3, np.zeros(3)), (0.4, ALONG)):
+        for _ in range(14):
+            extended(matcher, room(rng, 4000) + drift, (TIGHT[0], known))
+    found = matcher.match(source(room(rng, 2000) - PLACE), AWAY).alignment
+    assert found is not None
+    matcher.meet(found, 0.2)
+    for seen, knows in ((unseen(), False), (wide_corner_view(rng), True)):
+        part = MapRevisit().part_due(matcher, AWAY.state, lambda seen=seen: seen)
+        assert part is not None
+        surfaces = part.matcher.surfaces
+        share = known_share(surfaces, end_wall(rng))
+        assert share > 0.8 if knows else share < 0.1
+        assert known_share(surfaces, end_wall(rng) + ALONG) < 0.1
 
 
 def test_gravity_keeps_the_pose_level_that_returns() -> None:

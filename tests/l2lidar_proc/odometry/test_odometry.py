@@ -16,6 +16,8 @@ from l2lidar_node.types import F64, POINT, HostNs, Level, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
+from l2lidar_proc.odometry.free_space import SeenThrough
+from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
 from l2lidar_proc.odometry.uncertainty import MapDrift
@@ -638,6 +640,18 @@ def test_an_older_part_of_the_map_is_looked_for_again_after_the_clock_has_gone_b
     estimates = feed(odometry, run, late, imu)
     assert Status.RESTARTED in estimates[0].status
     assert len(places) == len(late) > 10
+
+
+@pytest.mark.parametrize(("share", "is_suspect"), [(0.05, False), (0.07, True)])
+def test_a_pose_from_which_walls_are_seen_through_is_suspect(
+    monkeypatch: pytest.MonkeyPatch, share: float, is_suspect: bool
+) -> None:
+    """More than 6 % of the rays pass through them; looked at while the place is uncertain."""
+    seen = SeenThrough(share, np.zeros(9, np.int64))
+    monkeypatch.setattr(MapDrift, "more_certain_than_held", lambda *_: np.zeros(9, np.bool_))
+    monkeypatch.setattr(SweepMatcher, "seen_through", lambda *_: seen)
+    estimates = drive(recording("room", "walk", 8.0), "turn")[-10:]
+    assert all((Status.SUSPECT in item.status) == is_suspect for item in estimates)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 9, 50])

@@ -14,7 +14,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, InertialState
 from l2lidar_proc.odometry.cell_index import CellIndex
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.free_space import rays_through
+from l2lidar_proc.odometry.free_space import seen_through
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
 from l2lidar_proc.odometry.principal_axes import principal_axes
@@ -203,23 +203,30 @@ def test_rays_pass_through_surfaces_only_where_these_are() -> None:
     for number in range(4):
         surfaces.add(wall(2.0), number, origin=origin)
         if number < 2:
-            assert rays_through(surfaces, origin, ends(4.0, 0.0)) == 0.0  # from too few sweeps
+            assert (
+                seen_through(surfaces, origin, ends(4.0, 0.0)).share == 0.0
+            )  # from too few sweeps
     through, beside = ends(4.0, 0.0), ends(4.0, 3.5)
-    share = rays_through(surfaces, origin, through)  # near the edges of cells none are counted
+    share = seen_through(
+        surfaces, origin, through
+    ).share  # near the edges of cells none are counted
     assert share > 0.5
-    assert rays_through(surfaces, origin, beside) == 0.0
+    assert seen_through(surfaces, origin, beside).share == 0.0
+    opened = seen_through(surfaces, origin, through).sweeps
+    assert len(opened) == round(share * len(through[:: len(through) // tuning.RAYS]))
+    assert not opened.any()  # all by the first
     # two in three, which no step through the points meets by chance
     mixed = np.stack((through, through, beside), axis=1).reshape(-1, 3)
-    both = rays_through(surfaces, origin, mixed)
+    both = seen_through(surfaces, origin, mixed).share
     assert both == pytest.approx(share * 2 / 3, abs=0.07)
     # at a grazing angle a ray may pass beside what a noisy normal says
     grazing = rng.uniform((2.4, 1.5, 0.8), (2.4, 1.5, 1.2), (400, 3))
-    assert rays_through(surfaces, np.array([1.6, -1.5, 1.0]), grazing) == 0.0
+    assert seen_through(surfaces, np.array([1.6, -1.5, 1.0]), grazing).share == 0.0
     # on it, in front of it, and behind it by less than such surfaces may be off
     for x in (1.0, 2.0, 2.2):
-        assert rays_through(surfaces, origin, ends(x, 0.0)) == 0.0
-    assert rays_through(surfaces, origin, origin[None]) == 0.0
-    assert rays_through(surfaces, origin, np.empty((0, 3))) == 0.0
+        assert seen_through(surfaces, origin, ends(x, 0.0)).share == 0.0
+    assert seen_through(surfaces, origin, origin[None]).share == 0.0
+    assert seen_through(surfaces, origin, np.empty((0, 3))).share == 0.0
 
 
 def test_a_surface_is_known_where_its_points_are_not_in_all_of_its_cell() -> None:
@@ -228,9 +235,9 @@ def test_a_surface_is_known_where_its_points_are_not_in_all_of_its_cell() -> Non
     for number in range(4):
         surfaces.add(rng.uniform((2.1, 0.0, 0.6), (2.1, 0.2, 1.2), (120, 3)), number)
     ends = rng.uniform((4.2, -0.1, 0.8), (4.2, 0.1, 1.0), (200, 3))  # at 0.1 to 0.2 m
-    assert rays_through(surfaces, origin, ends) > 0.9
+    assert seen_through(surfaces, origin, ends).share > 0.9
     beside = ends + np.array((0.0, 0.5, 0.0))  # at 0.35 to 0.45 m
-    assert rays_through(surfaces, origin, beside) == 0.0
+    assert seen_through(surfaces, origin, beside).share == 0.0
 
 
 def test_points_of_one_line_are_no_surface() -> None:

@@ -601,6 +601,19 @@ def test_sweeps_that_were_far_more_certain_than_what_holds_a_place_now_are_told_
     assert drift.more_certain_than_held(place) is None
 
 
+def test_all_sweeps_before_the_last_that_was_far_more_certain_are_told_apart() -> None:
+    """Between them the place may have been uncertain: what was mapped then is as old."""
+    drift, place = MapDrift(), np.array([4.0, 0.0, 0.0])
+    for sweep in range(120):
+        doubt = SURE + np.diag([0.04 * (sweep % 60 >= 30), 0.0, 0.0, 0.0, 0.0, 0.0])
+        drift.record(sweep, place, doubt)
+    drift.meet(held_by(110), place)
+    apart = drift.more_certain_than_held(place)
+    assert apart is not None
+    assert apart[:88].all()
+    assert not apart[92:].any()
+
+
 def test_sweeps_that_share_an_entry_are_as_uncertain_as_the_least_certain() -> None:
     """The first of them came before sight was lost, the others after."""
     drift = MapDrift()
