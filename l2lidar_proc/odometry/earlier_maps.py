@@ -6,7 +6,8 @@ odometry frame where the prediction had come to, and stays as uncertain as that 
 :class:`MapRevisit` looks for the older part of the map in use. Where a narrow view sees one wall
 only, the pose drifts; what it then adds to the map lies beside what was there before, and agrees
 with the drifted pose. As it turns away from the wall, what shows the drift is in sight for less
-than a second.
+than a second. A sweep that sees through walls of the map shows that its pose is wrong, even where
+it fits; the part of the map that it sees through is older than what holds it.
 
 When a sweep meets such a map, the odometry goes on in it and the pose jumps back. A wrong jump is
 worse than none, so a meeting counts only if it fixes the place in every direction and the next one
@@ -37,6 +38,7 @@ from l2lidar_proc.motion.filter import (
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.free_space import SeenThrough
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.pose_hypotheses import is_explained_by_drift, level_basis
 from l2lidar_proc.odometry.uncertainty import FrameJump
@@ -210,25 +212,32 @@ class MapRevisit:
             self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
             self._meetings.clear()
             return None
-        seen = matcher.seen_through(source(), state)
-        self.is_contradicted = seen.share > tuning.RAYS_THROUGH
-        if self.is_contradicted:
-            self._contradicted_until = stamp + tuning.REVISIT_MET_NS
-            self._contradicted_by = 1 + int(np.quantile(seen.sweeps, tuning.REVISIT_SEEN))
+        self._note_seen_through(matcher.seen_through(source(), state), stamp)
         of_late = stamp < self._contradicted_until
         if of_late:
             older[: self._contradicted_by] = True
         if is_due:
-            if self._certain_at is None:
-                self._certain_at = stamp
-            pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
-            pause = min(max(tuning.EARLIER_PAUSE_NS, pause), tuning.REVISIT_PAUSE_NS)
-            self._next_search = stamp + pause
-        elif not (of_late or stamp < self._in_sight_until) or not _is_loose_on_level(
-            state, matcher.drift.at(state.position), contradicted=of_late
-        ):
-            return None
+            self._next_search = stamp + self._pause(stamp)
+        else:
+            is_tried = of_late or stamp < self._in_sight_until
+            uncertain = matcher.drift.at(state.position)
+            if not (is_tried and _is_loose_on_level(state, uncertain, contradicted=of_late)):
+                return None
         return OlderPart(matcher.part_of(older), is_due, of_late)
+
+    def _note_seen_through(self, seen: SeenThrough, stamp: int) -> None:
+        """Note whether the sweep of a stamp contradicts its pose, and by how old a part."""
+        self.is_contradicted = seen.share > tuning.RAYS_THROUGH
+        if self.is_contradicted:
+            self._contradicted_until = stamp + tuning.REVISIT_MET_NS
+            self._contradicted_by = 1 + int(np.quantile(seen.sweeps, tuning.REVISIT_SEEN))
+
+    def _pause(self, stamp: int) -> int:
+        """Return the time [ns] from a search of all of the older part until the next."""
+        if self._certain_at is None:
+            self._certain_at = stamp
+        pause = int(tuning.EARLIER_PAUSE_SHARE * (stamp - self._certain_at))
+        return min(max(tuning.EARLIER_PAUSE_NS, pause), tuning.REVISIT_PAUSE_NS)
 
     def search(
         self, source: Source, part: OlderPart, motion: SweepMotion, jump: FrameJump
