@@ -285,7 +285,8 @@ def _found_in(
 ) -> tuple[Alignment | None, bool]:
     """Return how a sweep meets the older part of the map, and whether it needs no confirmation.
 
-    It needs none where it relocalizes the pose by a likely drift.
+    It needs none where it relocalizes the pose by a likely drift. A pose that is known to be wrong
+    is searched with each sweep, so that one may fit by chance.
     """
     older, place = part.matcher, motion.state.position
     uncertain = _kept_level(motion.state, older.drift.at(place))
@@ -304,7 +305,8 @@ def _found_in(
     if found is None:
         return None, False
     move = found.state.position - place
-    return found, is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
+    is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
+    return found, is_likely and not part.is_contradicted
 
 
 def _kept_level(state: InertialState, uncertain: F64) -> F64:

@@ -516,6 +516,20 @@ def test_a_pose_that_is_wrong_goes_back_farther_than_drift_is_expected(contradic
     assert (back is not None) == contradicted
 
 
+@pytest.mark.parametrize("contradicted", [True, False])
+def test_a_likely_place_has_to_be_confirmed_if_each_sweep_is_tried(contradicted: bool) -> None:
+    rng, revisit, matcher = (
+        np.random.default_rng(50),
+        MapRevisit(),
+        drifted_matcher(0.6, drift=ALONG),
+    )
+    part = OlderPart(matcher.part_of(np.arange(28) < 14), False, contradicted)
+    back = revisit.search(wide_corner_view(rng), part, AWAY, FrameJump())
+    assert (back is None) == contradicted
+    if contradicted:
+        assert revisit.search(wide_corner_view(rng), part, later(AWAY, 0.2), FrameJump())
+
+
 def test_surfaces_that_are_seen_through_are_older_however_uncertain_they_were() -> None:
     """Only a part of the floor was seen while the pose was certain."""
     rng, matcher = np.random.default_rng(49), SweepMatcher(OdometryConfig(), np.zeros(3))
