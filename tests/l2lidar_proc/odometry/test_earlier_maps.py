@@ -29,6 +29,7 @@ from l2lidar_proc.odometry.earlier_maps import (
     Return,
     moved,
 )
+from l2lidar_proc.odometry.free_space import SeenThrough
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import FrameJump
@@ -530,6 +531,19 @@ def test_a_likely_place_has_to_be_confirmed_if_each_sweep_is_tried(contradicted:
         assert revisit.search(wide_corner_view(rng), part, later(AWAY, 0.2), FrameJump())
 
 
+def test_what_is_seen_through_is_forgotten_once_the_place_is_certain() -> None:
+    rng, revisit, matcher = (
+        np.random.default_rng(51),
+        MapRevisit(),
+        drifted_matcher(0.26, drift=ALONG),
+    )
+    assert searched(revisit, matcher, wide_corner_view(rng), AWAY) is None
+    assert revisit.is_contradicted
+    certain = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA)
+    assert revisit.part_due(certain, later(AWAY, 0.2).state, unseen) is None
+    assert not revisit.is_contradicted
+
+
 def test_surfaces_that_are_seen_through_are_older_however_uncertain_they_were() -> None:
     """Only a part of the floor was seen while the pose was certain."""
     rng, matcher = np.random.default_rng(49), SweepMatcher(OdometryConfig(), np.zeros(3))
@@ -542,6 +556,7 @@ def test_surfaces_that_are_seen_through_are_older_however_uncertain_they_were() 
     found = matcher.match(source(room(rng, 2000) - PLACE), AWAY).alignment
     assert found is not None
     matcher.meet(found, 0.2)
+    assert set(matcher.seen_through(wide_corner_view(rng), AWAY.state).sweeps) == {14}
     for seen, knows in ((unseen(), False), (wide_corner_view(rng), True)):
         part = MapRevisit().part_due(matcher, AWAY.state, lambda seen=seen: seen)
         assert part is not None
@@ -549,6 +564,19 @@ def test_surfaces_that_are_seen_through_are_older_however_uncertain_they_were() 
         share = known_share(surfaces, end_wall(rng))
         assert share > 0.8 if knows else share < 0.1
         assert known_share(surfaces, end_wall(rng) + ALONG) < 0.1
+
+
+@pytest.mark.parametrize(("newer", "are_older"), [(1, False), (3, True)])
+def test_a_few_of_the_surfaces_that_are_seen_through_may_be_newer(
+    monkeypatch: pytest.MonkeyPatch, newer: int, are_older: bool
+) -> None:
+    """One of twenty was opened by a sweep after the drift."""
+    matcher, rng = drifted_matcher(0.26, drift=ALONG), np.random.default_rng(52)
+    seen = SeenThrough(0.2, np.repeat((5, 27), (20 - newer, newer)))
+    monkeypatch.setattr(SweepMatcher, "seen_through", lambda *_: seen)
+    part = MapRevisit().part_due(matcher, AWAY.state, unseen)
+    assert part is not None
+    assert (known_share(part.matcher.surfaces, end_wall(rng) + ALONG) > 0.5) == are_older
 
 
 def test_gravity_keeps_the_pose_level_that_returns() -> None:
