@@ -202,7 +202,7 @@ class MapRevisit:
             Returns the points of the sweep; they are needed only where the place is uncertain.
         """
         stamp = int(state.stamp)
-        self.is_contradicted = False
+        self.is_contradicted = matcher.drift.is_doubted = False
         is_due = stamp >= self._next_search
         if not (is_due or self._is_uncertain or stamp < self._in_sight_until):
             return None
@@ -214,6 +214,7 @@ class MapRevisit:
             return None
         self._note_seen_through(matcher.seen_through(source(), state), stamp)
         of_late = stamp < self._contradicted_until
+        matcher.drift.is_doubted = of_late
         if of_late:
             older[: self._contradicted_by] = True
         if is_due:
@@ -273,6 +274,7 @@ class MapRevisit:
             return None
         self._meetings.clear()
         self._returned_until = stamp + tuning.REVISIT_MET_NS
+        self._contradicted_until, part.matcher.drift.is_doubted = stamp, False
         way = float(np.linalg.norm(found.state.position - motion.state.position))
         covariance = found.covariance.copy()
         covariance[VELOCITY, VELOCITY] += (way / tuning.REVISIT_DRIFT_S) ** 2 * np.eye(3)
@@ -300,8 +302,7 @@ def _found_in(
         return None, False
     loose = with_loose_pose(motion.state, motion.covariance, uncertain)
     freed = dataclasses.replace(motion, covariance=loose)
-    allowed = uncertain[:3, :3]
-    found = older.relocalize(source, freed, allowed, allowed if part.is_contradicted else expected)
+    found = older.relocalize(source, freed, uncertain[:3, :3], expected)
     if found is None:
         return None, False
     move = found.state.position - place

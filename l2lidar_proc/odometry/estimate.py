@@ -29,7 +29,7 @@ class Status(Enum):
     UNMATCHED = "too few points match the map"
     SKIPPED = "skipped to catch up: clouds arrive faster than they can be aligned"
     DEGENERATE = "the scene does not constrain the pose in every direction"
-    SUSPECT = "contradicts max_speed, the IMU or the sweeps before, or sees through the map"
+    SUSPECT = "contradicts max_speed, the IMU, earlier sweeps or walls: the covariance is widened"
     IMU_GAP = "IMU samples are missing within the span of this estimate"
     NO_IMU = "no IMU samples: constant motion is assumed"
     GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"

@@ -147,6 +147,9 @@ class MapDrift:
     beam_sigmas : tuple of float
         What the beam angles of the sweeps to come may be wrong by, 1 sigma [rad], along their
         best known direction and the other.
+    is_doubted : bool
+        Whether the drift is known to be larger than expected: then as much as has to be allowed
+        for is expected.
     """
 
     def __init__(self) -> None:
@@ -159,6 +162,7 @@ class MapDrift:
     def clear(self) -> None:
         """Forget everything: a new map begins, without error by definition."""
         self.first_pose: F64 = np.zeros((6, 6))
+        self.is_doubted = False
         self._known = 0
         self._current: F64 = np.zeros((2, 6, 6))
         self._reported: F64 = np.zeros((2, 6, 6))  # the same, but falling over some sweeps
@@ -408,7 +412,7 @@ class MapDrift:
         """What it amounts to by now; it stays as it is when more sweeps come."""
         return MapError(
             drift=self._reported[_ALLOWED],
-            expected_drift=self._reported[_EXPECTED],
+            expected_drift=self._reported[_ALLOWED if self.is_doubted else _EXPECTED],
             behind=self._behind,
             beam_sigmas=self.beam_sigmas,
             beam_began=self._began,

@@ -472,13 +472,16 @@ def test_a_pose_from_which_walls_are_seen_through_goes_back_without_a_free_direc
     assert not revisit.is_contradicted
     assert searched(revisit, matcher, wide_corner_view(rng), later(AWAY, 0.4)) is None
     assert revisit.is_contradicted
+    assert matcher.drift.is_doubted
     back = searched(revisit, matcher, wide_corner_view(rng), later(AWAY, 0.6))
     assert back is not None
+    assert not back.map.matcher.drift.is_doubted
     np.testing.assert_allclose(back.alignment.state.position, PLACE, atol=0.02)
     # where it is back, nothing is seen through
     there = motion(TIGHT, PLACE)
     revisit.part_due(back.map.matcher, later(there, 0.8).state, lambda: wide_corner_view(rng))
     assert not revisit.is_contradicted
+    assert not back.map.matcher.drift.is_doubted
 
 
 def test_each_sweep_is_tried_for_two_seconds_after_one_that_has_seen_through_walls() -> None:
@@ -493,6 +496,7 @@ def test_each_sweep_is_tried_for_two_seconds_after_one_that_has_seen_through_wal
         sweep = later(AWAY, 0.1 * number + 0.05)
         part = revisit.part_due(matcher, sweep.state, unseen)
         assert not revisit.is_contradicted
+        assert matcher.drift.is_doubted == (number < 20)
         if part is not None:
             tried.append(number)
             contradicted.append(part.is_contradicted)
@@ -512,6 +516,7 @@ def test_a_pose_that_is_wrong_goes_back_farther_than_drift_is_expected(contradic
     rng, revisit = np.random.default_rng(48), MapRevisit()
     matcher = drifted_matcher(0.4, drift=ALONG, expected_share=0.25)
     part = OlderPart(matcher.part_of(np.arange(28) < 14), False, contradicted)
+    matcher.drift.is_doubted = contradicted
     assert revisit.search(wide_corner_view(rng), part, AWAY, FrameJump()) is None
     back = revisit.search(wide_corner_view(rng), part, later(AWAY, 0.2), FrameJump())
     assert (back is not None) == contradicted
@@ -540,8 +545,10 @@ def test_what_is_seen_through_is_forgotten_once_the_place_is_certain() -> None:
     assert searched(revisit, matcher, wide_corner_view(rng), AWAY) is None
     assert revisit.is_contradicted
     certain = drifted_matcher(0.5 * tuning.REVISIT_FROM_SIGMA)
+    certain.drift.is_doubted = True
     assert revisit.part_due(certain, later(AWAY, 0.2).state, unseen) is None
     assert not revisit.is_contradicted
+    assert not certain.drift.is_doubted
 
 
 def test_surfaces_that_are_seen_through_are_older_however_uncertain_they_were() -> None:

@@ -227,6 +227,23 @@ def test_what_is_reported_drifts_and_leans_like_the_map() -> None:
     np.testing.assert_allclose(drift.reported_at(ZERO) - alone, np.diag(expected), rtol=0.01)
 
 
+def test_all_that_has_to_be_allowed_for_is_expected_of_a_map_that_is_doubted() -> None:
+    drift, covariance = MapDrift(), np.diag([0.04, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
+    for sweep in range(40):
+        drift.record(sweep, ZERO, SURE)
+    alone = drift.reported_at(ZERO)
+    for sweep in range(40, 80):
+        drift.record(sweep, ZERO, covariance, 0.25)
+    drift.meet(held_by(60), ZERO)
+    added = drift.reported_at(ZERO) - alone
+    np.testing.assert_allclose(added, 0.25 * covariance, rtol=0.01, atol=1e-9)
+    drift.is_doubted = True
+    added = drift.reported_at(ZERO) - alone
+    np.testing.assert_allclose(added, covariance, rtol=0.01, atol=1e-9)
+    drift.clear()
+    assert not drift.is_doubted
+
+
 @pytest.mark.parametrize("gain", [0.0, 0.02, 0.3])
 def test_the_drift_of_a_velocity_that_is_corrected_is_as_large_as_its_errors(gain: float) -> None:
     """The velocity is estimated by a Kalman filter in equilibrium, its error added up (NEES)."""
