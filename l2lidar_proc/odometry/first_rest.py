@@ -15,6 +15,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.beam_angles import BeamAngles
+from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
 
@@ -89,19 +90,22 @@ class FirstRest:
         better = [self._beams.corrected(one) for one in self.sweeps]
         return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
 
-    def unknown_beams_explain(self, still: SweepMotion) -> bool:
+    def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
         """Return whether unknown beams may be why sweeps deviate; the sensor rests as before then.
 
         Parameters
         ----------
         still : SweepMotion
             Of the latest sweep.
+        seen : Source
+            Its points.
         """
         sigmas = self._beams.sigmas if self.sweeps else None
         if sigmas is None:
             return False
         turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
-        if not self._zero_velocity.has_drifted_within(turn, shift):
+        middle = seen.points.mean(axis=0)
+        if not self._zero_velocity.has_drifted_within(turn, shift, middle):
             return False
         self._zero_velocity.resume(still.state)
         return True

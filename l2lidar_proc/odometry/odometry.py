@@ -598,7 +598,7 @@ class Odometry:
             stays = self._zero_velocity.stays(found)
             if self.config.correct_beams:
                 remapped = first.map_with_known_beams(still, doubted=not stays)
-                stays = stays or (remapped is None and first.unknown_beams_explain(still))
+                stays = stays or (remapped is None and first.unknown_beams_explain(still, source))
             if not (stays if remapped is None else remapped):
                 return self._retry_in_motion(sweep, status)
         first.end_doubt()

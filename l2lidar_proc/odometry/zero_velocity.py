@@ -16,6 +16,7 @@ from collections import deque
 
 import numpy as np
 
+from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import (
@@ -47,6 +48,7 @@ class ZeroVelocityTest:
     def clear(self) -> None:
         """Forget everything: the sensor may move."""
         self._drift: F64 = np.zeros(6)
+        self._given_up: F64 = np.eye(3)  # rotation of the anchor that was, for that drift
         self._test_ns = tuning.STILL_TEST_NS
         self._recent: deque[InertialState] = deque()
         self._reference: StaticReference | None = None
@@ -57,10 +59,23 @@ class ZeroVelocityTest:
         """Whether the last anchor was given up since sweeps deviated from it."""
         return bool(self._drift.any())
 
-    def has_drifted_within(self, turn: float, way: float) -> bool:
-        """Return whether the drift for which the anchor was given up is small [rad, m]."""
-        size = np.linalg.norm(self._drift.reshape(2, 3), axis=1)
-        return self.drifted and bool((size <= (turn, way)).all())
+    def has_drifted_within(self, turn: float, way: float, middle: F64) -> bool:
+        """Return whether the drift for which the anchor was given up is small.
+
+        Parameters
+        ----------
+        turn : float
+            As much as may be [rad].
+        way : float
+            As much as the sensor may have moved, or else what it sees [m]. One that sees to one
+            side only turns about that.
+        middle : ndarray, shape (3,)
+            Of what it sees, its axes [m].
+        """
+        turned, moved = self._drift.reshape(2, 3)
+        seen = moved + self._given_up @ rotations.cross(turned, middle)
+        least = min(np.linalg.norm(moved), np.linalg.norm(seen))
+        return self.drifted and bool(np.linalg.norm(turned) <= turn and least <= way)
 
     def anchored(self, state: InertialState, samples: Samples) -> bool:
         """Begin with the hypothesis at a state; return whether the IMU allows it.
@@ -183,6 +198,8 @@ class ZeroVelocityTest:
         return out
 
     def _doubt(self) -> None:
+        if self.anchor is not None:
+            self._given_up = self.anchor.rotation
         self._test_ns = min(2 * self._test_ns, tuning.STILL_TEST_MAX_NS)
         self._recent.clear()
         self._release()

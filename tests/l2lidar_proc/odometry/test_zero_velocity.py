@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from l2lidar_node import rotations
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GYRO_BIAS, POSE, POSITION, VELOCITY, InertialState
@@ -290,16 +291,39 @@ def test_a_rest_that_is_taken_up_again_compares_no_earlier_sweep() -> None:
     tested = anchored()
     lasted = until_released(tested, 0.23, [*noise[:10], *turned])
     assert 10 < lasted < 20
-    assert tested.has_drifted_within(0.009, 0.005)
-    assert not tested.has_drifted_within(0.005, 0.005)
-    assert not tested.has_drifted_within(0.009, 1e-4)
+    assert tested.has_drifted_within(0.009, 0.005, np.zeros(3))
+    assert not tested.has_drifted_within(0.005, 0.005, np.zeros(3))
+    assert not tested.has_drifted_within(0.009, 1e-4, np.zeros(3))
     moving = dataclasses.replace(ORIGIN, velocity=np.array([0.1, 0.0, 0.0]))
     tested.resume(moving)
     assert tested.anchor is not None
     np.testing.assert_array_equal(tested.anchor.velocity, 0.0)
     assert not tested.drifted
-    assert not tested.has_drifted_within(1.0, 1.0)
+    assert not tested.has_drifted_within(1.0, 1.0, np.zeros(3))
     assert until_released(tested, 0.23, noise) == 40
+
+
+def test_a_drift_that_turns_the_sensor_about_what_it_sees_is_small_there() -> None:
+    rng = np.random.default_rng(5)
+    rotation = rotations.matrices(rotations.exp((0.1, -0.2, 0.7)))
+    arm, turn = np.array([3.0, -1.0, 0.5]), np.array([0.001, -0.002, 0.008])
+    moved = -rotation @ np.cross(turn, arm)
+    assert np.linalg.norm(moved) > 0.02
+    noise = rng.normal(0.0, [[3e-4] * 3 + [2e-3] * 3], (30, 6))
+    drifted = noise + np.r_[turn, moved]
+    tested = ZeroVelocityTest()
+    assert tested.anchored(dataclasses.replace(ORIGIN, rotation=rotation), resting(0.0, 0.0))
+    found = found_at(0.0, np.zeros(6))
+    for number, error in enumerate((*noise[:10], *drifted)):
+        state = dataclasses.replace(ORIGIN, rotation=rotation).boxplus(np.r_[error, np.zeros(12)])
+        state = dataclasses.replace(state, stamp=HostNs(EPOCH + round((number + 1) * 0.23e9)))
+        if not tested.stays(dataclasses.replace(found, state=state)):
+            break
+    assert tested.drifted
+    assert tested.has_drifted_within(0.009, 0.006, arm)
+    assert not tested.has_drifted_within(0.009, 0.006, np.zeros(3))
+    assert not tested.has_drifted_within(0.009, 0.006, -arm)
+    assert not tested.has_drifted_within(0.007, 0.006, arm)
 
 
 def test_along_a_direction_that_nothing_fixes_rest_is_up_to_the_imu() -> None:
