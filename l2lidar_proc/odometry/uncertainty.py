@@ -136,8 +136,8 @@ class MapDrift:
     Covariances (6, 6) are of a shift and a turn of the map about its origin [m, rad], in its axes.
     There are two of everything. One is as large as has to be allowed for, for decisions: poses err
     as their covariances say, and the velocity along a free direction always alike. The other is as
-    large as is expected, to be reported: poses err as the innovations show, and the velocity until
-    something corrects it.
+    large as is expected, to be reported: places err as the innovations show, turns all the same,
+    and the velocity until something corrects it.
 
     Attributes
     ----------
@@ -316,7 +316,8 @@ class MapDrift:
         covariance : ndarray, shape (6, 6)
             Of place and turn relative to the surfaces around, map axes [m, rad].
         expected_share : float
-            Of that covariance.
+            Of the covariance of the place. NIS does not show what turns the map: surfaces that
+            err alike from sweep to sweep.
         """
         row = sweep // tuning.DRIFT_GROUP
         if row >= len(self._history):
@@ -338,7 +339,9 @@ class MapDrift:
         self._swings[self._known : row + 1] = self._swing
         moved = _carried(-place)
         added = moved @ covariance @ moved.T
-        found = self._current + np.stack((added, expected_share * added))
+        scale = np.repeat((np.sqrt(expected_share), 1.0), 3)
+        less = moved @ (covariance * np.outer(scale, scale)) @ moved.T
+        found = self._current + np.stack((added, less))
         # of sweeps that share an entry, the least certain: sight may have been lost in between
         if row < self._known:
             here = _carried(place)[:3]

@@ -236,7 +236,7 @@ def test_all_that_has_to_be_allowed_for_is_expected_of_a_map_that_is_doubted() -
         drift.record(sweep, ZERO, covariance, 0.25)
     drift.meet(held_by(60), ZERO)
     added = drift.reported_at(ZERO) - alone
-    np.testing.assert_allclose(added, 0.25 * covariance, rtol=0.01, atol=1e-9)
+    np.testing.assert_allclose(added, PLACES_ALONE * covariance, rtol=0.01, atol=1e-9)
     drift.is_doubted = True
     added = drift.reported_at(ZERO) - alone
     np.testing.assert_allclose(added, covariance, rtol=0.01, atol=1e-9)
@@ -290,6 +290,10 @@ def test_a_velocity_that_is_right_at_once_adds_nothing() -> None:
     np.testing.assert_allclose(drift.reported_at(ZERO), before, rtol=1e-6, atol=1e-12)
 
 
+PLACES_ALONE = np.outer(np.repeat((0.5, 1.0), 3), np.repeat((0.5, 1.0), 3))
+"""What is expected of a covariance (6, 6) if a quarter of that of the place is."""
+
+
 def test_decisions_allow_for_all_of_a_covariance_and_reports_for_what_is_expected() -> None:
     drift, doubt, place = upright(), np.diag([0.04] * 3 + [1e-4] * 3), np.array([5.0, 0.0, 0.0])
     drift.record(0, place, doubt, 0.25)
@@ -297,7 +301,7 @@ def test_decisions_allow_for_all_of_a_covariance_and_reports_for_what_is_expecte
     unit = upright()
     np.testing.assert_allclose(drift.at(place) - unit.at(place), doubt, rtol=1e-6, atol=1e-9)
     expected = drift.reported_at(place) - unit.reported_at(place)
-    np.testing.assert_allclose(expected, 0.25 * doubt, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(expected, PLACES_ALONE * doubt, rtol=1e-6, atol=1e-9)
     # of sweeps that share an entry the least certain counts, in either sense
     drift.clear()
     drift.record(0, place, doubt, 0.25)
