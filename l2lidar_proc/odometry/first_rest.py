@@ -104,8 +104,8 @@ class FirstRest:
         if sigmas is None:
             return False
         turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
-        middle = seen.points.mean(axis=0)
-        if not self._zero_velocity.has_drifted_within(turn, shift, middle):
+        rotation, middle = still.state.rotation, seen.points.mean(axis=0)
+        if not self._zero_velocity.has_drifted_within(turn, shift, rotation, middle):
             return False
         self._zero_velocity.resume(still.state)
         return True

@@ -48,7 +48,6 @@ class ZeroVelocityTest:
     def clear(self) -> None:
         """Forget everything: the sensor may move."""
         self._drift: F64 = np.zeros(6)
-        self._given_up: F64 = np.eye(3)  # rotation of the anchor that was, for that drift
         self._test_ns = tuning.STILL_TEST_NS
         self._recent: deque[InertialState] = deque()
         self._reference: StaticReference | None = None
@@ -59,7 +58,7 @@ class ZeroVelocityTest:
         """Whether the last anchor was given up since sweeps deviated from it."""
         return bool(self._drift.any())
 
-    def has_drifted_within(self, turn: float, way: float, middle: F64) -> bool:
+    def has_drifted_within(self, turn: float, way: float, rotation: F64, middle: F64) -> bool:
         """Return whether the drift for which the anchor was given up is small.
 
         Parameters
@@ -69,11 +68,13 @@ class ZeroVelocityTest:
         way : float
             As much as the sensor may have moved, or else what it sees [m]. One that sees to one
             side only turns about that.
+        rotation : ndarray, shape (3, 3)
+            From the sensor's axes to the map's, at rest.
         middle : ndarray, shape (3,)
             Of what it sees, its axes [m].
         """
         turned, moved = self._drift.reshape(2, 3)
-        seen = moved + self._given_up @ rotations.cross(turned, middle)
+        seen = moved + rotation @ rotations.cross(turned, middle)
         least = min(np.linalg.norm(moved), np.linalg.norm(seen))
         return self.drifted and bool(np.linalg.norm(turned) <= turn and least <= way)
 
@@ -198,8 +199,6 @@ class ZeroVelocityTest:
         return out
 
     def _doubt(self) -> None:
-        if self.anchor is not None:
-            self._given_up = self.anchor.rotation
         self._test_ns = min(2 * self._test_ns, tuning.STILL_TEST_MAX_NS)
         self._recent.clear()
         self._release()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -164,6 +165,23 @@ def narrow(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         return recording(scenario("flat, cone of 70 degrees", 1, 28.0))
 
 
+HardRun = Callable[[str, int, float], tuple[Recording, Track]]
+
+
+@pytest.fixture
+def hard_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> HardRun:
+    """Return what records a run of a family, a seed and a length [s], and tracks it."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+
+    def run(family: str, seed: int, seconds: float) -> tuple[Recording, Track]:
+        given = recording(scenario(family, seed, seconds))
+        track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
+        assert track is not None
+        return given, track
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("family", "share", "most"),
     [
@@ -173,7 +191,7 @@ def narrow(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     ],
 )
 def test_a_narrow_view_finds_its_old_place_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, family: str, share: float, most: float
+    hard_run: HardRun, family: str, share: float, most: float
 ) -> None:
     """It had mapped another one beside it.
 
@@ -181,11 +199,7 @@ def test_a_narrow_view_finds_its_old_place_again(
     scaled by 3e-7 or 6e-7, and without, the cone drifts by 0.19 to 0.27 m and is 0.02 to 0.08 m
     off afterwards; the rosette drifts by 0.34 to 0.44 m and is 0.015 to 0.03 m off.
     """
-    seed, seconds = 3, 22.0
-    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
-    given = recording(scenario(family, seed, seconds))
-    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
-    assert track is not None
+    given, track = hard_run(family, 3, 22.0)
     off = np.linalg.norm(errors(given, track).position, axis=1)
     back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
     assert off[back - 3 : back].min() > 0.15  # it had drifted
@@ -195,17 +209,14 @@ def test_a_narrow_view_finds_its_old_place_again(
 
 
 def test_a_narrow_view_that_sees_through_walls_finds_its_old_place_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hard_run: HardRun,
 ) -> None:
     """It fits where it has drifted to, farther than expected, and would stay there.
 
     With all points scaled by 3e-7 or 6e-7, and without, it drifts by 0.30 to 0.89 m, and is 0.014
     to 0.026 m off in the end.
     """
-    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
-    given = recording(scenario("flat, cone of 70 degrees", 201, 46.0))
-    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
-    assert track is not None
+    given, track = hard_run("flat, cone of 70 degrees", 201, 46.0)
     off = np.linalg.norm(errors(given, track).position, axis=1)
     back = next(k for k, status in enumerate(track.status) if "RETURNED" in status)
     assert off[back - 1] > 0.2
@@ -213,14 +224,9 @@ def test_a_narrow_view_that_sees_through_walls_finds_its_old_place_again(
     assert off[back:].max() < 0.1
 
 
-def test_a_rest_outlasts_beams_that_turn_what_is_seen_to_one_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rest_outlasts_beams_that_turn_what_is_seen_to_one_side(hard_run: HardRun) -> None:
     """A backpack hides the rest: the pose turns about what is left, and moves by 24 mm."""
-    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
-    given = recording(scenario("hall behind a backpack", 213, 4.0))
-    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
-    assert track is not None
+    given, track = hard_run("hall behind a backpack", 213, 4.0)
     found = errors(given, track)
     seconds = (track.stamps - given.spans[0, 0]) * 1e-9
     assert np.linalg.norm(found.position[seconds < 1.8], axis=1).max() < 1e-3
@@ -228,14 +234,9 @@ def test_a_rest_outlasts_beams_that_turn_what_is_seen_to_one_side(
     assert np.linalg.norm(found.turn, axis=1).max() < 0.01
 
 
-def test_gravity_keeps_a_narrow_view_level_that_returns(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gravity_keeps_a_narrow_view_level_that_returns(hard_run: HardRun) -> None:
     """The few points that fix its place would let it lean by 3 degrees, and then run away."""
-    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
-    given = recording(scenario("flat, cone of 70 degrees", 43, 54.0))
-    track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, given)
-    assert track is not None
+    given, track = hard_run("flat, cone of 70 degrees", 43, 54.0)
     found = errors(given, track)
     lean = np.linalg.norm(found.turn[:, :2], axis=1)
     assert np.degrees(lean.max()) < 1.5

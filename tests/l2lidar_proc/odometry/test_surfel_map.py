@@ -203,16 +203,12 @@ def test_rays_pass_through_surfaces_only_where_these_are() -> None:
     for number in range(4):
         surfaces.add(wall(2.0), number, origin=origin)
         if number < 2:
-            assert (
-                seen_through(surfaces, origin, ends(4.0, 0.0)).share == 0.0
-            )  # from too few sweeps
+            # from too few sweeps
+            assert seen_through(surfaces, origin, ends(4.0, 0.0)).share == 0.0
     through, beside = ends(4.0, 0.0), ends(4.0, 3.5)
-    share = seen_through(
-        surfaces, origin, through
-    ).share  # near the edges of cells none are counted
-    assert share > 0.5
+    share, opened = seen_through(surfaces, origin, through)
+    assert share > 0.5  # near the edges of cells none are counted
     assert seen_through(surfaces, origin, beside).share == 0.0
-    opened = seen_through(surfaces, origin, through).sweeps
     assert len(opened) == round(share * len(through[:: len(through) // tuning.RAYS]))
     assert not opened.any()  # all by the first
     # two in three, which no step through the points meets by chance

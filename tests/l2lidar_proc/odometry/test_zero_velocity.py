@@ -291,15 +291,15 @@ def test_a_rest_that_is_taken_up_again_compares_no_earlier_sweep() -> None:
     tested = anchored()
     lasted = until_released(tested, 0.23, [*noise[:10], *turned])
     assert 10 < lasted < 20
-    assert tested.has_drifted_within(0.009, 0.005, np.zeros(3))
-    assert not tested.has_drifted_within(0.005, 0.005, np.zeros(3))
-    assert not tested.has_drifted_within(0.009, 1e-4, np.zeros(3))
+    assert tested.has_drifted_within(0.009, 0.005, np.eye(3), np.zeros(3))
+    assert not tested.has_drifted_within(0.005, 0.005, np.eye(3), np.zeros(3))
+    assert not tested.has_drifted_within(0.009, 1e-4, np.eye(3), np.zeros(3))
     moving = dataclasses.replace(ORIGIN, velocity=np.array([0.1, 0.0, 0.0]))
     tested.resume(moving)
     assert tested.anchor is not None
     np.testing.assert_array_equal(tested.anchor.velocity, 0.0)
     assert not tested.drifted
-    assert not tested.has_drifted_within(1.0, 1.0, np.zeros(3))
+    assert not tested.has_drifted_within(1.0, 1.0, np.eye(3), np.zeros(3))
     assert until_released(tested, 0.23, noise) == 40
 
 
@@ -320,10 +320,10 @@ def test_a_drift_that_turns_the_sensor_about_what_it_sees_is_small_there() -> No
         if not tested.stays(dataclasses.replace(found, state=state)):
             break
     assert tested.drifted
-    assert tested.has_drifted_within(0.009, 0.006, arm)
-    assert not tested.has_drifted_within(0.009, 0.006, np.zeros(3))
-    assert not tested.has_drifted_within(0.009, 0.006, -arm)
-    assert not tested.has_drifted_within(0.007, 0.006, arm)
+    assert tested.has_drifted_within(0.009, 0.006, rotation, arm)
+    assert not tested.has_drifted_within(0.009, 0.006, np.eye(3), np.zeros(3))
+    assert not tested.has_drifted_within(0.009, 0.006, rotation, -arm)
+    assert not tested.has_drifted_within(0.007, 0.006, rotation, arm)
 
 
 def test_along_a_direction_that_nothing_fixes_rest_is_up_to_the_imu() -> None:
