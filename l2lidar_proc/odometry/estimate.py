@@ -16,7 +16,8 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
 from l2lidar_proc.motion.head_line import LineRates
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift, MapError, observed_scale
+from l2lidar_proc.odometry.innovations import observed_scale
+from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift, MapError
 from l2lidar_proc.recording.outputs import StampedPoses, leveled_start
 
 

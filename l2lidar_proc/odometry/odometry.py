@@ -30,16 +30,12 @@ from l2lidar_proc.odometry.estimate import (
     gaps_in,
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
+from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, with_loose_motion
 from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor, blur_of
 from l2lidar_proc.odometry.start_velocity import StartVelocity
-from l2lidar_proc.odometry.uncertainty import (
-    FrameJump,
-    InnovationTest,
-    inflated_prior,
-    with_loose_motion,
-)
+from l2lidar_proc.odometry.uncertainty import FrameJump
 from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 

@@ -1,4 +1,4 @@
-"""Uncertainty beyond the filter's: of the map, of its frame, and of the assumed noise.
+"""Uncertainty beyond the filter's: of the map, and of its frame.
 
 :class:`MapDrift`: what a sweep adds to the map carries the error of the pose that added it. A
 sweep that is aligned with what the last few sweeps have put into the map learns where it is
@@ -7,22 +7,11 @@ how uncertain its pose was, and a pose is as uncertain as the surfaces that hold
 alignment with them besides (VoxelMap, Yuan et al. 2022, carries the like in its planes).
 
 :class:`FrameJump`: a map begun after a loss lies where the prediction had come to.
-
-:class:`InnovationTest`: each alignment corrects what the IMU predicted. By how much it may is
-known: the covariance of the correction is the prior's less the posterior's. The corrections of
-some seconds show two things. Their size shows whether the noise is as assumed: the mean of the
-normalized innovation squared (NIS) is 1 for each degree of freedom (Bar-Shalom et al. 2001,
-section 5.4). Their sum shows whether the accelerometer, with biases and gravity as estimated,
-contradicts the alignments: corrections of the velocity that are all alike do not average out.
-The reported variances are scaled accordingly, up or down. Neither sees an error along a direction
-that nothing measures: as long as there is one, the variances are not scaled down.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +19,8 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import POSE, POSITION, ROTATION, VELOCITY, InertialState, skew
+from l2lidar_proc.motion.filter import POSITION, ROTATION, InertialState, skew
 from l2lidar_proc.odometry.correspondences import Support
-
-_MOTION: Final = slice(POSE.start, VELOCITY.stop)  # turn, place and velocity
-_VELOCITY: Final = slice(VELOCITY.start - POSE.start, VELOCITY.stop - POSE.start)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -486,224 +472,3 @@ class FrameJump:
         way = tuning.UNSEEN_POSITION + tuning.UNSEEN_S * float(np.linalg.norm(state.velocity))
         jump = np.diag(np.square([way] * 3 + [tuning.UNSEEN_ROTATION] * 3))
         return FrameJump(state.position, self.at(state.position) + jump)
-
-
-class _Correction(NamedTuple):
-    stamp: int
-    squared: float  # normalized, of all degrees of freedom
-    freedoms: int
-    velocity: F64  # correction of the velocity, map axes [m/s], shape (3,)
-    allowed: F64  # its covariance, shape (3, 3)
-
-
-def _correction(
-    prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
-) -> _Correction:
-    """Return how a prior was corrected, with its covariance (18, 18) before and after."""
-    before = covariance[_MOTION, _MOTION]
-    allowed = before - corrected[_MOTION, _MOTION]
-    change = posterior.boxminus(prior)[_MOTION]
-    unit = np.sqrt(np.maximum(np.diag(before), 1e-18))
-    # only directions that were measured: elsewhere nothing was corrected, nor could be
-    share, axes = np.linalg.eigh(allowed / np.outer(unit, unit))
-    seen = share > tuning.NIS_SEEN
-    normalized = (axes[:, seen].T @ (change / unit)) ** 2 / share[seen]
-    return _Correction(
-        posterior.stamp,
-        float(normalized.sum()),
-        int(seen.sum()),
-        change[_VELOCITY],
-        allowed[_VELOCITY, _VELOCITY],
-    )
-
-
-def _lowered(ratio: float, most: float) -> float:
-    """Return the factor, at most 1, on variances that are to those assumed as a ratio shows."""
-    return min(max(tuning.NIS_MARGIN * ratio, 1.0 / most), 1.0)
-
-
-def observed_scale(covariance: F64, factor: float, unobserved: F64) -> F64:
-    """Return the matrix (3, 3) that scales a vector's errors, but not along some directions.
-
-    The variance along these directions stays, and what of the other errors they explain; the rest
-    is multiplied by a factor. With G the regression of the errors on those along the directions,
-    G + sqrt(factor) (I - G) does so, as G v and (I - G) v are not correlated.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (3, 3)
-        Of the vector.
-    factor : float
-        At most 1.
-    unobserved : ndarray, shape (3, K)
-        Orthonormal.
-    """
-    if factor >= 1.0:
-        return np.eye(3)
-    along = covariance @ unobserved
-    regression = along @ np.linalg.solve(unobserved.T @ along, unobserved.T)
-    return np.asarray(regression + np.sqrt(factor) * (np.eye(3) - regression))
-
-
-def inflated_prior(
-    prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
-) -> F64 | None:
-    """Return the covariance that a prior must have had, if a correction contradicts it.
-
-    A single correction far beyond what the covariances allow (an innovation gate) means that one
-    of the two is wrong. A prior that is too sure of itself would make a compromise of both, at
-    which neither fits.
-
-    Parameters
-    ----------
-    prior : InertialState
-        As predicted.
-    covariance : ndarray, shape (18, 18)
-        Of the prior.
-    posterior : InertialState
-        As aligned.
-    corrected : ndarray, shape (18, 18)
-        Covariance of the posterior.
-
-    Returns
-    -------
-    ndarray, shape (18, 18), or None
-        Pose and velocity are as uncertain as the correction shows. None within the gate.
-    """
-    item = _correction(prior, covariance, posterior, corrected)
-    nis = item.squared / max(item.freedoms, 1)
-    if nis < tuning.NIS_GATE:
-        return None
-    scale = np.ones(len(covariance))
-    scale[_MOTION] = np.sqrt(nis)
-    return np.asarray(covariance * np.outer(scale, scale))
-
-
-def with_loose_motion(covariance: F64) -> F64:
-    """Return the covariance (18, 18) of a prior whose position and velocity may be wrong."""
-    found = covariance.copy()
-    found[POSITION, POSITION] += tuning.DOUBT_SIGMA[0] ** 2 * np.eye(3)
-    found[VELOCITY, VELOCITY] += tuning.DOUBT_SIGMA[1] ** 2 * np.eye(3)
-    return found
-
-
-class InnovationTest:
-    """Compares the innovations of the last seconds with their covariances."""
-
-    def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget everything, as after a rest or a loss."""
-        self._recent: deque[_Correction] = deque()
-        self._unobserved: deque[tuple[int, F64]] = deque()  # stamps, and directions (3, K)
-
-    def note_unobserved(self, stamp: int, directions: F64) -> None:
-        """Note that a sweep did not observe the position in every direction.
-
-        Parameters
-        ----------
-        stamp : int
-            Of the sweep [ns].
-        directions : ndarray, shape (3, K)
-            In which it did not, orthonormal, map axes.
-        """
-        noted = self._unobserved
-        noted.append((stamp, directions))
-        while stamp - noted[0][0] > tuning.NIS_WINDOW_NS:
-            noted.popleft()
-
-    def take(
-        self,
-        prior: InertialState,
-        covariance: F64,
-        posterior: InertialState,
-        corrected: F64,
-    ) -> None:
-        """Take an alignment, given as to :func:`inflated_prior`."""
-        item = _correction(prior, covariance, posterior, corrected)
-        if not item.freedoms:
-            return
-        recent = self._recent
-        recent.append(item)
-        while recent[-1].stamp - recent[0].stamp > tuning.NIS_WINDOW_NS:
-            recent.popleft()
-
-    @property
-    def nis(self) -> float:
-        """Mean normalized innovation squared for each degree of freedom; 0 before the first."""
-        freedoms = sum(item.freedoms for item in self._recent)
-        return sum(item.squared for item in self._recent) / max(freedoms, 1)
-
-    @property
-    def velocity_nis(self) -> float:
-        """Normalized square of the sum of all corrections of the velocity, for each of its axes.
-
-        1 on average if they are independent; 0 as long as there are few.
-        """
-        if len(self._recent) < tuning.NIS_LEAST:
-            return 0.0
-        total = np.sum([item.velocity for item in self._recent], axis=0)
-        allowed = np.sum([item.allowed for item in self._recent], axis=0)
-        allowed = allowed + tuning.NIS_SPEED_FLOOR**2 * np.eye(3)
-        return float(total @ np.linalg.solve(allowed, total)) / 3.0
-
-    @property
-    def _ratio(self) -> float | None:
-        """What variances are to those assumed; None while there are few corrections."""
-        if len(self._recent) < tuning.NIS_LEAST:
-            return None
-        return max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
-
-    @property
-    def expected_share(self) -> float:
-        """Share of the variances of poses that they are expected to add to the map's drift.
-
-        Also where a direction is not measured: along it the drift is that of the velocity.
-        """
-        found = self._ratio
-        if found is None:
-            return 1.0
-        return min(max(tuning.NIS_DRIFT_MARGIN * found, 1.0 / tuning.NIS_MOST), 1.0)
-
-    @property
-    def variance_factor(self) -> float:
-        """Factor by which variances are to be reported larger, or smaller where below 1.
-
-        Smaller only where every direction was measured throughout the window.
-        """
-        found = self._ratio
-        if found is None:
-            return 1.0
-        if found >= 1.0:
-            return min(found, tuning.NIS_MOST)
-        return 1.0 if self.unobserved.size else _lowered(found, tuning.NIS_MOST)
-
-    @property
-    def velocity_factor(self) -> float:
-        """Further factor, at most 1, on the variances of the velocity where they are measured.
-
-        Of use where some direction was not measured throughout the window: along the others the
-        velocity is known as well as the innovations show. Poses are not: in narrow views they err
-        with the surfaces that they have put into the map themselves.
-        """
-        found = self._ratio
-        if found is None or self.unobserved.shape[1] not in (1, 2):
-            return 1.0
-        return _lowered(found, tuning.NIS_PARTLY_MOST)
-
-    @property
-    def unobserved(self) -> F64:
-        """Directions (3, K), orthonormal, map axes, not measured throughout the window."""
-        first = self._recent[-1].stamp - tuning.NIS_WINDOW_NS if self._recent else 0
-        found = [directions for stamp, directions in self._unobserved if stamp >= first]
-        if not found:
-            return np.zeros((3, 0))
-        together = np.concatenate(found, axis=1)
-        strength, axes = np.linalg.eigh(together @ together.T)
-        return np.asarray(axes[:, strength > tuning.NIS_UNOBSERVED**2 * len(found)])
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether chance does not explain the corrections."""
-        return self.variance_factor > tuning.NIS_SUSPECT

@@ -15,12 +15,8 @@ from hypothesis import given, strategies as st
 
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSE, POSITION, VELOCITY, InertialState
-from l2lidar_proc.odometry.uncertainty import (
-    InnovationTest,
-    MapDrift,
-    inflated_prior,
-    observed_scale,
-)
+from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, observed_scale
+from l2lidar_proc.odometry.uncertainty import MapDrift
 from tests.l2lidar_proc.motion.analytic import at
 
 ZERO = np.zeros(3)
