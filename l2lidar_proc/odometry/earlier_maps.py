@@ -137,6 +137,31 @@ class EarlierMaps:
         return None
 
 
+class _Recently:
+    """Whether an event is less than a time ago.
+
+    Parameters
+    ----------
+    time_ns : int
+    """
+
+    def __init__(self, time_ns: int) -> None:
+        self._time_ns = time_ns
+        self._noted: int | None = None
+
+    def note(self, stamp: int) -> None:
+        """Note the event of an instant [ns]."""
+        self._noted = int(stamp)
+
+    def clear(self) -> None:
+        """Forget the event."""
+        self._noted = None
+
+    def at(self, stamp: int) -> bool:
+        """Return whether it was recent at an instant [ns] after it."""
+        return self._noted is not None and stamp < self._noted + self._time_ns
+
+
 class OlderPart(NamedTuple):
     """The older part of the map in use.
 
@@ -165,25 +190,26 @@ class MapRevisit:
     """
 
     def __init__(self) -> None:
-        self._certain_at: int | None = None  # stamp until which the pose was certain enough
         self._is_uncertain = self.is_contradicted = False
         self._meetings = _Meetings()
+        self._met = _Recently(tuning.REVISIT_MET_NS)
+        self._unobserved = _Recently(tuning.REVISIT_SIGHT_NS)
+        self._returned = _Recently(tuning.REVISIT_MET_NS)
+        self._contradicted = _Recently(tuning.REVISIT_MET_NS)
         self.restart(HostNs(0))
 
     def restart(self, stamp: HostNs) -> None:
         """Begin anew at an instant of another time line."""
         self._next_search = int(stamp)
-        self._met_until = int(stamp)  # until then a meeting may be confirmed
-        self._in_sight_until = int(stamp)  # until then relocalization is tried with each sweep
-        self._returned_until = int(stamp)  # until then the latest return may have been wrong
-        self._contradicted_until = int(stamp)  # until then the pose is known to be wrong,
-        self._contradicted_by = 0  # by surfaces that the sweeps before this one have opened
-        self._certain_at = None
+        self._certain_at: int | None = None  # stamp until which the pose was certain enough
+        for event in (self._met, self._unobserved, self._returned, self._contradicted):
+            event.clear()
+        self._contradicting = 0  # the surfaces that did so were opened by the sweeps before this
         self._meetings.clear()
 
     def note_unobserved(self, stamp: HostNs) -> None:
         """Note that the sweep of a stamp left a direction of the place free."""
-        self._in_sight_until = int(stamp) + tuning.REVISIT_SIGHT_NS
+        self._unobserved.note(stamp)
 
     def part_due(
         self, matcher: SweepMatcher, state: InertialState, source: Callable[[], Source]
@@ -204,7 +230,7 @@ class MapRevisit:
         stamp = int(state.stamp)
         self.is_contradicted = matcher.drift.is_doubted = False
         is_due = stamp >= self._next_search
-        if not (is_due or self._is_uncertain or stamp < self._in_sight_until):
+        if not (is_due or self._is_uncertain or self._unobserved.at(stamp)):
             return None
         older = matcher.drift.more_certain_than_held(state.position)
         self._is_uncertain = not (older is None or matcher.is_young or matcher.driving)
@@ -213,25 +239,25 @@ class MapRevisit:
             self._meetings.clear()
             return None
         self._note_seen_through(matcher.seen_through(source(), state), stamp)
-        of_late = stamp < self._contradicted_until
-        matcher.drift.is_doubted = of_late
-        if of_late:
-            older[: self._contradicted_by] = True
+        contradicted = self._contradicted.at(stamp)
+        matcher.drift.is_doubted = contradicted
+        if contradicted:
+            older[: self._contradicting] = True
         if is_due:
             self._next_search = stamp + self._pause(stamp)
         else:
-            is_tried = of_late or stamp < self._in_sight_until
+            is_tried = contradicted or self._unobserved.at(stamp)
             uncertain = matcher.drift.at(state.position)
-            if not (is_tried and _is_loose_on_level(state, uncertain, contradicted=of_late)):
+            if not (is_tried and _is_loose_on_level(state, uncertain, contradicted=contradicted)):
                 return None
-        return OlderPart(matcher.part_of(older), is_due, of_late)
+        return OlderPart(matcher.part_of(older), is_due, contradicted)
 
     def _note_seen_through(self, seen: SeenThrough, stamp: int) -> None:
         """Note whether the sweep of a stamp contradicts its pose, and by how old a part."""
         self.is_contradicted = seen.share > tuning.RAYS_THROUGH
         if self.is_contradicted:
-            self._contradicted_until = stamp + tuning.REVISIT_MET_NS
-            self._contradicted_by = 1 + int(np.quantile(seen.sweeps, tuning.REVISIT_SEEN))
+            self._contradicted.note(stamp)
+            self._contradicting = 1 + int(np.quantile(seen.sweeps, tuning.REVISIT_SEEN))
 
     def _pause(self, stamp: int) -> int:
         """Return the time [ns] from a search of all of the older part until the next."""
@@ -262,19 +288,20 @@ class MapRevisit:
         found, is_likely = _found_in(part, source, motion)
         stamp = int(motion.state.stamp)
         if found is None:
-            if stamp < self._met_until:
+            if self._met.at(stamp):
                 self._next_search = stamp + 1
             else:
                 self._meetings.clear()
             return None
         is_confirmed = self._meetings.confirm(None, _moves(motion.state, found.state))
-        if not (is_confirmed or (is_likely and stamp >= self._returned_until)):
-            self._met_until = stamp + tuning.REVISIT_MET_NS
+        if not (is_confirmed or (is_likely and not self._returned.at(stamp))):
+            self._met.note(stamp)
             self._next_search = stamp + 1
             return None
         self._meetings.clear()
-        self._returned_until = stamp + tuning.REVISIT_MET_NS
-        self._contradicted_until, part.matcher.drift.is_doubted = stamp, False
+        self._returned.note(stamp)
+        self._contradicted.clear()
+        part.matcher.drift.is_doubted = False
         way = float(np.linalg.norm(found.state.position - motion.state.position))
         covariance = found.covariance.copy()
         covariance[VELOCITY, VELOCITY] += (way / tuning.REVISIT_DRIFT_S) ** 2 * np.eye(3)
