@@ -109,6 +109,11 @@ class Setting:
         unit = f" {self.unit}" if self.unit else ""
         return f"{_number(self.lo)} to {_number(self.hi)}{unit}"
 
+    @property
+    def range_or_unit(self) -> str:
+        """The permitted values in words, or the unit where anything of the type will do."""
+        return self.range_text or (f"in {self.unit}" if self.unit else "")
+
     def check(self, value: object) -> Value:
         """Return the value in this setting's own type.
 
@@ -277,7 +282,7 @@ def markdown_table(group: type) -> str:
     for item in settings_of(group):
         kind = f"list of {item.item.__name__}" if item.item else item.type.__name__
         rows.append(
-            f"| `{item.name}` | {kind} | `{_literal(item.default)}` | {item.range_text} "
+            f"| `{item.name}` | {kind} | `{_literal(item.default)}` | {item.range_or_unit} "
             f"| {'yes' if item.live else ''} | {item.doc} |"
         )
     return "\n".join(rows)

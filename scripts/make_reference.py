@@ -42,8 +42,21 @@ Parameters marked as live can be set while the node runs. A wrong value is refus
 at start and live, all or nothing. Upstream's YAML file works unchanged.
 `ros2 param describe /l2lidar_node NAME` says the same.
 
-The files to start from are `config/l2lidar_node.yaml` and `config/l2lidar_proc.yaml`;
-`config/consumers/` has the driver's parameters for LIO-SAM, FAST-LIO and others.
+Copy the file of a node, change it, and pass your copy:
+
+```console
+cp $(ros2 pkg prefix --share l2lidar_node)/config/l2lidar_node.yaml my_l2.yaml
+ros2 launch l2lidar_node l2lidar.launch.py params_file:=my_l2.yaml
+```
+
+| File in `config/` | Nodes | Launch argument |
+|---|---|---|
+| `l2lidar_node.yaml` (sets `enable_IMU_publishing`) | driver | `params_file` |
+| `l2lidar_proc.yaml` | deskew, odometry | `proc_params_file` |
+| `l2lidar_slam.yaml` | SLAM | `slam_params_file` |
+
+`config/consumers/` has the driver's parameters for LIO-SAM, FAST-LIO and others. What
+`ros2 param set` changes lasts until the node ends.
 """
 
 
@@ -72,7 +85,7 @@ def parameter_page() -> str:
 
 
 def _meaning(item: Setting) -> str:
-    facts = [item.range_text or (item.unit and f"in {item.unit}"), "live" if item.live else ""]
+    facts = [item.range_or_unit, "live" if item.live else ""]
     extra = "; ".join(fact for fact in facts if fact)
     return item.doc[0].upper() + item.doc[1:] + (f" ({extra})" if extra else "")
 

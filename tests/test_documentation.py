@@ -51,6 +51,7 @@ NOT_RUN = {
     r"rosdep .*": ROS,
     r"colcon build --packages-select lio_sam .*": "builds another package, with ROS",
     r"mkdir -p ~/ros2_ws/src.*": ADMIN,
+    r"cp \$\(ros2 pkg prefix --share l2lidar_node\)/config/\w+\.yaml .*": ROS,
     r"cd .*": ADMIN,
     r"export .*": ROS,
     r"sudo .*": ADMIN,

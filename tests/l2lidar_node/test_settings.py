@@ -67,6 +67,17 @@ def test_range_texts() -> None:
     assert texts["name"] == ""
 
 
+def test_where_anything_goes_the_unit_is_told() -> None:
+    @dataclass(frozen=True)
+    class Angles:
+        tilt: float = setting(0.0, "x", unit="deg")
+        bounded: float = setting(0.0, "x", lo=0.0, hi=1.0, unit="deg")
+        name: str = setting("", "x")
+
+    texts = [item.range_or_unit for item in settings_of(Angles)]
+    assert texts == ["in deg", "0 to 1 deg", ""]
+
+
 def test_defaults() -> None:
     assert build(Group, {}) == Group()
 
