@@ -233,6 +233,10 @@ def predict(
     gyro2 = gyro2 + np.add.reduceat(imu.rate_errors[:knot] * sparse, first) ** 2 / dt
     accel2 = accel2 + np.add.reduceat(imu.force_errors[:knot] * sparse, first) ** 2 / dt
     if blind_forces:
+        # the velocity is held, whatever attitude, biases and gravity are
+        for moved in (VELOCITY, POSITION):
+            for cause in (ROTATION, GYRO_BIAS, ACCEL_BIAS, GRAVITY):
+                f[..., moved, cause] = 0.0
         accel2 = np.full_like(accel2, tuning.BLIND_ACCEL**2)
     q = process_noise(gyro2, accel2, noise, dt)
     whole, added = f[0], q[0]

@@ -361,10 +361,10 @@ def initial_state(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Ini
         excess,
         np.array([0.0, 0.0, -g]) if trusted else np.zeros(3),
     )
-    return InitialState(state, _covariance(rotation, at_rest), at_rest, trusted)
+    return InitialState(state, _covariance(rotation, at_rest, trusted), at_rest, trusted)
 
 
-def _covariance(rotation: F64, at_rest: bool) -> F64:
+def _covariance(rotation: F64, at_rest: bool, trusted: bool) -> F64:
     """Return how well the first state is known, shape (18, 18)."""
     sigma = np.zeros(ERRORS)
     sigma[ROTATION] = sigma[POSITION] = tuning.START_POSE_SIGMA
@@ -373,8 +373,10 @@ def _covariance(rotation: F64, at_rest: bool) -> F64:
     sigma[ACCEL_BIAS] = tuning.START_ACCEL_BIAS_SIGMA[not at_rest]
     # in motion the mean force is off by the motion too; the size of gravity is known
     sigma[GRAVITY] = tuning.START_GRAVITY_SIGMA[not at_rest]
+    if not trusted:
+        sigma[GRAVITY] = 0.0  # there is none in the model, and none may be learned
     covariance = np.diag(sigma**2)
-    if at_rest:
+    if at_rest and trusted:
         # bias and tilt are not separable, but their sum is what was measured: so the one that is
         # wrong across gravity is wrong by as much as the other
         both = np.zeros((ERRORS, 2))

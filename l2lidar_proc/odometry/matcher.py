@@ -412,9 +412,10 @@ class SweepMatcher:
         that is open.
         """
         free = unobserved_directions(found.information[POSITION, POSITION])
-        if free.shape[1] != 1:
+        gravity = found.state.gravity
+        if free.shape[1] != 1 or not gravity.any():
             return None
-        along, gravity = free[:, 0], found.state.gravity
+        along = free[:, 0]
         if abs(float(along @ gravity)) > tuning.LINE_SLOPE * float(np.linalg.norm(gravity)):
             return None
         sigma = float(np.sqrt(along @ found.covariance[VELOCITY, VELOCITY] @ along))

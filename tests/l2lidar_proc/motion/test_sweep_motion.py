@@ -105,6 +105,9 @@ def test_the_speed_is_as_uncertain_as_the_forces_that_were_used() -> None:
     sigma = np.sqrt(np.diag(unused.covariance)[eskf.VELOCITY])
     np.testing.assert_allclose(sigma, tuning.BLIND_ACCEL * np.sqrt(seconds), rtol=0.05)
     np.testing.assert_allclose(unused.state.velocity, true_state(BEGIN).velocity, atol=1e-9)
+    for cause in (eskf.ROTATION, eskf.GYRO_BIAS, eskf.ACCEL_BIAS, eskf.GRAVITY):
+        assert not unused.covariance[eskf.VELOCITY, cause].any()  # they do not move it
+        assert not unused.covariance[eskf.POSITION, cause].any()
     again = unused.with_state(true_state(REFERENCE), unused.covariance)
     at_end = again.state_at(at(END))
     np.testing.assert_allclose(at_end.velocity, true_state(REFERENCE).velocity, atol=1e-9)

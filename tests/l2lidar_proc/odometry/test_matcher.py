@@ -456,6 +456,8 @@ def test_a_drive_along_one_free_level_direction(
     assert (direction is not None) == found
     if direction is not None:
         assert abs(float(direction @ axes[:, 0])) == pytest.approx(1.0)
+    unknown = dataclasses.replace(state, gravity=np.zeros(3))  # which way is level
+    assert matcher.driving_direction(dataclasses.replace(aligned, state=unknown)) is None
 
 
 def test_a_height_that_was_not_fixed_for_long_is_not_observed() -> None:

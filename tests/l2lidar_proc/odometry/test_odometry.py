@@ -355,6 +355,7 @@ def test_without_imu_it_holds_and_says_so() -> None:
     assert errors(run, estimates).max() < 0.04
     assert Status.NO_IMU in estimates[-1].status
     assert Status.GRAVITY_UNTRUSTED in estimates[-1].status
+    assert not any(item.gravity.any() for item in estimates)
 
 
 def test_imu_gap_is_bridged_and_reported() -> None:
@@ -372,6 +373,7 @@ def test_doubled_gravity_is_not_trusted_and_survived() -> None:
     imu["linear_acceleration"] *= 2.05
     estimates = drive(run, imu=imu)
     assert all(Status.GRAVITY_UNTRUSTED in item.status for item in estimates)
+    assert not any(item.gravity.any() for item in estimates)
     assert errors(run, estimates).max() < 0.04
 
 
