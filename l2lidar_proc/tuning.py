@@ -15,6 +15,7 @@ from typing import Final
 # ---- IMU samples
 
 IMU_PERIOD_S: Final = 0.004  # [s] derived: 250 Hz; the noise parameters are stated for it
+PERIOD_SAMPLES: Final = 10  # that show another period; fewer may lie beside a gap
 MAX_RATE: Final = 100.0  # [rad/s] derived: no gyro measures more
 MAX_FORCE: Final = 5000.0  # [m/s^2] derived: no accelerometer measures more
 MAX_SAMPLES: Final = 100_000  # in a buffer; derived: 25 s at 4 kHz
@@ -351,7 +352,8 @@ REFIT_GROWTH: Final = 1.2  # growth of the weight before a cell is fitted again.
 
 # ---- odometry: uncertainty of the map
 
-DRIFT_GROUP: Final = 4  # sweeps that share an entry. Memory: 288 bytes per second
+DRIFT_GROUP: Final = 4  # sweeps that share an entry, of 288 bytes
+DRIFT_ENTRIES: Final = 8192  # at most: after two hours twice as many share one, and so on
 # Share left a sweep later of what the uncertainty was larger. Tuned on: camera looking into rooms,
 # 0.5 m -> 0.03 -> 0.17 in three sweeps, 0.37 m off
 DRIFT_FALL: Final = 0.6

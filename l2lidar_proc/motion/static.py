@@ -192,7 +192,18 @@ class NoiseSpectrum(NamedTuple):
     vibration: float
 
 
-def noise_spectrum(values: F64) -> NoiseSpectrum:
+def sample_period_s(samples: Samples) -> float:
+    """Return the time [s] from one sample (N,) of an IMU to the next, to a tenth of a millisecond.
+
+    Stamps jitter; an L2 has exactly 250 Hz, which counts where samples are too few.
+    """
+    if len(samples) < tuning.PERIOD_SAMPLES:
+        return tuning.IMU_PERIOD_S
+    period = round(float(np.median(np.diff(samples["stamp"]))) * 1e-9, 4)
+    return max(period, 1e-4)
+
+
+def noise_spectrum(values: F64, period_s: float) -> NoiseSpectrum:
     """Return the noise floor of samples at the IMU's rate, and the effect of vibrations.
 
     Motors and vibrations are lines of the spectrum; the motion of a carrier ends below
@@ -206,13 +217,15 @@ def noise_spectrum(values: F64) -> NoiseSpectrum:
     values : ndarray, shape (N, 3)
         Angular velocities [rad/s] or forces [m/s^2]. Too few of them to resolve lines show only
         their :func:`white_noise`.
+    period_s : float
+        From one to the next [s].
     """
     count = len(values)
     if count < tuning.NOISE_LEAST_SAMPLES:
         return NoiseSpectrum(white_noise(values), 0.0)
     window = np.hanning(count)[:, None]
     amplitudes = np.fft.rfft((values - values.mean(axis=0)) * window, axis=0)
-    frequencies = np.fft.rfftfreq(count, tuning.IMU_PERIOD_S)
+    frequencies = np.fft.rfftfreq(count, period_s)
     high = frequencies >= tuning.NOISE_FROM_HZ
     power = np.square(np.abs(amplitudes[high])) / np.square(window).sum()  # white: the variance
     integrated = power / np.square(2.0 * np.pi * frequencies[high, None])

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import GYRO_BIAS, POSITION, ROTATION, VELOCITY, InertialState, skew
+from l2lidar_proc.motion.filter import (
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    InertialState,
+    skew,
+    twist_jacobian,
+)
 from l2lidar_proc.motion.head_line import LineRates
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.innovations import observed_scale
@@ -247,12 +255,14 @@ def estimate_of(
         status = (*status, Status.DEGENERATE)
     pose = np.zeros((6, 18))
     pose[:3, POSITION] = np.eye(3)
+    pose[:3, ROTATION] = state.rotation @ skew(lever)  # the state is the IMU's
     pose[3:, ROTATION] = state.rotation
     twist = np.zeros((6, 18))
     unobserved = np.reshape(quality.unobserved, (-1, 3)).T
     scale = observed_scale(p[VELOCITY, VELOCITY], quality.velocity_factor, unobserved)
+    twist[:3] = twist_jacobian(state, lever)
     twist[:3, VELOCITY] = state.rotation.T @ scale
-    twist[3:, GYRO_BIAS] = np.eye(3)
+    twist[3:, GYRO_BIAS] = -np.eye(3)  # the rate is what was measured less the bias
     twist_covariance = twist @ p @ twist.T
     twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)
     late = tuning.IMU_STAMP_SIGMA * motion.acceleration

@@ -24,7 +24,7 @@ from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import GYRO_BIAS, ROTATION, VELOCITY, InertialState, Noise
 from l2lidar_proc.motion.head_line import HeadAngle, HeadLine, LineRates
 from l2lidar_proc.motion.imu_buffer import ImuBuffer, Samples
-from l2lidar_proc.motion.static import noise_spectrum
+from l2lidar_proc.motion.static import noise_spectrum, sample_period_s
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
 from l2lidar_proc.motion.tracker import turned
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -32,8 +32,6 @@ from l2lidar_proc.odometry.estimate import OdometryEstimate
 
 LONGEST_NS: Final = 1_000_000_000
 """Without a sweep for this long the pose is not carried on: the speed drifts by 0.1 m/s."""
-_PERIOD_S: Final = 0.004  # of the IMU, for which the odometry's gyro_noise is stated
-_MAX_GAP_NS: Final = 50_000_000  # the default of imu_gap_ms: beyond it the rate is not known
 
 
 class Predictor:
@@ -74,6 +72,11 @@ class Predictor:
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
         self._imu.push(turned(samples, self._turn))
+
+    @property
+    def newest_imu(self) -> HostNs | None:
+        """Stamp of the newest sample, None before the first."""
+        return self._imu.newest
 
     def samples(self, start: int, end: int) -> Samples:
         """Return the samples of a span with a neighbor on either side, cloud axes.
@@ -129,7 +132,8 @@ class Predictor:
             # the bias stands for the change of the rate: the sweep itself will show it
             covariance = eskf.decorrelated(covariance, GYRO_BIAS, tuning.STEADY_RATE_SIGMA)
         gap = reference - state.stamp
-        if gap > tuning.LONG_GAP_NS and len(samples) * tuning.IMU_PERIOD_S * 1e9 < 0.5 * gap:
+        covered = len(samples) * sample_period_s(samples) * 1e9
+        if gap > tuning.LONG_GAP_NS and covered < 0.5 * gap:
             speed = float(np.linalg.norm(state.velocity))
             covariance = eskf.decorrelated(covariance, VELOCITY, max(1.0, speed))
             state = dataclasses.replace(state, velocity=np.zeros(3))
@@ -173,26 +177,31 @@ class Predictor:
         self._rest = known, count
 
     @property
-    def _least_gyro_noise(self) -> float:
-        """The gyro's noise as measured at rest [rad/s], the parameter before that."""
+    def _least_gyro_noise(self) -> float | None:
+        """The gyro's noise as measured at rest [rad/s], None before that."""
         known, count = self._rest
         if count < tuning.GYRO_REST_SAMPLES:
-            return self.config.inertial.gyro_noise
+            return None
         return max(float(np.sqrt(known.max())), tuning.LEAST_GYRO_NOISE)
 
     def _noise(self, samples: Samples) -> Noise:
         """Return the noise at the end of samples: as known, or more where a second shows more."""
         settings = self.config.inertial
-        scale = float(np.sqrt(tuning.IMU_PERIOD_S))
         if len(samples):
             latest = HostNs(int(samples["stamp"][-1]))
             samples = self.samples(HostNs(latest - tuning.NOISE_WINDOW_NS), latest)
-        gyro = noise_spectrum(samples["angular_velocity"])
-        accel = noise_spectrum(samples["linear_acceleration"])
-        self.gyro_noise = max(self._least_gyro_noise, tuning.GYRO_NOISE_FACTOR * gyro.floor)
+        period = sample_period_s(samples)
+        stated = float(np.sqrt(tuning.IMU_PERIOD_S / period))  # a density, as white noise has
+        gyro = noise_spectrum(samples["angular_velocity"], period)
+        accel = noise_spectrum(samples["linear_acceleration"], period)
+        least = self._least_gyro_noise
+        if least is None:
+            least = settings.gyro_noise * stated
+        self.gyro_noise = max(least, tuning.GYRO_NOISE_FACTOR * gyro.floor)
+        scale = float(np.sqrt(period))
         return Noise(
             self.gyro_noise * scale,
-            max(settings.accel_noise, accel.floor) * scale,
+            max(settings.accel_noise * stated, accel.floor) * scale,
             settings.gyro_bias_walk,
             settings.accel_bias_walk,
             tuning.GYRO_SHARE,
@@ -241,6 +250,8 @@ class DeadReckoning:
     ----------
     T_cloud_imu : ndarray, shape (4, 4)
         IMU coordinates to cloud coordinates.
+    gap_ns : int
+        Beyond a gap so long between samples the rate is not known.
 
     Attributes
     ----------
@@ -248,7 +259,9 @@ class DeadReckoning:
         Instant of the latest pose.
     """
 
-    def __init__(self, T_cloud_imu: F64) -> None:
+    def __init__(self, T_cloud_imu: F64, gap_ns: int) -> None:
+        self._gap_ns = gap_ns
+        self._period_s = tuning.IMU_PERIOD_S
         self._turn: F64 = T_cloud_imu[:3, :3].T
         self._lever: F64 = T_cloud_imu[:3, 3]
         self._anchor: OdometryEstimate | None = None
@@ -304,9 +317,10 @@ class DeadReckoning:
             before = (self.stamp, measured[0])
         at = (before[0], *stamps)
         steps = [later - earlier for earlier, later in pairwise(at)]
-        if stamps[-1] - anchor.stamp > LONGEST_NS or max(steps) > _MAX_GAP_NS:
+        if stamps[-1] - anchor.stamp > LONGEST_NS or max(steps) > self._gap_ns:
             self._anchor = None
             return None
+        self._period_s = float(np.median(steps)) * 1e-9
         knots = np.vstack((before[1], measured))
         if anchor.gyro_line is not None:
             knots[:, :3] -= anchor.gyro_line.at(np.array(at))
@@ -328,6 +342,8 @@ class DeadReckoning:
         if self._anchor is None:
             raise ValueError("no estimate to carry on from")
         rotation, seconds = self._rotation, (self.stamp - self._anchor.stamp) * 1e-9
+        turned = rotation.T @ self._anchor.T_map_lidar[:3, :3]  # cloud axes then to those now
+        twist = np.kron(np.eye(2), turned)
         of_bias = self._anchor.gyro_bias_covariance.copy()
         of_bias[3:6] -= self._by_rate @ of_bias[6:]
         # the map errs the more, the farther away from where it was begun
@@ -336,9 +352,12 @@ class DeadReckoning:
             self._anchor,
             stamp=self.stamp,
             T_map_lidar=self._pose(),
-            covariance=more + _grown(self._anchor, rotation, self._rate, self._by_rate, seconds),
+            covariance=more
+            + _grown(self._anchor, rotation, self._rate, self._by_rate, seconds, self._period_s),
             velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
             angular_velocity=self._rate,
+            twist_covariance=twist @ self._anchor.twist_covariance @ twist.T,
+            late=turned @ self._anchor.late,
             gyro_bias_covariance=of_bias,
         )
 
@@ -380,7 +399,12 @@ class DeadReckoning:
 
 
 def _grown(
-    anchor: OdometryEstimate, rotation: F64, rate: F64, by_rate: F64, seconds: float
+    anchor: OdometryEstimate,
+    rotation: F64,
+    rate: F64,
+    by_rate: F64,
+    seconds: float,
+    period_s: float,
 ) -> F64:
     """Return the covariance (6, 6) of a pose so long after an estimate.
 
@@ -403,11 +427,14 @@ def _grown(
         Derivatives of turns about the map's axes by a constant rate about the cloud's [s].
     seconds : float
         Since the estimate.
+    period_s : float
+        Of the IMU's samples.
     """
     found = anchor.covariance.copy()
     place = found[:3, :3]
     lasting = anchor.twist_covariance[:3, :3] - np.outer(anchor.late, anchor.late)
-    speed = rotation @ lasting @ rotation.T * seconds**2
+    then = anchor.T_map_lidar[:3, :3]
+    speed = then @ lasting @ then.T * seconds**2
     ratio = np.sqrt(max(float(np.trace(speed)), 0.0) / max(float(np.trace(place)), 1e-12))
     if ratio > 0.0:
         found[:3, :3] = (1.0 + ratio) * place + (1.0 + 1.0 / ratio) * speed
@@ -416,7 +443,7 @@ def _grown(
     together = with_bias @ by_bias.T
     found += by_bias @ bias @ by_bias.T + together + together.T
     samples = anchor.twist_covariance[3:, 3:] - bias
-    white = _PERIOD_S * rotation @ samples @ rotation.T
+    white = period_s * rotation @ samples @ rotation.T
     share = tuning.GYRO_SHARE * float(np.abs(rate).max())
     grown = (white + share**2 * np.eye(3)) * seconds
     found[3:, 3:] += anchor.quality.variance_factor * grown

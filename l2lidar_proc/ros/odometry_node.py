@@ -152,6 +152,7 @@ class OdometryNode(ManagedNode):
             lambda: self._base_name,
             self._tf,
             self.create_publisher(OdometryMessage, topics.fast_odometry_topic, out),
+            round(config.odometry.inertial.imu_gap_ms * 1e6),
         )
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         for name, answer in (

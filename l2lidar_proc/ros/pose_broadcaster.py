@@ -40,6 +40,8 @@ class PoseBroadcaster:
         Of ``TFMessage``.
     fast : Publisher
         Of the ``Odometry`` at IMU samples.
+    gap_ns : int
+        Longest gap between samples, as of :class:`DeadReckoning`.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class PoseBroadcaster:
         base_name: Callable[[], str],
         transforms: Any,
         fast: Any,
+        gap_ns: int,
     ) -> None:
         self._topics = topics
         self._base_name = base_name
@@ -55,7 +58,8 @@ class PoseBroadcaster:
         self._fast = fast
         self._lock = threading.Lock()
         self._base = BaseFrame(np.eye(4))
-        self._reckoning = DeadReckoning(np.eye(4))
+        self._gap_ns = gap_ns
+        self._reckoning = DeadReckoning(np.eye(4), gap_ns)
         self._recent: deque[Samples] = deque(maxlen=_MOST_BATCHES)
         self._pending: list[Samples] = []  # those of the recent that wait for the next step
         self._newest = HostNs(0)  # stamp of a sample
@@ -64,7 +68,7 @@ class PoseBroadcaster:
     def mount(self, T_cloud_imu: F64) -> None:
         """Take the place of the IMU on the sensor (4, 4); go on from the next sweep."""
         with self._lock:
-            self._reckoning = DeadReckoning(T_cloud_imu)
+            self._reckoning = DeadReckoning(T_cloud_imu, self._gap_ns)
 
     def reset(self) -> None:
         """Forget samples and estimate."""

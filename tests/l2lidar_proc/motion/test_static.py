@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from l2lidar_node import rotations
-from l2lidar_node.types import STANDARD_GRAVITY, HostNs
+from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.static import (
     gravity_is_plausible,
     initial_state,
     may_be_static,
     noise_spectrum,
+    sample_period_s,
     static_reference,
     white_noise,
 )
@@ -136,10 +137,26 @@ def test_a_start_can_be_leveled_by_another_vertical() -> None:
     np.testing.assert_array_equal(after[:15], before[:15])
 
 
+PERIOD_S = 0.004
+
+
+@pytest.mark.parametrize("hz", [100.0, 250.0, 1000.0])
+def test_the_period_of_an_imu_is_that_of_most_samples(hz: float) -> None:
+    samples = np.zeros(50, IMU_SAMPLE)
+    stamps = 1e9 / hz * np.arange(50) + np.random.default_rng(7).normal(0.0, 3e4, 50)
+    stamps[20:] += 3e8  # a gap
+    samples["stamp"] = stamps.astype(np.int64)
+    assert sample_period_s(samples) == 1.0 / hz
+    few = samples[: tuning.PERIOD_SAMPLES - 1]
+    assert sample_period_s(few) == PERIOD_S
+    samples["stamp"] = 5
+    assert sample_period_s(samples) > 0.0
+
+
 def test_the_spectrum_shows_white_noise_alone_as_it_is() -> None:
     rng = np.random.default_rng(1)
     for sigma in (0.01, 0.5):
-        found = [noise_spectrum(rng.normal(0.0, sigma, (250, 3))) for _ in range(200)]
+        found = [noise_spectrum(rng.normal(0.0, sigma, (250, 3)), PERIOD_S) for _ in range(200)]
         floors, vibrations = np.array(found).T
         # of the worst axis, so a little more
         assert 1.0 < floors.mean() / sigma < 1.15
@@ -158,7 +175,7 @@ def test_vibrations_are_no_white_noise(lines: tuple[float, ...]) -> None:
     for hz in lines:
         force[:, 1] += 1.2 * np.sin(2.0 * np.pi * hz * times + rng.random())
         variance += 0.5 * (1.2 / (2.0 * np.pi * hz)) ** 2
-    found = noise_spectrum(force)
+    found = noise_spectrum(force, PERIOD_S)
     assert found.floor == pytest.approx(0.06, rel=0.35)
     assert found.vibration == pytest.approx(np.sqrt(variance), rel=0.1)
     assert white_noise(force) > 5.0 * found.floor
@@ -169,14 +186,14 @@ def test_a_trembling_hand_is_no_noise() -> None:
     still = rng.normal(0.0, 0.06, (250, 3))
     held = still + 3.0 * np.sin(2.0 * np.pi * (9.0 * times + rng.random(3)))
     held += 9.8 + 2.0 * times
-    found = noise_spectrum(held)
-    assert found.floor == pytest.approx(noise_spectrum(still).floor, rel=0.15)
+    found = noise_spectrum(held, PERIOD_S)
+    assert found.floor == pytest.approx(noise_spectrum(still, PERIOD_S).floor, rel=0.15)
     assert found.vibration < 0.002
 
 
 def test_a_few_samples_show_the_noise_of_their_differences() -> None:
     few = np.random.default_rng(4).normal(0.0, 0.3, (tuning.NOISE_LEAST_SAMPLES - 1, 3))
-    assert noise_spectrum(few) == (white_noise(few), 0.0)
-    assert noise_spectrum(few[:0]) == (0.0, 0.0)
+    assert noise_spectrum(few, PERIOD_S) == (white_noise(few), 0.0)
+    assert noise_spectrum(few[:0], PERIOD_S) == (0.0, 0.0)
     enough = np.vstack((few, few[:1]))
-    assert noise_spectrum(enough).vibration > 0.0
+    assert noise_spectrum(enough, PERIOD_S).vibration > 0.0

@@ -7,7 +7,16 @@ import pytest
 
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, POINT, HostNs
-from l2lidar_proc.odometry.estimate import AlignmentQuality, BaseFrame, OdometryEstimate
+from l2lidar_proc.motion import filter as eskf
+from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
+from l2lidar_proc.odometry.estimate import (
+    AlignmentQuality,
+    BaseFrame,
+    OdometryEstimate,
+    estimate_of,
+)
+from l2lidar_proc.odometry.uncertainty import FrameJump, MapDrift
+from tests.l2lidar_proc.motion.analytic import Motion, at
 
 ARM = np.array([0.4, -0.3, 0.2])
 MOUNT = rotations.transform(rotations.exp((0.2, -0.4, 1.1)), ARM)
@@ -77,6 +86,55 @@ def test_the_covariance_of_the_pose_follows_its_derivatives() -> None:
         step = moved[:3, 3] - here.T_odom_base[:3, 3]
         jacobian[:, column] = np.concatenate((step, turn)) / STEP
     np.testing.assert_allclose(here.covariance, jacobian @ spread @ jacobian.T, atol=1e-6)
+
+
+LEVER = np.array([0.3, -0.2, 0.5])
+
+
+def estimated(motion: SweepMotion) -> OdometryEstimate:
+    """Return the estimate of a motion, without points, on a map without error."""
+    return estimate_of(
+        motion, LEVER, np.zeros(0, POINT), (), AlignmentQuality(), 0.0, None, FrameJump(),
+        MapDrift(),
+    )  # fmt: skip
+
+
+def test_the_covariances_of_an_estimate_follow_its_derivatives_by_the_state() -> None:
+    """Pose and twist are the cloud frame's, the state is the IMU's."""
+    turn = rotations.matrices(rotations.exp((0.3, -0.2, 0.9)))
+    state = eskf.InertialState(
+        at(1.0), turn, np.zeros(3), np.array([2.0, -1.0, 0.5]), np.full(3, 0.02), np.zeros(3),
+        np.array([0.0, 0.0, -9.80665]),
+    )  # fmt: skip
+    root = np.random.default_rng(5).normal(0.0, 0.01, (eskf.ERRORS, eskf.ERRORS))
+    motion = predict_sweep(
+        state, root @ root.T, Motion().imu(0.9, 1.5), (at(1.0), at(1.0)), at(1.0),
+        noise=eskf.Noise(0.0, 0.0, 0.0, 0.0), gap_ns=50_000_000, steady_rate=np.zeros(3),
+        use_forces=True,
+    )  # fmt: skip
+    here = estimated(motion)
+    jacobian = np.empty((12, eskf.ERRORS))
+    for column in range(eskf.ERRORS):
+        off = np.zeros(eskf.ERRORS)
+        off[column] = STEP
+        moved = estimated(motion.with_state(motion.state.boxplus(off), motion.covariance))
+        turned = moved.T_map_lidar[:3, :3] @ here.T_map_lidar[:3, :3].T
+        parts = (
+            moved.T_map_lidar[:3, 3] - here.T_map_lidar[:3, 3],
+            rotations.log(rotations.from_matrix(turned)),
+            moved.velocity - here.velocity,
+            moved.angular_velocity - here.angular_velocity,
+        )
+        jacobian[:, column] = np.concatenate(parts) / STEP
+    both = jacobian @ motion.covariance @ jacobian.T
+    pose = here.covariance - here.map_covariance(motion.state.position)
+    twist = here.twist_covariance.copy()
+    twist[:3, :3] -= np.outer(here.late, here.late)
+    np.testing.assert_allclose(pose, both[:6, :6], atol=1e-8)
+    np.testing.assert_allclose(twist, both[6:, 6:], atol=1e-8)
+    bias = both[:6, :6] * 0.0
+    bias[:, :3] = (jacobian @ motion.covariance)[:6, eskf.GYRO_BIAS]
+    np.testing.assert_allclose(here.gyro_bias_covariance[:6], bias[:, :3], atol=1e-8)
 
 
 def test_the_first_pose_is_the_origin_with_yaw_zero() -> None:

@@ -23,6 +23,7 @@ from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording
 from tests.support.odometry_runs import sweeps
 
 STEP = 5  # samples, 20 ms
+GAP_NS = 50_000_000
 
 
 @cache
@@ -30,7 +31,7 @@ def track(world: str, motion: str) -> list[tuple[Any, Any, Any]]:
     """Return dead reckoning, extrapolation and the extrapolation after the sweep, of each."""
     found, run = [], recording(world, motion)
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     first = 0
     for sweep in sweeps(run, "turn"):
         last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
@@ -114,7 +115,7 @@ def samples(start: Any, count: Any, **fields: Any) -> Any:
 
 
 def test_nothing_comes_of_nothing(estimate: Any) -> None:
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     with pytest.raises(ValueError, match="no estimate"):
         assert reckoning.estimate
     assert carry(reckoning, samples(estimate.stamp, 5)) is None
@@ -123,7 +124,7 @@ def test_nothing_comes_of_nothing(estimate: Any) -> None:
 
 
 def test_samples_that_are_damaged_or_late_move_nothing(estimate: Any) -> None:
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     reckoning.reset(estimate)
     good = carry(reckoning, samples(estimate.stamp, 5))
     assert good is not None
@@ -138,7 +139,7 @@ def test_samples_that_are_damaged_or_late_move_nothing(estimate: Any) -> None:
 
 @pytest.mark.parametrize("silence", [60_000_000, LONGEST_NS, 10**15])
 def test_it_ends_with_a_gap_and_begins_with_the_next_sweep(estimate: Any, silence: Any) -> None:
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     reckoning.reset(estimate)
     assert carry(reckoning, samples(estimate.stamp + silence, 5)) is None
     assert carry(reckoning, samples(estimate.stamp + silence + 20_000_000, 5)) is None
@@ -148,7 +149,7 @@ def test_it_ends_with_a_gap_and_begins_with_the_next_sweep(estimate: Any, silenc
 
 
 def test_it_ends_a_second_after_the_latest_sweep(estimate: Any) -> None:
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     reckoning.reset(estimate)
     lasted = [
         carry(reckoning, samples(estimate.stamp + 20_000_000 * n, 5)) is not None
@@ -167,7 +168,7 @@ def test_the_covariance_grows_by_what_speed_and_rate_are_uncertain_by(estimate: 
         gyro_bias_covariance=np.zeros((9, 3)),
         map_error=None,
     )
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     reckoning.reset(known)
     for n in range(10):
         carried = carry(reckoning, samples(known.stamp + 20_000_000 * n, 5))
@@ -205,7 +206,7 @@ def test_turns_by_an_uncertain_gyro_bias_grow_with_the_time(
         ),
         map_error=None,
     )
-    reckoning = DeadReckoning(T_CLOUD_IMU)
+    reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
     for steps in (20, 1):
         reckoning.reset(known)
         for n in range(steps):
@@ -234,7 +235,7 @@ def test_the_map_errs_the_more_the_farther_away_it_was_begun(estimate: Any, fact
         gravity=np.zeros(3),
         map_error=drift.error,
     )
-    there, alone = DeadReckoning(np.eye(4)), DeadReckoning(np.eye(4))
+    there, alone = DeadReckoning(np.eye(4), GAP_NS), DeadReckoning(np.eye(4), GAP_NS)
     there.reset(known)
     alone.reset(dataclasses.replace(known, map_error=None))
     for n in range(10):
@@ -247,8 +248,36 @@ def test_the_map_errs_the_more_the_farther_away_it_was_begun(estimate: Any, fact
     np.testing.assert_allclose(found.covariance - without.covariance, added, atol=1e-12)
 
 
+def test_the_covariance_of_the_twist_turns_with_its_axes(estimate: Any) -> None:
+    """A quarter turn about z, with a speed that is known ten times as well to the left."""
+    known = dataclasses.replace(
+        estimate,
+        T_map_lidar=np.eye(4),
+        covariance=np.zeros((6, 6)),
+        angular_velocity=np.zeros(3),
+        twist_covariance=np.diag(np.square([0.1, 0.01, 0.01, 1e-4, 1e-4, 1e-4])),
+        gyro_bias=np.zeros(3),
+        gyro_bias_covariance=np.zeros((9, 3)),
+        late=np.array([0.02, 0.0, 0.0]),
+        map_error=None,
+        gravity=np.zeros(3),
+    )
+    reckoning = DeadReckoning(np.eye(4), GAP_NS)
+    reckoning.reset(known)
+    rate = [0.0, 0.0, 0.5 * np.pi / 0.24]
+    for n in range(12):
+        step = samples(known.stamp + 20_000_000 * n, 5, angular_velocity=rate)
+        found = carry(reckoning, step)
+    sigmas = np.sqrt(np.diag(found.twist_covariance)[:3])
+    np.testing.assert_allclose(sigmas, (0.01, 0.1, 0.01), rtol=1e-3)
+    np.testing.assert_allclose(found.late, (0.0, -0.02, 0.0), atol=1e-4)
+    place = np.sqrt(np.diag(found.covariance)[:3])  # of the map, where nothing has turned
+    np.testing.assert_allclose(place[1:], 0.24 * 0.01, rtol=1e-3)
+    assert place[0] == pytest.approx(0.24 * np.sqrt(0.1**2 - 0.02**2), rel=1e-3)
+
+
 def test_untrusted_gravity_holds_the_speed(estimate: Any) -> None:
-    reckoning = DeadReckoning(np.eye(4))
+    reckoning = DeadReckoning(np.eye(4), GAP_NS)
     reckoning.reset(dataclasses.replace(estimate, gravity=np.zeros(3)))
     carried = carry(reckoning, samples(estimate.stamp, 10, linear_acceleration=[40.0, 0.0, 0.0]))
     before = estimate.T_map_lidar[:3, :3] @ estimate.velocity
@@ -277,6 +306,43 @@ def test_noise_is_a_density_and_more_than_the_parameter_where_more_shows() -> No
     # white noise vibrates as well: 3.5 ms of its standard deviation above 15 Hz
     assert loud.gyro_vibration == pytest.approx(0.3 * 0.0035, rel=0.3)
     assert loud.accel_vibration == pytest.approx(0.7 * 0.0035, rel=0.3)
+
+
+def at_rate(hz: float, seconds: float, noise: float = 0.0) -> Any:
+    """Return samples of an IMU with another rate, at rest, with white noise of its gyro."""
+    made = np.zeros(round(hz * seconds), IMU_SAMPLE)
+    made["stamp"] = EPOCH + (1e9 / hz * np.arange(len(made))).astype(np.int64)
+    made["linear_acceleration"] = [0.0, 0.0, 9.80665]
+    made["angular_velocity"] = np.random.default_rng(8).normal(0.0, noise, (len(made), 3))
+    return made
+
+
+@pytest.mark.parametrize("hz", [100.0, 200.0, 400.0, 1000.0])
+def test_an_imu_may_have_another_rate(hz: float) -> None:
+    """The parameters are densities, told for 250 Hz; measured noise is that of its samples."""
+    settings = OdometryConfig().inertial
+    quiet, loud = (Predictor(OdometryConfig(), np.eye(4)) for _ in range(2))
+    quiet.imu(at_rate(hz, 2.0))
+    found = quiet._noise(at_rate(hz, 2.0))
+    assert found.gyro == pytest.approx(settings.gyro_noise * np.sqrt(0.004))
+    assert found.accel == pytest.approx(settings.accel_noise * np.sqrt(0.004))
+    loud.imu(at_rate(hz, 2.0, noise=0.3))
+    found = loud._noise(at_rate(hz, 2.0, noise=0.3))
+    assert found.gyro == pytest.approx(tuning.GYRO_NOISE_FACTOR * 0.3 / np.sqrt(hz), rel=0.25)
+
+
+@pytest.mark.parametrize("hz", [100.0, 250.0])
+def test_the_velocity_is_kept_while_no_cloud_comes_but_samples_do(hz: float) -> None:
+    zero, down = np.zeros(3), np.array([0.0, 0.0, -9.80665])
+    velocity = np.array([1.0, 0.0, 0.0])
+    state = InertialState(HostNs(EPOCH), np.eye(3), zero, velocity, zero, zero, down)
+    until = HostNs(EPOCH + 1_500_000_000)
+    for samples, kept in ((at_rate(hz, 2.0), True), (at_rate(hz, 0.5), False)):
+        predictor = Predictor(OdometryConfig(), np.eye(4))
+        predictor.trusts_gravity = True
+        predictor.imu(samples)
+        motion = predictor.over(state, 1e-4 * np.eye(eskf.ERRORS), (state.stamp, until), until)
+        assert (np.linalg.norm(motion.state.velocity - velocity) < 0.1) == kept
 
 
 def test_samples_are_without_the_line_of_the_head_once_turns_have_shown_it() -> None:
@@ -310,7 +376,7 @@ def test_dead_reckoning_does_not_follow_the_line_of_the_head(estimate: Any) -> N
     amplitudes[0] = 0.3, -0.2, 0.1
     amplitudes[3] = 0.1, 0.2, -0.1
     line = LineRates(head, amplitudes)
-    true, found, other = (DeadReckoning(np.eye(4)) for _ in range(3))
+    true, found, other = (DeadReckoning(np.eye(4), GAP_NS) for _ in range(3))
     true.reset(estimate)
     found.reset(dataclasses.replace(estimate, gyro_line=line))
     other.reset(estimate)
