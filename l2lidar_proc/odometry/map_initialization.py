@@ -403,7 +403,7 @@ class MapInitializer:
         if not fitted.is_other:
             before = self._lead_s * (fitted.state.velocity - self._lead_velocity)
             shift = fitted.shift + before
-            self._matcher.drift.first_pose[:3, :3] += np.outer(shift, shift)
+            self._matcher.drift.shift_first_pose(shift)
             return []
         known = covariance.copy()
         known[VELOCITY] = known[:, VELOCITY] = 0.0

@@ -149,6 +149,7 @@ class MapDrift:
         """Forget everything: a new map begins, without error by definition."""
         self.first_pose: F64 = np.zeros((6, 6))
         self.is_doubted = False
+        self._group = tuning.DRIFT_GROUP  # sweeps that share an entry of the history
         self._known = 0
         self._current: F64 = np.zeros((2, 6, 6))
         self._reported: F64 = np.zeros((2, 6, 6))  # the same, but falling over some sweeps
@@ -162,6 +163,12 @@ class MapDrift:
         self._vertical: F64 | None = None  # gravity when it was first known [m/s^2]
         self._lean: F64 = np.zeros(3)  # by which the map has bent since, as gravity shows [rad]
         self._up: F64 | None = None  # as gravity shows it now, unit; None while it does not
+
+    def shift_first_pose(self, shift: F64) -> None:
+        """Let the first pose be as uncertain as by a shift (3,) [m] besides, map axes."""
+        wider = self.first_pose.copy()
+        wider[:3, :3] += np.outer(shift, shift)
+        self.first_pose = wider
 
     def meet(
         self,
@@ -211,7 +218,7 @@ class MapDrift:
         self._reported = self._current + (axes * left) @ np.swapaxes(axes, 1, 2)
 
     def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.clip(sweeps // tuning.DRIFT_GROUP, 0, self._known - 1)
+        return np.clip(sweeps // self._group, 0, self._known - 1)
 
     def _combine(self, place: F64, most: F64, some: F64, along: F64) -> F64:
         """Let errors (2, 6, 6) be ``some`` along a projection (6, 6) of a place, else ``most``.
@@ -305,11 +312,14 @@ class MapDrift:
             Of the covariance of the place. NIS does not show what turns the map: surfaces that
             err alike from sweep to sweep.
         """
-        row = sweep // tuning.DRIFT_GROUP
+        while sweep // self._group >= tuning.DRIFT_ENTRIES:
+            self._share_entries()
+        row = sweep // self._group
         if row >= len(self._history):
-            grown = np.zeros((2 * row, 2, 6, 6), np.float32)
+            rows = min(2 * row, tuning.DRIFT_ENTRIES)
+            grown = np.zeros((rows, 2, 6, 6), np.float32)
             grown[: len(self._history)] = self._history
-            more = np.zeros(2 * row - len(self._ways))
+            more = np.zeros(rows - len(self._ways))
             self._ways = np.concatenate((self._ways, more))
             self._swings = np.concatenate((self._swings, more))
             self._history = grown
@@ -336,6 +346,22 @@ class MapDrift:
             self._history[row][is_less_certain] = found[is_less_certain]
         self._history[self._known : row + 1] = found
         self._known = max(self._known, row + 1)
+
+    def _share_entries(self) -> None:
+        """Let twice as many sweeps share an entry: the history stays bounded.
+
+        Of two that become one, the less certain counts.
+        """
+        pairs = self._history.reshape(-1, 2, 2, 6, 6)  # entry, of the two, which drift
+        sizes = np.trace(pairs[..., :3, :3], axis1=-2, axis2=-1)
+        worse = np.argmax(sizes, axis=1)[:, None, :, None, None]
+        merged = np.take_along_axis(pairs, worse, axis=1)[:, 0]
+        self._group *= 2
+        self._known = -(-self._known // 2)
+        self._history = np.concatenate((merged, np.zeros_like(merged)))
+        for name in ("_ways", "_swings"):
+            later = getattr(self, name)[1::2]
+            setattr(self, name, np.concatenate((later, np.zeros_like(later))))
 
     def more_certain(self, place: F64) -> NDArray[np.bool_] | None:
         """Return which sweeps (S,) were far more certain of a place (3,) [m] than the latest.
@@ -369,7 +395,7 @@ class MapDrift:
             return None
         history = self._history[: self._known, _ALLOWED].astype(np.float64)
         all_squared = np.einsum("jk,njk->n", here.T @ here, history)
-        return np.repeat(all_squared < tuning.APART_SHARE**2 * squared, tuning.DRIFT_GROUP)
+        return np.repeat(all_squared < tuning.APART_SHARE**2 * squared, self._group)
 
     def lean(self, gravity: F64, covariance: F64) -> None:
         """Record how far gravity has turned in the map: so far the map has bent.

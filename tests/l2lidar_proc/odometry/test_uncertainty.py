@@ -419,6 +419,43 @@ def test_all_sweeps_before_the_last_that_was_far_more_certain_are_told_apart() -
     assert not apart[92:].any()
 
 
+def test_of_a_long_history_more_sweeps_share_an_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that stands for days: memory and time stay as they are."""
+    place, most = np.array([4.0, 0.0, 0.0]), 64
+    whole = MapDrift()
+    monkeypatch.setattr(tuning, "DRIFT_ENTRIES", most)
+    bounded = MapDrift()
+    for sweep in range(1000):
+        doubt = SURE + np.diag([0.04 * (sweep >= 300), 0.0, 0.0, 0.0, 0.0, 0.0])
+        at = np.array([0.01 * sweep, 0.0, 0.0])
+        bounded.record(sweep, at, doubt)
+        monkeypatch.setattr(tuning, "DRIFT_ENTRIES", 10**6)
+        whole.record(sweep, at, doubt)
+        monkeypatch.setattr(tuning, "DRIFT_ENTRIES", most)
+    assert len(bounded._history) <= most
+    assert len(bounded._ways) == len(bounded._swings) == len(bounded._history)
+    group = bounded._group
+    assert group * most >= 1000
+    found, expected = bounded.more_certain(place), whole.more_certain(place)
+    assert found is not None
+    assert expected is not None
+    assert len(found) >= 1000
+    # no sweep of an entry is taken for more certain than the least certain in it
+    assert not (found[:1000] & ~expected[:1000]).any()
+    assert (found[: 300 // group * group]).all()
+    for drift in (whole, bounded):
+        drift.meet(held_by(700))
+    assert bounded.error.behind == pytest.approx(whole.error.behind, abs=0.01 * group)
+
+
+def test_what_an_estimate_knows_of_the_map_stays_as_it_is() -> None:
+    drift = MapDrift()
+    before = drift.error
+    drift.shift_first_pose(np.array([0.3, 0.0, 0.0]))
+    assert not before.first_pose.any()
+    assert drift.error.first_pose[0, 0] == pytest.approx(0.09)
+
+
 def test_sweeps_that_share_an_entry_are_as_uncertain_as_the_least_certain() -> None:
     """The first of them came before sight was lost, the others after."""
     drift = MapDrift()
