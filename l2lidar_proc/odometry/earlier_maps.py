@@ -129,7 +129,8 @@ class EarlierMaps:
             if found is None:
                 continue
             if self._meetings.confirm(kept, _moves(motion.state, found.state)):
-                self._maps.remove(kept)
+                # those after it began where it was lost: what they tell of it is no news any more
+                del self._maps[self._maps.index(kept) :]
                 return Return(kept, found)
             self._next_search = stamp + 1
             return None

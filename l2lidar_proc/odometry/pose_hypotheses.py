@@ -161,7 +161,8 @@ def _drawn(covariance: F64, middles: F64, count: int, seed: int) -> F64:
 
 def _grid(covariance: F64) -> F64:
     """Return errors (N, 18) of the place that fill an ellipsoid of three sigma."""
-    radius = np.clip(3.0 * np.sqrt(np.diag(covariance)[POSITION]), *tuning.SEARCH_RADIUS_M)
+    variances = np.maximum(np.diag(covariance)[POSITION], 0.0)
+    radius = np.clip(3.0 * np.sqrt(variances), *tuning.SEARCH_RADIUS_M)
     volume = 4.0 / 3.0 * np.pi * float(radius.prod())
     step = max(tuning.SEARCH_STEP_M, (volume / tuning.SEARCH_PLACES) ** (1.0 / 3.0))
     axes = [step * np.arange(-np.ceil(r / step), np.ceil(r / step) + 1.0) for r in radius]

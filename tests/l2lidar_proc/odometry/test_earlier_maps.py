@@ -89,6 +89,24 @@ def test_a_few_maps_are_kept_and_the_smallest_go() -> None:
     assert [item.matcher for item in maps] == [kept[0], kept[2]]
 
 
+def test_maps_that_were_begun_after_one_was_lost_go_when_it_is_found() -> None:
+    """What they tell of its place is no news of any map that is begun later."""
+    rng, maps = np.random.default_rng(23), EarlierMaps()
+    found, other = (SweepMatcher(OdometryConfig(), np.zeros(3)) for _ in range(2))
+    for _ in range(14):
+        extended(found, room(rng, 4000))
+    other.surfaces.add(rng.uniform(30.0, 60.0, (10, 3)))
+    loose = FrameJump(np.zeros(3), np.diag([0.3**2] * 3 + [0.02**2] * 3))
+    maps.keep(found, FrameJump(), HostNs(0))
+    maps.keep(other, FrameJump(np.zeros(3), loose.covariance / 2.0), HostNs(0))
+    sweep = motion(TIGHT, PLACE + np.array([0.2, 0.1, 0.0]))
+    backs = [maps.search(view(rng), later(sweep, 1.5 + t), loose) for t in (0.0, 0.2)]
+    assert backs[0] is None
+    assert backs[1] is not None
+    assert backs[1].map.matcher is found
+    assert len(maps) == 0
+
+
 DRIFT = np.array([0.4, -0.25, 0.0])
 
 
