@@ -72,7 +72,7 @@ class BeamAngles:
         return self._seen[1]
 
     def corrected(self, sweep: Sweep) -> Sweep:
-        """Return a sweep as the unit would have measured it with the corrected angles.
+        """Return the next sweep with corrected angles; remember it, if it is to :meth:`learn`.
 
         Parameters
         ----------
@@ -81,20 +81,27 @@ class BeamAngles:
         """
         self._latest = None
         self._sweeps += 1
-        is_due = self._teaches()
-        if not (is_due or self.correction.any()):
-            return sweep
-        found = self._halves_of(sweep)
+        corrected = self.applied_to(sweep)
+        found = self._halves_of(sweep) if self._teaches() else None
+        if found is not None:
+            self._latest = corrected, found.sign, self.correction
+        return corrected
+
+    def applied_to(self, sweep: Sweep) -> Sweep:
+        """Return a sweep as the unit would have measured it with the corrected angles.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            As for :meth:`corrected`.
+        """
+        found = self._halves_of(sweep) if self.correction.any() else None
         if found is None:
             return sweep
-        if self.correction.any():
-            points = sweep.points.copy()
-            for name, line in zip("xy", levers(points, found.sign), strict=True):
-                points[name] += self.correction @ line
-            sweep = dataclasses.replace(sweep, points=points)
-        if is_due:
-            self._latest = sweep, found.sign, self.correction
-        return sweep
+        points = sweep.points.copy()
+        for name, line in zip("xy", levers(points, found.sign), strict=True):
+            points[name] += self.correction @ line
+        return dataclasses.replace(sweep, points=points)
 
     def learn(self, sweep: Sweep, moved: NDArray[np.void], *, at_rest: bool) -> None:
         """Take the gaps between the halves of a sweep.

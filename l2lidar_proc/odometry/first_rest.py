@@ -48,7 +48,7 @@ class FirstRest:
 
     def begin(self, sweeps: list[Sweep]) -> None:
         """Take the sweeps with which a map has begun at rest."""
-        self.sweeps = sweeps
+        self.sweeps, self._mapped_with = sweeps, self._beams.correction
 
     def note(self, sweep: Sweep) -> None:
         """Take another sweep of this rest, if it is still the first one."""
@@ -87,7 +87,7 @@ class FirstRest:
         if np.abs(self._beams.correction - self._mapped_with).max() <= tuning.BEAM_CHANGE:
             return None
         self._mapped_with = self._beams.correction
-        better = [self._beams.corrected(one) for one in self.sweeps]
+        better = [self._beams.applied_to(one) for one in self.sweeps]
         return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
 
     def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:

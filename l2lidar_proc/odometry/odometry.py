@@ -96,13 +96,11 @@ class Odometry:
         self._belief: tuple[InertialState, F64] | None = None  # state and covariance to go on from
         # posteriors of the present rest, oldest first
         self._at_rest: deque[tuple[InertialState, F64]] = deque()
-        self.matcher = SweepMatcher(self.config, self._lever)
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()
         self._innovations = InnovationTest()
-        self._initializer = self._new_initializer()
         self._beams = BeamAngles()
-        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._beams)
+        self._use(SweepMatcher(self.config, self._lever))
         self._start = StartVelocity(self._lever)
         self._peak_speed = 0.0  # of this carrier [m/s]
         self._unmatched_ns = 0  # of sweeps with enough points since the latest match
@@ -114,10 +112,13 @@ class Odometry:
         self._revisit = MapRevisit()
         self._last: OdometryEstimate | None = None
 
-    def _new_initializer(self) -> MapInitializer:
-        return MapInitializer(
-            self._predictor, self.matcher, self._zero_velocity, self.config.min_points
+    def _use(self, matcher: SweepMatcher) -> None:
+        """Go on with the maps of a matcher."""
+        self.matcher = matcher
+        self._initializer = MapInitializer(
+            self._predictor, matcher, self._zero_velocity, self.config.min_points
         )
+        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._beams)
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
@@ -197,6 +198,11 @@ class Odometry:
             self.matcher.drift,
         )
 
+    @property
+    def newest_imu(self) -> HostNs | None:
+        """Stamp of the newest IMU sample, None before the first."""
+        return self._predictor.newest_imu
+
     def map_points(self) -> F64:
         """Return the points of KISS-ICP's local map [m], shape (N, 3), map frame."""
         return self.matcher.kiss.points()
@@ -222,6 +228,7 @@ class Odometry:
 
     def _enter_map(self, begun: Begun) -> None:
         """Go on from a map that has just begun."""
+        self._at_rest.clear()
         self._keep(begun.motions[-1])
         self._forget_unmatched()
         at_rest = self._zero_velocity.anchor is not None
@@ -524,8 +531,7 @@ class Odometry:
             self.matcher.clear()
         else:
             self._earlier.keep(self.matcher, before, motion.state.stamp)
-            self.matcher = SweepMatcher(self.config, self._lever)
-            self._initializer = self._new_initializer()
+            self._use(SweepMatcher(self.config, self._lever))
         self._walls.clear()
         self._start.clear()
         self._forget_unmatched()
@@ -547,16 +553,16 @@ class Odometry:
 
     def _return(self, back: Return, motion: SweepMotion) -> SweepMotion:
         """Go on in an earlier map; return the motion of the sweep that met it."""
-        self.matcher, self._jump = back.map.matcher, back.map.jump
+        self._use(back.map.matcher)
+        self._jump = back.map.jump
         self.matcher.config = self.config
-        self._initializer = self._new_initializer()
         self.matcher.meet(back.alignment, 0.0)
         self._zero_velocity.clear()
         self._walls.clear()
         self._start.clear()
         self._innovations.clear()
         self._forget_unmatched()
-        self.phase = Phase.TRACKING
+        self._leave_rest()
         return motion.with_state(back.alignment.state, back.alignment.covariance)
 
     # ---- stationary
@@ -600,15 +606,16 @@ class Odometry:
         first.end_doubt()
         back = self._way_back(sweep, still)
         if back is not None:
-            first.end()
             still = self._return(back, still)
             status.append(Status.RETURNED)
-        self._keep_at_rest(still)
+            self._keep(still)
+        else:
+            self._keep_at_rest(still)
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
-        self._beams.learn(sweep, estimate.points, at_rest=True)
-        if remapped is None:
+        if remapped is None:  # else the beams have learned from all sweeps of this rest
+            self._beams.learn(sweep, estimate.points, at_rest=True)
             self.matcher.extend(estimate.points, still, still.state)
         return estimate
 

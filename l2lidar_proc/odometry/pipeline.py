@@ -83,7 +83,6 @@ class OdometryPipeline:
         self._max_skipped = max_skipped
         self._uses_accelerometer = accelerometer
         self._wait_ns = imu_wait_ms * _MS if config.mode == "inertial" else 0
-        self._newest_imu: HostNs | None = None
         self.extrinsics = extrinsics or ImuExtrinsics()
         self.convention = ImuConvention()
         self.mount(T_cloud_imu)
@@ -163,8 +162,9 @@ class OdometryPipeline:
 
     @property
     def newest_imu(self) -> HostNs | None:
-        """Stamp of the newest IMU sample."""
-        return self._newest_imu
+        """Stamp of the newest IMU sample; None before the first, and where none is used."""
+        odometry = self.odometry
+        return None if isinstance(odometry, PlainOdometry) else odometry.newest_imu
 
     def corrected(self, samples: Samples) -> Samples:
         """Return IMU samples (N,) as they are used; changes nothing, so any thread may ask."""
@@ -181,8 +181,6 @@ class OdometryPipeline:
         samples = self._usable(self.convention.corrected(self.extrinsics.corrected(samples)))
         self.odometry.imu(samples)
         self.check.imu(samples)
-        if len(samples):
-            self._newest_imu = HostNs(int(samples["stamp"][-1]))
 
     def sweep(self, sweep: Sweep, now: int, backlog: int = 0) -> None:
         """Take a sweep that arrives at ``now`` [ns].
@@ -201,7 +199,7 @@ class OdometryPipeline:
     def poll(self, now: int) -> list[OdometryEstimate]:
         """Return the estimates that are due by ``now`` [ns], in order."""
         estimates: list[OdometryEstimate] = []
-        for release in self._sequencer.release(self._newest_imu, now):
+        for release in self._sequencer.release(self.newest_imu, now):
             registered = self._registered(release.sweep)
             self._remember(release.sweep, registered)
             for estimate in registered:

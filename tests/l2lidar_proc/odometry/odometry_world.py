@@ -13,7 +13,7 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.types import Sweep
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
-from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.odometry import Odometry, Phase
 from tests.support.odometry_runs import Run, record, sweeps, truth
 
 T_CLOUD_IMU = np.eye(4)
@@ -41,6 +41,8 @@ def feed(
         odometry.imu(imu[first:last])
         first = last
         out += odometry.register(sweep, may_skip=may_skip(number))
+        # it goes back to them when the rest ends, so they have to be of that rest
+        assert odometry.phase is Phase.STATIONARY or not odometry._at_rest
     return out
 
 

@@ -337,6 +337,24 @@ def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
     np.testing.assert_array_equal(beams.correction, (0.0, 0.0))
 
 
+def test_other_sweeps_may_be_corrected_without_being_learned() -> None:
+    beams, other = BeamAngles(), BeamAngles()
+    for number in range(12):
+        sweep, _ = turn(UNIT, number)
+        corrected = beams.corrected(sweep)
+        for _ in range(30):
+            beams.applied_to(turn(UNIT, 0)[0])
+        beams.learn(corrected, corrected.points, at_rest=True)
+        corrected = other.corrected(sweep)
+        other.learn(corrected, corrected.points, at_rest=True)
+    np.testing.assert_array_equal(beams.correction, other.correction)
+    assert beams.sigmas == other.sigmas
+    assert beams.correction.any()
+    shown, again = beams.applied_to(sweep), beams.corrected(sweep)
+    np.testing.assert_array_equal(shown.points, again.points)
+    assert (shown.points["x"] != sweep.points["x"]).any()
+
+
 def test_nonsense_does_no_harm() -> None:
     beams = BeamAngles()
     sweep, _ = turn(UNIT, 0)
