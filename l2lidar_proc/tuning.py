@@ -428,9 +428,8 @@ BEAM_DRIFT_SHIFT: Final = 1.3  # [m/rad]
 # passed for 0.3 degrees of a unit that was right.
 BEAM_SPEED: Final = 0.2  # [m/s]
 BEAM_RATE: Final = 0.08  # [rad/s]
-BEAM_FLOOR: Final = (
-    3.5e-4  # [rad] 0.02 degrees; source: calibrations of one unit from part to part
-)
+# 0.02 degrees; source: calibrations of one unit from part to part
+BEAM_FLOOR: Final = 3.5e-4  # [rad]
 # [rad] 0.26 degrees: less certain, a direction is not corrected, nor if it may as well be zero.
 # The estimates are better than they claim: both angles together, in eight narrow corridors, by
 # 0.02 to 0.22 degrees after 5 s, where they claim 0.18 to 0.25. With 0.1 degrees and 3 sigma it
@@ -448,9 +447,8 @@ BEAM_CHANGE: Final = 0.0009  # [rad] after which a map at rest is begun again: 5
 
 NIS_WINDOW_NS: Final = 3_000_000_000  # [ns] over which innovations are judged
 NIS_LEAST: Final = 5  # alignments, before that nothing is said
-NIS_SEEN: Final = (
-    0.05  # share of its variance that an alignment takes from a direction it measures
-)
+# Share of its variance that an alignment takes from a direction that it measures
+NIS_SEEN: Final = 0.05
 # 3 s of turns measure 60 and more components. Derived: their mean exceeds 2 in one of 1e5 windows
 NIS_SUSPECT: Final = 2.0
 NIS_CHANCE: Final = 3.8  # mean of 3 components that chance exceeds in one of 100 windows
@@ -496,16 +494,17 @@ MOST_ACCEL_BIAS: Final = 1.0  # [m/s^2]
 LOOSE_POSITION: Final = 0.06  # [m] a prediction less certain may be a surface off
 LOOSE_ROTATION: Final = 0.03  # [rad] or turned too far
 INLIER_RATIO: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
-# After a loose prediction it may have so many times the usual number of recent outliers. Tuned on:
-# wood in rain (inliers 0.85 to 0.90 at the right place, up to 0.72 at wrong ones), bare trunks
 # Sizes of cells in which a point off the surface contradicts it. Through a door that opens, a room
 # appears in coarse cells of what is known of its frame: no outlier in the two finest sizes at the
 # right pose, 12 to 45 % in all (camera looking into rooms).
 FINE_LEVELS: Final = 2
+# After a loose prediction it may have so many times the usual number of recent outliers. Tuned on:
+# wood in rain (inliers 0.85 to 0.90 at the right place, up to 0.72 at wrong ones), bare trunks
 USUAL_OUTLIERS: Final = 2.5
 USUAL_BLEND: Final = 0.1  # share of each newer sweep in what is usual
 USUAL_LEAST: Final = 0.75  # inliers needed whatever is usual
-OVERLAP: Final = (0.0, 0.25)  # likewise, share of the points that must meet the map
+# Share of the points that must meet the map, after a good prediction and after a loose one
+OVERLAP: Final = (0.0, 0.25)
 # A pose farther from the predicted one than the robust kernel reaches needs so many points, as a
 # few fit in many places (tuned on: camera on stairs, where 30 at the right place were refused for
 # 6 s), and so many that fix the place along the way there. Tuned on: camera looking into rooms (4
@@ -737,9 +736,8 @@ RELOCALIZE_SIGMAS: Final = 2.0
 # of 15 such places were right, and what showed three of them was in sight for one sweep only
 RELOCALIZE_LIKELY: Final = 1.0
 RELOCALIZE_STEP_M: Final = 0.1  # [m] between the places; the robust kernel reaches as far
-RELOCALIZE_PLACES: Final = (
-    600  # at most; farther apart where these do not suffice. Bounds the time
-)
+# At most; they are farther apart where these do not suffice. Bounds the time
+RELOCALIZE_PLACES: Final = 600
 RELOCALIZE_STARTS: Final = 4  # of these places from which sweeps are aligned,
 RELOCALIZE_APART_M: Final = 0.25  # [m] so far apart
 # Tuned on: camera on stairs, where sweeps fit 0.16 m and more higher or lower as well, and flats

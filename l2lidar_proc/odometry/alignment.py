@@ -62,7 +62,6 @@ class Alignment:
         not lower it, a wrong pose does.
     residual : float
         Weighted root mean square of their distances [m].
-    steps : int
     support : Support
         Of all surfaces met.
     weakly : tuple of ndarray and Support, optional
@@ -86,7 +85,6 @@ class Alignment:
     matched: int
     inlier_ratio: float
     residual: float
-    steps: int
     support: Support
     weakly: tuple[F64, Support] | None = None
     strongly: tuple[tuple[F64, Support], ...] = ()
@@ -154,7 +152,7 @@ def align(
         )
         if len(found.index) < least:
             break
-        step = _step(prior, root, at, found, weak, number + 1)
+        step = _step(prior, root, at, found, weak)
         done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
             axes = weak_axes(at, found, surfaces, scatter)
@@ -167,7 +165,7 @@ def align(
             again = partial(views.of_some, source)
             weak = weak_directions(at, found, axes, again, prior, covariance[POSE, POSE])
             before = step.state
-            step = _step(prior, root, at, found, weak, number + 1)
+            step = _step(prior, root, at, found, weak)
             done = _is_small(step.state.boxminus(before))
             last = number + tuning.WEAK_STEPS
         if done:
@@ -221,7 +219,6 @@ class _Step(NamedTuple):
     information: F64
     normals: F64  # derivatives (M, 3) of the residuals by the place
     found: Correspondences
-    number: int
     weak: WeakDirections | None
 
     @property
@@ -237,7 +234,6 @@ class _Step(NamedTuple):
             len(found.index),
             found.inlier_ratio,
             found.residual,
-            self.number,
             found.support,
             (weakest, found.support_along(self.normals @ weakest)),
             tuple((axis, found.places_along(self.normals @ axis)) for axis in others),
@@ -253,7 +249,6 @@ def _step(
     at: InertialState,
     found: Correspondences,
     weak: WeakDirections | None,
-    number: int,
 ) -> _Step:
     """Return the posterior of correspondences found from a state."""
     pose = by_pose = pose_jacobian(found, at.rotation)
@@ -268,7 +263,7 @@ def _step(
     state, posterior = update_with_information(
         prior, root, at, information, -(weighted.T @ found.distances)
     )
-    return _Step(state, posterior, information, pose[:, 3:], found, number, weak)
+    return _Step(state, posterior, information, pose[:, 3:], found, weak)
 
 
 def _is_small(change: F64) -> bool:

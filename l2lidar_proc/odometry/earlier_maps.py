@@ -75,7 +75,7 @@ class Return:
 
 
 class EarlierMaps:
-    """The maps of the last losses, oldest first."""
+    """The largest of the maps that were lost, oldest first."""
 
     def __init__(self) -> None:
         self._maps: list[EarlierMap] = []
@@ -205,7 +205,7 @@ class MapRevisit:
         self._certain_at: int | None = None  # stamp until which the pose was certain enough
         for event in (self._met, self._unobserved, self._returned, self._contradicted):
             event.clear()
-        self._contradicting = 0  # the surfaces that did so were opened by the sweeps before this
+        self._contradicting = 0  # sweeps before this were the first at the surfaces that did so
         self._meetings.clear()
 
     def note_unobserved(self, stamp: HostNs) -> None:

@@ -21,7 +21,7 @@ class SeenThrough(NamedTuple):
     share : float
         Of the rays that do. Many mean a wrong pose, or a wrong map.
     sweeps : ndarray of int64, shape (N,)
-        For each of these rays, the sweep that opened the surface.
+        For each of these rays, the sweep that was the first at the surface's place.
     """
 
     share: float
@@ -59,5 +59,5 @@ def seen_through(surfaces: SurfelMap, origin: F64, points: F64) -> SeenThrough:
         & (cells["sweeps"] >= tuning.RAY_SWEEPS)
     )
     rays, first = np.unique(ray[through], return_index=True)
-    opened = planes["born"][through][first].astype(np.int64)
-    return SeenThrough(len(rays) / max(len(points), 1), opened)
+    born = planes["born"][through][first].astype(np.int64)
+    return SeenThrough(len(rays) / max(len(points), 1), born)

@@ -598,7 +598,7 @@ class SweepMatcher:
         )
         nobody = np.empty(0, np.int64), np.empty(0)
         claimed = information[POSITION, POSITION]
-        return Alignment(state, covariance, information, claimed, 0, 0.0, 0.0, 1, nobody)
+        return Alignment(state, covariance, information, claimed, 0, 0.0, 0.0, nobody)
 
     def _registered(
         self, source: Source, guess: InertialState, most: float = np.inf

@@ -406,33 +406,41 @@ class Odometry:
         assert self._belief is not None
         before = self._belief[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
-        self._peak_speed = carrier_priors.peak_speed_after(
-            self._peak_speed, after, covariance, lasted
-        )
-        height = self.matcher.observes_height
-        peak = self._peak_speed
-        if self._start.is_open:
-            # the prior of the start has said already how fast carriers are
-            peak = max(peak, tuning.START_VELOCITY_SIGMA[1])
-            speeds = np.linalg.eigvalsh(covariance[eskf.VELOCITY, eskf.VELOCITY])
-            self._start.note_velocity(float(np.sqrt(speeds[-1])))
-        posterior = carrier_priors.apply_zero_velocity_prior(
-            after, covariance, lasted, peak, height_observed=height
-        )
-        self.matcher.driving = carrier_priors.is_driving_speed(self._peak_speed)
-        posterior = carrier_priors.with_gravity_of_known_size(*posterior)
-        way = float(np.linalg.norm(posterior[0].position - before.position))
-        lean = way * tuning.MAP_BEND**2
-        posterior = posterior[0], eskf.with_leaning_gravity(*posterior, lean)
-        gravity = posterior[1][eskf.GRAVITY, eskf.GRAVITY]
-        self.matcher.drift.lean(posterior[0].gravity, gravity)
+        self._note_speed(after, covariance, lasted)
+        posterior = self._with_priors(before.position, after, covariance, lasted)
         bounded = carrier_priors.bound_speed(*posterior, self.config.max_speed)
         is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)
         if is_suspect and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
-        velocity = eskf.VELOCITY, eskf.VELOCITY
-        self.matcher.drift.correct_velocity(predicted.covariance[velocity], bounded[1][velocity])
+        drift, gravity, velocity = self.matcher.drift, eskf.GRAVITY, eskf.VELOCITY
+        self._start.note_velocity(covariance[velocity, velocity])
+        drift.lean(posterior[0].gravity, posterior[1][gravity, gravity])
+        drift.correct_velocity(
+            predicted.covariance[velocity, velocity], bounded[1][velocity, velocity]
+        )
         return predicted.with_state(*bounded)
+
+    def _note_speed(self, state: InertialState, covariance: F64, seconds: float) -> None:
+        """Take the velocity of a sweep [s] after the one before, which tells what carries it."""
+        self._peak_speed = carrier_priors.peak_speed_after(
+            self._peak_speed, state, covariance, seconds
+        )
+        self.matcher.driving = carrier_priors.is_driving_speed(self._peak_speed)
+
+    def _with_priors(
+        self, place: F64, state: InertialState, covariance: F64, seconds: float
+    ) -> tuple[InertialState, F64]:
+        """Return a state, [s] after that at a place (3,), with the priors of carriers."""
+        peak = self._peak_speed
+        if self._start.is_open:
+            # the prior of the start has said already how fast carriers are
+            peak = max(peak, tuning.START_VELOCITY_SIGMA[1])
+        state, covariance = carrier_priors.apply_zero_velocity_prior(
+            state, covariance, seconds, peak, height_observed=self.matcher.observes_height
+        )
+        state, covariance = carrier_priors.with_gravity_of_known_size(state, covariance)
+        lean = float(np.linalg.norm(state.position - place)) * tuning.MAP_BEND**2
+        return state, eskf.with_leaning_gravity(state, covariance, lean)
 
     def _skip(self, sweep: Sweep) -> OdometryEstimate | None:
         """Carry the pose through a sweep by the IMU alone, if it can; the map stays as it is."""
@@ -503,6 +511,11 @@ class Odometry:
         self._unmatched_ns += 0 if few else sweep.end - sweep.start
         self._was_blind |= points < tuning.UNMAPPED_POINTS
         self._zero_velocity.clear()
+
+    def _discard_map(self) -> None:
+        """Forget the map, which is of no use; the sweep to be tracked begins another, as LOST."""
+        self.matcher.clear()
+        self._unmatched_ns = tuning.LOST_NS
 
     def _forget_unmatched(self) -> None:
         """Begin to count anew: the pose is known relative to the map in use."""
@@ -653,9 +666,7 @@ class Odometry:
                 return self._estimate(
                     sweep, begun.motions[-1], [*status, Status.STARTING], quality
                 )
-            # the map of a rest that was none is of no use
-            self.matcher.clear()
-            self._unmatched_ns = tuning.LOST_NS
+            self._discard_map()
         self._leave_rest()
         return None
 

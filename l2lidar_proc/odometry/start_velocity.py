@@ -188,9 +188,10 @@ class StartVelocity:
         position = state.position - state.rotation @ self._lever
         self._passed.append(Passed(sweep, state.stamp, position))
 
-    def note_velocity(self, sigma: float) -> None:
-        """Take how well the velocity is known by now, at worst [m/s]."""
-        self.is_open &= sigma > tuning.PRIOR_LEARN_SIGMA
+    def note_velocity(self, covariance: F64) -> None:
+        """Take how well the velocity is known by now, covariance (3, 3) [m^2/s^2]."""
+        worst = float(np.linalg.eigvalsh(covariance)[-1])
+        self.is_open &= worst > tuning.PRIOR_LEARN_SIGMA**2
 
     def is_due(self, end: HostNs) -> bool:
         """Return whether it is time for a search, at the end of a sweep."""

@@ -26,9 +26,7 @@ def trial(inliers: float | None, weakest: float = 1.0) -> Trial:
     information[POSITION, POSITION] = np.diag([1e4 * weakest, 1e4, 1e4])
     nobody = np.zeros(0, np.int64), np.zeros(0)
     covariance = 1e-6 * np.eye(ERRORS)
-    last = Alignment(
-        MOTION.state, covariance, information, np.eye(3), 500, inliers, 0.01, 3, nobody
-    )
+    last = Alignment(MOTION.state, covariance, information, np.eye(3), 500, inliers, 0.01, nobody)
     return Trial([MOTION, MOTION], True, last)
 
 

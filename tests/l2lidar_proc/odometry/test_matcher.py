@@ -449,7 +449,7 @@ def test_a_drive_along_one_free_level_direction(
     known = np.diag([0.0 if axis in free else 1e6 for axis in range(3)])
     information[eskf.POSITION, eskf.POSITION] = axes @ known @ axes.T
     nobody = np.empty(0, np.int64), np.empty(0)
-    aligned = Alignment(state, covariance, information, np.eye(3), 100, 1.0, 0.0, 1, nobody)
+    aligned = Alignment(state, covariance, information, np.eye(3), 100, 1.0, 0.0, nobody)
     matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
     matcher.driving = driving
     direction = matcher.driving_direction(aligned)

@@ -223,10 +223,10 @@ def test_searches_follow_each_other_and_end(passing: list[Sweep]) -> None:
     # what the next one does not need is forgotten
     assert start.since >= end + tuning.START_PAUSE_NS - tuning.START_NS
     assert start.since == start.sweeps[0].start
-    start.note_velocity(tuning.PRIOR_LEARN_SIGMA + 0.01)
+    start.note_velocity((tuning.PRIOR_LEARN_SIGMA + 0.01) ** 2 * np.eye(3))
     assert start.is_open
-    start.note_velocity(tuning.PRIOR_LEARN_SIGMA - 0.01)
-    start.note_velocity(1.0)
+    start.note_velocity((tuning.PRIOR_LEARN_SIGMA - 0.01) ** 2 * np.eye(3))
+    start.note_velocity(np.eye(3))
     assert not start.is_open
     start.end_search(HostNs(EPOCH + tuning.START_WATCHED_NS + 1))
     assert not start.sweeps

@@ -225,7 +225,7 @@ def found_at(
     nobody = np.empty(0, np.int64), np.empty(0)
     nothing = np.zeros((ERRORS, ERRORS))
     return Alignment(
-        state.boxplus(deviation), covariance, nothing, np.diag(claimed), 500, 1.0, 0.0, 3, nobody
+        state.boxplus(deviation), covariance, nothing, np.diag(claimed), 500, 1.0, 0.0, nobody
     )
 
 
