@@ -70,6 +70,13 @@ class InertialState:
     accel_bias: F64
     gravity: F64
 
+    @property
+    def pose(self) -> F64:
+        """Pose of the IMU in the map, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.rotation, self.position
+        return pose
+
     def boxplus(self, error: F64) -> InertialState:
         """Return ``state boxplus error``, the error of shape (18,)."""
         return InertialState(
@@ -552,6 +559,20 @@ def decorrelated(covariance: F64, errors: slice, sigma: float) -> F64:
     out[:, errors] = 0.0
     out[errors, errors] = sigma**2 * np.eye(3)
     return out
+
+
+def pose_covariance(state: InertialState, covariance: F64) -> F64:
+    """Return the covariance (6, 6) of place and turn about the map's axes [m, rad].
+
+    Parameters
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    """
+    errors = np.r_[POSITION, ROTATION]
+    axes = np.eye(6)
+    axes[3:, 3:] = state.rotation
+    return np.asarray(axes @ covariance[np.ix_(errors, errors)] @ axes.T)
 
 
 def with_loose_pose(state: InertialState, covariance: F64, more: F64) -> F64:

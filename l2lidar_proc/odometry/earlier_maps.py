@@ -405,7 +405,7 @@ class _Meetings:
 
 def _moves(state: InertialState, found: InertialState) -> F64:
     """Return how a state found for another moves the map's poses (4, 4)."""
-    return np.asarray(_pose(found) @ np.linalg.inv(_pose(state)))
+    return np.asarray(found.pose @ np.linalg.inv(state.pose))
 
 
 def _met_in(
@@ -458,12 +458,6 @@ def moved(state: InertialState, transform: F64) -> InertialState:
         velocity=turn @ state.velocity,
         gravity=turn @ state.gravity,
     )
-
-
-def _pose(state: InertialState) -> F64:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = state.rotation, state.position
-    return pose
 
 
 def _are_one(one: F64, other: F64) -> bool:

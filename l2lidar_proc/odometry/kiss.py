@@ -7,7 +7,6 @@ point: nothing of that kind gets past this module.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -292,8 +291,7 @@ class PlainOdometry:
         if self._last is not None:
             step = stamp - self._last.stamp
             if -tuning.LONG_GAP_NS < step <= 0:
-                refused = (Status.REFUSED,)
-                return [dataclasses.replace(self._last, points=points[:0], status=refused)]
+                return [self._last.refusing(points)]
             if not 0 < step <= tuning.TIME_JUMP_NS:
                 self._last = None
                 status = (Status.RESTARTED,)

@@ -25,6 +25,7 @@ from l2lidar_proc.motion.filter import (
     ROTATION,
     VELOCITY,
     InertialState,
+    pose_covariance,
     square_root,
     update_with_information,
 )
@@ -346,14 +347,15 @@ class SweepMatcher:
         state = motion.state
         points = xyz(moved) - self.lever
         placed = (state.rotation @ points.T + state.position[:, None]).T
-        self.drift.record(self._sweeps, state.position, pose_covariance(motion), expected_share)
+        added = pose_covariance(state, motion.covariance)
+        self.drift.record(self._sweeps, state.position, added, expected_share)
         apart = self.drift.more_certain(state.position)
         # what is ahead of a carrier that drives was seen from afar first, and tells its way:
         # points from nearby, which the errors of that way have moved, must not take its place
         weighted = not self.driving
         fresh = self.surfaces.add(placed, self._sweeps, apart, state.position, weighted=weighted)
         measured = not motion.imu.missing.all()
-        self.kiss.update(points, _pose(state), _pose(guess), keyframes=measured)
+        self.kiss.update(points, state.pose, guess.pose, keyframes=measured)
         self._walk(state.position)
         self._sweeps += 1
         return fresh
@@ -604,7 +606,7 @@ class SweepMatcher:
         self, source: Source, guess: InertialState, most: float = np.inf
     ) -> InertialState:
         """Return the guess with the pose that KISS-ICP's registration finds."""
-        better = self.kiss.register(source.points, _pose(guess), most)
+        better = self.kiss.register(source.points, guess.pose, most)
         if better is None:
             return guess
         return dataclasses.replace(guess, rotation=better[:3, :3], position=better[:3, 3])
@@ -642,23 +644,9 @@ def _are_apart(one: Alignment, other: Alignment) -> bool:
     return bool(np.linalg.norm(way) > tuning.RELOCALIZE_APART_M)
 
 
-def pose_covariance(motion: SweepMotion) -> F64:
-    """Return the covariance (6, 6) of place and turn about the map's axes [m, rad]."""
-    errors = np.r_[POSITION, ROTATION]
-    axes = np.eye(6)
-    axes[3:, 3:] = motion.state.rotation
-    return np.asarray(axes @ motion.covariance[np.ix_(errors, errors)] @ axes.T)
-
-
 def xyz(points: NDArray[np.void]) -> F64:
     """Return the coordinates of structured points (N,) as float64, shape (N, 3).
 
     Each axis is contiguous: that is how the maps compute with them.
     """
     return np.stack([points[axis] for axis in "xyz"], dtype=np.float64).T
-
-
-def _pose(state: InertialState) -> F64:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = state.rotation, state.position
-    return pose

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import POSITION, ROTATION, InertialState, skew
+from l2lidar_proc.motion.filter import InertialState, pose_covariance, skew
 from l2lidar_proc.odometry.correspondences import Support
 
 
@@ -487,10 +487,7 @@ class FrameJump:
         drift : ndarray, shape (6, 6)
             Of that map itself, at the state's place.
         """
-        errors = np.r_[POSITION, ROTATION]
-        axes = np.eye(6)
-        axes[3:, 3:] = state.rotation
-        jump = axes @ covariance[np.ix_(errors, errors)] @ axes.T
+        jump = pose_covariance(state, covariance)
         return FrameJump(state.position, self.at(state.position) + jump + drift)
 
     def unseen(self, state: InertialState) -> FrameJump:
