@@ -20,12 +20,27 @@ StampedPoses = NDArray[np.void]
 """Array of dtype STAMPED_POSE, shape (N,)."""
 
 
-class Trajectory:
-    """A growing array of stamped poses."""
+MOST_POSES: Final = 1_000_000
+"""Of a trajectory: 136 MB, and 64 hours of an L2."""
 
-    def __init__(self) -> None:
-        self._rows = np.empty(256, STAMPED_POSE)
+
+class Trajectory:
+    """A growing array of stamped poses; once it is full, of every second one, and so on.
+
+    The latest is always the last.
+
+    Parameters
+    ----------
+    most : int
+        Poses at most, even.
+    """
+
+    def __init__(self, most: int = MOST_POSES) -> None:
+        self._rows = np.empty(min(256, most), STAMPED_POSE)
+        self._most = most
         self._count = 0
+        self._every = 1  # of the poses that came, one is kept
+        self._came = 0
 
     @property
     def poses(self) -> StampedPoses:
@@ -34,8 +49,16 @@ class Trajectory:
 
     def append(self, stamp: HostNs, pose: F64) -> None:
         """Add a pose, shape (4, 4)."""
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        if (self._came - 1) % self._every:
+            self._count -= 1  # the one before was there only as the latest
+        self._came += 1
+        if self._count == self._most:
+            self._every, self._count = 2 * self._every, self._most // 2
+            self._rows[: self._count] = self._rows[::2].copy()
+        elif self._count == len(self._rows):
+            grown = np.empty(min(2 * self._count, self._most), STAMPED_POSE)
+            grown[: self._count] = self._rows
+            self._rows = grown
         self._rows[self._count] = stamp, pose
         self._count += 1
 

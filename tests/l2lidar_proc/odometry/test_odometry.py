@@ -460,6 +460,18 @@ def test_only_a_backlog_makes_a_pipeline_skip_and_never_many_in_a_row() -> None:
         assert "".join("01"[one] for one in skipped[begun : begun + 4]) == expected
 
 
+def test_the_newest_sample_is_not_the_one_that_comes_last() -> None:
+    run = recording("room", "walk")
+    pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU)
+    assert pipeline.newest_imu is None
+    pipeline.imu(run.imu[20:60])
+    pipeline.imu(run.imu[5:6])  # late
+    far = run.imu[60:61].copy()
+    far["stamp"] += 3_600_000_000_000  # a damaged stamp, which no other sample confirms
+    pipeline.imu(far)
+    assert pipeline.newest_imu == run.imu["stamp"][59]
+
+
 def test_a_skipped_sweep_is_a_warning_and_a_blocked_sensor_an_error() -> None:
     last = driven("room", "walk")[-1]
     for status, expected in (

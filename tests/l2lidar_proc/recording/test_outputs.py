@@ -25,6 +25,20 @@ def test_trajectory_files_keep_nanoseconds() -> None:
     assert tum(trajectory.poses[-1:]).startswith("1700000000.123457088 ")
 
 
+def test_a_trajectory_of_days_stays_bounded_and_keeps_its_latest_pose() -> None:
+    trajectory = Trajectory(most=16)
+    for index in range(1000):
+        trajectory.append(HostNs(index), np.eye(4) * index)
+        poses = trajectory.poses
+        assert len(poses) <= 16
+        assert poses["stamp"][-1] == index
+        assert (np.diff(poses["stamp"]) > 0).all()
+        np.testing.assert_array_equal(poses["pose"][:, 0, 0], poses["stamp"])
+    assert len(poses) >= 8
+    assert poses["stamp"][0] == 0
+    assert np.diff(poses["stamp"])[:-1].max() <= 128
+
+
 def test_the_start_keeps_roll_and_pitch_only() -> None:
     pose = np.eye(4)
     pose[:3, :3] = rotations.matrices(
