@@ -246,13 +246,13 @@ def predict(
                 f[..., moved, cause] = 0.0
         accel2 = np.full_like(accel2, tuning.BLIND_ACCEL**2)
     q = process_noise(gyro2, accel2, noise, dt)
-    whole, added = f[0], q[0]
+    phi, noise_of_all = f[0], q[0]
     for step, more in zip(f[1:], q[1:], strict=True):
-        whole, added = step @ whole, step @ added @ step.T + more
+        phi, noise_of_all = step @ phi, step @ noise_of_all @ step.T + more
     # the errors of a vibration at the beginning and at the end are independent, and as large
-    added[ROTATION, ROTATION] += 2.0 * noise.gyro_vibration**2 * np.eye(3)
-    added[VELOCITY, VELOCITY] += 2.0 * noise.accel_vibration**2 * np.eye(3)
-    _, covariance = kalman().predict(np.zeros(ERRORS), covariance, whole, added)
+    noise_of_all[ROTATION, ROTATION] += 2.0 * noise.gyro_vibration**2 * np.eye(3)
+    noise_of_all[VELOCITY, VELOCITY] += 2.0 * noise.accel_vibration**2 * np.eye(3)
+    _, covariance = kalman().predict(np.zeros(ERRORS), covariance, phi, noise_of_all)
     return state.at(preintegrated, knot), covariance
 
 
@@ -380,8 +380,8 @@ def update(
     noise : ndarray, shape (M, M)
         Covariance of the measurement.
     """
-    spread = jacobian @ covariance @ jacobian.T + noise
-    nis = float(innovation @ np.linalg.solve(spread, innovation))
+    innovation_covariance = jacobian @ covariance @ jacobian.T + noise
+    nis = float(innovation @ np.linalg.solve(innovation_covariance, innovation))
     error, posterior = kalman().update(np.zeros(ERRORS), covariance, innovation, noise, jacobian)
     symmetric = 0.5 * (posterior + posterior.T)
     return Update(state.boxplus(np.asarray(error)), symmetric, nis)
@@ -520,7 +520,7 @@ def update_static(
     jacobian = np.zeros((9, ERRORS))
     jacobian[:3, GYRO_BIAS] = np.eye(3)
     jacobian[3:6, VELOCITY] = np.eye(3)
-    worth = np.repeat((seconds / noise.gyro**2, 1.0 / tuning.ZERO_VELOCITY**2, 0.0), 3)
+    weights = np.repeat((seconds / noise.gyro**2, 1.0 / tuning.ZERO_VELOCITY**2, 0.0), 3)
     innovation = np.zeros(9)
     innovation[:3] = samples["angular_velocity"].mean(axis=0) - state.gyro_bias
     innovation[3:6] = -state.velocity
@@ -529,10 +529,10 @@ def update_static(
         jacobian[6:, GRAVITY] = -state.rotation.T
         if levels:
             jacobian[6:, ROTATION] = skew(state.rest_force)
-        worth[6:] = seconds / noise.accel**2
+        weights[6:] = seconds / noise.accel**2
         force = samples["linear_acceleration"].mean(axis=0)
         innovation[6:] = force - state.accel_bias - state.rest_force
-    weighted = jacobian.T * worth
+    weighted = jacobian.T * weights
     better, covariance = update_with_information(
         state, square_root(covariance), state, weighted @ jacobian, weighted @ innovation
     )

@@ -24,11 +24,11 @@ _G_NORMS: Final = (0.7, 1.4)  # median |a| of an accelerometer that measures in 
 _DECIDED: Final = 100  # samples after which the unit stays as it is
 _KEPT_NS: Final = 2_000_000_000
 _MOST_KEPT: Final = 10_000  # samples
-# The sign is decided by comparing accelerations with how poses bend: 20 bends are 4 to 5 s, and
-# walking gives bends of 0.1 to 0.3 m/s; noise of 2 mm in poses 0.2 s apart makes 0.025 m/s.
-_LEAST_BENDS: Final = 20
-_MOST_BENDS: Final = 200
-_LEAST_BEND: Final = 0.05  # [m/s] root mean square
+# The sign is decided by comparing the changes of the velocity: 20 of them are 4 to 5 s, and
+# walking gives 0.1 to 0.3 m/s; noise of 2 mm in poses 0.2 s apart makes 0.025 m/s.
+_LEAST_CHANGES: Final = 20
+_MOST_CHANGES: Final = 200
+_LEAST_CHANGE: Final = 0.05  # [m/s] root mean square
 _OPPOSITE: Final = -0.7  # correlation of what was measured with what the poses say
 _LONGEST_S: Final = 0.5  # between poses that are compared
 _SHORTEST_NS: Final = 190_000_000
@@ -71,7 +71,7 @@ class ImuConvention:
         """Forget poses and samples, as after a restart; keep what was detected."""
         self._recent: Samples = np.empty(0, IMU_SAMPLE)
         self._poses: list[tuple[HostNs, F64]] = []
-        self._bends: list[tuple[F64, F64]] = []
+        self._changes: list[tuple[F64, F64]] = []
 
     def applied(self, samples: Samples) -> Samples:
         """Return samples (N,) in m/s^2, as specific force, by the detections so far."""
@@ -117,11 +117,11 @@ class ImuConvention:
         pose = np.column_stack([R_odom_imu, position])
         self._poses = [*self._poses[-2:], (stamp, pose)]
         if not self.reversed and len(self._poses) == 3:
-            bend = self._bend()
-            if bend is not None:
-                self._bends = [*self._bends[1 - _MOST_BENDS :], bend]
+            change = self._velocity_change()
+            if change is not None:
+                self._changes = [*self._changes[1 - _MOST_CHANGES :], change]
         self._drop(self._poses[0][0] - _KEPT_NS)
-        if self.reversed or len(self._bends) < _LEAST_BENDS:
+        if self.reversed or len(self._changes) < _LEAST_CHANGES:
             return False
         self.reversed = self._opposite()
         return self.reversed
@@ -130,7 +130,7 @@ class ImuConvention:
         """Forget samples that no pose will ask for again."""
         self._recent = self._recent[np.searchsorted(self._recent["stamp"], before) :]
 
-    def _bend(self) -> tuple[F64, F64] | None:
+    def _velocity_change(self) -> tuple[F64, F64] | None:
         """Return the change of velocity between three poses, by the poses and by the samples.
 
         The difference of the mean velocities before and after the middle pose is the integral of
@@ -145,7 +145,7 @@ class ImuConvention:
         if np.count_nonzero(within) < 8:
             return None
         p = np.array([pose[:, 3] for _, pose in self._poses])
-        seen = (p[2] - p[1]) / (t[2] - t[1]) - (p[1] - p[0]) / (t[1] - t[0])
+        by_poses = (p[2] - p[1]) / (t[2] - t[1]) - (p[1] - p[0]) / (t[1] - t[0])
         when = (stamps[within] - instants[1]) * 1e-9
         weight = np.interp(when, t, [0.0, 1.0, 0.0])
         force = self._recent["linear_acceleration"][within]
@@ -153,18 +153,18 @@ class ImuConvention:
         near = np.clip(np.searchsorted((t[:-1] + t[1:]) / 2.0, when), 0, 2)
         turned = np.einsum("nij,nj->ni", turns[near], force)
         # a mean by weights times half the span: samples may be missing
-        felt = weight @ turned / weight.sum() * (t[2] - t[0]) / 2.0
-        return seen, felt
+        by_samples = weight @ turned / weight.sum() * (t[2] - t[0]) / 2.0
+        return by_poses, by_samples
 
     def _opposite(self) -> bool:
-        """Return whether samples and poses clearly bend in opposite directions."""
-        seen = np.array([bend[0] for bend in self._bends])
-        felt = np.array([bend[1] for bend in self._bends])
-        seen = seen - seen.mean(axis=0)
-        felt = felt - felt.mean(axis=0)  # gravity is the same in all of them
-        energy = np.sqrt((seen**2).sum() * (felt**2).sum())
-        strong = np.sqrt((seen**2).sum(axis=1).mean()) > _LEAST_BEND
-        return bool(strong and (seen * felt).sum() < _OPPOSITE * energy)
+        """Return whether samples and poses clearly show opposite changes of the velocity."""
+        by_poses = np.array([change[0] for change in self._changes])
+        by_samples = np.array([change[1] for change in self._changes])
+        by_poses = by_poses - by_poses.mean(axis=0)
+        by_samples = by_samples - by_samples.mean(axis=0)  # gravity is the same in all of them
+        energy = np.sqrt((by_poses**2).sum() * (by_samples**2).sum())
+        strong = np.sqrt((by_poses**2).sum(axis=1).mean()) > _LEAST_CHANGE
+        return bool(strong and (by_poses * by_samples).sum() < _OPPOSITE * energy)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

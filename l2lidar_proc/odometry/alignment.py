@@ -207,7 +207,7 @@ class _Views(NamedTuple):
             return source
         more = source.denser()
         found = self.of([(at, more)])[0]
-        facing = weak.faces(0, at, found, weak.levers(at, found)[:, 0])
+        facing = weak.faces(0, at, found, weak.derivatives(at, found)[:, 0])
         return source.extended(more.some(np.unique(found.index[facing])))
 
 

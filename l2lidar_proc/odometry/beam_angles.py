@@ -23,10 +23,10 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.head_line import HeadAngle
 from l2lidar_proc.odometry.fan_halves import (
     Halves,
+    angle_derivatives,
     angles_at_rest,
     between_halves,
     halves,
-    levers,
 )
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
@@ -99,7 +99,7 @@ class BeamAngles:
         if found is None:
             return sweep
         points = sweep.points.copy()
-        for name, line in zip("xy", levers(points, found.sign), strict=True):
+        for name, line in zip("xy", angle_derivatives(points, found.sign), strict=True):
             points[name] += self.correction @ line
         return dataclasses.replace(sweep, points=points)
 
@@ -124,17 +124,17 @@ class BeamAngles:
         gaps = between_halves(sweep.points, moved, sign)
         if gaps is None:
             return
-        measured = gaps.levers @ used - gaps.gap
-        residual = (measured - gaps.levers @ self._estimate) / tuning.BEAM_GAP_SCALE
+        measured = gaps.derivatives @ used - gaps.gap
+        residual = (measured - gaps.derivatives @ self._estimate) / tuning.BEAM_GAP_SCALE
         weights = 1.0 / (tuning.BEAM_GAP_SIGMA * (1.0 + residual**2)) ** 2
-        weighted = gaps.levers * weights[:, None]
-        information, gradient = weighted.T @ gaps.levers, weighted.T @ measured
+        weighted = gaps.derivatives * weights[:, None]
+        information, gradient = weighted.T @ gaps.derivatives, weighted.T @ measured
         if not at_rest:
             prior = np.repeat((1.0 / tuning.BEAM_SPEED, 1.0 / tuning.BEAM_RATE), 3) ** 2
             own = gaps.motion * weights[:, None]
             shared = np.linalg.solve(
                 own.T @ gaps.motion + np.diag(prior),
-                np.column_stack([own.T @ gaps.levers, own.T @ measured]),
+                np.column_stack([own.T @ gaps.derivatives, own.T @ measured]),
             )
             information -= weighted.T @ gaps.motion @ shared[:, :2]
             gradient -= weighted.T @ gaps.motion @ shared[:, 2]

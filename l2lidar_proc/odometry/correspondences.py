@@ -184,7 +184,7 @@ class Correspondences:
             age = min(age, self.latest // 2)
         return np.asarray(self.latest - self.opened >= age)
 
-    def support_along(self, levers: F64) -> Support:
+    def support_along(self, derivatives: F64) -> Support:
         """Return the sweeps that opened the surfaces which hold a direction.
 
         A niche in a wall that was seen from afar long before is as well known along the wall as
@@ -192,14 +192,14 @@ class Correspondences:
 
         Parameters
         ----------
-        levers : ndarray, shape (M,)
+        derivatives : ndarray, shape (M,)
             Derivatives of the residuals along the direction.
         """
-        return support_of(self.opened, self.weights * levers**2)
+        return support_of(self.opened, self.weights * derivatives**2)
 
-    def places_along(self, levers: F64) -> Support:
+    def places_along(self, derivatives: F64) -> Support:
         """Return the sweeps that were the first where the surfaces are which hold a direction."""
-        return support_of(self.born, self.weights * levers**2)
+        return support_of(self.born, self.weights * derivatives**2)
 
 
 def support_of(sweeps: I64, weights: F64) -> Support:

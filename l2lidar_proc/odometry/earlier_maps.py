@@ -60,7 +60,7 @@ class EarlierMap:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Return:
+class Relocalization:
     """The way back into an earlier map, or the older part of the one in use.
 
     Attributes
@@ -109,7 +109,9 @@ class EarlierMaps:
         """Return whether the maps should be searched now: ever more rarely."""
         return bool(self._maps) and int(stamp) >= self._next_search
 
-    def search(self, source: Source, motion: SweepMotion, jump: FrameJump) -> Return | None:
+    def search(
+        self, source: Source, motion: SweepMotion, jump: FrameJump
+    ) -> Relocalization | None:
         """Return the way back into a map that a sweep meets for the second time.
 
         Parameters
@@ -131,7 +133,7 @@ class EarlierMaps:
             if self._meetings.confirm(kept, _moves(motion.state, found.state)):
                 # those after it began where it was lost: what they tell of it is no news any more
                 del self._maps[self._maps.index(kept) :]
-                return Return(kept, found)
+                return Relocalization(kept, found)
             self._next_search = stamp + 1
             return None
         self._meetings.clear()
@@ -269,7 +271,7 @@ class MapRevisit:
 
     def search(
         self, source: Source, part: OlderPart, motion: SweepMotion, jump: FrameJump
-    ) -> Return | None:
+    ) -> Relocalization | None:
         """Return the way back into the older part of the map if two sweeps meet it.
 
         One is enough where it relocalizes the pose by a likely drift, unless it has just returned.
@@ -307,7 +309,7 @@ class MapRevisit:
         covariance = found.covariance.copy()
         covariance[VELOCITY, VELOCITY] += (way / tuning.REVISIT_DRIFT_S) ** 2 * np.eye(3)
         found = dataclasses.replace(found, covariance=covariance)
-        return Return(EarlierMap(part.matcher, jump), found)
+        return Relocalization(EarlierMap(part.matcher, jump), found)
 
 
 def _found_in(

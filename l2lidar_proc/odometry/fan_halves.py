@@ -99,18 +99,18 @@ class Gaps(NamedTuple):
     ----------
     gap : ndarray, shape (C,)
         Of the rising half from the falling one along the normal [m].
-    levers : ndarray, shape (C, 2)
+    derivatives : ndarray, shape (C, 2)
         Derivatives of the gap by xi and beta [m/rad].
     motion : ndarray, shape (C, 6)
         Derivatives by errors of velocity [s] and rate [m s/rad] of what deskewed the points.
     """
 
     gap: F64
-    levers: F64
+    derivatives: F64
     motion: F64
 
 
-def levers(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
+def angle_derivatives(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
     """Return how points move along x and y with errors of xi and beta.
 
     Parameters
@@ -153,10 +153,10 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
         return None
     kept = np.cumsum(both) - 1
     at, cell, rising = at[:, inside], kept[cell[inside]], rising[inside]
-    x_levers, y_levers = levers(points[inside], sign[inside])
+    x_derivatives, y_derivatives = angle_derivatives(points[inside], sign[inside])
     time = points["time"][inside].astype(np.float64)
     time -= 0.5 * (time.min() + time.max())
-    values = np.concatenate((at, x_levers, y_levers, time[None], time * at))
+    values = np.concatenate((at, x_derivatives, y_derivatives, time[None], time * at))
     apart, spread, axes = _compared(values, cell, rising)
     normal = axes[:, 0].T
     gap = (normal * apart[:3]).sum(axis=0)
@@ -204,7 +204,7 @@ def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64
     None instead where no cell can be compared.
     """
     at = np.stack([points[name].astype(np.float64) for name in "xyz"])
-    along = np.concatenate(levers(points, sign))
+    along = np.concatenate(angle_derivatives(points, sign))
     line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)
     line -= line.min(initial=0)
     angles, information = np.zeros(2), prior
@@ -244,7 +244,7 @@ def _seen_by_both(
     at : ndarray, shape (3, N)
         Points [m].
     along : ndarray, shape (4, N)
-        Their :func:`levers`, along x and along y.
+        Their :func:`angle_derivatives`, along x and along y.
     sign, line : ndarray, shape (N,)
         Their halves, and the numbers of the directions of the head in which they were seen.
     shift : float
@@ -254,7 +254,7 @@ def _seen_by_both(
     -------
     gap : ndarray, shape (C, 3)
         Of the rising half from the falling one [m].
-    levers : ndarray, shape (C, 3, 2)
+    derivatives : ndarray, shape (C, 3, 2)
         Derivatives of the gap by xi and beta [m/rad].
     weight : ndarray, shape (C, 3)
         Of the gaps [1/m^2], 0 along what continues in the next cell.

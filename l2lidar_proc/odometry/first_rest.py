@@ -16,7 +16,7 @@ from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer
+from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
 
 
@@ -112,7 +112,7 @@ class FirstRest:
 
     def begun_in_motion(
         self, sweeps: list[Sweep], state: InertialState, covariance: F64
-    ) -> Begun | None:
+    ) -> InitializedMap | None:
         """Return the map begun again as in motion, if a rest was none that the IMU ended soon.
 
         Parameters
@@ -129,9 +129,9 @@ class FirstRest:
         if not motions:
             return None
         self._forget_beams()
-        return Begun(motions, sweeps, 0, sweeps[0].start)
+        return InitializedMap(motions, sweeps, 0, sweeps[0].start)
 
-    def retried(self, sweeps: list[Sweep]) -> Begun | None:
+    def retried(self, sweeps: list[Sweep]) -> InitializedMap | None:
         """Return the map begun again, as in motion, with sweeps that have shown motion.
 
         None if that does not fit, or leads too far away for what passed for a rest.
@@ -147,7 +147,7 @@ class FirstRest:
             if motions:
                 way = float(np.linalg.norm(motions[-1].state.position))
                 if way < tuning.RETRY_FARTHEST_M:
-                    return Begun(motions, sweeps, 0, sweeps[0].start)
+                    return InitializedMap(motions, sweeps, 0, sweeps[0].start)
         return None
 
     def _forget_beams(self) -> None:

@@ -114,7 +114,7 @@ class MovingStart(NamedTuple):
     open_axes: F64
 
 
-class Begun(NamedTuple):
+class InitializedMap(NamedTuple):
     """A map that has begun.
 
     Attributes
@@ -174,7 +174,7 @@ class MapInitializer:
         self._lead_s = 0.0  # from the first pose of all to that of the first sweep in the map
         self._lead_velocity: F64 = np.zeros(3)  # with which that pose was estimated [m/s]
 
-    def add(self, sweep: Sweep) -> Begun | None:
+    def add(self, sweep: Sweep) -> InitializedMap | None:
         """Hold a sweep; return the map if it can begin now."""
         held = self.held
         if held and not 0 < sweep.start - held[-1].start < tuning.LONG_GAP_NS:
@@ -202,7 +202,7 @@ class MapInitializer:
             del held[0]
             return None
         self._lead_velocity = motions[0].state.velocity
-        return Begun([motions[0]] * seed + motions, whole, seed, held[0].start)
+        return InitializedMap([motions[0]] * seed + motions, whole, seed, held[0].start)
 
     def begin(
         self, sweeps: list[Sweep], since: HostNs, may_rest: bool = True

@@ -21,7 +21,7 @@ from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Return
+from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Relocalization
 from l2lidar_proc.odometry.estimate import (
     AlignmentQuality,
     OdometryEstimate,
@@ -31,7 +31,7 @@ from l2lidar_proc.odometry.estimate import (
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
 from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, with_loose_motion
-from l2lidar_proc.odometry.map_initialization import Begun, MapInitializer, cropped
+from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor, blur_of
 from l2lidar_proc.odometry.start_velocity import StartVelocity
@@ -93,7 +93,8 @@ class Odometry:
         """Forget map and motion; the next sweep begins a new map."""
         self.phase = Phase.INITIALIZING
         self.motion: SweepMotion | None = None
-        self._belief: tuple[InertialState, F64] | None = None  # state and covariance to go on from
+        # state and covariance to go on from
+        self._posterior: tuple[InertialState, F64] | None = None
         # posteriors of the present rest, oldest first
         self._at_rest: deque[tuple[InertialState, F64]] = deque()
         self._predictor.reset()
@@ -173,9 +174,9 @@ class Odometry:
         stamp : HostNs
             Not before the latest reference; best not after the newest IMU sample.
         """
-        if self._belief is None or self._last is None:
+        if self._posterior is None or self._last is None:
             return None
-        state, covariance = self._belief
+        state, covariance = self._posterior
         if not 0 < stamp - state.stamp <= tuning.TIME_JUMP_NS:
             return None
         motion = self._predictor.over(state, covariance, (state.stamp, stamp), stamp)
@@ -226,7 +227,7 @@ class Odometry:
         held.clear()
         return estimates
 
-    def _enter_map(self, begun: Begun) -> None:
+    def _enter_map(self, begun: InitializedMap) -> None:
         """Go on from a map that has just begun."""
         self._at_rest.clear()
         self._keep(begun.motions[-1])
@@ -246,8 +247,8 @@ class Odometry:
 
     def _track(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate:
         """Predict, deskew, align, deskew again, extend the map."""
-        assert self._belief is not None
-        state, covariance = self._belief
+        assert self._posterior is not None
+        state, covariance = self._posterior
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         source = self.matcher.source(sweep, predicted)
         found, matched = self.matcher.match(source, predicted)
@@ -277,9 +278,10 @@ class Odometry:
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
         guess = predicted.state
-        back = self._way_back(sweep, motion)
-        if back is not None:
-            found, motion, guess = back.alignment, self._return(back, motion), motion.state
+        relocalization = self._relocalization(sweep, motion)
+        if relocalization is not None:
+            found, guess = relocalization.alignment, motion.state
+            motion = self._relocalize(relocalization, motion)
             status.append(Status.RETURNED)
         elif self._revisit.is_contradicted and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
@@ -403,8 +405,8 @@ class Odometry:
         self, predicted: SweepMotion, after: InertialState, covariance: F64, status: list[Status]
     ) -> SweepMotion:
         """Return the motion with the state after a sweep, held to what physics allows."""
-        assert self._belief is not None
-        before = self._belief[0]
+        assert self._posterior is not None
+        before = self._posterior[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
         self._note_speed(after, covariance, lasted)
         posterior = self._with_priors(before.position, after, covariance, lasted)
@@ -444,8 +446,8 @@ class Odometry:
 
     def _skip(self, sweep: Sweep) -> OdometryEstimate | None:
         """Carry the pose through a sweep by the IMU alone, if it can; the map stays as it is."""
-        assert self._belief is not None
-        state, covariance = self._belief
+        assert self._posterior is not None
+        state, covariance = self._posterior
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         if gaps_in(predicted):
             return None
@@ -498,11 +500,11 @@ class Odometry:
         new part of the map is uncertain by. Else the next alignment, which compares with what was
         put there at the same wrong place, would confirm velocity and biases that led to it.
         """
-        assert self._belief is not None
-        state, covariance = self._belief
+        assert self._posterior is not None
+        state, covariance = self._posterior
         scale = np.ones(eskf.ERRORS)
         scale[eskf.POSITION] = np.sqrt(1.0 - min(fresh, tuning.DRIFT_MOST_FRESH))
-        self._belief = state, covariance * np.outer(scale, scale)
+        self._posterior = state, covariance * np.outer(scale, scale)
 
     def _note_unmatched(self, sweep: Sweep, points: int, status: list[Status]) -> None:
         """Count a sweep that was not aligned: a few seconds of them, and the odometry is lost."""
@@ -552,31 +554,31 @@ class Odometry:
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
 
-    # ---- returning
+    # ---- relocalization
 
-    def _way_back(self, sweep: Sweep, motion: SweepMotion) -> Return | None:
+    def _relocalization(self, sweep: Sweep, motion: SweepMotion) -> Relocalization | None:
         """Search the earlier maps and the older part of this one, where it is time to."""
         source = functools.cache(lambda: self.matcher.source(sweep, motion))
         if self._earlier.is_due(motion.state.stamp):
-            back = self._earlier.search(source(), motion, self._jump)
-            if back is not None:
-                return back
+            found = self._earlier.search(source(), motion, self._jump)
+            if found is not None:
+                return found
         part = self._revisit.part_due(self.matcher, motion.state, source)
         return None if part is None else self._revisit.search(source(), part, motion, self._jump)
 
-    def _return(self, back: Return, motion: SweepMotion) -> SweepMotion:
+    def _relocalize(self, found: Relocalization, motion: SweepMotion) -> SweepMotion:
         """Go on in an earlier map; return the motion of the sweep that met it."""
-        self._use(back.map.matcher)
-        self._jump = back.map.jump
+        self._use(found.map.matcher)
+        self._jump = found.map.jump
         self.matcher.config = self.config
-        self.matcher.meet(back.alignment, 0.0)
+        self.matcher.meet(found.alignment, 0.0)
         self._zero_velocity.clear()
         self._walls.clear()
         self._start.clear()
         self._innovations.clear()
         self._forget_unmatched()
         self._leave_rest()
-        return motion.with_state(back.alignment.state, back.alignment.covariance)
+        return motion.with_state(found.alignment.state, found.alignment.covariance)
 
     # ---- stationary
 
@@ -585,14 +587,14 @@ class Odometry:
         first = self._first_rest
         sweeps = first.sweeps
         if not self._stays_at_rest(sweep):
-            assert self._belief is not None
-            begun = first.begun_in_motion(sweeps, *self._belief)
+            assert self._posterior is not None
+            begun = first.begun_in_motion(sweeps, *self._posterior)
             if begun is not None:
                 self._enter_map(begun)
                 status.append(Status.STARTING)
             return None
-        assert self._belief is not None
-        state, covariance = self._belief
+        assert self._posterior is not None
+        state, covariance = self._posterior
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         trial = predicted.at_rest(state, free_pose())
         source = self.matcher.source(sweep, trial)
@@ -617,9 +619,9 @@ class Odometry:
             if not (stays if remapped is None else remapped):
                 return self._retry_in_motion(sweep, status)
         first.end_doubt()
-        back = self._way_back(sweep, still)
-        if back is not None:
-            still = self._return(back, still)
+        relocalization = self._relocalization(sweep, still)
+        if relocalization is not None:
+            still = self._relocalize(relocalization, still)
             status.append(Status.RETURNED)
             self._keep(still)
         else:
@@ -640,7 +642,7 @@ class Odometry:
         if not self._zero_velocity.holds(samples):
             if self._at_rest:
                 # the onset of the motion is in samples that passed for rest
-                self._belief = self._at_rest[0]
+                self._posterior = self._at_rest[0]
             self._leave_rest()
             return False
         self._first_rest.note(self._reported)
@@ -653,9 +655,9 @@ class Odometry:
 
     def _retry_in_motion(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Begin the map again, as in motion, if the sensor was taken for still since its start."""
-        assert self._belief is not None
-        state, covariance = self._belief
-        self._belief = state, self._zero_velocity.widened(covariance)
+        assert self._posterior is not None
+        state, covariance = self._posterior
+        self._posterior = state, self._zero_velocity.widened(covariance)
         sweeps = self._first_rest.end()
         if sweeps and self._zero_velocity.drifted:
             begun = self._first_rest.retried(sweeps)
@@ -675,10 +677,10 @@ class Odometry:
     def _keep(self, motion: SweepMotion) -> None:
         """Remember a motion for the next prediction."""
         belief = motion.state, motion.covariance
-        if motion.imu.missing.all() and self._belief is not None:
-            belief = eskf.with_gyro_bias_of(*belief, *self._belief)
+        if motion.imu.missing.all() and self._posterior is not None:
+            belief = eskf.with_gyro_bias_of(*belief, *self._posterior)
         self._predictor.steady_rate = motion.rate
-        self._belief = belief
+        self._posterior = belief
         self.motion = motion
 
     def _keep_at_rest(self, motion: SweepMotion) -> None:
@@ -691,9 +693,9 @@ class Odometry:
 
     def _begin_time_line(self, reference: HostNs) -> None:
         """Keep pose and map after a jump of time; the motion is unknown."""
-        assert self._belief is not None
-        self._jump = self._jump.unseen(self._belief[0])
-        self._belief = eskf.after_time_jump(*self._belief, HostNs(reference - 1))
+        assert self._posterior is not None
+        self._jump = self._jump.unseen(self._posterior[0])
+        self._posterior = eskf.after_time_jump(*self._posterior, HostNs(reference - 1))
         self._zero_velocity.clear()
         self._walls.clear()
         self._start.clear()

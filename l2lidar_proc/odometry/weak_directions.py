@@ -93,19 +93,19 @@ class WeakAxes:
     scatter: F64 | None = None
     free: int = 0
 
-    def levers(self, state: InertialState, found: Correspondences) -> F64:
+    def derivatives(self, state: InertialState, found: Correspondences) -> F64:
         """Return the derivatives (M, K) of the residuals by the directions."""
         return np.asarray((pose_jacobian(found, state.rotation) * self.scale) @ self.axes)
 
     def facing(self, state: InertialState, found: Correspondences) -> NDArray[np.bool_]:
         """Return which surfaces face each of the directions (M, K)."""
-        levers = self.levers(state, found)
+        derivatives = self.derivatives(state, found)
         return np.stack(
-            [self.faces(k, state, found, along) for k, along in enumerate(levers.T)], axis=1
+            [self.faces(k, state, found, along) for k, along in enumerate(derivatives.T)], axis=1
         )
 
     def faces(
-        self, number: int, state: InertialState, found: Correspondences, levers: F64
+        self, number: int, state: InertialState, found: Correspondences, derivatives: F64
     ) -> NDArray[np.bool_]:
         """Return which surfaces (M,) face a direction, so that they tell the place along it.
 
@@ -116,13 +116,13 @@ class WeakAxes:
         state : InertialState
             From which the correspondences were found.
         found : Correspondences
-        levers : ndarray, shape (M,)
+        derivatives : ndarray, shape (M,)
             Derivatives of the residuals along the direction.
         """
         age = tuning.WEAK_AGE if self.scatter is None else tuning.DRIVING_AGE
         is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
         settled = found.settled(age, strict=is_ignored)
-        faces = (np.abs(levers) > tuning.WEAK_FACING) & settled
+        faces = (np.abs(derivatives) > tuning.WEAK_FACING) & settled
         if self.scatter is None:
             return faces
         some = np.flatnonzero(faces)
@@ -134,7 +134,7 @@ class WeakAxes:
         moves = np.cross(axis[:3], found.points[some]) @ state.rotation.T + axis[_PLACE]
         tilts = self.surfaces.tilts(found.cells[some], found.axis[some])
         sigma = np.linalg.norm(np.einsum("nij,nj->ni", tilts, moves), axis=1)
-        faces[some] = np.abs(levers[some]) > tuning.FACING_SIGMAS * sigma
+        faces[some] = np.abs(derivatives[some]) > tuning.FACING_SIGMAS * sigma
         return faces
 
 
@@ -158,8 +158,8 @@ def weak_axes(
     # a turn counts as the way that it moves the points
     arm = float(np.sqrt((found.points**2).sum(axis=1).mean()))
     scale = np.repeat((1.0 / max(arm, tuning.WEAK_LEAST_ARM), 1.0), 3)
-    levers = pose_jacobian(found, state.rotation) * scale
-    strength, axes = np.linalg.eigh((levers * found.weights[:, None]).T @ levers)
+    derivatives = pose_jacobian(found, state.rotation) * scale
+    strength, axes = np.linalg.eigh((derivatives * found.weights[:, None]).T @ derivatives)
     weak = strength < tuning.WEAK_SHARE * strength[-1]
     if not weak.any():
         return None
@@ -169,7 +169,7 @@ def weak_axes(
         return WeakAxes(scale, axes, surfaces, free=free)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
-    axes = _along_walls(axes, levers, weights)
+    axes = _along_walls(axes, derivatives, weights)
     axes, scatter = _steadied(axes, found.normals, weights, scatter)
     return WeakAxes(scale, axes, surfaces, scatter)
 
@@ -213,22 +213,22 @@ def _is_way(axis: F64, gravity: F64) -> bool:
     return level and float(np.linalg.norm(way)) > tuning.DRIVING_WAY
 
 
-def _along_walls(axes: F64, levers: F64, weights: F64) -> F64:
+def _along_walls(axes: F64, derivatives: F64, weights: F64) -> F64:
     """Return the weak directions (6, K) without the surfaces that face the weakest.
 
     Parameters
     ----------
     axes : ndarray, shape (6, K)
-    levers : ndarray, shape (M, 6)
+    derivatives : ndarray, shape (M, 6)
         Derivatives of the residuals by turn and place, scaled.
     weights : ndarray, shape (M,)
         The better a normal is known, the more.
     """
     for _ in range(tuning.WALL_ROUNDS):
-        walls = np.abs(levers @ axes[:, 0]) < tuning.WEAK_FACING
+        walls = np.abs(derivatives @ axes[:, 0]) < tuning.WEAK_FACING
         if np.count_nonzero(walls) < tuning.WALL_LEAST * len(walls):
             break
-        some = levers[walls]
+        some = derivatives[walls]
         directions = np.linalg.eigh((some * weights[walls, None]).T @ some)[1]
         axes = directions[:, : axes.shape[1]]
     return axes
@@ -352,9 +352,9 @@ class _Trial:
     ) -> None:
         self._weak, self._number = weak, number
         self._axis = weak.scale * weak.axes[:, number]  # [rad, m]
-        levers = pose_jacobian(found, state.rotation) @ self._axis
-        facing = np.flatnonzero(weak.faces(number, state, found, levers))
-        self._facing = levers[facing], found.distances[facing], found.scales[facing]
+        derivatives = pose_jacobian(found, state.rotation) @ self._axis
+        facing = np.flatnonzero(weak.faces(number, state, found, derivatives))
+        self._facing = derivatives[facing], found.distances[facing], found.scales[facing]
         self._variances = found.variances[facing]
         self._some = np.unique(found.index[facing])
         move = np.zeros(ERRORS)
@@ -380,16 +380,16 @@ class _Trial:
         covariance : ndarray, shape (6, 6)
             Of the predicted ones.
         """
-        levers, distances, scales = self._facing
+        derivatives, distances, scales = self._facing
         weights = robust_weights(distances, scales) / self._variances
-        claimed = float((weights * levers**2).sum())
+        claimed = float((weights * derivatives**2).sum())
         information = share**2 * claimed
         unit = self._weak.axes[:, self._number] / self._weak.scale
-        pulled = -float((weights * levers * distances).sum()) / (share * claimed)
+        pulled = -float((weights * derivatives * distances).sum()) / (share * claimed)
         innovation = float(unit @ moved) + pulled
         before = float(unit @ covariance @ unit)
         expected = before + 1.0 / information
-        many = len(levers) >= tuning.FACING_MANY
+        many = len(derivatives) >= tuning.FACING_MANY
         right = association_probability(innovation, expected, tuning.FACING_TRUE[many])
         gain = before / expected
         spread = right * (1.0 - right) * (gain * innovation) ** 2
@@ -403,12 +403,12 @@ class _Trial:
 
     def real_share(self, there: list[Correspondences]) -> float:
         """Return how much of the information about the direction the moved points confirm."""
-        levers, distances, scales = self._facing
+        derivatives, distances, scales = self._facing
         claimed = pulled = noise = 0.0
         for step, moved, seen in zip(_STEPS, self._moved, there, strict=bool(there)):
-            expected = distances + step * levers
+            expected = distances + step * derivatives
             claimed += step * float(
-                (robust_weights(expected, scales) / self._variances * levers * expected).sum()
+                (robust_weights(expected, scales) / self._variances * derivatives * expected).sum()
             )
             along = pose_jacobian(seen, moved.rotation) @ self._axis
             pulls = seen.weights * along * seen.distances

@@ -26,7 +26,7 @@ from l2lidar_proc.odometry.earlier_maps import (
     EarlierMaps,
     MapRevisit,
     OlderPart,
-    Return,
+    Relocalization,
     moved,
 )
 from l2lidar_proc.odometry.free_space import SeenThrough
@@ -166,7 +166,7 @@ def later(sweep: SweepMotion, seconds: float) -> SweepMotion:
 
 def searched(
     revisit: MapRevisit, matcher: SweepMatcher, seen: Source, sweep: SweepMotion
-) -> Return | None:
+) -> Relocalization | None:
     """Return what a search that is due finds."""
     part = revisit.part_due(matcher, sweep.state, lambda: seen)
     assert part is not None
