@@ -77,8 +77,8 @@ FAULTS: Final = (
     ),
     Fault(
         "l2lidar_proc/odometry/prediction.py",
-        "max(settings.accel_noise, accel.floor) * scale",
-        "max(settings.accel_noise, accel.floor)",
+        "max(settings.accel_noise * stated, accel.floor) * scale",
+        "max(settings.accel_noise * stated, accel.floor)",
         (f"{_PROC}/odometry/test_prediction.py",),
     ),
     Fault(
