@@ -54,13 +54,13 @@ BLIND_SHORT_S: Final = 0.1
 BLIND_SHORT_SPREAD: Final = (0.2, 0.5)
 BLIND_STEPS: Final = 2  # without a gap, at least
 ZERO_VELOCITY: Final = 0.003  # [m/s] noise of a zero-velocity update. Tuned on: captures
-# A carrier that has been faster than the first drives. A velocity known worse than the second, if
-# it drives worse than its peak speed, is drawn towards zero as if that were measured once a second
-# with the third. Derived: walking and driving speeds are a few meters a second. Tuned on:
-# corridors at 1.25 m/s, and cameras moved by hand at up to 0.6 m/s.
-DRIVING_SPEED: Final = 0.8  # [m/s]
+# Zero-velocity prior: a velocity less certain than PRIOR_FROM_SIGMA, and where the carrier drives
+# less certain than its peak speed, gets a pseudo-measurement of zero once a second. Derived:
+# walking and driving speeds are a few meters a second. Tuned on: corridors at 1.25 m/s, and
+# cameras moved by hand at up to 0.6 m/s.
+DRIVING_SPEED: Final = 0.8  # [m/s] a carrier that has been faster drives
 PRIOR_FROM_SIGMA: Final = 0.2  # [m/s]
-PRIOR_SPEED: Final = 1.0  # [m/s]
+PRIOR_SPEED: Final = 1.0  # [m/s] sigma of the pseudo-measurement
 PRIOR_LEARN_SIGMA: Final = 0.1  # [m/s] of velocities that show the peak speed
 PRIOR_LEARN_SIGMAS: Final = 2.0  # less certain ones count with so many sigmas subtracted
 PRIOR_MEMORY_S: Final = 60.0  # [s] time constant of its decay
@@ -69,10 +69,9 @@ PRIOR_MEMORY_S: Final = 60.0  # [s] time constant of its decay
 HAND_FROM_SIGMA: Final = 0.1  # [m/s] less certain, its velocity is drawn to zero,
 HAND_SPEED: Final = 0.3  # [m/s] with its peak speed as the standard deviation, at least this
 # The same for the vertical velocity where sweeps hardly ever fix the height. Derived: the height
-# of what walks or drives wanders by half a meter in a minute. Tuned on: bare trunks. The first is
-# the least sigma, as the IMU may know better.
-RISE_FROM_SIGMA: Final = 0.02  # [m/s]
-RISE_SPEED: Final = 0.07  # [m/s]
+# of what walks or drives wanders by half a meter in a minute. Tuned on: bare trunks.
+RISE_FROM_SIGMA: Final = 0.02  # [m/s] least sigma, as the IMU may know better
+RISE_SPEED: Final = 0.07  # [m/s] sigma of the pseudo-measurement
 # [m/s] to which it is known at best. Derived: a slope of a tenth at a walk, and slopes last;
 # drones rise and sink by 0.17. Tuned on: bare trunks, seeds 0 to 7; with 0.1, 6 to 27 % of the
 # velocities of a drone were outside the bound that 5 % should exceed
@@ -111,7 +110,7 @@ START_FORCE_CHANGE: Final = 0.25  # [m/s^2]
 GRAVITY_AT_REST: Final = (8.8, 10.8)  # [m/s^2] sound units; the known fault reads 16 to 21
 GRAVITY_IN_MOTION: Final = (7.5, 12.5)  # [m/s^2] mean of |a| over a second of walking
 
-# ---- initialization: first at rest, then in motion
+# ---- initialization. Of pairs, the first value is for a sensor at rest, the second in motion
 
 START_POSE_SIGMA: Final = 1e-4  # [m, rad] the first pose defines the map frame
 START_VELOCITY_SIGMA: Final = (0.02, 1.0)  # [m/s]

@@ -198,7 +198,7 @@ class Correspondences:
         return support_of(self.opened, self.weights * derivatives**2)
 
     def places_along(self, derivatives: F64) -> Support:
-        """Return the sweeps that were the first where the surfaces are which hold a direction."""
+        """Return the sweeps that first mapped the places of the surfaces that fix a direction."""
         return support_of(self.born, self.weights * derivatives**2)
 
 

@@ -113,7 +113,7 @@ class FirstRest:
     def begun_in_motion(
         self, sweeps: list[Sweep], state: InertialState, covariance: F64
     ) -> InitializedMap | None:
-        """Return the map begun again as in motion, if a rest was none that the IMU ended soon.
+        """Return the map begun again as in motion, if the IMU has soon ended what passed for rest.
 
         Parameters
         ----------

@@ -55,7 +55,7 @@ def _correction(
 
 
 def _lowered(ratio: float, most: float) -> float:
-    """Return the factor, at most 1, on variances that are to those assumed as a ratio shows."""
+    """Return the factor, at most 1, on assumed variances; the ratio is that of observed ones."""
     return min(max(tuning.NIS_MARGIN * ratio, 1.0 / most), 1.0)
 
 

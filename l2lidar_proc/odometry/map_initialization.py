@@ -627,9 +627,14 @@ class MapInitializer:
 
 
 def weak_axis(information: F64) -> tuple[float, F64]:
-    """Return the direction of the place (3,) that an alignment fixes least, map axes.
+    """Return how well an alignment fixes the weakest direction of the place, and the direction.
 
-    Before it comes its share of the strongest one's information.
+    Returns
+    -------
+    float
+        Its information, relative to that of the strongest.
+    ndarray, shape (3,)
+        Unit, map axes.
     """
     strength, axes = np.linalg.eigh(information[POSITION, POSITION])
     return float(strength[0] / max(strength[-1], 1e-9)), axes[:, 0]

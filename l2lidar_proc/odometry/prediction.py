@@ -212,7 +212,7 @@ class Predictor:
 
 
 def blur_of(predicted: SweepMotion, before: F64) -> F64 | None:
-    """Return by what the IMU does not tell how the sensor moved within a sweep, if by much.
+    """Return the covariance that the IMU leaves open within a sweep, if it is large.
 
     After a hit, or in a gap of its samples, attitude and velocity become uncertain all at once,
     and the parts of the sweep before and after do not fit together. The sweep then tells the

@@ -180,7 +180,7 @@ class StartVelocity:
             self.note(sweep, motion)
 
     def note(self, sweep: Sweep, motion: SweepMotion) -> None:
-        """Take a sweep with its motion; where none has been searched for long, begin no more."""
+        """Take a sweep with its motion; clear all if no search ran for twice START_NS."""
         if sweep.end - self.since > 2 * tuning.START_NS:
             self.clear()
             return

@@ -1,10 +1,9 @@
 """Uncertainty beyond the filter's: of the map, and of its frame.
 
-:class:`MapDrift`: what a sweep adds to the map carries the error of the pose that added it. A
-sweep that is aligned with what the last few sweeps have put into the map learns where it is
-relative to them, not where it is. So every cell remembers the sweep that opened it, every sweep
-how uncertain its pose was, and a pose is as uncertain as the surfaces that hold it, and by its
-alignment with them besides (VoxelMap, Yuan et al. 2022, carries the like in its planes).
+:class:`MapDrift` remembers how uncertain the pose was of each sweep that mapped something. The
+covariance of a pose is that of the surfaces that it is aligned with, plus that of the alignment
+(VoxelMap, Yuan et al. 2022, carries the like in its planes). Alignment with what the last few
+sweeps have mapped only tells the pose relative to these sweeps.
 
 :class:`FrameJump`: a map begun after a loss lies where the prediction had come to.
 """
@@ -374,9 +373,9 @@ class MapDrift:
         return self._surer(place, latest, tuning.APART_LEAST)
 
     def more_certain_than_held(self, place: F64) -> NDArray[np.bool_] | None:
-        """Return which sweeps (S,) came before what holds a place (3,) [m] now became uncertain.
+        """Return the sweeps (S,) up to the last that was far more certain of a place (3,) [m].
 
-        They are all up to the last that was far more certain of it. None where the place is
+        More certain than the surfaces that hold it now. None where the place is
         certain enough, so that no other surfaces need be looked for.
         """
         surer = self._surer(place, self._reported[_ALLOWED], tuning.REVISIT_FROM_SIGMA)

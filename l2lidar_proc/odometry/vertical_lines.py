@@ -1,9 +1,9 @@
-"""Vertical lines in a sweep: what tells a sensor between bare walls how fast it moves along them.
+"""Vertical lines in a sweep: they measure the velocity along bare walls.
 
 Between bare walls only the reveals of doors, niches and pillars fix the place along them: narrow
 faces across the direction of travel, 2 to 12 cm deep. Thinned to a point or two each, they say
 nothing, and the cells of the map are wider than they are. In the whole sweep, however, a scan line
-that meets such a face runs down it, and leaves 10 to 60 points at one place of the plan. That is a
+that meets such a face runs down it, and leaves 12 to 60 points at one place of the plan. That is a
 vertical line, whose place along the direction is known to some millimeters. Several sweeps see a
 door while it is passed, so its lines measure the velocity.
 

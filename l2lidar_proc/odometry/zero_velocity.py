@@ -95,7 +95,7 @@ class ZeroVelocityTest:
         return self.anchor is not None
 
     def watch(self, state: InertialState, covariance: F64, samples: Samples) -> bool:
-        """Look at a state in motion; return whether it turned out to be at rest, anchored now.
+        """Test a state in motion for rest; if it is at rest, set the anchor and return True.
 
         Parameters
         ----------
