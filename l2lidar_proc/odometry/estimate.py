@@ -17,7 +17,6 @@ from l2lidar_proc.motion.filter import (
     GYRO_BIAS,
     POSITION,
     ROTATION,
-    VELOCITY,
     InertialState,
     skew,
     twist_jacobian,
@@ -259,9 +258,9 @@ def estimate_of(
     pose[3:, ROTATION] = state.rotation
     twist = np.zeros((6, 18))
     unobserved = np.reshape(quality.unobserved, (-1, 3)).T
-    scale = observed_scale(p[VELOCITY, VELOCITY], quality.velocity_factor, unobserved)
-    twist[:3] = twist_jacobian(state, lever)
-    twist[:3, VELOCITY] = state.rotation.T @ scale
+    in_map = state.rotation @ twist_jacobian(state, lever)
+    scale = observed_scale(in_map @ p @ in_map.T, quality.velocity_factor, unobserved)
+    twist[:3] = state.rotation.T @ scale @ in_map
     twist[3:, GYRO_BIAS] = -np.eye(3)  # the rate is what was measured less the bias
     twist_covariance = twist @ p @ twist.T
     twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)
