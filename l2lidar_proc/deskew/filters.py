@@ -39,8 +39,8 @@ def slot_time(times: NDArray[np.float32]) -> float:
     if not len(steps):
         return _USUAL_SLOT_S
     # gaps are whole multiples of a slot, so the low quantile is one slot wherever returns are not
-    # rare
-    usual = float(np.quantile(steps, 0.2))
+    # rare; a step that is there, as between two of them there may be none to average
+    usual = float(np.quantile(steps, 0.2, method="lower"))
     return float(steps[np.abs(steps - usual) < 0.4 * usual].mean())
 
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import POINT
-from l2lidar_proc.deskew.filters import SLOTS, organise
+from l2lidar_proc.deskew import filters
+from l2lidar_proc.deskew.config import FilterConfig
+from l2lidar_proc.deskew.filters import SLOTS, organise, slot_time
 
 SLOT, PERIOD = 7.7316e-6, 4.63895e-3
 
@@ -62,3 +64,18 @@ def test_few_points_and_other_fields() -> None:
         assert image.shape == (min(count, 1), SLOTS)
         assert np.isfinite(image["x"]).sum() == count
         assert not image["ring"].any()
+
+
+@pytest.mark.parametrize("slots", [[0, 1, 12], [0, 1, 13], [0, 1, 2, *range(10, 90, 10)]])
+def test_a_nearly_empty_cloud_has_a_slot_time_and_places(slots: list[int]) -> None:
+    """Between a step of one slot and one of many lies no step."""
+    returned = np.zeros((1, SLOTS), dtype=bool)
+    returned[0, slots] = True
+    points, packet, slot = sweep(returned)
+    assert slot_time(points["time"]) == pytest.approx(SLOT, rel=1e-3)
+    image = organise(points, points["time"])
+    assert (image["y"][packet, slot] == slot).all()
+    assert np.isfinite(image["x"]).sum() == len(slots)
+    points["x"], points["y"] = 5.0, 0.0
+    kept = filters.apply(points, ["isolated"], FilterConfig(isolated_neighbours=1))
+    assert {0, 1} <= set(kept.tolist())
