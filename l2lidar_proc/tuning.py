@@ -90,16 +90,19 @@ LONG_GAP_NS: Final = 1_000_000_000  # [ns] of silence after which an old velocit
 # ---- static detection
 
 # Readings of units at rest were published from 0.03 to 0.35 rad/s of noise, lines included.
-STATIC_BLOCK: Final = 25  # samples, 0.1 s: long enough to show a sudden start
+STATIC_BLOCK_S: Final = 0.1  # [s] long enough to show a sudden start
+# Samples of a block, at least: of so many, white noise shows twice its spread once in 1e5 blocks;
+# of 5 (50 Hz), once in 2000
+STATIC_BLOCK_LEAST: Final = 10
 STATIC_SIGMAS: Final = 5.0  # of a mean's noise; a false alarm in 1e6 blocks
-STATIC_SAMPLES: Final = 100  # needed to learn a reference
+STATIC_LEARN_S: Final = 0.4  # [s] needed to learn a reference
 STATIC_RATE_FLOOR: Final = 0.005  # [rad/s] no change, however quiet the unit
 STATIC_FORCE_FLOOR: Final = 0.03  # [m/s^2]
 STATIC_RATE_SPREAD: Final = 0.5  # [rad/s] stronger shaking is not rest
-# [m/s^2] of means over STATIC_SMOOTHED samples (40 ms). Motors shake above 25 Hz, which these
-# hardly show; carriers move below. Units of the hard runs: 0.16 at rest, 0.26 to 2.6 in motion
+# [m/s^2] of means over STATIC_SMOOTHED_S. Motors shake above 25 Hz, which these hardly show;
+# carriers move below. Units of the hard runs: 0.16 at rest, 0.26 to 2.6 in motion
 STATIC_FORCE_SPREAD: Final = 1.2
-STATIC_SMOOTHED: Final = 10
+STATIC_SMOOTHED_S: Final = 0.04  # [s]
 STATIC_VIBRATION: Final = 2.5  # [m/s^2] of single samples; beyond it slow motion does not show
 STATIC_ENTRY_SIGMAS: Final = 3.0  # to enter rest; missing one costs little, a wrong one teaches
 STATIC_BLEND: Final = 0.1  # share of each newer second in the reference

@@ -61,12 +61,19 @@ class StaticReference:
         Parameters
         ----------
         samples : ndarray, shape (N,), dtype IMU_SAMPLE
-            Best a turn of the head or more; fewer than 25 samples never match.
+            Best a turn of the head or more; less than a tenth of a second, or fewer than 10
+            samples, never match.
         """
+        size = max(_count(tuning.STATIC_BLOCK_S, samples), tuning.STATIC_BLOCK_LEAST)
         return _matches(
-            samples["angular_velocity"], self.rate, self.rate_spread, tuning.STATIC_RATE_FLOOR
+            samples["angular_velocity"],
+            size,
+            self.rate,
+            self.rate_spread,
+            tuning.STATIC_RATE_FLOOR,
         ) and _matches(
             samples["linear_acceleration"],
+            size,
             self.force,
             self.force_spread,
             tuning.STATIC_FORCE_FLOOR,
@@ -84,15 +91,12 @@ class StaticTest(NamedTuple):
         Largest difference between the means of two parts [rad/s, m/s^2],
     sigmas : float
         and so many standard deviations of that difference besides.
-    least : int
-        Samples needed.
     """
 
     parts: int
     rate: float
     force: float
     sigmas: float
-    least: int
 
 
 LEARNING: Final = StaticTest(
@@ -100,7 +104,6 @@ LEARNING: Final = StaticTest(
     2.0 * tuning.STATIC_RATE_FLOOR,
     2.0 * tuning.STATIC_FORCE_FLOOR,
     tuning.STATIC_SIGMAS,
-    tuning.STATIC_SAMPLES,
 )
 """Strict: what passes teaches the gyro bias."""
 
@@ -109,7 +112,6 @@ PLAUSIBLE: Final = StaticTest(
     tuning.START_RATE_CHANGE,
     tuning.START_FORCE_CHANGE,
     tuning.STATIC_SIGMAS,
-    tuning.START_SAMPLES,
 )
 """Loose: what passes may be at rest, and the clouds decide."""
 
@@ -120,7 +122,7 @@ def static_reference(
     margin: float,
     *,
     sigmas: float = tuning.STATIC_SIGMAS,
-    least: int = LEARNING.least,
+    least_s: float = tuning.STATIC_LEARN_S,
 ) -> StaticReference | None:
     """Return the readings of a sensor at rest, None if it moved.
 
@@ -134,15 +136,15 @@ def static_reference(
         How wrong that may be [rad/s]: the mean rate may differ so much from it,
     sigmas : float
         and so many standard deviations of the mean.
-    least : int
-        Fewer samples are not enough.
+    least_s : float
+        Samples of a shorter time are not enough [s].
 
     Notes
     -----
     The mean is weighted by a Hann window, whose side lobes all but remove the lines of the head at
     more than two periods per window: 4 Hz and above for a second.
     """
-    if len(samples) < least:
+    if len(samples) < _count(least_s, samples):
         return None
     rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
     found = StaticReference(
@@ -151,7 +153,7 @@ def static_reference(
     shakes = (
         found.rate_spread.max() > tuning.STATIC_RATE_SPREAD
         or found.force_spread.max() > tuning.STATIC_VIBRATION
-        or _without_vibration(forces).std(axis=0).max() > tuning.STATIC_FORCE_SPREAD
+        or _without_vibration(samples).std(axis=0).max() > tuning.STATIC_FORCE_SPREAD
     )
     if shakes or _drifts(samples, found.rate_spread, found.force_spread, LEARNING):
         return None
@@ -166,7 +168,7 @@ def may_be_static(samples: Samples) -> bool:
     ----------
     samples : ndarray, shape (N,), dtype IMU_SAMPLE
     """
-    if len(samples) < PLAUSIBLE.least:
+    if len(samples) < tuning.START_SAMPLES:
         return False
     rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
     return bool(
@@ -269,9 +271,14 @@ def gravity_is_plausible(samples: Samples, *, at_rest: bool) -> bool:
     return low < size < high
 
 
-def _without_vibration(values: F64) -> F64:
-    """Return the means of successive parts of samples (N, 3), in which motors hardly show."""
-    size = tuning.STATIC_SMOOTHED
+def _count(seconds: float, samples: Samples) -> int:
+    """Return how many samples of this IMU (N,) a time [s] has, at least one."""
+    return max(round(seconds / sample_period_s(samples)), 1)
+
+
+def _without_vibration(samples: Samples) -> F64:
+    """Return the mean forces of successive parts of samples, in which motors hardly show."""
+    size, values = _count(tuning.STATIC_SMOOTHED_S, samples), samples["linear_acceleration"]
     return np.asarray(values[: len(values) // size * size].reshape(-1, size, 3).mean(axis=1))
 
 
@@ -296,8 +303,8 @@ def _drifts(
     return False
 
 
-def _matches(values: F64, mean: F64, spread: F64, floor: float) -> bool:
-    size = tuning.STATIC_BLOCK
+def _matches(values: F64, size: int, mean: F64, spread: F64, floor: float) -> bool:
+    """Return whether values (N, 3), and each block of so many, have this mean and spread."""
     blocks = len(values) // size
     if not blocks:
         return False

@@ -25,6 +25,7 @@ from l2lidar_proc.motion.static import (
     StaticReference,
     gravity_is_plausible,
     initial_state,
+    sample_period_s,
     static_reference,
     white_noise,
 )
@@ -159,8 +160,8 @@ class TwistFilter:
             return self._reference.matches(samples)
         if self._steps >= tuning.TRACKER_WINDOW:
             return False
-        least = tuning.STATIC_BLOCK
-        return static_reference(samples, np.zeros(3), self._max_bias, least=least) is not None
+        least_s = tuning.STATIC_BLOCK_S
+        return static_reference(samples, np.zeros(3), self._max_bias, least_s=least_s) is not None
 
     # ---- what arrives
 
@@ -240,7 +241,9 @@ class TwistFilter:
             sigmas = tuning.STATIC_SIGMAS if stays else tuning.STATIC_ENTRY_SIGMAS
             margin = min(self._max_bias, 3.0 * self.gyro_bias_sigma)
             found = static_reference(second, self.gyro_bias, margin, sigmas=sigmas)
-        newest = second[-len(second) * tuning.TRACKER_TURN // tuning.TRACKER_WINDOW :]
+        turn = -(-len(second) * tuning.TRACKER_TURN // tuning.TRACKER_WINDOW)
+        # a slow IMU has fewer in a turn than it takes to match
+        newest = second[-max(turn, tuning.STATIC_BLOCK_LEAST) :]
         if self._reference is not None and not self._reference.matches(newest):
             found = None
         if found is not None and self._reference is not None:
@@ -375,11 +378,15 @@ class TwistFilter:
         return self.uses_accelerometer and known and not self.is_faulty
 
     def _noise(self, samples: Samples) -> eskf.Noise:
-        scale = float(np.sqrt(tuning.IMU_PERIOD_S))
+        # densities: what is known is stated for 250 Hz, what is measured has the IMU's own rate,
+        # which a few samples between two velocities do not show
+        stated = float(np.sqrt(tuning.IMU_PERIOD_S))
+        recent = self._buffer.samples[-round(1.0 / tuning.IMU_PERIOD_S) :]
+        measured = float(np.sqrt(sample_period_s(recent)))
         rates, forces = samples["angular_velocity"], samples["linear_acceleration"]
         return eskf.Noise(
-            max(tuning.TRACKER_GYRO_NOISE, white_noise(rates)) * scale,
-            max(tuning.TRACKER_ACCEL_NOISE, white_noise(forces)) * scale,
+            max(tuning.TRACKER_GYRO_NOISE * stated, white_noise(rates) * measured),
+            max(tuning.TRACKER_ACCEL_NOISE * stated, white_noise(forces) * measured),
             tuning.TRACKER_GYRO_WALK,
             tuning.TRACKER_ACCEL_WALK,
         )

@@ -48,7 +48,7 @@ def test_too_few_samples_say_nothing(level: Any) -> None:
     samples = still(level, 2.0)
     rest = static_reference(samples[:250], UNKNOWN, 0.1)
     assert rest.matches(samples[250:310])
-    for few in (samples[:0], samples[:1], samples[: tuning.STATIC_BLOCK - 1]):
+    for few in (samples[:0], samples[:1], samples[:24]):
         assert not rest.matches(few)
         assert static_reference(few, UNKNOWN, 0.1) is None
     assert may_be_static(samples)

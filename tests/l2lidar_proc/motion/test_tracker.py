@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from l2lidar_node import rotations
 from l2lidar_node.protocol import wire
 from l2lidar_node.settings import SettingError, build
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, carried_over
@@ -221,3 +221,30 @@ def test_velocity_of_a_mounted_sensor() -> None:
     velocity = carried_over((0.5, 0, 0), (0, 0, 2.0), rotations.inverse(mount))
     expected = Rotation.from_euler("z", -90, degrees=True).apply((0.5, 2.0, 0))
     np.testing.assert_allclose(velocity, expected, atol=1e-12)
+
+
+def sampled(hz: float, seconds: float, turn: float = 0.0, first: float = 0.0) -> Any:
+    """Return noisy samples of an IMU of another rate, level, with a bias of 0.02 rad/s."""
+    rng = np.random.default_rng(4)
+    made = np.zeros(round(seconds * hz), IMU_SAMPLE)
+    made["stamp"] = EPOCH + np.round(1e9 * (first + np.arange(len(made)) / hz)).astype(np.int64)
+    made["angular_velocity"] = rng.normal(0.02, 0.003, (len(made), 3))
+    made["angular_velocity"][:, 2] += turn
+    made["linear_acceleration"] = rng.normal((0.0, 0.0, 9.81), 0.02, (len(made), 3))
+    return made
+
+
+@pytest.mark.parametrize("hz", [20.0, 50.0, 90.0, 100.0, 250.0, 400.0, 1000.0])
+def test_rest_is_found_at_any_rate_of_the_imu(hz: float) -> None:
+    tracker = tracked(sampled(hz, 8.0))
+    assert tracker.filter.is_static
+    np.testing.assert_allclose(tracker.bias, 0.02, atol=1e-3)
+    _, quality = tracker.trajectory(at(7.0), at(7.9))
+    assert quality.is_still
+    tracker.imu(sampled(hz, 4.0, turn=0.1, first=8.0))
+    for start in (8.5, 11.7):
+        trajectory, quality = tracker.trajectory(at(start), at(start + 0.2))
+        assert not quality.is_still
+        turned, _ = trajectory.between(at(start), at(start + 0.2))
+        assert np.linalg.norm(rotations.log(turned)) == pytest.approx(0.02, rel=0.1)
+    np.testing.assert_allclose(tracker.bias, 0.02, atol=2e-3)

@@ -10,6 +10,7 @@ import pytest
 from l2lidar_node import rotations
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import ImuBuffer
+from l2lidar_proc.motion.static import white_noise
 from l2lidar_proc.motion.twist_filter import TwistFilter
 from tests.l2lidar_proc.motion.analytic import EPOCH, T_CLOUD_IMU, G, Motion, at, noisy
 
@@ -83,6 +84,29 @@ def test_noise_is_a_density_and_more_than_the_usual_where_more_shows() -> None:
     loud = found._noise(samples)
     assert loud.gyro == pytest.approx(0.3 * np.sqrt(0.004), rel=0.05)
     assert loud.accel == pytest.approx(0.7 * np.sqrt(0.004), rel=0.05)
+
+
+@pytest.mark.parametrize("hz", [100.0, 1000.0])
+def test_measured_noise_has_the_rate_of_the_imu(hz: float) -> None:
+    """A few samples between two velocities have the rate of those around them."""
+    rng = np.random.default_rng(0)
+    samples = Motion().imu(0, 8)
+    samples["stamp"] = EPOCH + np.arange(len(samples)) * round(1e9 / hz)
+    samples["angular_velocity"] += rng.normal(0.0, 0.5, (len(samples), 3))
+    samples["linear_acceleration"] += rng.normal(0.0, 0.9, (len(samples), 3))
+    found = follow(samples)
+    scale = np.sqrt(1.0 / hz)
+    loud = found._noise(samples)
+    assert loud.gyro == pytest.approx(0.5 * scale, rel=0.05)
+    assert loud.accel == pytest.approx(0.9 * scale, rel=0.05)
+    few = samples[:9]
+    shown = white_noise(few["angular_velocity"])
+    assert found._noise(few).gyro == pytest.approx(shown * scale)
+    # what is stated for 250 Hz is a density at any rate
+    samples["angular_velocity"] = samples["linear_acceleration"] = 0.0
+    quiet = found._noise(samples)
+    assert quiet.gyro == pytest.approx(tuning.TRACKER_GYRO_NOISE * np.sqrt(0.004))
+    assert quiet.accel == pytest.approx(tuning.TRACKER_ACCEL_NOISE * np.sqrt(0.004))
 
 
 @pytest.mark.parametrize("with_velocity", [True, False])
