@@ -22,7 +22,7 @@ from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.filters import FilterError, organise
 from l2lidar_proc.motion.imu_buffer import ImuCounts, Reason, Release, Samples, Sequencer
-from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, Quality
 from l2lidar_proc.motion.twist_filter import TwistFilter
@@ -95,8 +95,13 @@ class Pipeline:
         What is known of the IMU beside its place.
     T_cloud_imu : ndarray, shape (4, 4)
         The mount that is used.
+    convention : ImuConvention
+        In which unit and with which sign the accelerometer measures.
     odometry_motion : callable or None
         Returns the motion that an odometry in the same process has estimated for a sweep.
+    odometry_convention : callable or None
+        Returns the convention that an odometry with the same IMU has detected, None if it is not
+        there. Without one the unit is detected here, and the sign stays.
     counts : PipelineCounts
     problems : str
         What the last filter that could not work said.
@@ -113,6 +118,9 @@ class Pipeline:
         self.problems = ""
         self.odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
         self._is_known = False  # the motion of the latest sweep, by the odometry
+        self.convention = ImuConvention()
+        self._factor = self.convention.factor  # of the samples that the tracker has
+        self.odometry_convention: Callable[[], ImuConvention | None] | None = None
         self.configure(config)
 
     def mount(self, T_cloud_imu: F64) -> bool:
@@ -141,10 +149,24 @@ class Pipeline:
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples, shape (N,), in any order and state."""
-        samples = self.extrinsics.corrected(samples)
+        samples = self._converted(self.extrinsics.corrected(samples))
         if self.tracker.imu(samples, is_needed=not self._is_known):
             self._jumped()
             self._sequencer.jump()
+
+    def _converted(self, samples: Samples) -> Samples:
+        """Return samples in m/s^2, as specific force; put those right that came before."""
+        theirs = self.odometry_convention() if self.odometry_convention is not None else None
+        if theirs is not None and theirs.knows_unit:
+            self.convention.adopt(theirs)
+            samples = self.convention.applied(samples)
+        else:
+            samples = self.convention.in_unit(samples)
+        factor = self.convention.factor
+        if factor != self._factor:
+            self.tracker.rescale(factor / self._factor)
+            self._factor = factor
+        return samples
 
     def velocity(
         self, stamp: HostNs, velocity: ArrayLike, source: str, covariance: F64 | None = None

@@ -122,6 +122,10 @@ class ImuBuffer:
         for name in ("angular_velocity", "linear_acceleration"):
             kept[name] = kept[name] @ rotation.T
 
+    def scale_forces(self, factor: float) -> None:
+        """Multiply the forces of all samples."""
+        self.samples["linear_acceleration"] *= factor
+
     def push(self, samples: Samples) -> Samples:
         """Take samples in any order.
 

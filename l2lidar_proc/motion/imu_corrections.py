@@ -55,6 +55,17 @@ class ImuConvention:
         self.forget_motion()
 
     @property
+    def knows_unit(self) -> bool:
+        """Whether samples have come that show the unit."""
+        return len(self._norms) > 0
+
+    @property
+    def factor(self) -> float:
+        """What forces are multiplied by, by the detections so far."""
+        size = STANDARD_GRAVITY if self.in_g else 1.0
+        return -size if self.reversed else size
+
+    @property
     def notes(self) -> list[str]:
         """Descriptions of what was detected."""
         found = []
@@ -78,19 +89,29 @@ class ImuConvention:
         if not self.in_g and not self.reversed:
             return samples
         samples = samples.copy()
-        factor = STANDARD_GRAVITY if self.in_g else 1.0
-        samples["linear_acceleration"] *= -factor if self.reversed else factor
+        samples["linear_acceleration"] *= self.factor
         return samples
 
-    def corrected(self, samples: Samples) -> Samples:
-        """Learn from samples (N,); return them in m/s^2, as specific force."""
+    def adopt(self, other: ImuConvention) -> None:
+        """Take over what was detected with the poses of an odometry."""
+        self.in_g, self.reversed = other.in_g, other.reversed
+
+    def in_unit(self, samples: Samples) -> Samples:
+        """Learn the unit from samples (N,); return them as :meth:`applied` does.
+
+        This is enough where no poses come that could tell the sign.
+        """
         if len(self._norms) < _DECIDED and len(samples):
             norms = np.linalg.norm(samples["linear_acceleration"], axis=1)
             norms = norms[np.isfinite(norms)]
             self._norms = np.concatenate((self._norms, norms))[:_DECIDED]
             if len(self._norms):
                 self.in_g = bool(_G_NORMS[0] < np.median(self._norms) < _G_NORMS[1])
-        samples = self.applied(samples)
+        return self.applied(samples)
+
+    def corrected(self, samples: Samples) -> Samples:
+        """Learn from samples (N,); return them in m/s^2, as specific force."""
+        samples = self.in_unit(samples)
         if len(samples) and len(self._recent):
             step = int(samples["stamp"][0]) - int(self._recent["stamp"][-1])
             if abs(step) > _KEPT_NS:

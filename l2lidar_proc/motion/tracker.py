@@ -135,11 +135,20 @@ class MotionTracker:
             return False
         self.buffer.turn(T_cloud_imu[:3, :3] @ self._T_cloud_imu[:3, :3].T)
         self._T_cloud_imu = np.array(T_cloud_imu)
+        self._learn_anew()
+        return True
+
+    def rescale(self, factor: float) -> None:
+        """Multiply the forces of all samples so far; what was learned from them is void."""
+        self.buffer.scale_forces(factor)
+        self._learn_anew()
+
+    def _learn_anew(self) -> None:
+        """Begin again with the samples that are there."""
         self.filter = TwistFilter(
             self.buffer, self._T_cloud_imu[:3, 3], self._config.max_gyro_bias
         )
         self.configure(self._config)
-        return True
 
     def reset(self) -> None:
         """Forget all motion, as after a jump of the clock."""

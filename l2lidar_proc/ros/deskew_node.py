@@ -38,6 +38,7 @@ from l2lidar_proc.deskew.laser_scan import ScanBuilder, level_rotation
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, of_period, of_sweep
 from l2lidar_proc.motion.filter import LIBRARY
 from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_corrections import ImuConvention
 from l2lidar_proc.motion.tracker import KnownMotion, MotionTracker, carried_over
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, load_libraries, steady_timer
@@ -146,8 +147,9 @@ class DeskewNode(ManagedNode):
     ----------
     companion : OdometryNode, optional
         An odometry in the same process. If it uses the same clouds and IMU, its subscriptions are
-        shared. If the velocities would come from it as well, each sweep is deskewed with the
-        motion that it has estimated for that sweep.
+        shared, and unit and sign of the accelerometer are those that it detects. If the
+        velocities would come from it as well, each sweep is deskewed with the motion that it has
+        estimated for that sweep.
 
     Raises
     ------
@@ -165,6 +167,9 @@ class DeskewNode(ManagedNode):
             self, topics.cloud_topic, topics.imu_topic, topics.input_reliability
         )
         self._odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
+        self._odometry_convention: Callable[[], ImuConvention | None] | None = None
+        if companion is not None and shared is not None:
+            self._odometry_convention = companion.convention_of_imu
         if companion is not None and companion.publishes(self, topics) and shared is not None:
             self._odometry_motion = companion.motion_of
         self.start(self._settings.value.lifecycle.autostart)
@@ -177,6 +182,7 @@ class DeskewNode(ManagedNode):
         if self._pipeline.extrinsics.problem:
             self.get_logger().warning(self._pipeline.extrinsics.problem)
         self._pipeline.odometry_motion = self._odometry_motion
+        self._pipeline.odometry_convention = self._odometry_convention
         self._frames = StaticFrames(self) if topics.use_tf else None
         self._mounted: tuple[str, str, int] | None = None
         self._cloud_frame = ""
@@ -385,6 +391,8 @@ class DeskewNode(ManagedNode):
         )
         self._before = self.pipeline.counts
         judged.values["calibration of the IMU"] = self.pipeline.extrinsics.source
+        if self.pipeline.convention.notes:
+            judged.values["recognized"] = "; ".join(self.pipeline.convention.notes)
         refused = self._frames.refused if self._frames is not None else ""
         judged = self._inputs.judge(judged, refused)
         name = self.get_fully_qualified_name().lstrip("/")

@@ -31,7 +31,7 @@ from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.deskew.config import DeskewTopics
 from l2lidar_proc.motion.imu_buffer import Samples
-from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
@@ -198,6 +198,10 @@ class OdometryNode(ManagedNode):
     def motion_of(self, sweep: Sweep) -> KnownMotion | None:
         """Return the motion that was estimated for a sweep, None if there is none."""
         return self._pipeline.motion_of(sweep) if self._pipeline is not None else None
+
+    def convention_of_imu(self) -> ImuConvention | None:
+        """Return unit and sign of the accelerometer as detected, None while not configured."""
+        return self._pipeline.convention if self._pipeline is not None else None
 
     @property
     def is_waiting(self) -> bool:

@@ -56,13 +56,14 @@ class _Deskewer:
         self._writer = writer
         self._odometry: OdometryPipeline | None = None
         if not topics.velocity and config.topics.velocity_type == "odometry":
-            self._odometry = OdometryPipeline(
+            odometry = self._odometry = OdometryPipeline(
                 OdometryConfig(),
                 config.proc.motion.T_cloud_imu,
                 config.proc.deskew.imu_wait_ms,
                 self.pipeline.extrinsics,
             )
-            self.pipeline.odometry_motion = self._odometry.motion_of
+            self.pipeline.odometry_motion = odometry.motion_of
+            self.pipeline.odometry_convention = lambda: odometry.convention
         self._frames = FrameTree()
         self._cloud_frame = ""
 
@@ -73,9 +74,10 @@ class _Deskewer:
         elif topic == self._topics.imu:
             self._mount(message.header.frame_id)
             sample = bag.sample_of(message)
-            self.pipeline.imu(sample)
+            # The odometry first: it tells in which unit they are.
             if self._odometry is not None:
                 self._odometry.imu(sample)
+            self.pipeline.imu(sample)
         elif topic == self._topics.velocity:
             self._velocity(message)
         elif kind == bag.TRANSFORMS and topic.endswith("tf_static") and self._uses_tf:

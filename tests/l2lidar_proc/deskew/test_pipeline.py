@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from l2lidar_node.settings import build
-from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_node.types import POINT, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.pipeline import Pipeline
+from l2lidar_proc.motion.imu_corrections import ImuConvention
 from l2lidar_proc.motion.sweep_motion import still_trajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion, at, noisy, rms, seen, xyz
@@ -254,3 +255,60 @@ def test_stamps_of_the_imu_that_are_late_are_put_right() -> None:
     last = [xyz(done[-1].points) for _, done in (right, put_right, wrong)]
     np.testing.assert_allclose(last[1], last[0], atol=1e-6)
     assert rms(last[2] - last[0]) > 1e-3
+
+
+def test_an_accelerometer_in_g_is_as_good_as_any() -> None:
+    samples = WALK.imu(0, 4.0)
+    in_g = samples.copy()
+    in_g["linear_acceleration"] /= STANDARD_GRAVITY
+    _, expected = run(WALK, 4.0, samples=samples)
+    pipeline, done = run(WALK, 4.0, samples=in_g)
+    for a, b in zip(expected, done, strict=True):
+        assert a.quality.flags == b.quality.flags
+        assert b.quality.is_gravity_trusted == a.quality.is_gravity_trusted
+        np.testing.assert_allclose(xyz(b.points), xyz(a.points), atol=1e-5)
+    assert done[-1].quality.is_gravity_trusted
+    assert pipeline.convention.in_g
+    assert in_g["linear_acceleration"][0, 2] < 2.0  # what came in was not changed
+
+
+def upright(pipeline: Pipeline, t: float) -> float:
+    """Return how much of the vertical is along the cloud's z axis."""
+    up = pipeline.tracker.up(at(t))
+    return float(up[2]) if up is not None else 0.0
+
+
+@pytest.mark.parametrize("size", [1.0, 1.0 / STANDARD_GRAVITY])
+def test_unit_and_sign_that_an_odometry_finds_hold_for_what_came_before(size: float) -> None:
+    """And after the odometry has gone."""
+    samples = noisy(Motion().imu(0, 6.0))
+    samples["linear_acceleration"] *= -size
+    found: ImuConvention | None = ImuConvention()
+    pipeline = Pipeline(ProcConfig())
+    pipeline.odometry_convention = lambda: found
+    for i in range(0, 1000, 10):
+        found.corrected(samples[i : i + 10])
+        pipeline.imu(samples[i : i + 10])
+    assert upright(pipeline, 3.9) < -0.99
+    pipeline.sweep(sweep_at(STILL, 3.95), 0)
+    found.reversed = True
+    pipeline.imu(samples[1000:1200])
+    (item,) = pipeline.poll(0)
+    assert item.quality.flags == ()
+    assert item.quality.is_still
+    assert item.quality.is_gravity_trusted
+    for t in (2.0, 4.5):
+        assert upright(pipeline, t) > 0.99
+    found = None
+    pipeline.imu(samples[1200:])
+    assert upright(pipeline, 5.9) > 0.99
+
+
+def test_an_odometry_without_samples_does_not_know_the_unit() -> None:
+    samples = noisy(Motion().imu(0, 2.0), force=0.0)
+    samples["linear_acceleration"] /= STANDARD_GRAVITY
+    pipeline = Pipeline(ProcConfig())
+    paused = ImuConvention()
+    pipeline.odometry_convention = lambda: paused
+    pipeline.imu(samples)
+    assert upright(pipeline, 1.9) > 0.99

@@ -90,6 +90,25 @@ def test_samples_in_g_are_multiplied() -> None:
     assert given["linear_acceleration"][0, 2] < 2.0  # what came in was not changed
 
 
+def test_where_no_poses_come_the_unit_is_found_and_no_sample_is_kept() -> None:
+    motion = trajectories.make("walk", scenes.make("room"))
+    true, given = samples_of(motion, 2.0), samples_of(motion, 2.0, 1.0 / 9.80665)
+    convention = ImuConvention()
+    assert not convention.knows_unit
+    assert convention.factor == 1.0
+    found = convention.in_unit(given)
+    assert convention.knows_unit
+    assert convention.factor == 9.80665
+    np.testing.assert_allclose(
+        found["linear_acceleration"], true["linear_acceleration"], rtol=1e-6, atol=1e-6
+    )
+    assert not len(convention._recent)
+    another = ImuConvention()
+    another.adopt(convention)
+    assert another.in_g
+    assert not another.reversed
+
+
 def test_the_known_fault_of_the_l2_is_not_taken_for_a_unit() -> None:
     samples = samples_of(trajectories.make("still", scenes.make("room")), 1.0, 2.0)
     convention = ImuConvention()

@@ -215,6 +215,23 @@ def test_another_mount_turns_the_samples_so_far_and_forgets_what_was_learned() -
     np.testing.assert_allclose(tracker.buffer.samples["angular_velocity"], expected, atol=1e-12)
 
 
+def test_another_scale_of_the_accelerometer_holds_for_the_samples_so_far() -> None:
+    samples = noisy(Motion().imu(0, END))
+    expected = tracked(samples)
+    samples["linear_acceleration"] /= -2.0
+    tracker = tracked(samples)
+    assert tracker.filter.is_faulty
+    learned = tracker.filter
+    tracker.rescale(-2.0)
+    assert tracker.filter is not learned
+    _, quality = tracker.trajectory(at(START), at(END))
+    assert quality.flags == ()
+    assert quality.is_gravity_trusted
+    up = expected.filter.up_at(at(END))
+    np.testing.assert_allclose(tracker.filter.up_at(at(END)), up, atol=1e-3)
+    np.testing.assert_allclose(tracker.bias, expected.bias, atol=2e-3)
+
+
 def test_velocity_of_a_mounted_sensor() -> None:
     """A sensor one meter ahead of a body that turns left moves to the left as well."""
     mount = rotations.transform([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)], (1.0, 0.0, 0.2))

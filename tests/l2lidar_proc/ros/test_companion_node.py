@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
 from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import from_cloud, from_time
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import Sweep
+from l2lidar_node.types import STANDARD_GRAVITY, Sweep
 from l2lidar_proc.ros.companion_node import make_nodes
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.l2lidar_proc.ros.bench import Bench
@@ -133,11 +135,30 @@ def test_one_goes_on_while_a_manager_takes_the_other_out_and_back(bench: Compani
     assert not bench.imu_out.get_subscription_count()
 
 
+def test_the_deskew_knows_unit_and_sign_that_the_odometry_finds(bench: CompanionBench) -> None:
+    """An accelerometer in g and with the opposite sign: the level frame is not upside down."""
+    odometry, deskew = bench.nodes
+    imu = recording("yard", "walk", 7.0).imu.copy()
+    imu["linear_acceleration"] /= -STANDARD_GRAVITY
+    sent = play(bench, replace(recording("yard", "walk", 7.0), imu=imu), 7.0)
+    assert odometry._pipeline.convention.in_g
+    assert odometry._pipeline.convention.reversed
+    assert deskew._pipeline.tracker.up(sent[-1].start)[2] > 0.98
+    assert not deskew._pipeline.tracker.filter.is_faulty
+    bench.until(lambda: any(told(status) for status in bench.diagnostics))
+
+
+def told(status: DiagnosticStatus) -> bool:
+    values = {item.key: item.value for item in status.values}
+    return status.name == "deskew_node: deskew" and "opposite sign" in values.get("recognized", "")
+
+
 @pytest.mark.parametrize("bench", [("deskew_node:imu_topic:=/other/imu",)], indirect=True)
 def test_other_topics_have_subscriptions_of_their_own(bench: CompanionBench) -> None:
     odometry, deskew = bench.nodes
     assert deskew._sensors is not odometry.sensors
     assert deskew._pipeline.odometry_motion is None
+    assert deskew._pipeline.odometry_convention is None
     assert odometry.get_parameter("imu_topic").value == "/imu/data"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.settings import build
-from l2lidar_node.types import POINT, HostNs
+from l2lidar_node.types import POINT, STANDARD_GRAVITY, HostNs
 from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
-from l2lidar_proc.verbs.deskew import deskew_recording
+from l2lidar_proc.verbs.deskew import Topics, _Deskewer, deskew_recording
 from tests.l2lidar_proc.motion.analytic import Motion, at, rms, seen, xyz
 from tests.support.deskew_scenarios import Scenario, record
 
@@ -124,6 +125,48 @@ def test_clouds_are_deskewed_and_the_rest_is_kept(
         assert "time" not in (points.dtype.names or ())
         raw, truth = points_at(start)
         assert rms(xyz(points) - truth) < rms(xyz(raw) - truth) / 5
+
+
+def changed(recording: Path, path: Path, kind: str, change: Callable[[Any], None]) -> Path:
+    """Return a copy of a recording with all messages of a type changed."""
+    with bag.open_bag(recording) as reader, bag.BagFile(path) as writer:
+        for connection, recorded, data in bag.messages(reader):
+            raw = bytes(data)
+            if connection.msgtype == kind:
+                message = reader.deserialize(data, kind)
+                change(message)
+                raw = bytes(TYPES.serialize_cdr(message, kind))
+            writer.copy(connection, recorded, raw)
+    return path
+
+
+def test_an_accelerometer_in_g_gives_the_same_clouds(recording: Path, tmp_path: Path) -> None:
+    def to_g(message: Any) -> None:
+        force = message.linear_acceleration
+        for axis in "xyz":
+            setattr(force, axis, getattr(force, axis) / STANDARD_GRAVITY)
+
+    source = changed(recording, tmp_path / "in_g", bag.IMU, to_g)
+    clouds = []
+    for name, bag_path in (("a", recording), ("b", source)):
+        deskew_recording(bag_path, tmp_path / name, DeskewNodeConfig())
+        clouds.append([bag.points_of(m) for m in read(tmp_path / name)["/points_deskewed"]])
+    for expected, points in zip(*clouds, strict=True):
+        np.testing.assert_allclose(xyz(points), xyz(expected), atol=1e-4)
+
+
+def test_the_sign_is_the_one_that_the_odometry_on_the_way_finds(tmp_path: Path) -> None:
+    with bag.BagFile(tmp_path / "out") as writer:
+        deskewer = _Deskewer(DeskewNodeConfig(), Topics("/points", "/imu", ""), writer)
+        samples = Motion().imu(0, 0.1)
+        samples["linear_acceleration"] /= -STANDARD_GRAVITY
+        for number, sample in enumerate(samples):
+            if number == 20:
+                deskewer._odometry.convention.reversed = True
+            deskewer.take("/imu", bag.IMU, imu(sample), at(0.1))
+    kept = deskewer.pipeline.tracker.buffer.samples["linear_acceleration"]
+    assert len(kept) == len(samples)
+    np.testing.assert_allclose(kept[:, 2], STANDARD_GRAVITY, rtol=1e-3)
 
 
 def test_the_command_line(run: Any, recording: Path, tmp_path: Path) -> None:
