@@ -365,3 +365,15 @@ def carried_over(linear: ArrayLike, angular: ArrayLike, T_cloud_body: F64) -> F6
     place_of_cloud = -turn.T @ T_cloud_body[:3, 3]
     moved = np.asarray(linear, dtype=np.float64) + rotations.cross(angular, place_of_cloud)
     return np.asarray(turn @ moved)
+
+
+def covariance_of_carried(covariance: F64 | None, T_cloud_body: F64) -> F64 | None:
+    """Return the covariance (3, 3) of a velocity that :func:`carried_over` returns.
+
+    From that of the body's velocity, in its axes; None stays None. What the body's rate is
+    uncertain by is left out.
+    """
+    if covariance is None:
+        return None
+    turn = T_cloud_body[:3, :3]
+    return np.asarray(turn @ covariance @ turn.T)

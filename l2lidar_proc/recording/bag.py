@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from l2lidar_node.recording.bag import (
     open_bag as open_bag,
     unreadable as unreadable,
 )
-from l2lidar_node.types import IMU_SAMPLE, HostNs
+from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 TWIST: Final = "geometry_msgs/msg/TwistStamped"
@@ -149,14 +149,33 @@ def sample_of(message: Any) -> NDArray[np.void]:
     return np.array([row], dtype=IMU_SAMPLE)
 
 
-def twist_of(message: Any) -> tuple[str, tuple[float, ...], tuple[float, ...]]:
-    """Return frame, velocity [m/s] and rate [rad/s] of an Odometry or a TwistStamped."""
+class Twist(NamedTuple):
+    """A velocity as a message gives it.
+
+    Attributes
+    ----------
+    frame : str
+        The body whose velocity it is, and whose axes it is in.
+    linear, angular : tuple of float
+        [m/s, rad/s].
+    covariance : ndarray, shape (3, 3), or None
+        Of the velocity, the same axes; None where the message has none.
+    """
+
+    frame: str
+    linear: tuple[float, float, float]
+    angular: tuple[float, float, float]
+    covariance: F64 | None
+
+
+def twist_of(message: Any) -> Twist:
+    """Return the velocity in an Odometry or a TwistStamped."""
     is_odometry = hasattr(message, "child_frame_id")
     twist = message.twist.twist if is_odometry else message.twist
-    frame = message.child_frame_id if is_odometry else message.header.frame_id
     linear, angular = twist.linear, twist.angular
-    return (
-        str(frame),
+    return Twist(
+        str(message.child_frame_id if is_odometry else message.header.frame_id),
         (linear.x, linear.y, linear.z),
         (angular.x, angular.y, angular.z),
+        np.reshape(message.twist.covariance, (6, 6))[:3, :3] if is_odometry else None,
     )

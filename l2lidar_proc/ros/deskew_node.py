@@ -39,7 +39,12 @@ from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, of_period, of_sweep
 from l2lidar_proc.motion.filter import LIBRARY
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.imu_corrections import ImuConvention
-from l2lidar_proc.motion.tracker import KnownMotion, MotionTracker, carried_over
+from l2lidar_proc.motion.tracker import (
+    KnownMotion,
+    MotionTracker,
+    carried_over,
+    covariance_of_carried,
+)
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, load_libraries, steady_timer
 from l2lidar_proc.ros.subscriptions import (
@@ -337,9 +342,7 @@ class DeskewNode(ManagedNode):
         velocity = carried_over(
             (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), T_cloud_body
         )
-        if covariance is not None:
-            turn = T_cloud_body[:3, :3]
-            covariance = turn @ covariance @ turn.T
+        covariance = covariance_of_carried(covariance, T_cloud_body)
         self.pipeline.velocity(from_time(message.header.stamp), velocity, source, covariance)
 
     def advance(self) -> None:

@@ -17,7 +17,7 @@ from l2lidar_node.types import is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
-from l2lidar_proc.motion.tracker import carried_over
+from l2lidar_proc.motion.tracker import carried_over, covariance_of_carried
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag
@@ -97,7 +97,12 @@ class _Deskewer:
         # The odometry first, as in the companion: a sweep is deskewed with its own motion.
         if self._odometry is not None:
             for estimate in self._odometry.poll(now):
-                self.pipeline.velocity(estimate.stamp, estimate.velocity, "own odometry")
+                self.pipeline.velocity(
+                    estimate.stamp,
+                    estimate.velocity,
+                    "own odometry",
+                    estimate.twist_covariance[:3, :3],
+                )
         for item in self.pipeline.poll(now):
             self._write(item, min(now, int(item.sweep.end) + item.waited_ns))
 
@@ -126,11 +131,15 @@ class _Deskewer:
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def _velocity(self, message: Any) -> None:
-        frame, linear, angular = bag.twist_of(message)
-        T_cloud_body = self._frames.find(self._cloud_frame, frame)
+        twist = bag.twist_of(message)
+        T_cloud_body = self._frames.find(self._cloud_frame, twist.frame)
         if T_cloud_body is not None:
-            velocity = carried_over(linear, angular, T_cloud_body)
-            self.pipeline.velocity(bag.stamp_of(message), velocity, self._topics.velocity)
+            self.pipeline.velocity(
+                bag.stamp_of(message),
+                carried_over(twist.linear, twist.angular, T_cloud_body),
+                self._topics.velocity,
+                covariance_of_carried(twist.covariance, T_cloud_body),
+            )
 
 
 def deskew_recording(

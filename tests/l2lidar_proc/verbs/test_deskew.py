@@ -11,6 +11,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from l2lidar_node import rotations
 from l2lidar_node.settings import build
 from l2lidar_node.types import POINT, STANDARD_GRAVITY, HostNs
 from l2lidar_proc.deskew.config import DeskewNodeConfig
@@ -153,6 +154,45 @@ def test_an_accelerometer_in_g_gives_the_same_clouds(recording: Path, tmp_path: 
         clouds.append([bag.points_of(m) for m in read(tmp_path / name)["/points_deskewed"]])
     for expected, points in zip(*clouds, strict=True):
         np.testing.assert_allclose(xyz(points), xyz(expected), atol=1e-4)
+
+
+def test_velocities_that_admit_to_be_wrong_do_little_harm(recording: Path, tmp_path: Path) -> None:
+    count = 0
+
+    def off(message: Any) -> None:
+        nonlocal count
+        count += 1
+        is_right = count % 2 == 0  # the latest one before each cloud is wrong
+        message.twist.twist.linear.y += 0.0 if is_right else 2.0
+        variance = 0.01**2 if is_right else 4.0
+        message.twist.covariance = (variance * np.eye(6)).ravel()
+
+    source = changed(recording, tmp_path / "source", bag.ODOMETRY, off)
+    deskew_recording(source, tmp_path / "target", DeskewNodeConfig())
+    clouds = read(tmp_path / "target")["/points_deskewed"]
+    for message, start in list(zip(clouds, STARTS, strict=True))[1:]:
+        raw, truth = points_at(start)
+        assert rms(xyz(bag.points_of(message)) - truth) < rms(xyz(raw) - truth) / 50
+
+
+def test_the_covariance_of_a_velocity_is_turned_into_cloud_axes(tmp_path: Path) -> None:
+    with bag.BagFile(tmp_path / "out") as writer:
+        deskewer = _Deskewer(DeskewNodeConfig(), Topics("/points", "/imu", "/wheels"), writer)
+        turn = rotations.transform([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], (0.0, 0.0, 0.0))
+        deskewer._frames.add("lidar", "body", turn)
+        deskewer._cloud_frame = "lidar"
+        message = odometry(0.5)
+        message.child_frame_id = "body"
+        message.twist.covariance[[0, 7, 14]] = 1.0, 4.0, 9.0
+        deskewer.take("/wheels", bag.ODOMETRY, message, at(0.5))
+        (waiting,) = deskewer.pipeline.tracker.filter._pending
+    np.testing.assert_allclose(waiting.covariance, np.diag([4.0, 1.0, 9.0]), atol=1e-4)
+
+
+def test_a_twist_has_no_covariance() -> None:
+    twist = T["geometry_msgs/msg/Twist"](vector((1, 2, 3)), vector((4, 5, 6)))
+    found = bag.twist_of(T[bag.TWIST](header(0.0, "body"), twist))
+    assert found == ("body", (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), None)
 
 
 def test_the_sign_is_the_one_that_the_odometry_on_the_way_finds(tmp_path: Path) -> None:
