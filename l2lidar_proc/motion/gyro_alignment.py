@@ -35,6 +35,9 @@ Rotations up to 10 degrees, scales of 2 %, misalignments of 1 %, biases of 0.2 r
 
 _PARTS: Final = 8  # of the recording, whose scatter tells the uncertainty
 _OUTLIER: Final = 3.0  # Huber's bound in standard deviations
+# [rad] Poses and rates are rounded numbers, so no agreement is closer than this. A simulated
+# sensor at rest has residuals of exactly zero, which would be infinitely certain.
+_LEAST_RESIDUAL: Final = 1e-6
 _ITERATIONS: Final = 8
 _CONVERGED: Final = 0.02  # of a standard deviation
 _LONGEST_NS: Final = 1_000_000_000  # between poses: longer ones span a gap
@@ -350,7 +353,7 @@ def information(turns: Turns) -> tuple[F64, F64]:
 def _weights(turns: Turns) -> F64:
     """Return Huber's weights of the intervals, as factors of residuals, shape (K,)."""
     size = np.linalg.norm(turns.residual, axis=1)
-    scale = np.median(size) / 1.54  # of a norm of three normal numbers
+    scale = max(np.median(size) / 1.54, _LEAST_RESIDUAL)  # of a norm of three normal numbers
     return np.asarray(np.minimum(1.0, np.sqrt(3.0) * _OUTLIER * scale / np.maximum(size, 1e-12)))
 
 
@@ -367,7 +370,7 @@ def _whitened(turns: Turns, weights: F64) -> Turns:
 
     residual = turns.residual * weights[:, None]
     count = len(residual)
-    total = float(np.mean(residual**2))
+    total = max(float(np.mean(residual**2)), _LEAST_RESIDUAL**2)
     shared = -float(np.mean(residual[1:] * residual[:-1]))
     pose = min(max(shared, 0.05 * total), 0.45 * total)
     bands = np.vstack((np.full(count, total), np.full(count, -pose)))

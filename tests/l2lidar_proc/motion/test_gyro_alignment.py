@@ -57,6 +57,25 @@ def test_the_truth_is_within_the_stated_deviations() -> None:
     assert np.sqrt(np.mean(np.square(away))) > 0.4
 
 
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_a_sensor_at_rest_without_any_noise_shows_its_bias_alone(share: float) -> None:
+    """All residuals, or more than half of them, are exactly zero."""
+    stamps, q, samples = recording()
+    count = round(share * len(stamps))
+    q[:count] = 1.0, 0.0, 0.0, 0.0
+    q[count:] = rotations.exp(np.linspace(0.0, 1e-3, len(stamps) - count)[:, None] * np.ones(3))
+    samples["angular_velocity"] = 0.0
+    normal, right = gyro.information(gyro.turns_between(stamps, q, samples, GyroModel.ideal()))
+    assert np.isfinite(normal).all()
+    assert np.isfinite(right).all()
+    assert (np.diag(normal)[gyro.BIAS] > 1e4).all()
+    found = gyro.align(stamps, q, samples)
+    assert (found.sd[gyro.BIAS] < 1e-3).all()
+    assert np.abs(found.model.bias).max() < 1e-3
+    assert found.sd[gyro.ROTATION].min() > np.deg2rad(5.0)
+    assert found.outliers <= len(stamps) - count
+
+
 @pytest.mark.parametrize(("pose", "between"), [(1.0, 0.5), (0.0, 1.0)])
 def test_errors_that_neighbors_share_are_told_from_those_of_each_interval(
     pose: float, between: float
