@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -46,6 +47,8 @@ _GIVEN: Final = (np.radians(15.0), 1.0)  # [rad, m] of a pose that a person give
 _UNIQUE_M: Final = 0.3  # a second place that far off would have been told: "ambiguous"
 _JUMP: Final = np.radians(5.0)
 _FEWEST_SWEEPS: Final = 3
+_MOST_SWEEPS: Final = 200
+_ELSEWHERE: Final = (np.radians(4.0), 0.05)  # [rad, m] nearer sweeps show the same again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +96,7 @@ class Localizer:
         self._eligible &= np.array([node.submap is not None for node in saved.nodes])
         self._views = ViewCache()
         self._hypotheses = PlaceHypotheses(PlaceSearch(self._view_of), config.loop)
-        self._sweeps: deque[tuple[float, OdometrySweep]] = deque()
+        self._sweeps: deque[tuple[float, OdometrySweep]] = deque(maxlen=_MOST_SWEEPS)
         self._latest: OdometrySweep | None = None
         self._way = 0.0
         self._looked_at = 0.0
@@ -112,7 +115,7 @@ class Localizer:
         elif self._latest is not None:
             self._carry_on(self._latest, sweep)
         self._latest = sweep
-        if sweep.health in (Health.GOOD, Health.DEGENERATE):
+        if sweep.health in (Health.GOOD, Health.DEGENERATE) and self._is_new(sweep):
             self._sweeps.append((self._way, sweep))
         step = self.config.localization.query_step_m
         while self._sweeps and self._way - self._sweeps[0][0] > _LOOK_BACK * step:
@@ -200,6 +203,17 @@ class Localizer:
         self._hypotheses.clear()
         if self.T_map_odom is not None:
             self.state = SlamState.LOST
+
+    def _is_new(self, sweep: OdometrySweep) -> bool:
+        """Return whether a sweep is from elsewhere than the last few that are kept.
+
+        Sweeps leave with the way: those of a sensor at rest would pile up.
+        """
+        last = [kept for _, kept in islice(reversed(self._sweeps), _FEWEST_SWEEPS)]
+        off = [magnitude(error(kept.T_odom_body, sweep.T_odom_body)) for kept in last]
+        return len(last) < _FEWEST_SWEEPS or all(
+            turn > _ELSEWHERE[0] or way > _ELSEWHERE[1] for turn, way in off
+        )
 
     def _forget(self) -> None:
         self.T_map_odom, self.state = None, SlamState.SEARCHING

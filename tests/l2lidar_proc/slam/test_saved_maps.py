@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 
 from l2lidar_node.emulator.world.mapping_scenes import furnished_office, street_block
+from l2lidar_node.types import HostNs
 from l2lidar_proc.slam import atlas, export, se3
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.localization import Localizer, bounded
-from l2lidar_proc.slam.nodes import SlamState
+from l2lidar_proc.slam.nodes import Health, OdometrySweep, SlamState
 from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.slam.submap import Submap
 from tests.l2lidar_proc.conftest import STEP
@@ -296,3 +298,21 @@ def test_far_from_the_map_the_place_is_carried_on_then_lost(
     assert SlamState.DEAD_RECKONING in states
     assert localizer.T_map_odom is not None
     assert localizer.sigma > 0.05
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0])
+def test_a_sensor_that_rests_or_turns_on_the_spot_takes_no_more_memory(
+    mapped: Slam, degrees: float
+) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    points = np.zeros((1000, 3))
+    tracemalloc.start()
+    for number in range(1000):
+        pose = se3.planar(0.0, 0.0, np.radians(degrees * number))
+        localizer.add(
+            OdometrySweep(HostNs(number), pose, points.copy(), Health.GOOD, np.zeros((6, 6)))
+        )
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert kept < (250 if degrees else 10) * points.nbytes
