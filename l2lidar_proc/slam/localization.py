@@ -270,7 +270,8 @@ class Localizer:
         ad = adjoint(_only_turn(measured))
         noise = ad @ match.covariance @ ad.T
         noise += np.diag(np.repeat(np.square(_BENT), 3))
-        off = ad @ error(predicted, measured)
+        # the error is in the axes of the prediction, which may be turned against what was measured
+        off = adjoint(_only_turn(predicted)) @ error(predicted, measured)
         spread = self.covariance + noise
         if self.state is not SlamState.TENTATIVE and off @ np.linalg.solve(spread, off) > _GATE:
             self.counts["odometry"] += 1

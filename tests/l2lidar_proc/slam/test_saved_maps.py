@@ -20,6 +20,7 @@ from l2lidar_proc.slam.localization import Localizer, bounded
 from l2lidar_proc.slam.nodes import Health, OdometrySweep, SlamState
 from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.slam.submap import Submap
+from l2lidar_proc.slam.verification import Fit, Match
 from tests.l2lidar_proc.conftest import STEP
 from tests.support.mapping_runs import MappingRun, drifting, scan, walk
 
@@ -316,3 +317,18 @@ def test_a_sensor_that_rests_or_turns_on_the_spot_takes_no_more_memory(
     tracemalloc.stop()
 
     assert kept < (250 if degrees else 10) * points.nbytes
+
+
+def test_an_exact_match_corrects_a_pose_whose_heading_is_off(mapped: Slam) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    localizer.add(OdometrySweep(HostNs(0), np.eye(4), np.zeros((1, 3)), Health.GOOD, np.eye(6)))
+    localizer.set_pose(1.0, 0.0, np.radians(15.0))
+    assert localizer.T_map_odom is not None
+    true = np.eye(4)
+    exact = np.diag(np.repeat((1e-3**2, 0.01**2), 3))
+    match = Match(se3.inverse(mapped.poses[0]) @ true, exact, Fit(0.9, 0.95, 0.0), 0.1, True)
+
+    vars(Localizer)["_correct"](localizer, np.eye(4), localizer.T_map_odom, 0, match)
+
+    assert np.linalg.norm(localizer.T_map_odom[:2, 3]) < 0.005
+    assert abs(se3.yaw_of(localizer.T_map_odom)) < np.radians(0.1)
