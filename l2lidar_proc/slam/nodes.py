@@ -265,6 +265,8 @@ class OpenNode:
         if sweep.health in (Health.GOOD, Health.SKIPPED):
             return
         self._usable = False
+        if sweep.health is Health.CUT:  # speaks of the motion before this submap
+            return
         turned = np.zeros((6, 6))
         axes = self.T_odom_node[:3, :3]
         turned[TURN, TURN] = axes.T @ sweep.covariance[3:, 3:] @ axes

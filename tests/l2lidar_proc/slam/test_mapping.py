@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from l2lidar_node.emulator.world.mapping_scenes import office_ring
-from l2lidar_node.types import F64
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.slam import se3
 from l2lidar_proc.slam.config import LoopConfig, SlamConfig
 from l2lidar_proc.slam.loops import Admission, Graph, Loop
-from l2lidar_proc.slam.nodes import Health, Keyframe, SlamState
+from l2lidar_proc.slam.nodes import Health, Keyframe, OdometrySweep, SlamState
 from l2lidar_proc.slam.pose_graph import (
     CUT,
     EDGE,
@@ -273,3 +273,39 @@ def test_a_ring_of_identical_doors_never_gets_a_wrong_loop() -> None:
     for edge in slam.edges[slam.edges["kind"] == LOOP]:
         expected = se3.inverse(true[edge["first"]]) @ true[edge["second"]]
         assert se3.magnitude(se3.error(expected, edge["pose"]))[1] < 0.3
+
+
+def drive(count: int, step: float, **changes: Any) -> list[OdometrySweep]:
+    """Return sweeps straight ahead, each so many meters farther; no loops can be found."""
+    points = np.random.default_rng(0).uniform(-10.0, 10.0, (50, 3))
+    sweep = OdometrySweep(HostNs(0), np.eye(4), points, Health.GOOD, np.zeros((6, 6)))
+    return [
+        dataclasses.replace(
+            sweep, stamp=HostNs(number), T_odom_body=se3.planar(step * number, 0.0, 0.0), **changes
+        )
+        for number in range(count)
+    ]
+
+
+def chained(sweeps: list[OdometrySweep]) -> Slam:
+    """Return the graph of some sweeps, without loops."""
+    slam = Slam(SlamConfig(loop=LoopConfig(loops=False)))
+    for sweep in sweeps:
+        slam.add(sweep)
+    slam.finish()
+    return slam
+
+
+@pytest.mark.parametrize("covariance", [9999.0, 0.25])
+def test_a_cut_says_nothing_of_the_motion_after_it(covariance: float) -> None:
+    sweeps = drive(200, 0.25)
+    sweeps[80] = dataclasses.replace(
+        sweeps[80], health=Health.CUT, covariance=covariance * np.eye(6)
+    )
+    slam = chained(sweeps)
+
+    (cut,) = np.flatnonzero(slam.edges["kind"] == CUT)
+    np.testing.assert_allclose(
+        slam.edges["covariance"][cut + 1], slam.edges["covariance"][0], rtol=1e-6
+    )
+    assert not slam.nodes[slam.edges["second"][cut]].usable
