@@ -17,7 +17,7 @@ import numpy as np
 from l2lidar_node.types import F64
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.hypotheses import PlaceHypotheses
-from l2lidar_proc.slam.loops import odometry_covariance
+from l2lidar_proc.slam.loops import odometry_covariance, unknown_covariance
 from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.se3 import (
@@ -202,7 +202,7 @@ class Localizer:
         self._looks = []
         self._hypotheses.clear()
         if self.T_map_odom is not None:
-            self.state = SlamState.LOST
+            self.state, self.covariance = SlamState.LOST, unknown_covariance()
 
     def _is_new(self, sweep: OdometrySweep) -> bool:
         """Return whether a sweep is from elsewhere than the last few that are kept.

@@ -32,6 +32,7 @@ _REACH_M: Final = 6.0  # submaps farther apart than this are not worth a compari
 _MOST: Final = 3  # candidates of a submap: neighbors say the same
 _CHI2: Final = 22.5  # 6 degrees of freedom, 99.9 %
 _LARGEST_WINDOW: Final = (6.0, 1.5, np.radians(8.0))  # [m, m, rad] that is searched
+_UNKNOWN: Final = (3.0, 1000.0)  # [rad, m]
 _LEAST_WINDOW: Final = (0.3, 0.1, np.radians(0.5))
 _TURN_PER_M: Final = np.radians(0.05) / 10.0  # systematic drift in yaw
 
@@ -187,6 +188,11 @@ def odometry_covariance(way: float, turn: float, extra: F64, config: SlamConfig)
     covariance[TURN, TURN] += np.eye(3) * angle**2
     covariance[SHIFT, SHIFT] += np.eye(3) * shift**2
     return covariance
+
+
+def unknown_covariance() -> F64:
+    """Return a covariance (6, 6) that says nothing, as where the odometry lost its way."""
+    return np.diag(np.repeat(np.square(_UNKNOWN), 3))
 
 
 def between(poses: F64, first: int, second: int) -> F64:

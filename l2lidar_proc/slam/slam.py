@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from l2lidar_node.types import F64
 from l2lidar_proc.slam import pose_graph
 from l2lidar_proc.slam.config import SlamConfig
-from l2lidar_proc.slam.loops import LARGEST_DEVIATION, Admission, Graph, Loop
+from l2lidar_proc.slam.loops import LARGEST_DEVIATION, Admission, Graph, Loop, unknown_covariance
 from l2lidar_proc.slam.nodes import (
     Health,
     Keyframe,
@@ -29,7 +29,6 @@ from l2lidar_proc.slam.submap import SubmapView, ViewCache, voxel_keys
 from l2lidar_proc.slam.verification import verify
 
 _TIE: Final = (np.radians(0.1), 0.02)  # [rad, m] by which a saved map is bent itself
-_CUT_SIGMA: Final = (3.0, 1000.0)  # [rad, m] an edge that says nothing
 _DISAGREE: Final = (np.radians(1.0), 0.15)  # [rad, m] places one query may have at once
 _KNOWN: Final = 0.85  # a submap of which so much was seen before keeps no points
 _KNOWN_CELL_M: Final = 0.5
@@ -91,6 +90,8 @@ class Slam:
         elif saved is not None:
             self.state, self.T_map_odom = SlamState.SEARCHING, None
         self.admission = Admission(config.loop)
+        # a node of the part that counts: of a saved map the largest, of a new one the first
+        self._root = int(np.argmax(saved.largest_part())) if saved else 0
         self._views = ViewCache()
         self._search = PlaceSearch(self.view_of)
         self._on_keyframe = on_keyframe
@@ -134,7 +135,7 @@ class Slam:
         following = OpenNode(sweep, self._way, self.config)
         if sweep.health is Health.CUT:
             self._join_by = CUT
-            self.state = SlamState.LOST
+            self.state, self.covariance = SlamState.LOST, unknown_covariance()
         covariance = open_node.covariance_to(following.T_odom_node)
         T_node_next = inverse(open_node.T_odom_node) @ following.T_odom_node
         self._pending_edge = T_node_next, covariance, open_node.way
@@ -152,7 +153,9 @@ class Slam:
         elif self._place is not None:  # first of a session in a saved map
             self._tie(number, *self._place)
         else:
-            self._connect(number, inverse(self.poses[-1]) @ node.T_odom_node, _cut(), 0.0)
+            self._connect(
+                number, inverse(self.poses[-1]) @ node.T_odom_node, unknown_covariance(), 0.0
+            )
         self._pending_edge = self._place = None
         entered: list[Loop] = []
         if self.config.loop.loops and node.is_comparable:
@@ -191,7 +194,7 @@ class Slam:
         kind, self._join_by = self._join_by, ODOMETRY
         edge["first"], edge["second"], edge["kind"] = number - 1, number, kind
         edge["pose"], edge["way"] = pose, way
-        edge["covariance"] = _cut() if kind == CUT else covariance
+        edge["covariance"] = unknown_covariance() if kind == CUT else covariance
         self.edges = np.concatenate((self.edges, edge))
         self.poses = np.concatenate((self.poses, (self.poses[-1] @ pose)[None]))
 
@@ -199,7 +202,7 @@ class Slam:
         """Return the loops that entered the graph."""
         graph = Graph(self.poses, self.edges, number, self.config)
         verified = self._near(graph, number)
-        if not np.isfinite(graph.ways[0]):
+        if not np.isfinite(graph.ways[self._root]):
             verified += self._anywhere(graph, number)
         if _contradict(self.poses, verified):
             self.admission.rejected["ambiguous"] += len(verified)
@@ -291,12 +294,12 @@ class Slam:
     def _publish(self) -> None:
         """Renew state and ``T_map_odom``."""
         graph = Graph(self.poses, self.edges, len(self.nodes) - 1, self.config)
-        if np.isfinite(graph.ways[0]):
+        if np.isfinite(graph.ways[self._root]):
             self.state = SlamState.LOCALIZED
             turned = np.eye(4)
             turned[:3, :3] = self.poses[-1][:3, :3]
             ad = adjoint(turned)
-            self.covariance = ad @ graph.relation(0).covariance @ ad.T
+            self.covariance = ad @ graph.relation(self._root).covariance @ ad.T
         if (
             self.state in (SlamState.LOCALIZED, SlamState.LOST) and self.T_map_odom is not None
         ) or self.state is SlamState.LOCALIZED:
@@ -334,7 +337,3 @@ def _edges_of(loops: list[Loop]) -> NDArray[np.void]:
         edge["first"], edge["second"], edge["kind"] = loop.target, loop.query, LOOP
         edge["pose"], edge["covariance"] = loop.match.T_target_query, loop.match.covariance
     return edges
-
-
-def _cut() -> F64:
-    return np.diag(np.repeat(np.square(_CUT_SIGMA), 3))

@@ -309,3 +309,34 @@ def test_a_cut_says_nothing_of_the_motion_after_it(covariance: float) -> None:
         slam.edges["covariance"][cut + 1], slam.edges["covariance"][0], rtol=1e-6
     )
     assert not slam.nodes[slam.edges["second"][cut]].usable
+
+
+def test_while_the_place_is_lost_its_covariance_says_so() -> None:
+    sweeps = drive(200, 0.25)
+    sweeps[8] = dataclasses.replace(sweeps[8], health=Health.CUT)
+    slam = Slam(SlamConfig(loop=LoopConfig(loops=False)))
+    for sweep in sweeps:
+        slam.add(sweep)
+        if slam.state is SlamState.LOST:
+            assert np.sqrt(np.linalg.eigvalsh(slam.covariance)[0]) > 1.0
+    slam.finish()
+
+    assert slam.state is SlamState.LOST
+
+
+def test_a_loaded_map_with_an_early_cut_is_extended_where_most_of_it_is(
+    office: MappingRun, mapped: Slam
+) -> None:
+    built = mapped.map()
+    edges = built.edges[built.edges["kind"] != LOOP]
+    edges["kind"][1] = CUT
+    slam = Slam(SlamConfig(), dataclasses.replace(built, edges=edges))
+    run = office.part(40, 130)  # the first submaps are not passed
+    for sweep in run.sweeps(drifting(run.truth, 0.5, 5, STEP)):
+        slam.add(sweep)
+    slam.finish()
+
+    assert slam.state is SlamState.LOCALIZED
+    assert np.isfinite(slam.covariance).all()
+    assert np.sqrt(slam.covariance[3, 3]) < 1.0
+    assert slam.T_map_odom is not None

@@ -332,3 +332,14 @@ def test_an_exact_match_corrects_a_pose_whose_heading_is_off(mapped: Slam) -> No
 
     assert np.linalg.norm(localizer.T_map_odom[:2, 3]) < 0.005
     assert abs(se3.yaw_of(localizer.T_map_odom)) < np.radians(0.1)
+
+
+def test_after_a_cut_the_held_pose_has_an_unknown_covariance(mapped: Slam) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    localizer.take_over(np.eye(4), np.eye(6) * 1e-4)
+    nothing = np.zeros((1, 3))
+    for number, health in enumerate((Health.GOOD, Health.CUT, Health.GOOD)):
+        localizer.add(OdometrySweep(HostNs(number), np.eye(4), nothing, health, np.zeros((6, 6))))
+
+    assert localizer.state is SlamState.LOST
+    assert np.sqrt(np.linalg.eigvalsh(localizer.covariance)[0]) > 1.0
