@@ -18,11 +18,10 @@ from l2lidar_node.types import F64
 from l2lidar_proc.slam.config import SlamConfig
 from l2lidar_proc.slam.hypotheses import PlaceHypotheses
 from l2lidar_proc.slam.loops import odometry_covariance, unknown_covariance
-from l2lidar_proc.slam.nodes import Health, Map, OdometrySweep, SlamState
+from l2lidar_proc.slam.nodes import CovarianceGrowth, Health, Map, OdometrySweep, SlamState
 from l2lidar_proc.slam.place_search import PlaceSearch
 from l2lidar_proc.slam.se3 import (
     SHIFT,
-    TURN,
     adjoint,
     error,
     exp,
@@ -41,7 +40,6 @@ _DRIFT: Final = 0.01  # part of the way by which they may differ more
 _NEAR_M: Final = 8.0
 _MOST_TARGETS: Final = 2
 _GATE: Final = 22.5  # chi2 of 6 degrees of freedom, 99.9 %
-_SHARE: Final = 0.1  # of a sweep's covariance: two seconds of bad sweeps add it once
 _BENT: Final = (np.radians(0.1), 0.02)  # [rad, m] a saved map is not exact either
 _GIVEN: Final = (np.radians(15.0), 1.0)  # [rad, m] of a pose that a person gives
 _UNIQUE_M: Final = 0.3  # a second place that far off would have been told: "ambiguous"
@@ -98,6 +96,7 @@ class Localizer:
         self._hypotheses = PlaceHypotheses(PlaceSearch(self._view_of), config.loop)
         self._sweeps: deque[tuple[float, OdometrySweep]] = deque(maxlen=_MOST_SWEEPS)
         self._latest: OdometrySweep | None = None
+        self._growth = CovarianceGrowth()
         self._way = 0.0
         self._looked_at = 0.0
         self._confirmed_at = 0.0
@@ -110,10 +109,11 @@ class Localizer:
 
     def add(self, sweep: OdometrySweep) -> bool:
         """Take a sweep, in order of time; return whether the map was looked at."""
+        grown = self._growth.add(sweep)
         if sweep.health is Health.CUT:
             self._cut()
         elif self._latest is not None:
-            self._carry_on(self._latest, sweep)
+            self._carry_on(self._latest, sweep, grown)
         self._latest = sweep
         if sweep.health in (Health.GOOD, Health.DEGENERATE) and self._is_new(sweep):
             self._sweeps.append((self._way, sweep))
@@ -169,20 +169,16 @@ class Localizer:
 
     # ---- steps
 
-    def _carry_on(self, before: OdometrySweep, sweep: OdometrySweep) -> None:
+    def _carry_on(self, before: OdometrySweep, sweep: OdometrySweep, grown: F64) -> None:
         _, way = magnitude(error(before.T_odom_body, sweep.T_odom_body))
         self._way += way
         if self.T_map_odom is None:
             return
-        extra = np.zeros((6, 6))
-        is_sure = sweep.health in (Health.GOOD, Health.SKIPPED)
-        if not is_sure and np.isfinite(sweep.covariance).all():
-            extra[TURN, TURN] = sweep.covariance[3:, 3:]
-            extra[SHIFT, SHIFT] = sweep.covariance[:3, :3]
+        ad = adjoint(_only_turn(self.T_map_odom))
         # a little at each sweep: as much as an edge of the whole step would have
         step = self.config.localization.query_step_m
         whole = odometry_covariance(step, 0.0, np.zeros((6, 6)), self.config)
-        self.covariance = self.covariance + whole * (way / step) + _SHARE * extra
+        self.covariance = self.covariance + whole * (way / step) + ad @ grown @ ad.T
         unconfirmed = self._way - self._confirmed_at
         if self.state is SlamState.LOCALIZED and (
             unconfirmed > self.config.localization.dead_reckoning_m

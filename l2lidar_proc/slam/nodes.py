@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,8 @@ from l2lidar_proc.slam.se3 import (
 )
 from l2lidar_proc.slam.submap import Submap, SubmapBuilder
 
-_TURN_ARM_M = 0.5  # a turn counts like the way it makes at this distance
+_TURN_ARM_M: Final = 0.5  # a turn counts like the way it makes at this distance
+_HELD_M: Final = 0.5  # nearer than this the same place is seen, and the same covariance counts
 
 
 class Health(Enum):
@@ -230,6 +232,42 @@ class Map:
         return np.concatenate(parts) if parts else np.empty(0, STAMPED_POSE)
 
 
+class CovarianceGrowth:
+    """What the odometry's covariance grows by over sweeps that it could not align well.
+
+    Its covariance is that of the whole way since its start, and goes up and down a little from
+    sweep to sweep. So what counts is by how much it exceeds the largest one since the odometry
+    was last sure: the ups alone would add up, at rest without end.
+    """
+
+    def __init__(self) -> None:
+        self._counted: F64 | None = None  # turn, translation; odometry axes
+        self._place = np.zeros(3)
+
+    def add(self, sweep: OdometrySweep) -> F64:
+        """Take the next sweep; return its share (6, 6): turn, translation; odometry axes.
+
+        It is zero where the covariance is not finite, and after a cut: what the odometry says
+        then is not the covariance of this motion.
+        """
+        now, grown = np.zeros((6, 6)), np.zeros((6, 6))
+        now[TURN, TURN] = sweep.covariance[3:, 3:]
+        now[SHIFT, SHIFT] = sweep.covariance[:3, :3]
+        if not np.isfinite(now).all():
+            self._counted = None
+            return grown
+        place = sweep.T_odom_body[:3, 3]
+        is_sure = sweep.health in (Health.GOOD, Health.SKIPPED)
+        has_moved = np.linalg.norm(place - self._place) > _HELD_M
+        if self._counted is None or sweep.health is Health.CUT or (is_sure and has_moved):
+            self._counted, self._place = now, place
+        elif not is_sure:
+            variance, axes = np.linalg.eigh(now - self._counted)
+            grown = (axes * np.maximum(variance, 0.0)) @ axes.T
+            self._counted = self._counted + grown
+        return grown
+
+
 class OpenNode:
     """A submap that is still growing.
 
@@ -250,6 +288,7 @@ class OpenNode:
         self._sweeps = Trajectory()
         self._latest = first.T_odom_body
         self._usable = True
+        self._growth = CovarianceGrowth()
         self._extra = np.zeros((6, 6))
         self.way = 0.0
         self.turn = 0.0
@@ -260,21 +299,11 @@ class OpenNode:
         self.way, self.turn, self._latest = self.way + way, self.turn + turn, sweep.T_odom_body
         T_node_body = inverse(self.T_odom_node) @ sweep.T_odom_body
         self._sweeps.append(sweep.stamp, T_node_body)
-        if sweep.health is Health.GOOD:
+        self._extra += self._growth.add(sweep)
+        if sweep.health in (Health.GOOD, Health.DEGENERATE):
             self._builder.add(T_node_body, sweep.points)
-        if sweep.health in (Health.GOOD, Health.SKIPPED):
-            return
-        self._usable = False
-        if sweep.health is Health.CUT:  # speaks of the motion before this submap
-            return
-        turned = np.zeros((6, 6))
-        axes = self.T_odom_node[:3, :3]
-        turned[TURN, TURN] = axes.T @ sweep.covariance[3:, 3:] @ axes
-        turned[SHIFT, SHIFT] = axes.T @ sweep.covariance[:3, :3] @ axes
-        if np.isfinite(turned).all() and np.trace(turned) > np.trace(self._extra):
-            self._extra = turned
-        if sweep.health is Health.DEGENERATE:
-            self._builder.add(T_node_body, sweep.points)
+        if sweep.health not in (Health.GOOD, Health.SKIPPED):
+            self._usable = False
 
     @property
     def is_full(self) -> bool:
@@ -295,8 +324,12 @@ class OpenNode:
 
     def covariance_to(self, following: F64) -> F64:
         """Return the covariance (6, 6) of the edge to the next node's frame (4, 4) in odom."""
-        covariance = odometry_covariance(self.way, self.turn, self._extra, self._config)
-        turn = following[:3, :3].T @ self.T_odom_node[:3, :3]
+        axes = self.T_odom_node[:3, :3]
+        extra = np.zeros((6, 6))
+        for part in (TURN, SHIFT):
+            extra[part, part] = axes.T @ self._extra[part, part] @ axes
+        covariance = odometry_covariance(self.way, self.turn, extra, self._config)
+        turn = following[:3, :3].T @ axes
         for part in (TURN, SHIFT):
             covariance[part, part] = turn @ covariance[part, part] @ turn.T
         return covariance

@@ -340,3 +340,20 @@ def test_a_loaded_map_with_an_early_cut_is_extended_where_most_of_it_is(
     assert np.isfinite(slam.covariance).all()
     assert np.sqrt(slam.covariance[3, 3]) < 1.0
     assert slam.T_map_odom is not None
+
+
+def test_an_edge_counts_what_the_covariance_grows_by_not_what_it_was_before() -> None:
+    late = drive(100, 0.25, covariance=0.25 * np.eye(6))
+    late[50] = dataclasses.replace(late[50], health=Health.DEGENERATE)
+    growing = drive(100, 0.25, covariance=0.25 * np.eye(6))
+    for number in range(44, 56):  # within the third submap
+        covariance = (0.25 + 0.01 * (number - 43)) * np.eye(6)
+        growing[number] = dataclasses.replace(
+            growing[number], health=Health.PREDICTED, covariance=covariance
+        )
+    plain, same, more = chained(drive(100, 0.25)), chained(late), chained(growing)
+
+    np.testing.assert_allclose(same.edges["covariance"], plain.edges["covariance"], atol=1e-12)
+    added = more.edges["covariance"] - plain.edges["covariance"]
+    np.testing.assert_allclose(added[2], 0.12 * np.eye(6), atol=1e-12)
+    assert np.abs(added[[0, 1, 3]]).max() < 1e-12

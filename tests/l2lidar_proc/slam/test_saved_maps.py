@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.emulator.world.mapping_scenes import furnished_office, street_block
-from l2lidar_node.types import HostNs
+from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.slam import atlas, export, se3
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
 from l2lidar_proc.slam.config import SlamConfig
@@ -343,3 +343,36 @@ def test_after_a_cut_the_held_pose_has_an_unknown_covariance(mapped: Slam) -> No
 
     assert localizer.state is SlamState.LOST
     assert np.sqrt(np.linalg.eigvalsh(localizer.covariance)[0]) > 1.0
+
+
+def degenerate(pose: F64, covariance: F64, health: Health = Health.DEGENERATE) -> OdometrySweep:
+    return OdometrySweep(HostNs(0), pose, np.zeros((1, 3)), health, covariance)
+
+
+@pytest.mark.parametrize("flickers", [False, True])
+def test_a_sensor_parked_in_a_corridor_keeps_its_place(mapped: Slam, flickers: bool) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    localizer.take_over(np.eye(4), np.eye(6) * 1e-4)
+    rng = np.random.default_rng(0)
+    for number in range(3000):  # the odometry's covariance is never quite the same
+        covariance = rng.uniform(0.95, 1.05) * np.diag((0.09, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6))
+        health = Health.GOOD if flickers and number % 2 else Health.DEGENERATE
+        localizer.add(degenerate(np.eye(4), covariance, health))
+
+    assert localizer.state is SlamState.LOCALIZED
+    assert localizer.sigma < 0.12
+
+
+def test_what_the_odometry_does_not_fix_widens_the_place_in_the_axes_of_the_map(
+    mapped: Slam,
+) -> None:
+    localizer = Localizer(SlamConfig(), mapped.map())
+    localizer.take_over(se3.planar(0.0, 0.0, np.pi / 2.0), np.eye(6) * 1e-4)
+    for number in range(51):  # from 0.5 m to 1.118 m: 1 m^2 more, ahead
+        ahead = 0.25 + 0.02 * number
+        covariance = np.diag((ahead, 0.01, 0.01, 1e-4, 1e-4, 1e-4))
+        localizer.add(degenerate(np.eye(4), covariance))
+
+    np.testing.assert_allclose(
+        np.diag(localizer.covariance), (1e-4, 1e-4, 1e-4, 1e-4, 1.0 + 1e-4, 1e-4), atol=1e-9
+    )
