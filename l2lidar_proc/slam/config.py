@@ -111,7 +111,8 @@ class LocalizationConfig:
     )
     dead_reckoning_m: float = setting(
         20.0,
-        "distance without a match after which the state is DEAD_RECKONING",
+        "distance without a match after which the state is DEAD_RECKONING, and an initial pose is "
+        "given up where the place may be searched for",
         unit="m",
         lo=2.0,
         hi=1000.0,

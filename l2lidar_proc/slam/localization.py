@@ -218,6 +218,14 @@ class Localizer:
 
     def _look(self) -> None:
         origin, query = self._query()
+        unconfirmed = self._way - self._confirmed_at
+        if (
+            self.state is SlamState.TENTATIVE
+            and self.T_map_odom is not None
+            and unconfirmed > self.config.localization.dead_reckoning_m
+            and self._may_search
+        ):
+            self._forget()  # a given pose that nothing speaks for
         if self.state in (SlamState.LOCALIZED, SlamState.DEAD_RECKONING) or (
             self.T_map_odom is not None and self.state is SlamState.TENTATIVE
         ):

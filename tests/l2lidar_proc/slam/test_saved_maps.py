@@ -15,7 +15,7 @@ from l2lidar_node.emulator.world.mapping_scenes import furnished_office, street_
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.slam import atlas, export, se3
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
-from l2lidar_proc.slam.config import SlamConfig
+from l2lidar_proc.slam.config import LocalizationConfig, SlamConfig
 from l2lidar_proc.slam.localization import Localizer, bounded
 from l2lidar_proc.slam.nodes import Health, OdometrySweep, SlamState
 from l2lidar_proc.slam.slam import Slam
@@ -376,3 +376,25 @@ def test_what_the_odometry_does_not_fix_widens_the_place_in_the_axes_of_the_map(
     np.testing.assert_allclose(
         np.diag(localizer.covariance), (1e-4, 1e-4, 1e-4, 1e-4, 1.0 + 1e-4, 1e-4), atol=1e-9
     )
+
+
+@pytest.mark.parametrize("relocalize", ["auto", "never"])
+def test_a_wrong_initial_pose_is_given_up_where_the_place_may_be_searched_for(
+    office: MappingRun, mapped: Slam, relocalize: str
+) -> None:
+    config = SlamConfig(localization=LocalizationConfig(relocalize=relocalize))
+    localizer = Localizer(config, mapped.map())
+    true = se3.inverse(se3.leveled(office.truth[0])) @ office.truth[:150]
+    for number, sweep in enumerate(office.part(0, 150).sweeps(true)):
+        localizer.add(sweep)
+        if number == 0:
+            localizer.set_pose(500.0, 500.0, 0.0)
+        if number < 38:  # 19 m
+            assert localizer.state is SlamState.TENTATIVE
+
+    if relocalize == "never":
+        assert localizer.state is SlamState.TENTATIVE
+    else:
+        assert localizer.state is SlamState.LOCALIZED
+        assert localizer.T_map_odom is not None
+        assert np.linalg.norm((localizer.T_map_odom @ true[-1] - true[-1])[:3, 3]) < 0.2
