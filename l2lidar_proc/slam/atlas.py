@@ -39,6 +39,8 @@ _NODE: Final = np.dtype(
     ]
 )
 _OURS: Final = re.compile(r"(graph|submap)-[0-9a-f]{24}\.npz")
+_PART: Final = re.compile(rf"\.part-({_OURS.pattern}|{re.escape(MANIFEST)})")
+"""What a program killed while writing one of our files leaves."""
 _RIGID: Final = 1e-6
 
 
@@ -70,7 +72,8 @@ class AtlasWriter:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not (self.folder / MANIFEST).exists() and any(
-                not _OURS.fullmatch(path.name) for path in self.folder.iterdir()
+                not (_OURS.fullmatch(path.name) or _PART.fullmatch(path.name))
+                for path in self.folder.iterdir()
             ):
                 raise AtlasError(
                     f"{self.folder} contains files that are not a map; choose a new or empty "
@@ -100,6 +103,8 @@ class AtlasWriter:
                     total += path.stat().st_size
                 else:
                     path.unlink(missing_ok=True)
+            elif _PART.fullmatch(path.name):
+                path.unlink(missing_ok=True)
         return total
 
     def _submap(self, number: int, node: Node) -> str | None:

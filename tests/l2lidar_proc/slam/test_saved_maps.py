@@ -398,3 +398,32 @@ def test_a_wrong_initial_pose_is_given_up_where_the_place_may_be_searched_for(
         assert localizer.state is SlamState.LOCALIZED
         assert localizer.T_map_odom is not None
         assert np.linalg.norm((localizer.T_map_odom @ true[-1] - true[-1])[:3, 3]) < 0.2
+
+
+def test_what_a_killed_first_save_left_is_removed_by_the_next(
+    mapped: Slam, tmp_path: Path
+) -> None:
+    left = [
+        tmp_path / f".part-{name}"
+        for name in (f"submap-{'0f' * 12}.npz", f"graph-{'a1' * 12}.npz", atlas.MANIFEST)
+    ]
+    for path in left:
+        path.write_bytes(b"PK")
+
+    AtlasWriter(tmp_path).save(mapped.map())
+
+    assert not any(path.exists() for path in left)
+    assert len(atlas.load(tmp_path)[0].nodes) == len(mapped.nodes)
+
+
+def test_files_that_someone_put_beside_a_map_stay_as_they_are(
+    mapped: Slam, tmp_path: Path
+) -> None:
+    AtlasWriter(tmp_path).save(mapped.map())
+    notes, part = tmp_path / "notes.txt", tmp_path / ".part-notes.txt"
+    for path in (notes, part):
+        path.write_text("third floor")
+
+    AtlasWriter(tmp_path).save(mapped.map())
+
+    assert notes.read_text() == part.read_text() == "third floor"
