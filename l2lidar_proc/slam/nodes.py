@@ -295,15 +295,19 @@ class OpenNode:
 
     def add(self, sweep: OdometrySweep) -> None:
         """Add a sweep."""
-        turn, way = magnitude(error(self._latest, sweep.T_odom_body))
-        self.way, self.turn, self._latest = self.way + way, self.turn + turn, sweep.T_odom_body
+        self.lead_to(sweep)
         T_node_body = inverse(self.T_odom_node) @ sweep.T_odom_body
         self._sweeps.append(sweep.stamp, T_node_body)
-        self._extra += self._growth.add(sweep)
         if sweep.health in (Health.GOOD, Health.DEGENERATE):
             self._builder.add(T_node_body, sweep.points)
         if sweep.health not in (Health.GOOD, Health.SKIPPED):
             self._usable = False
+
+    def lead_to(self, sweep: OdometrySweep) -> None:
+        """Count the motion to a sweep, which may be the first of the next submap."""
+        turn, way = magnitude(error(self._latest, sweep.T_odom_body))
+        self.way, self.turn, self._latest = self.way + way, self.turn + turn, sweep.T_odom_body
+        self._extra += self._growth.add(sweep)
 
     @property
     def is_full(self) -> bool:

@@ -131,6 +131,8 @@ class Slam:
         """Turn the open submap into a node and look for loops."""
         assert self._open is not None
         open_node, self._open = self._open, None
+        if sweep.health is not Health.CUT:
+            open_node.lead_to(sweep)
         self._append(open_node.finish(), open_node)
         following = OpenNode(sweep, self._way, self.config)
         if sweep.health is Health.CUT:

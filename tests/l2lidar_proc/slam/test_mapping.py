@@ -357,3 +357,47 @@ def test_an_edge_counts_what_the_covariance_grows_by_not_what_it_was_before() ->
     added = more.edges["covariance"] - plain.edges["covariance"]
     np.testing.assert_allclose(added[2], 0.12 * np.eye(6), atol=1e-12)
     assert np.abs(added[[0, 1, 3]]).max() < 1e-12
+
+
+@pytest.mark.parametrize("step", [0.25, 4.0])
+def test_the_way_between_two_submaps_counts(step: float) -> None:
+    keyframes: list[Keyframe] = []
+    config = SlamConfig(loop=LoopConfig(loops=False))
+    slam = Slam(config, on_keyframe=keyframes.append)
+    for sweep in drive(60, step):
+        slam.add(sweep)
+    slam.finish()
+
+    for node in slam.nodes:
+        assert node.way == pytest.approx(node.T_odom_node[0, 3])
+    np.testing.assert_allclose(slam.edges["way"], slam.edges["pose"][:, 0, 3])
+    sigma = np.hypot(0.002, 0.01 * config.drift.drift_percent * slam.edges["way"])
+    np.testing.assert_allclose(np.sqrt(slam.edges["covariance"][:, 3, 3]), sigma)
+    told = [item.covariance for item in keyframes[1:]]
+    np.testing.assert_array_equal(told, slam.edges["covariance"])
+
+
+def test_a_bad_sweep_that_begins_a_submap_counts_for_the_edge_to_it() -> None:
+    sweeps = drive(100, 0.25)
+    first = 42  # each submap holds 20 steps and the one that leads to the next
+    plain = chained(drive(100, 0.25))
+    assert plain.nodes[2].stamp == first
+    sweeps[first] = dataclasses.replace(
+        sweeps[first], health=Health.PREDICTED, covariance=0.1 * np.eye(6)
+    )
+    added = chained(sweeps).edges["covariance"] - plain.edges["covariance"]
+
+    np.testing.assert_allclose(added[1], 0.1 * np.eye(6), atol=1e-12)
+    assert np.abs(added[[0, 2]]).max() < 1e-12
+
+
+def test_the_jump_of_a_cut_is_no_way() -> None:
+    sweeps = drive(100, 0.25)
+    away = se3.planar(0.0, 300.0, 0.0)
+    for number in range(50, 100):
+        jumped = away @ sweeps[number].T_odom_body
+        health = Health.CUT if number == 50 else Health.GOOD
+        sweeps[number] = dataclasses.replace(sweeps[number], T_odom_body=jumped, health=health)
+    slam = chained(sweeps)
+
+    assert slam.nodes[-1].way < 25.0
