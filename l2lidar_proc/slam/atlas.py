@@ -110,7 +110,9 @@ class AtlasWriter:
     def _submap(self, number: int, node: Node) -> str | None:
         """Return the name of a submap's file, which is written unless it is there."""
         if node.submap is None:
-            return None
+            # what could not be read stays in the map: the next time it may be readable again
+            is_kept = node.unread is not None and (self.folder / node.unread).exists()
+            return node.unread if is_kept else None
         known = self._names.get(number)
         if known is None or known[0] is not node.submap or not (self.folder / known[1]).exists():
             name = self._written("submap", points=node.submap.points, views=node.submap.views)
@@ -162,12 +164,14 @@ def load(folder: Path) -> tuple[Map, list[str]]:
     built: list[Node] = []
     ends = np.cumsum(nodes["sweeps"])
     for number, (row, name) in enumerate(zip(nodes, body["submaps"], strict=True)):
-        submap = None
+        submap = unread = None
         if name is not None:
             try:
                 submap = _submap_of(folder, name)
             except AtlasError as error:
-                warnings.append(f"submap {number} is skipped: {error}")
+                unread = name
+                kept = "; its file is kept" if (folder / name).exists() else ""
+                warnings.append(f"submap {number} is skipped: {error}{kept}")
         built.append(
             Node(
                 HostNs(int(row["stamp"])),
@@ -176,6 +180,7 @@ def load(folder: Path) -> tuple[Map, list[str]]:
                 sweeps[ends[number] - row["sweeps"] : ends[number]].copy(),
                 bool(row["usable"]),
                 float(row["way"]),
+                unread,
             )
         )
     if not any(node.submap is not None for node in built):

@@ -114,7 +114,7 @@ class Node:
     T_odom_node : ndarray, shape (4, 4)
         z up.
     submap : Submap or None
-        None where another one knows the place, or the file was damaged.
+        None where another one knows the place, or the file could not be read.
     sweeps : ndarray of STAMPED_POSE
         ``T_node_body`` of each sweep.
     usable : bool
@@ -122,6 +122,8 @@ class Node:
         no loop.
     way : float
         Of the odometry at its beginning [m].
+    unread : str or None
+        Name of the submap's file in the saved map, where it could not be read.
     """
 
     stamp: HostNs
@@ -130,6 +132,7 @@ class Node:
     sweeps: StampedPoses
     usable: bool
     way: float
+    unread: str | None = None
 
     @property
     def is_comparable(self) -> bool:

@@ -15,7 +15,7 @@ from l2lidar_node.emulator.world.mapping_scenes import furnished_office, street_
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.slam import atlas, export, se3
 from l2lidar_proc.slam.atlas import AtlasError, AtlasWriter
-from l2lidar_proc.slam.config import LocalizationConfig, SlamConfig
+from l2lidar_proc.slam.config import LocalizationConfig, LoopConfig, SlamConfig
 from l2lidar_proc.slam.localization import Localizer, bounded
 from l2lidar_proc.slam.nodes import Health, OdometrySweep, SlamState
 from l2lidar_proc.slam.slam import Slam
@@ -427,3 +427,40 @@ def test_files_that_someone_put_beside_a_map_stay_as_they_are(
     AtlasWriter(tmp_path).save(mapped.map())
 
     assert notes.read_text() == part.read_text() == "third floor"
+
+
+def test_a_submap_that_could_not_be_read_is_not_deleted_by_the_next_save(
+    mapped: Slam, tmp_path: Path
+) -> None:
+    AtlasWriter(tmp_path / "map").save(mapped.map())
+    body = json.loads((tmp_path / "map" / atlas.MANIFEST).read_text())["map"]
+    number, name = next((i, name) for i, name in enumerate(body["submaps"]) if name)
+    path = tmp_path / "map" / name
+    sound = path.read_bytes()
+    path.write_bytes(sound[:-1])
+
+    loaded, (warning,) = atlas.load(tmp_path / "map")
+    grown = Slam(SlamConfig(loop=LoopConfig(loops=False)), loaded)
+    AtlasWriter(tmp_path / "map").save(grown.map())
+    AtlasWriter(tmp_path / "copy").save(grown.map())
+
+    assert warning.endswith("; its file is kept")
+    assert path.read_bytes() == sound[:-1]
+    path.write_bytes(sound)  # the disk can be read again
+    again, warnings = atlas.load(tmp_path / "map")
+    assert warnings == []
+    assert again.nodes[number].submap is not None
+    copy, warnings = atlas.load(tmp_path / "copy")
+    assert warnings == []
+    assert copy.nodes[number].submap is None
+
+
+def test_a_submap_whose_file_is_missing_is_left_out_for_good(mapped: Slam, tmp_path: Path) -> None:
+    AtlasWriter(tmp_path).save(mapped.map())
+    next(tmp_path.glob("submap-*")).unlink()
+
+    loaded, (warning,) = atlas.load(tmp_path)
+    AtlasWriter(tmp_path).save(loaded)
+
+    assert "is kept" not in warning
+    assert atlas.load(tmp_path)[1] == []
