@@ -52,6 +52,17 @@ class FrameTree:
                 return np.asarray(inverse(T_frame_target) @ ups[frame])
         return None
 
+    def obstacle(self, parent: str, child: str) -> str:
+        """Return in words why a child may not be put below a parent; empty if it may.
+
+        It may have no other parent already, and must not be above the new one.
+        """
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        known, _ = self._parents.get(child, ("", None))
+        if known not in ("", parent):
+            return f"'{known}' is already the parent of '{child}'"
+        return f"'{child}' is already above '{parent}'" if child in self._ancestors(parent) else ""
+
     def root(self, frame: str) -> tuple[str, F64]:
         """Return the topmost frame above a frame, and the transform to it, (4, 4).
 

@@ -50,6 +50,14 @@ class StaticFrames:
         """Return the topmost frame above a frame, and the transform to it, (4, 4)."""
         return self._tree.root(frame)
 
+    def obstacle(self, parent: str, child: str) -> str:
+        """Return in words why no transform may put a child below a parent; empty if it may.
+
+        A frame with two parents breaks the tree: tf2 drops one of the two transforms.
+        """
+        reason = self._tree.obstacle(parent, child)
+        return f"{reason} on /tf_static" if reason else ""
+
     def _take(self, message: TFMessage) -> None:
         problems = self._tree.take(message)
         if problems:

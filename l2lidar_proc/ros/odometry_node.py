@@ -6,6 +6,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -27,7 +28,7 @@ from l2lidar_node.ros.mounting import StaticFrames, untied
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import run
 from l2lidar_node.settings import SettingError
-from l2lidar_node.types import F64, HostNs, Sweep
+from l2lidar_node.types import F64, HostNs, Level, Sweep
 from l2lidar_proc.cloud import CloudError
 from l2lidar_proc.deskew.config import DeskewTopics
 from l2lidar_proc.motion.imu_buffer import Samples
@@ -86,7 +87,9 @@ class OdometryNode(ManagedNode):
         if self._pipeline.extrinsics.problem:
             self.get_logger().warning(self._pipeline.extrinsics.problem)
         self._folder = DataFolder(config.files.data_dir, config.files.overwrite)
-        self._frames = StaticFrames(self) if topics.use_tf else None
+        self._static = StaticFrames(self)  # also without use_tf: a second parent breaks the tree
+        self._withheld = ""  # why the transform is, as last logged
+        self._frames = self._static if topics.use_tf else None
         self._base = BaseFrame(np.eye(4))
         self._cloud_frame = ""
         self._mounted: tuple[int, str, str] | None = None
@@ -153,6 +156,7 @@ class OdometryNode(ManagedNode):
             self._tf,
             self.create_publisher(OdometryMessage, topics.fast_odometry_topic, out),
             round(config.odometry.inertial.imu_gap_ms * 1e6),
+            lambda parent, child: not self._static.obstacle(parent, child),
         )
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         for name, answer in (
@@ -426,6 +430,28 @@ class OdometryNode(ManagedNode):
         self.get_logger().warning(text, throttle_duration_sec=10.0)
         return text
 
+    def _unpublished(self) -> str:
+        """Return why the transform is withheld, and what to set; empty if it is not."""
+        topics = self._settings.value.topics
+        odom, base = topics.odom_frame, self._base_name
+        if not topics.publish_tf or not base:
+            return ""
+        parent, child = (base, odom) if topics.invert_tf else (odom, base)
+        obstacle = self._static.obstacle(parent, child)
+        if not obstacle:
+            self._withheld = ""
+            return ""
+        root, _ = self._static.root(child)
+        if topics.invert_tf or root == odom:
+            remedy = f"take '{odom}' off /tf_static, or set publish_tf to false"
+        else:
+            remedy = f"set base_frame to '{root}', or invert_tf to true, or publish_tf to false"
+        text = f"no transform from '{parent}' to '{child}': {obstacle}; {remedy}"
+        if text != self._withheld:
+            self.get_logger().warning(text)
+        self._withheld = text
+        return text
+
     def _diagnose(self) -> None:
         since = self.pipeline.sweeps - self._looked_at
         self._looked_at = self.pipeline.sweeps
@@ -441,6 +467,10 @@ class OdometryNode(ManagedNode):
         judged.values["calibration of the IMU"] = self.pipeline.extrinsics.source
         if self._said:
             judged.values["recognized"] = "; ".join(sorted(self._said))
+        unpublished = self._unpublished()
+        if unpublished:
+            text = f"{judged.message}; {unpublished}"
+            judged = replace(judged, level=Level.ERROR, message=text)
         refused = self._frames.refused if self._frames is not None else ""
         judged = self._inputs.judge(judged, refused)
         name = self.get_fully_qualified_name().lstrip("/")

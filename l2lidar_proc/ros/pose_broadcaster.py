@@ -42,6 +42,8 @@ class PoseBroadcaster:
         Of the ``Odometry`` at IMU samples.
     gap_ns : int
         Longest gap between samples, as of :class:`DeadReckoning`.
+    is_free : callable
+        Given parent and child, returns whether a transform between them may be published.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class PoseBroadcaster:
         transforms: Any,
         fast: Any,
         gap_ns: int,
+        is_free: Callable[[str, str], bool],
     ) -> None:
         self._topics = topics
         self._base_name = base_name
@@ -59,6 +62,7 @@ class PoseBroadcaster:
         self._lock = threading.Lock()
         self._base = BaseFrame(np.eye(4))
         self._gap_ns = gap_ns
+        self._is_free = is_free
         self._reckoning = DeadReckoning(np.eye(4), gap_ns)
         self._recent: deque[Samples] = deque(maxlen=_MOST_BATCHES)
         self._pending: list[Samples] = []  # those of the recent that wait for the next step
@@ -168,9 +172,11 @@ class PoseBroadcaster:
         is_late = stamp <= self._transform_ns < newest + _TIME_JUMP_NS
         if not topics.publish_tf or is_late:
             return
-        self._transform_ns = stamp
         frames = topics.odom_frame, self._base_name()
         if topics.invert_tf:
             T_odom_base, frames = rotations.inverse(T_odom_base), frames[::-1]
+        if not self._is_free(*frames):
+            return
+        self._transform_ns = stamp
         made = messages.transform(T_odom_base, stamp, *frames)
         self._transforms.publish(made)

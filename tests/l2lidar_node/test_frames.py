@@ -55,6 +55,17 @@ def test_a_frame_has_one_parent_the_newest() -> None:
     assert found(tree, "c", "b")[0, 3] == 2
 
 
+def test_a_frame_takes_no_second_parent_and_none_from_below_it() -> None:
+    tree = FrameTree()
+    tree.add("base", "mast", np.eye(4))
+    tree.add("mast", "lidar", np.eye(4))
+    assert tree.obstacle("odom", "lidar") == "'mast' is already the parent of 'lidar'"
+    assert tree.obstacle("/odom", "/mast") == "'base' is already the parent of 'mast'"
+    assert tree.obstacle("lidar", "base") == "'base' is already above 'lidar'"
+    for parent, child in (("odom", "base"), ("lidar", "odom"), ("mast", "lidar")):
+        assert tree.obstacle(parent, child) == ""
+
+
 def test_mounts_in_a_circle_and_long_chains_have_an_end() -> None:
     tree = FrameTree()
     for child, parent in ("ab", "bc", "ca"):

@@ -189,6 +189,73 @@ def test_base_frame_from_tf_with_the_transform_inverted(bench: Any) -> None:
     assert not bench.node._untied()
 
 
+def static(parent: str, child: str) -> TFMessage:
+    mount = TransformStamped(child_frame_id=child)
+    mount.header.frame_id = parent
+    mount.transform.translation.z = 1.0
+    mount.transform.rotation.w = 1.0
+    return TFMessage(transforms=[mount])
+
+
+@pytest.mark.parametrize(
+    ("bench", "mount", "words"),
+    [
+        (
+            (),
+            ("base_link", FRAME),
+            ("'base_link' is already the parent of 'l2lidar_link'", "base_frame to 'base_link'"),
+        ),
+        (("use_tf:=false",), ("base_link", FRAME), ("base_frame to 'base_link'",)),
+        (
+            ("base_frame:=base_link", "invert_tf:=true"),
+            ("map", "odom"),
+            ("'map' is already the parent of 'odom'", "take 'odom' off", "publish_tf to false"),
+        ),
+        # base_frame cannot be odom_frame, nor can the transform be inverted
+        ((), ("odom", "base_link"), ("'base_link' is already", "take 'odom' off /tf_static")),
+        (("invert_tf:=true",), ("odom", "base_link"), ("'odom' is already above", "'odom' off")),
+    ],
+    indirect=["bench"],
+)
+def test_a_frame_that_has_a_parent_gets_no_second_one(
+    bench: Any, mount: tuple[str, str], words: tuple[str, ...]
+) -> None:
+    """A cloud frame below a robot's base_link: tf2 would drop the mount."""
+    run = recording("room", "walk")
+    bench.tf_out.publish(static(*mount))
+    bench.tf_out.publish(static("base_link", FRAME))
+    bench.until(lambda: bench.node._static.version == 2)
+    bench.send(run, list(sweeps(run, "turn"))[:8])
+    bench.until(lambda: len(bench.poses) == 8 and bench.fast)
+    bench.diagnostics.clear()
+    bench.until(lambda: any(words[0] in status.message for status in bench.diagnostics))
+
+    (said, *_) = [status for status in bench.diagnostics if words[0] in status.message]
+    assert said.level == DiagnosticStatus.ERROR
+    for word in words:
+        assert word in said.message
+    assert bench.transforms == []
+
+
+@pytest.mark.parametrize("bench", [(), ("base_frame:=base_link",)], indirect=True)
+def test_a_mount_that_comes_late_ends_the_transforms_of_a_frame_below_it(bench: Any) -> None:
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:14]
+    is_root = bench.node._base_name == "base_link"
+    bench.send(run, some[:7])
+    bench.until(lambda: len(bench.poses) == 7 and bench.transforms)
+    bench.tf_out.publish(static("base_link", FRAME))
+    bench.until(lambda: bench.node._static.version)
+    newest = bench.node._pipeline.newest_imu
+    bench.send(run, some[7:])
+    bench.until(lambda: len(bench.poses) == 14)
+    bench.diagnostics.clear()
+    bench.until(lambda: bench.diagnostics)
+
+    assert ("is already the parent" in bench.diagnostics[-1].message) is not is_root
+    assert (bench.known_until(2**62) > newest) is is_root
+
+
 def test_a_cloud_can_be_transformed_when_it_comes(bench: Any) -> None:
     """RViz, Nav2 and others drop a cloud whose transform has not come yet."""
     run = recording("room", "walk")
