@@ -46,6 +46,8 @@ class Deskewed:
     quality : Quality
     waited_ns : int
         How long the sweep was held for the IMU.
+    known : KnownMotion, optional
+        Its motion, where an odometry in the same process had estimated that.
     """
 
     stamp: HostNs
@@ -53,6 +55,7 @@ class Deskewed:
     sweep: Sweep
     quality: Quality
     waited_ns: int
+    known: KnownMotion | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +219,7 @@ class Pipeline:
             quality = replace(quality, flags=(*quality.flags, Flag.FILTER_LEFT_OUT))
             self.problems = problems
         self._count(quality)
-        return Deskewed(stamp, points, sweep, quality, release.waited_ns)
+        return Deskewed(stamp, points, sweep, quality, release.waited_ns, known)
 
     def _assemble(
         self, sweep: Sweep, trajectory: SweepTrajectory | None

@@ -76,6 +76,7 @@ class Quality:
 
 
 _LONGEST_MOTION_NS: Final = 2_000_000_000  # between two sweeps that follow each other
+_SEAM_NS: Final = 10_000_000  # between two trajectories that follow each other, at most
 
 
 class KnownMotion(NamedTuple):
@@ -246,13 +247,33 @@ class MotionTracker:
         found = self.filter.up_at(stamp)
         return found if found.any() and not self.filter.is_faulty else None
 
-    def motion(self, source: HostNs, target: HostNs) -> F64 | None:
+    def motion(
+        self,
+        source: HostNs,
+        target: HostNs,
+        before: KnownMotion | None = None,
+        now: KnownMotion | None = None,
+    ) -> F64 | None:
         """Return cloud coordinates at one instant to those at a later one, (4, 4).
 
         None where no IMU samples tell the rotation. Without a velocity it is a rotation alone.
+
+        Parameters
+        ----------
+        source, target : HostNs
+        before, now : KnownMotion, optional
+            Of the sweeps with these instants. Where they meet, they take the place of everything
+            known here: while an odometry knows the motion, the filter gets no velocities.
         """
+        if not 0 < target - source < _LONGEST_MOTION_NS:
+            return None
+        if before is not None and now is not None:
+            seam = HostNs(int(before.trajectory.stamps[-1]))
+            if now.trajectory.stamps[0] - seam <= _SEAM_NS:
+                to_seam = rotations.transform(*before.trajectory.between(seam, source))
+                return rotations.transform(*now.trajectory.between(target, seam)) @ to_seam
         stamps = self.buffer.samples["stamp"]
-        if not len(stamps) or stamps[0] > source or not 0 < target - source < _LONGEST_MOTION_NS:
+        if not len(stamps) or stamps[0] > source:
             return None
         if self._is_still(source, target):
             return np.eye(4)

@@ -73,7 +73,7 @@ class ScanPublisher:
         self._node = node
         self._frames = frames
         self._builder = ScanBuilder(config)
-        self._before: HostNs | None = None
+        self._before: tuple[HostNs, KnownMotion | None] | None = None
         self._scans = self._transforms = None
         if config.publish == "never":
             return
@@ -98,8 +98,11 @@ class ScanPublisher:
         if place is None:
             return
         frame, T_scan_cloud = place
-        before, self._before = self._before, item.stamp
-        T_now_before = None if before is None else tracker.motion(before, item.stamp)
+        before, self._before = self._before, (item.stamp, item.known)
+        T_now_before = None
+        if before is not None:
+            stamp_before, known_before = before
+            T_now_before = tracker.motion(stamp_before, item.stamp, known_before, item.known)
         scan = self._builder.add(item.points, T_scan_cloud, T_now_before)
         message = LaserScan(
             angle_min=scan.angle_min,

@@ -15,6 +15,7 @@ from l2lidar_node.settings import SettingError, build
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.config import MotionConfig
+from l2lidar_proc.motion.sweep_motion import SweepTrajectory
 from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, carried_over
 from tests.l2lidar_proc.motion.analytic import (
     EPOCH,
@@ -67,6 +68,43 @@ def test_a_walk_with_a_velocity_from_before_the_sweep() -> None:
         assert found is trajectory
         assert told.flags == flags
         assert told.velocity_sigma == sigma
+
+
+def known(start: float, end: float) -> KnownMotion:
+    """Return the true motion of a walk as an odometry knows it, seen from the middle."""
+    t = np.linspace(start, end, 60)
+    middle = np.array([(start + end) / 2])
+    origin, turn = WALK.position(middle), WALK.rotation(middle).inv()
+    h = 1e-4
+    rates = (WALK.rotation(t - h).inv() * WALK.rotation(t + h)).as_rotvec() / (2 * h)
+    q = np.roll((turn * WALK.rotation(t)).as_quat(), 1, axis=1)
+    stamps = EPOCH + np.round(t * 1e9).astype(np.int64)
+    positions = turn.apply(WALK.position(t) - origin)
+    return KnownMotion(SweepTrajectory(stamps, q, positions, rates), is_aligned=True)
+
+
+@pytest.mark.parametrize(("gap_s", "is_known"), [(-0.1, True), (0.0, True), (0.1, False)])
+def test_from_sweep_to_sweep_the_odometry_knows_how_far_it_is(
+    gap_s: float, is_known: bool
+) -> None:
+    """The tracker has rotations only: while the odometry knows better it takes no velocity."""
+    tracker = tracked(WALK.imu(0, END + 0.4))
+    before, now = known(START, END), known(END + gap_s, END + 0.35)
+    source, target = START + 0.05, END + 0.2
+
+    alone = tracker.motion(at(source), at(target))
+    found = tracker.motion(at(source), at(target), before, now)
+
+    instants = np.array([source, target])
+    places, turns = WALK.position(instants), WALK.rotation(instants)
+    way = turns[1].inv().apply(places[0] - places[1])
+    assert alone is not None
+    assert found is not None
+    assert not alone[:3, 3].any()
+    np.testing.assert_allclose(found[:3, 3], way if is_known else 0.0, atol=1e-3)
+    turn = (turns[1].inv() * turns[0]).as_matrix()
+    np.testing.assert_allclose(found[:3, :3], turn, atol=0.01)
+    assert tracker.motion(at(target), at(source), before, now) is None
 
 
 def test_the_accelerometer_makes_the_difference() -> None:

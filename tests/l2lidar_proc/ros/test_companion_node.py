@@ -108,6 +108,31 @@ def test_each_cloud_comes_in_once_and_out_of_both(bench: CompanionBench) -> None
     assert np.median(np.linalg.norm(at_start[kept] - expected, axis=1)) < 0.01
 
 
+@pytest.mark.parametrize("bench", [("deskew_node:publish_scan:=always",)], indirect=True)
+def test_sweeps_of_a_scan_move_with_the_sensor(bench: CompanionBench) -> None:
+    """The odometry knows how far it went from one to the next."""
+    run = recording("room", "walk", 6.0)
+    builder = bench.nodes[1]._scan._builder
+    add, motions = builder.add, []
+
+    def noted(points: Any, T_scan_cloud: Any, T_now_before: Any) -> Any:
+        motions.append(T_now_before)
+        return add(points, T_scan_cloud, T_now_before)
+
+    builder.add = noted
+    sent = play(bench, run, 5.5)
+    starts = np.array([sweep.start for sweep in sent])
+    positions, q = truth(run, starts)
+    for number in range(-8, 0):
+        before, now = number - 1, number
+        back = rotations.conjugate(q[now])
+        way = rotations.rotate(back, positions[before] - positions[now])
+        assert np.linalg.norm(way) > 0.05
+        np.testing.assert_allclose(motions[now][:3, 3], way, atol=0.01)
+        turn = rotations.matrices(rotations.multiply(back, q[before]))
+        np.testing.assert_allclose(motions[now][:3, :3], turn, atol=0.01)
+
+
 def test_one_goes_on_while_a_manager_takes_the_other_out_and_back(bench: CompanionBench) -> None:
     """Clouds are still deskewed, and poses come again, each before its cloud."""
     odometry, deskew = bench.nodes
