@@ -333,9 +333,10 @@ class BaseFrame:
 
         The first pose that is given decides.
         """
-        if self._T_odom_map is None:
-            self._T_odom_map = leveled_start(T_map_lidar @ self.T_lidar_base)
-        return self._T_odom_map
+        T_odom_map = self._T_odom_map  # once: another thread may reset it
+        if T_odom_map is None:
+            T_odom_map = self._T_odom_map = leveled_start(T_map_lidar @ self.T_lidar_base)
+        return T_odom_map
 
     def pose(self, T_map_lidar: F64) -> F64:
         """Return the pose (..., 4, 4) of the base frame for one of the cloud frame."""

@@ -381,9 +381,10 @@ class OdometryNode(ManagedNode):
         return response
 
     def _begin_again(self) -> None:
+        # First: the IMU's thread would begin the new odometry frame at a pose in the old map.
+        self._poses.reset()
         self.pipeline.reset()
         self._base.reset()
-        self._poses.reset()
         self._path.clear()
         self._path_end = np.full((4, 4), np.inf)
         self._looked_at = 0

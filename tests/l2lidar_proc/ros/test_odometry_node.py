@@ -352,6 +352,29 @@ def test_without_a_rate_there_is_one_transform_for_each_sweep(bench: Any) -> Non
     assert not bench.fast
 
 
+def test_a_reset_leaves_nothing_of_the_old_map_to_the_new_frame(bench: Any) -> None:
+    """The thread of the IMU publishes dead-reckoned poses all the while."""
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:12]
+    bench.send(run, some)
+    bench.until(lambda: len(bench.poses) == len(some))
+    base, last = bench.node._base, int(np.searchsorted(run.imu["stamp"], some[-1].end)) + 1
+    reset = base.reset
+
+    def reset_between_samples() -> None:
+        reset()
+        bench.node._poses.take(run.imu[last : last + 20])
+
+    base.reset = reset_between_samples
+    assert bench.call("reset").success
+    bench.poses.clear()
+    bench.send(run, list(sweeps(run, "turn"))[12:18])
+    bench.until(lambda: bench.poses)
+
+    first = bench.poses[0].pose.pose.position
+    assert np.linalg.norm((first.x, first.y, first.z)) < 1e-6
+
+
 @pytest.mark.parametrize("bench", [("mode:=plain",)], indirect=True)
 def test_plain_kiss_icp(bench: Any) -> None:
     run = recording("room", "still", 3.0)
