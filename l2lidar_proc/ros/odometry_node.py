@@ -16,6 +16,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry as OdometryMessage, Path
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
@@ -65,6 +66,8 @@ class OdometryNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("odometry_node")
         self._pipeline: OdometryPipeline | None = None
+        self._map_timer: Timer | None = None
+        self._map_period_s = 0.0
         self._settings = ParameterSet(self, OdometryNodeConfig, self._configure)
         topics = self._settings.value.topics
         period_s = 1.0 / topics.imu_rate if topics.imu_rate > 0.0 else SLOW_LOOK_S
@@ -110,9 +113,8 @@ class OdometryNode(ManagedNode):
         self.sensors.add(self, self._guarded, is_first=True, fast=fast)
         guarded = self._guarded
         steady_timer(self, 1.0, guarded(self._diagnose))
-        map_period_s = self._settings.value.topics.map_period_s
-        if map_period_s > 0.0:
-            steady_timer(self, map_period_s, guarded(self._show_map))
+        self._map_timer, self._map_period_s = None, 0.0  # that of before ended with the pause
+        self._time_map(self._settings.value.topics.map_period_s)
         load_libraries(*LIBRARIES)
 
     def pause(self) -> None:
@@ -169,6 +171,19 @@ class OdometryNode(ManagedNode):
     def _configure(self, config: OdometryNodeConfig) -> None:
         if self._pipeline is not None:
             self._pipeline.configure(config.odometry)
+        if self.is_active:
+            self._time_map(config.topics.map_period_s)
+
+    def _time_map(self, period_s: float) -> None:
+        """Show the map in this period from now on [s], with 0 never."""
+        if period_s == self._map_period_s:
+            return
+        self._map_period_s = period_s
+        if self._map_timer is not None:
+            self.destroy_timer(self._map_timer)
+            self._map_timer = None
+        if period_s > 0.0:
+            self._map_timer = steady_timer(self, period_s, self._guarded(self._show_map))
 
     def shared_subscriptions(self, node: Node, topics: DeskewTopics) -> SensorSubscriptions | None:
         """Return the subscriptions if a deskew node wants exactly these."""

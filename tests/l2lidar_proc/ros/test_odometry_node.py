@@ -18,6 +18,7 @@ from nav_msgs.msg import (  # noqa: E402
     Odometry,
     Path as PathMessage,
 )
+from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
@@ -373,6 +374,31 @@ def test_a_reset_leaves_nothing_of_the_old_map_to_the_new_frame(bench: Any) -> N
 
     first = bench.poses[0].pose.pose.position
     assert np.linalg.norm((first.x, first.y, first.z)) < 1e-6
+
+
+@pytest.mark.parametrize("bench", [("map_period_s:=3600.0",)], indirect=True)
+def test_the_period_of_the_map_can_be_changed_while_it_runs(bench: Any) -> None:
+    run = recording("room", "walk")
+    bench.send(run, list(sweeps(run, "turn"))[:6])
+    bench.until(lambda: bench.poses and bench.node._map.get_subscription_count())
+    node = bench.node
+
+    def set_period(value: float) -> bool:
+        return bool(node.set_parameters([Parameter("map_period_s", value=value)])[0].successful)
+
+    assert not bench.maps
+    assert set_period(0.1)
+    bench.until(lambda: len(bench.maps) > 1)
+    assert set_period(0.0)
+    timers = len(list(node.timers))
+    assert set_period(5.0)
+    assert len(list(node.timers)) == timers + 1
+    node.trigger_deactivate()
+    assert set_period(0.1)
+    assert not list(node.timers)
+    node.trigger_activate()
+    bench.maps.clear()
+    bench.until(lambda: bench.maps)
 
 
 @pytest.mark.parametrize("bench", [("mode:=plain",)], indirect=True)
