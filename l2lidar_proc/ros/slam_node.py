@@ -215,9 +215,9 @@ class SlamNode(ManagedNode):
         parts = self._parts[stamp]
         if parts.odometry is None or parts.cloud is None:
             return
-        if parts.status is None and self.count_publishers(
-            self._settings.value.topics.odometry_status_topic
-        ):
+        # To count does not remap the name, as to subscribe does.
+        topic = self.resolve_topic_name(self._settings.value.topics.odometry_status_topic)
+        if parts.status is None and self.count_publishers(topic):
             return
         del self._parts[stamp]
         try:

@@ -36,10 +36,18 @@ class Bench:
         Makes the node.
     overrides : sequence of str
         Its parameters, ``NAME:=VALUE``.
+    remappings : sequence of str
+        Of names in both, ``OLD:=NEW``.
     """
 
-    def __init__(self, make: Callable[[], Any], overrides: tuple[str, ...]) -> None:
-        rclpy.init(args=["test", "--ros-args", *(w for o in overrides for w in ("-p", o))])
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        overrides: tuple[str, ...],
+        remappings: tuple[str, ...] = (),
+    ) -> None:
+        options = [("-p", item) for item in overrides] + [("-r", item) for item in remappings]
+        rclpy.init(args=["test", "--ros-args", *(word for option in options for word in option)])
         self.node = make()
         self.peer: Node = rclpy.create_node("peer")
         self.diagnostics: list[DiagnosticStatus] = []

@@ -48,8 +48,8 @@ pytestmark = pytest.mark.ros
 class SlamBench(Bench):
     """A SLAM node on the bench."""
 
-    def __init__(self, *overrides: str) -> None:
-        super().__init__(SlamNode, overrides)
+    def __init__(self, *overrides: str, remappings: tuple[str, ...] = ()) -> None:
+        super().__init__(SlamNode, overrides, remappings)
         self.transforms: list[TransformStamped] = []
         self.poses: list[PoseWithCovarianceStamped] = []
         self.states: list[str] = []
@@ -75,7 +75,8 @@ class SlamBench(Bench):
             self.until(publisher.get_subscription_count)
         self.until(self.node._transform._publisher.get_subscription_count)
         self.until(self.node._pose.get_subscription_count)
-        self.until(lambda: self.node.count_publishers("odometry_status"))
+        status = self.node.resolve_topic_name("odometry_status")
+        self.until(lambda: self.node.count_publishers(status))
         self.sent = 0
 
     def take_transforms(self, message: TFMessage) -> None:
@@ -83,18 +84,24 @@ class SlamBench(Bench):
 
     def send(self, sweep: OdometrySweep, frame: str = FRAME, remarks: str = "ALIGNED") -> None:
         """Send the three messages of a sweep, and wait until the node has taken them."""
+        self.send_pose_and_cloud(sweep, frame)
+        self.send_status(sweep, remarks)
+        self.until(lambda: self.is_taken(sweep.stamp))
+        self.sent += 1
+
+    def send_pose_and_cloud(self, sweep: OdometrySweep, frame: str = FRAME) -> None:
         odometry = Odometry(child_frame_id=frame)
         odometry.header.stamp = to_time(sweep.stamp)
         odometry.header.frame_id = "odom"
         odometry.pose.pose = messages.pose(sweep.T_odom_body)
-        status = DiagnosticArray(status=[DiagnosticStatus(name="odometry", message=remarks)])
-        status.header.stamp = odometry.header.stamp
         self.odometry_out.publish(odometry)
-        self.status_out.publish(status)
         cloud = messages.as_cloud(sweep.points)
         self.deskewed_out.publish(to_cloud(cloud, sweep.stamp, FRAME))
-        self.until(lambda: self.is_taken(sweep.stamp))
-        self.sent += 1
+
+    def send_status(self, sweep: OdometrySweep, remarks: str) -> None:
+        status = DiagnosticArray(status=[DiagnosticStatus(name="odometry", message=remarks)])
+        status.header.stamp = to_time(sweep.stamp)
+        self.status_out.publish(status)
 
     def is_taken(self, stamp: int) -> bool:
         latest = self.node._latest
@@ -426,6 +433,28 @@ def test_an_odometry_without_a_status_is_lost_where_its_covariance_says_so(
     ):
         odometry.pose.covariance = np.diag(variances).ravel()
         assert _sweep(sweep.stamp, odometry, cloud, None).health is health
+
+
+@pytest.mark.parametrize("remappings", [(), ("odometry_status:=/elsewhere/status",)])
+def test_a_sweep_waits_for_its_status(
+    office: MappingRun, tmp_path: Path, remappings: tuple[str, ...]
+) -> None:
+    bench = SlamBench(f"data_dir:={tmp_path}", remappings=remappings)
+    try:
+        sweep = sweeps_of(office)[0]
+        taken: list[OdometrySweep] = []
+        bench.node.worker.sweep = taken.append
+        bench.send_pose_and_cloud(sweep)
+        bench.until(lambda: bench.node._latest)
+        parts = bench.node._parts
+        bench.until(lambda: taken or (sweep.stamp in parts and parts[sweep.stamp].cloud))
+        assert not taken
+        bench.send_status(sweep, "LOST")
+        bench.until(lambda: taken)
+
+        assert taken[0].health is Health.CUT
+    finally:
+        bench.close()
 
 
 def test_another_parent_of_odom_silences_the_transform(
