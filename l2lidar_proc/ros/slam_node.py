@@ -7,12 +7,14 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import wraps
 from typing import Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
+from rclpy._rclpy_pybind11 import InvalidHandle, RCLError
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -73,6 +75,20 @@ class _Parts:
     odometry: Odometry | None = None
     cloud: PointCloud2 | None = None
     status: DiagnosticStatus | None = None
+
+
+def _until_shutdown(publish: Callable[..., None]) -> Callable[..., None]:
+    """Return a method for the worker's thread, silent once a signal has shut the context down."""
+
+    @wraps(publish)
+    def run(node: SlamNode, *arguments: Any) -> None:
+        try:
+            publish(node, *arguments)
+        except (RCLError, InvalidHandle):
+            if node.context.ok():
+                raise
+
+    return run
 
 
 class SlamNode(ManagedNode):
@@ -138,7 +154,7 @@ class SlamNode(ManagedNode):
         self._parts.clear()
 
     def tear_down(self) -> None:
-        """End the worker."""
+        """End the worker, which saves what is unsaved."""
         if self._worker is not None:
             self._worker.close()
             self._worker = None
@@ -291,6 +307,7 @@ class SlamNode(ManagedNode):
         stamp = self._latest.stamp
         worker.show(lambda built, loops: self._show_map(built, loops, stamp))
 
+    @_until_shutdown
     def _show_map(self, built: Map, loops: list[tuple[int, int]], stamp: HostNs) -> None:
         """Publish map, path and graph; called in the worker's thread."""
         frame = self._settings.value.topics.map_frame
@@ -311,6 +328,7 @@ class SlamNode(ManagedNode):
         if self._graph.get_subscription_count():
             self._graph.publish(_markers(built, loops, frame))
 
+    @_until_shutdown
     def _show_keyframe(self, keyframe: Keyframe) -> None:
         """Publish a submap for other back ends; called in the worker's thread."""
         latest = self._latest

@@ -25,6 +25,7 @@ from l2lidar_proc.slam.slam import Slam
 Answer = tuple[bool, str]
 """Success of a request, and its message."""
 
+_END_S: Final = 8.0  # for the last save; a launch kills what has not ended after 10 s
 _DEPTH: Final = 400  # sweeps that may wait while a loop is verified: over a minute
 _MOST_REQUESTS: Final = 50  # that may wait besides
 _NOW, _IN_TURN = 0, 1  # a job that does not depend on those before it, one that does
@@ -130,14 +131,24 @@ class SlamWorker:
             self._submit(_IN_TURN, lambda: show(*self._shown()))
 
     def close(self) -> None:
-        """End the thread; waiting work is dropped."""
+        """End the thread; waiting work is dropped.
+
+        What the map has grown by since the last save is saved where autosaving is on. Where it
+        is off, or not done in time, a warning says what is lost.
+        """
         try:
             while True:
                 self._jobs.get_nowait()
         except Empty:
             pass
+        self._submit(_NOW, self._save_the_rest)
         self._submit(_NOW, None)
-        self._thread.join(timeout=5.0)
+        self._thread.join(timeout=_END_S)
+        if self._changed and self._thread.is_alive():
+            self._warn(
+                f"the map was not saved within {_END_S:g} s: what was added since the last save "
+                "is lost"
+            )
 
     # ---- run in the thread
 
@@ -167,6 +178,15 @@ class SlamWorker:
         if not worked:
             self._warn(f"autosave: {text}")
         return worked, text
+
+    def _save_the_rest(self) -> None:
+        if self._config.topics.autosave_s > 0.0:
+            self._answered(self.autosave)
+        elif self._changed and isinstance(self._engine, Slam):
+            self._warn(
+                "the map has grown since the last save and is not saved, since autosave_s is 0; "
+                "call ~/save before the node ends"
+            )
 
     def load(self) -> Answer:
         """Start over with the saved map."""

@@ -197,7 +197,11 @@ class SlamTopics:
     map_name: str = setting("map", "folder of the map within data_dir", live=True)
     load_map: bool = setting(False, "start with the saved map")
     autosave_s: float = setting(
-        60.0, "time between saves of a growing map; 0 turns them off", unit="s", lo=0.0, hi=86400.0
+        60.0,
+        "time between saves of a growing map, the last one when the node ends; 0 turns them off",
+        unit="s",
+        lo=0.0,
+        hi=86400.0,
     )
     initial_pose: tuple[float, ...] = setting(
         (), "x, y [m] and yaw [deg] in the saved map at the start; empty if unknown"

@@ -30,7 +30,7 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 from l2lidar_node.ros.conversions import from_time, to_cloud, to_time  # noqa: E402
 from l2lidar_node.ros.program import StartError  # noqa: E402
 from l2lidar_node.types import HostNs  # noqa: E402
-from l2lidar_proc.ros import odometry_messages as messages  # noqa: E402
+from l2lidar_proc.ros import odometry_messages as messages, slam_worker  # noqa: E402
 from l2lidar_proc.ros.map_transform import Blend, reach  # noqa: E402
 from l2lidar_proc.ros.slam_node import SlamNode, _sweep  # noqa: E402
 from l2lidar_proc.ros.slam_worker import SlamWorker  # noqa: E402
@@ -362,6 +362,94 @@ def test_a_new_map_takes_the_name_of_an_old_one_but_not_its_place(
     assert said == [f"the previous map in {tmp_path}/map is now {tmp_path}/map-1"]
     assert len(atlas.load(tmp_path / "map")[0].nodes) < len(mapped.nodes)
     assert len(atlas.load(tmp_path / "map-1")[0].nodes) >= len(mapped.nodes)
+
+
+@pytest.mark.parametrize("autosave_s", [60.0, 0.0])
+def test_at_the_end_what_is_unsaved_is_saved_or_told_of(
+    office: MappingRun, tmp_path: Path, autosave_s: float
+) -> None:
+    """Who switched autosaving off did not ask for a file, but should know what is lost."""
+    topics = SlamTopics(data_dir=str(tmp_path), autosave_s=autosave_s)
+    said: list[str] = []
+    worker = SlamWorker(SlamNodeConfig(topics=topics), said.append, lambda keyframe: None)
+    for sweep in sweeps_of(office)[:30]:
+        worker.sweep(sweep)
+    done = threading.Event()
+    worker.request(lambda: (True, ""), lambda answer: done.set())
+    assert done.wait(60.0)
+    worker.close()
+
+    if autosave_s:
+        assert len(atlas.load(tmp_path / "map")[0].nodes) == worker.submaps > 0
+        assert said == []
+    else:
+        assert list(tmp_path.iterdir()) == []
+        (only,) = said
+        assert "not saved" in only
+        assert "autosave_s is 0" in only
+
+
+def test_a_worker_that_cannot_save_at_the_end_says_so(office: MappingRun, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    topics = SlamTopics(data_dir=str(tmp_path / "file"))
+    said: list[str] = []
+    worker = SlamWorker(SlamNodeConfig(topics=topics), said.append, lambda keyframe: None)
+    for sweep in sweeps_of(office)[:30]:
+        worker._add(sweep)
+    worker.close()
+
+    assert [text.partition(": ")[0] for text in said] == ["autosave"]
+    assert worker.failures == 0
+
+
+def test_a_worker_that_is_busy_does_not_hold_the_end_up(
+    office: MappingRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slam_worker, "_END_S", 0.2)
+    topics = SlamTopics(data_dir=str(tmp_path))
+    said: list[str] = []
+    worker = SlamWorker(SlamNodeConfig(topics=topics), said.append, lambda keyframe: None)
+    for sweep in sweeps_of(office)[:30]:
+        worker._add(sweep)
+    begun, over = threading.Event(), threading.Event()
+
+    def work() -> tuple[bool, str]:
+        begun.set()
+        return over.wait(60.0), ""
+
+    worker.request(work, lambda answer: None)
+    assert begun.wait(60.0)
+    worker.close()
+    over.set()
+
+    assert said == [
+        "the map was not saved within 0.2 s: what was added since the last save is lost"
+    ]
+
+
+def test_after_ctrl_c_the_worker_ends_without_a_traceback(
+    office: MappingRun, tmp_path: Path
+) -> None:
+    """The signal shuts the context down while the worker may be about to publish."""
+    bench = SlamBench(f"data_dir:={tmp_path}")
+    node = bench.node
+    some = sweeps_of(office)[:30]
+    bench.send(some[0])
+    worker = node.worker
+    rclpy.shutdown()
+    try:
+        for sweep in some[1:]:
+            worker.sweep(sweep)
+        worker.show(lambda built, loops: node._show_map(built, loops, some[0].stamp))
+        done = threading.Event()
+        worker.request(lambda: (True, ""), lambda answer: done.set())
+        assert done.wait(60.0)
+    finally:
+        node.destroy_node()
+        bench.peer.destroy_node()
+
+    assert worker.failures == 0
+    assert len(atlas.load(tmp_path / "map")[0].nodes) == worker.submaps > 0
 
 
 def test_a_transition_waits_for_the_answers_that_are_under_way(tmp_path: Path) -> None:
