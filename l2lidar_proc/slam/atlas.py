@@ -70,19 +70,11 @@ class AtlasWriter:
             If the folder holds something else, or cannot be written.
         """
         try:
+            check_place(self.folder)
             self.folder.mkdir(parents=True, exist_ok=True)
-            if not (self.folder / MANIFEST).exists() and any(
-                not (_OURS.fullmatch(path.name) or _PART.fullmatch(path.name))
-                for path in self.folder.iterdir()
-            ):
-                raise AtlasError(
-                    f"{self.folder} contains files that are not a map; choose a new or empty "
-                    "folder"
-                )
             return self._save(built)
         except OSError as error:
-            reason = error.strerror or str(error)
-            raise AtlasError(f"{self.folder}: the map could not be saved: {reason}") from None
+            raise _unsaved(self.folder, error) from None
 
     def _save(self, built: Map) -> int:
         submaps = [self._submap(number, node) for number, node in enumerate(built.nodes)]
@@ -127,6 +119,36 @@ class AtlasWriter:
         if not (self.folder / name).exists():
             write_whole(self.folder / name, content)
         return name
+
+
+def _is_of_a_map(name: str) -> bool:
+    """Return whether a file is one of a map, or what a save that was killed has left of one."""
+    return bool(_OURS.fullmatch(name) or _PART.fullmatch(name))
+
+
+def check_place(folder: Path) -> None:
+    """Check that a folder is new, empty, or a map already, so that a map can be saved to it.
+
+    Raises
+    ------
+    AtlasError
+        If it holds something else, is a file, or cannot be read.
+    """
+    try:
+        names = {path.name for path in folder.iterdir()}
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise _unsaved(folder, error) from None
+    if MANIFEST not in names and not all(map(_is_of_a_map, names)):
+        raise AtlasError(
+            f"{folder} contains files that are not a map; choose a new or empty folder"
+        )
+
+
+def _unsaved(folder: Path, error: OSError) -> AtlasError:
+    reason = error.strerror or str(error)
+    return AtlasError(f"{folder}: the map could not be saved: {reason}")
 
 
 def set_aside(folder: Path) -> Path | None:

@@ -26,6 +26,16 @@ from l2lidar_proc.slam.slam import Slam
 from l2lidar_proc.verbs.odometry import run_bag, run_capture
 
 _MAP: Final = "map"
+_EXPORTS: Final = ("tum", "kitti", "g2o", "ply")
+_FILES: Final = (  # of an earlier run, or of `l2lidar odometry`
+    f"{_MAP}/{atlas.MANIFEST}",
+    "odometry.tum",
+    "map.png",
+    "trajectory.tum",
+    "trajectory.kitti",
+    "graph.g2o",
+    "map.ply",
+)
 _FORMATS: Final = tuple(export.FORMATS)
 
 
@@ -55,12 +65,13 @@ def slam(
     trajectory (TUM and KITTI) and that of the odometry alone, the pose graph (g2o), the points
     (PLY) and a picture with the loops drawn.
     """
-    if (folder / _MAP / atlas.MANIFEST).exists() and not overwrite:
+    taken = [folder / name for name in _FILES if (folder / name).exists()]
+    if taken and not overwrite:
         raise UsageError(
-            f"{folder / _MAP} has a map of an earlier run; choose another folder or add "
-            "--overwrite"
+            f"{taken[0]} exists from an earlier run; choose another folder or add --overwrite"
         )
     try:
+        atlas.check_place(folder / _MAP)
         odometry_config = settings_for(params_file, "odometry_node", OdometryNodeConfig)
         config = settings_for(params_file, "slam_node", SlamNodeConfig)
         mapping = Slam(config.slam)
@@ -102,7 +113,7 @@ def slam(
     files = [folder / "odometry.tum", folder / "map.png"]
     write_whole(files[0], tum(run.poses))
     export.draw(built, files[1])
-    for kind in ("tum", "kitti", "g2o", "ply"):
+    for kind in _EXPORTS:
         files += export.write(built, kind, folder)
     for line in run.report:
         print(line)
