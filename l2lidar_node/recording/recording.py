@@ -51,7 +51,7 @@ SLEWED: Final = b"l2lidar_node: the host's clock was slewed by %+d ns since the 
 
 
 def _pattern(note: bytes) -> re.Pattern[bytes]:
-    return re.compile(re.escape(note).replace(re.escape(b"%+d"), rb"([+-][0-9]{1,18})"))
+    return re.compile(re.escape(note).replace(re.escape(b"%+d"), rb"([+-][0-9]{1,19})"))
 
 
 _STEP: Final = _pattern(STEPPED)

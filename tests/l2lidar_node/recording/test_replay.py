@@ -121,7 +121,8 @@ def test_shifted_events_move_in_time_and_in_nothing_else() -> None:
             assert after is before
 
 
-@pytest.mark.parametrize("step", [-1.0, 0.05, 3600.0])
+# The last one is as far as from today to 1970, where a host without a battery starts.
+@pytest.mark.parametrize("step", [-1.0, 0.05, 3600.0, -1.6e9])
 def test_a_clock_that_is_set_is_noticed_at_once_and_replayed(step: float) -> None:
     config, live, tap = live_run(4.0, host_steps=((2.0, step),), settings={"imu_adjust": False})
 
