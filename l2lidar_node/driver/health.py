@@ -131,6 +131,7 @@ POINTS_2D_HZ: Final = 50.0
 
 _RATE_TOLERANCE: Final = 0.1
 _LOSS_ERROR: Final = 0.05
+_HELD_ERROR: Final = 0.5
 _FLOOD_HZ: Final = 1000.0  # foreign datagrams; twice what a second L2 would send
 _MAX_DATAGRAM_HZ: Final = 5000.0  # ten times what an L2 sends
 _MIN_VALID_SHARE: Final = 0.1
@@ -175,10 +176,12 @@ class Period:
     kernel_drops: int
     send_errors: int
     clock_events: dict[ClockEventKind, int]
+    held: int
 
 
 def observe(driver: Driver, transport: TransportCounts, now: HostNs) -> Period:
     """Return the counts of this instant."""
+    status = driver.clock_status()
     return Period(
         now,
         driver.counters.snapshot(),
@@ -186,7 +189,8 @@ def observe(driver: Driver, transport: TransportCounts, now: HostNs) -> Period:
         transport.stranger,
         transport.kernel_drops,
         transport.send_errors,
-        driver.clock_status().events,
+        status.events,
+        status.held,
     )
 
 
@@ -344,6 +348,13 @@ def _clock(
     if not status.locked:
         level = Level.WARN if unlocked else Level.OK
         return Check("clock", level, "not locked yet" if unlocked else "no data yet", values)
+    held, measured = after.held - before.held, sum(_measured(before, after).values())
+    if held > _HELD_ERROR * measured:
+        message = (
+            f"{held} of {measured} packets not published: their stamps would be before earlier "
+            "ones; if a clock was set back, restart the node"
+        )
+        return Check("clock", Level.ERROR, message, values)
     troubles = [
         text
         for kind, text in _CLOCK_TROUBLES.items()

@@ -80,6 +80,27 @@ def test_packets_that_stay_late_are_told() -> None:
     assert judged(6.0, 7.0, late=[(4.0, 4.5, 0.2)])["clock"].message == "locked"
 
 
+@pytest.mark.parametrize("begin", [2.5, 6.0])
+def test_a_clock_that_was_set_back_withholds_everything(begin: float) -> None:
+    check = judged(begin, begin + 1.0, host_steps=((2.0, -3600.0),))["clock"]
+    assert check.level is ERROR
+    assert re.fullmatch(
+        r"(4[5-9]\d) of \1 packets not published: their stamps would be before earlier ones; if a "
+        "clock was set back, restart the node",
+        check.message,
+    )
+
+
+def test_a_clock_that_was_set_back_a_little_is_an_event() -> None:
+    check = judged(1.9, 2.9, host_steps=((2.0, -0.2),))["clock"]
+    assert (check.level, check.message) == (WARN, "locked; this host's clock was stepped")
+
+
+def test_a_clock_that_locked_late_in_a_period_withholds_nothing() -> None:
+    check = judged(0.05, 0.5)["clock"]
+    assert (check.level, check.message) == (OK, "locked")
+
+
 def test_spinning_up_counts_down() -> None:
     checks = judged(9.0, 10.0, power=PowerConfig())
     assert checks["device"].level is WARN
