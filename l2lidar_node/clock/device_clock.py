@@ -168,7 +168,8 @@ class _Mode(Enum):
 # These begin a time line; a follower needs all of them.
 _RARE: Final = frozenset({ClockEventKind.LOCKED, ClockEventKind.REBOOT, ClockEventKind.LOST})
 
-_ESTIMATED, _SYSTEM = _Mode.ESTIMATED, _Mode.SYSTEM  # to look up a member of an Enum takes long
+# To look up a member of an Enum takes long.
+_ESTIMATED, _DEVICE, _SYSTEM = _Mode.ESTIMATED, _Mode.DEVICE, _Mode.SYSTEM
 
 
 class DeviceClock:
@@ -190,7 +191,7 @@ class DeviceClock:
     -----
     Stamps of a stream never go backwards and are never after the packet's arrival. Where both
     are impossible, after the host's clock was set back, packets get no stamp until it has passed
-    the latest one.
+    the latest one. Stamps that count from the device's power-on begin anew when it restarts.
     """
 
     def __init__(self, config: ClockConfig) -> None:
@@ -202,8 +203,7 @@ class DeviceClock:
         self._now = 0  # arrival of the latest packet
         self._held = 0
         self._unlocked = 0
-        self._last = {Stream.IMU: 0, Stream.POINTS: 0}
-        self._ends = {Stream.IMU: 0, Stream.POINTS: 0}  # of the last packet's measurements
+        self._begin_stamps()
         self.configure(config)
         self.reset()
 
@@ -383,6 +383,10 @@ class DeviceClock:
         self.happened.clear()
         return happened
 
+    def _begin_stamps(self) -> None:
+        self._last = {Stream.IMU: 0, Stream.POINTS: 0}
+        self._ends = {Stream.IMU: 0, Stream.POINTS: 0}  # of the last packet's measurements
+
     @property
     def _locked(self) -> bool:
         if self._mode is _ESTIMATED:
@@ -419,6 +423,9 @@ class DeviceClock:
                 self._schedule.reset()
             if step is Step.REBOOT:
                 self._report(ClockEventKind.REBOOT, "device restarted, locking the clock again")
+                if self._mode is _DEVICE and not self._config.enable_l2_host_sync:
+                    # Its clock is below all earlier stamps for as long as it had been on.
+                    self._begin_stamps()
             elif step is Step.FOREIGN_SYNC:
                 self._host.reanchor()
                 self._report(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from l2lidar_node.clock import DeviceClock
+from l2lidar_node.clock import ClockEventKind, DeviceClock
 from l2lidar_node.config import ClockConfig
 from l2lidar_node.types import DeviceNs, HostNs, Stream
 
@@ -42,10 +42,14 @@ class Promises:
 
     def __init__(self, config: ClockConfig) -> None:
         self.clock = DeviceClock(config)
+        self._begins_anew = not (config.enable_l2_time_correction or config.enable_l2_host_sync)
         self.last = dict.fromkeys(Stream, 0)
 
     def observe(self, stream: Stream, seq: int, stamp: int, arrival: int, duration: int) -> None:
         answer = self.clock.observe(stream, seq, DeviceNs(stamp), HostNs(arrival), duration)
+        events = [event.kind for event in self.clock.events()]
+        if self._begins_anew and ClockEventKind.REBOOT in events:
+            self.last = dict.fromkeys(Stream, 0)
         if answer is not None:
             assert isinstance(answer, int)
             assert self.last[stream] < answer <= arrival - duration

@@ -394,6 +394,23 @@ def test_a_device_that_restarts_goes_on_without_loss(datagrams: list[Datagram]) 
     assert commands.request_version().encode() in run.sent
 
 
+def test_stamps_that_count_from_power_on_begin_anew_when_the_device_restarts(
+    datagrams: list[Datagram],
+) -> None:
+    run = Run(enable_l2_time_correction=False).play(datagrams)
+    before, sweeps = len(run.of(ImuSample)), len(run.of(Sweep))
+    assert run.of(ImuSample)[-1].stamp > build.to_device_ns(101_000_000_000)
+    run.play(shifted(build.capture(2.0, uptime_s=4.0), 30.0))
+    samples = [sample.stamp for sample in run.of(ImuSample)[before:]]
+    starts = [sweep.start for sweep in run.of(Sweep)[sweeps + 1 :]]  # the first one is the rest
+    assert len(samples) > 450
+    assert len(starts) > 8
+    for stamps in (samples, starts):
+        assert all(one < other for one, other in pairwise(stamps))
+        assert build.to_device_ns(4_000_000_000) <= stamps[0] <= stamps[-1]
+        assert stamps[-1] < build.to_device_ns(6_000_000_000)
+
+
 @pytest.mark.parametrize("outage_s", [1.5, 4.0, 4.5, 9.0])
 def test_after_an_outage_no_packet_is_taken_for_late(outage_s: float) -> None:
     """4 and 4.5 s are nearly a turn of the numbers: 1024 IMU or 970 point packets."""
