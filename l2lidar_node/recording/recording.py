@@ -416,12 +416,7 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
     CaptureError
         If its time is beyond what a ROS 2 stamp can hold.
     """
-    if not is_ros_time(entry.time):
-        raise CaptureError(
-            f"its times reach {entry.time // 1_000_000_000} s after 1970; stamps of ROS 2 end at "
-            f"{(LAST_STAMP + 1) // 1_000_000_000} s, in January 2038; check whether the clock of "
-            "that machine was set"
-        )
+    _check_time(entry.time)
     if isinstance(entry, Received):
         return driver.receive(entry.data, entry.time)
     if isinstance(entry, Sent):
@@ -432,6 +427,15 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
         driver.host_slewed(entry.by_ns, entry.time)
         return []
     return driver.settle(entry.time)
+
+
+def _check_time(time: HostNs) -> None:
+    if not is_ros_time(time):
+        raise CaptureError(
+            f"its times reach {time // 1_000_000_000} s after 1970; stamps of ROS 2 end at "
+            f"{(LAST_STAMP + 1) // 1_000_000_000} s, in January 2038; check whether the clock of "
+            "that machine was set"
+        )
 
 
 def events(recording: Recording, config: DriverConfig) -> Iterator[Event]:
@@ -584,7 +588,9 @@ class Playback(Loop):
 
     def _entries(self) -> Iterator[Entry]:
         try:
-            yield from self._recording
+            for entry in self._recording:
+                _check_time(entry.time)  # before it is waited for
+                yield entry
         except CaptureError as error:
             self.damage = str(error)
 

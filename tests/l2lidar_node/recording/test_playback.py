@@ -122,6 +122,29 @@ def test_it_answers_calls_and_stops_while_it_waits(recorded: Any) -> None:
     assert played.shifts == []
 
 
+def with_time(stream: io.BytesIO, seconds: int) -> io.BytesIO:
+    """Return a capture in the middle of which one packet has another time."""
+    data = bytearray(stream.getvalue())
+    at = 24
+    while at < len(data) // 2:
+        at += 16 + struct.unpack_from("<I", data, at + 8)[0]
+    struct.pack_into("<I", data, at, seconds)
+    return io.BytesIO(bytes(data))
+
+
+@pytest.mark.parametrize("rate", [0.0, 100.0])
+def test_a_time_that_cannot_be_is_damage(recorded: Any, rate: float) -> None:
+    config, live, stream = recorded
+    played = Played(with_time(stream, 0xF0000000), config, replay_rate=rate)
+    assert played.playback.wait(LIMIT_S)
+    assert played.playback.failure is None
+    assert "its times reach 4026531840 s after 1970" in played.playback.damage
+    part = [item for item in played.laps[0] if isinstance(item, ImuSample)]
+    whole = [item for item in live if isinstance(item, ImuSample)]
+    assert part
+    assert part == whole[: len(part)]
+
+
 def test_damage_ends_it_with_a_reason(recorded: Any) -> None:
     config, live, stream = recorded
     data = bytearray(stream.getvalue())
