@@ -372,7 +372,12 @@ class FileConfig:
         "calibration of the unit, written by l2lidar calibrate; applies only to packets whose "
         "reported calibration block equals that in the file",
     )
-    replay_rate: float = setting(1.0, "replay speed; 0 is as fast as possible", lo=0.0, hi=1000.0)
+    replay_rate: float = setting(
+        1.0,
+        "replay speed; 0 is as fast as possible; pauses of more than a minute last a minute",
+        lo=0.0,
+        hi=1000.0,
+    )
     replay_loop: bool = setting(False, "start over at the end, with stamps that continue")
     replay_clock: bool = setting(
         True, "publish the recorded time on /clock during a replay, for use_sim_time"

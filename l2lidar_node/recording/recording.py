@@ -11,7 +11,7 @@ import dataclasses
 import re
 import socket
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -29,6 +29,7 @@ from l2lidar_node.recording.capture import (
     Endpoint,
     UdpDatagram,
 )
+from l2lidar_node.recording.pacing import TimeLine
 from l2lidar_node.transport.session import Loop
 from l2lidar_node.types import (
     LAST_STAMP,
@@ -60,6 +61,7 @@ _SLEW: Final = _pattern(SLEWED)
 LAP_GAP_NS: Final = 5_000_000  # between the last datagram of a lap and the first of the next
 _CLOCK_NS: Final = 10_000_000
 _LOOK_S: Final = 0.01  # longest time between two looks at calls and stop
+_FORESEEN: Final = 512  # entries; twice what a session reads before it looks for a step
 _FROM_DEVICE: Final = frozenset(
     int(kind)
     for kind in (
@@ -532,6 +534,9 @@ class Playback(Loop):
     -----
     Each lap begins with a new driver, so all give the same, each later by the length of those
     before it: stamps never go backwards.
+
+    Entries come at the pace at which they were recorded, also where the host's clock was set
+    meanwhile, but a pause of more than a minute lasts a minute.
     """
 
     def __init__(
@@ -549,6 +554,7 @@ class Playback(Loop):
         self._on_time = on_time
         self._on_lap = on_lap
         self._time = recording.start
+        self._reached = recording.start  # the latest time of the lap
         self._shift_ns = 0
         self.damage = ""
 
@@ -564,35 +570,48 @@ class Playback(Loop):
             if not self._is_loop:
                 self._on_lap(None)
                 return
-            self._shift_ns += self._time - self._recording.start + LAP_GAP_NS
+            self._shift_ns += self._reached - self._recording.start + LAP_GAP_NS
             self._on_lap(self._shift_ns)
-            self._time = self._recording.start
+            self._time = self._reached = self._recording.start
             self.driver = Driver(self.driver.config, self.driver.blocks.file)
 
     def _play(self) -> None:
-        first = self._recording.start
+        line = TimeLine(self._recording.start)
         begun = time.monotonic()
         next_clock = 0
-        for entry in self._entries():
+        for entry in self._entries(line):
+            if isinstance(entry, Received) and not line.has_begun:
+                line.begin(entry.time)
+            elif isinstance(entry, Stepped):
+                line.step()
+            due_ns = line.place(entry.time)
             if self._rate:
-                self._wait(begun + (entry.time - first) / (1e9 * self._rate))
+                self._wait(begun + due_ns / (1e9 * self._rate))
             self._run_calls()
             if self._stopping.is_set():
                 break
-            self._time = max(self._time, entry.time)
-            if self._time >= next_clock:
-                next_clock = self._time + _CLOCK_NS
-                self._on_time(HostNs(self._time + self._shift_ns))
+            self._time = line.now
+            self._reached = max(self._reached, entry.time)
+            if self._reached >= next_clock:
+                next_clock = self._reached + _CLOCK_NS
+                self._on_time(HostNs(self._reached + self._shift_ns))
             self._give(feed(self.driver, entry))
         self._give(self.driver.flush())
 
-    def _entries(self) -> Iterator[Entry]:
+    def _entries(self, line: TimeLine) -> Iterator[Entry]:
+        """Yield the entries, and tell the line of a step some entries before its note."""
+        coming: deque[Entry] = deque()
         try:
             for entry in self._recording:
                 _check_time(entry.time)  # before it is waited for
-                yield entry
+                if isinstance(entry, Stepped):
+                    line.foresee(entry.by_ns)
+                coming.append(entry)
+                if len(coming) > _FORESEEN:
+                    yield coming.popleft()
         except CaptureError as error:
             self.damage = str(error)
+        yield from coming
 
     def _wait(self, until: float) -> None:
         while (left := until - time.monotonic()) > 0 and not self._stopping.is_set():

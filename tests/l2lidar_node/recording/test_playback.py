@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import struct
 import threading
+from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -18,10 +20,30 @@ from tests.l2lidar_node.driver.virtual_host import essence, live_run
 LIMIT_S = 120.0  # generous: only a failure waits that long
 
 
+class Unhurried(Playback):
+    """A playback that only notes until when it would wait, and its time by then."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.waits: list[float] = []
+        self.nows: list[int] = []
+
+    def _wait(self, until: float) -> None:
+        self.waits.append(until)
+        self.nows.append(self._now())
+
+
 class Played:
     """A playback and everything it says."""
 
-    def __init__(self, stream: io.BytesIO, config: Any, laps: int = 1, **files: Any) -> None:
+    def __init__(
+        self,
+        stream: io.BytesIO,
+        config: Any,
+        laps: int = 1,
+        kind: Callable[..., Playback] = Playback,
+        **files: Any,
+    ) -> None:
         self.events: list[Event] = []
         self.laps: list[list[Event]] = []
         self.shifts: list[int | None] = []
@@ -29,7 +51,7 @@ class Played:
         self.ended = threading.Event()
         self._laps = laps
         settings = change(config, {"replay_rate": 0.0, **files})
-        self.playback = Playback(
+        self.playback = kind(
             Recording(stream), settings, self.events.append, self.times.append, self._lap
         )
         self.playback.start()
@@ -143,6 +165,44 @@ def test_a_time_that_cannot_be_is_damage(recorded: Any, rate: float) -> None:
     whole = [item for item in live if isinstance(item, ImuSample)]
     assert part
     assert part == whole[: len(part)]
+
+
+@pytest.mark.parametrize("busy", [0.0, 0.05])
+@pytest.mark.parametrize("steps", [(), (60.0,), (-60.0,), (-3600.0, 7200.0), (1e8,), (-1e9,)])
+def test_its_pace_does_not_depend_on_how_the_clock_was_set(
+    steps: tuple[float, ...], busy: float
+) -> None:
+    host_steps = [(2.0 + number, step) for number, step in enumerate(steps)]
+    config, _, tap = live_run(4.0, host_steps=host_steps, busy=busy)
+    played = Played(tap.stream, config, kind=Unhurried, replay_rate=1.0)
+    assert played.playback.wait(LIMIT_S)
+    assert played.playback.failure is None
+    playback = played.playback
+    assert isinstance(playback, Unhurried)
+    waits = playback.waits
+    assert waits == sorted(waits)
+    assert waits[-1] - waits[0] == pytest.approx(4.0, abs=0.1)
+    assert max(after - before for before, after in pairwise(waits)) < 0.1 + 0.5 * bool(busy)
+    # The driver is asked by the clock of which it knows.
+    shown = [after - before for before, after in pairwise(playback.nows)]
+    jumps = [by for by in shown if abs(by) > 1e9]
+    assert [round(by / 1e9) for by in jumps] == list(steps)
+    assert all(by >= 0 for by in shown if by not in jumps)
+
+
+@pytest.mark.parametrize("years", [-8, 8])
+def test_a_time_far_off_is_waited_for_for_a_minute_at_most(recorded: Any, years: int) -> None:
+    config, _, stream = recorded
+    far = Recording(stream).start // 10**9 + years * 365 * 86_400
+    played = Played(with_time(stream, far), config, kind=Unhurried, replay_rate=1.0)
+    assert played.playback.wait(LIMIT_S)
+    playback = played.playback
+    assert isinstance(playback, Unhurried)
+    waits = playback.waits
+    assert waits == sorted(waits)
+    longest = max(after - before for before, after in pairwise(waits))
+    assert longest == pytest.approx(60.0, abs=0.1)
+    assert waits[-1] - waits[0] == pytest.approx(62.5, abs=0.2)
 
 
 def test_damage_ends_it_with_a_reason(recorded: Any) -> None:
