@@ -133,6 +133,8 @@ class ClockStatus:
         Half the shortest measured round trip, which is taken off every stamp; 0 if not measured.
     synced : bool
         Whether a sync of this host is in force in the device.
+    stepped_ns : int
+        By how much the host's clock was set since the start.
     epochs : int
         Steps of the device's clock that were bridged.
     held : int
@@ -153,6 +155,7 @@ class ClockStatus:
     slew_ppm: float
     path_delay_ns: int
     synced: bool
+    stepped_ns: int
     epochs: int
     held: int
     unlocked: int
@@ -201,6 +204,7 @@ class DeviceClock:
         self._counts: Counter[ClockEventKind] = Counter()
         self._reported: dict[ClockEventKind, tuple[int | None, int]] = {}
         self._now = 0  # arrival of the latest packet
+        self._stepped_ns = 0
         self._held = 0
         self._unlocked = 0
         self._begin_stamps()
@@ -371,6 +375,7 @@ class DeviceClock:
             slew_ppm=1e6 * self._host.slew_rate,
             path_delay_ns=self._host.advance_ns,
             synced=self._schedule.in_force,
+            stepped_ns=self._stepped_ns,
             epochs=self._device.epochs,
             held=self._held,
             unlocked=self._unlocked,
@@ -454,6 +459,7 @@ class DeviceClock:
     def _report_step(self, step: int, *, is_told: bool) -> None:
         """Report a step of published stamps; where steps are told, arrivals show only delays."""
         if not is_told:
+            self._stepped_ns += step
             text = f"host clock stepped by {step * 1e-9:+.3f} s{_hold(step)}"
             self._report(ClockEventKind.HOST_STEP, text)
         elif step < 0:

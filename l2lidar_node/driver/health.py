@@ -129,6 +129,7 @@ def metadata(driver: Driver) -> Metadata:
 POINTS_3D_HZ: Final = 1 / wire.MIRROR_PERIOD_S
 POINTS_2D_HZ: Final = 50.0
 
+_USUAL_NS: Final = 1_000_000_000  # between two instants
 _RATE_TOLERANCE: Final = 0.1
 _LOSS_ERROR: Final = 0.05
 _HELD_ERROR: Final = 0.5
@@ -177,6 +178,7 @@ class Period:
     send_errors: int
     clock_events: dict[ClockEventKind, int]
     held: int
+    stepped_ns: int
 
 
 def observe(driver: Driver, transport: TransportCounts, now: HostNs) -> Period:
@@ -191,12 +193,20 @@ def observe(driver: Driver, transport: TransportCounts, now: HostNs) -> Period:
         transport.send_errors,
         status.events,
         status.held,
+        status.stepped_ns,
     )
+
+
+def elapsed_ns(before: Period, after: Period) -> int:
+    """Return the time between two instants, whatever was done to the host's clock in it [ns]."""
+    return after.now - before.now - (after.stepped_ns - before.stepped_ns)
 
 
 def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
     """Return the checks of the time between two instants."""
-    seconds = max((after.now - before.now) / 1e9, 1e-6)
+    elapsed = elapsed_ns(before, after)
+    # Where it was set back without being noticed, nothing tells the time.
+    seconds = (elapsed if elapsed > 0 else _USUAL_NS) / 1e9
     checks = [
         _device(driver, before, after, seconds),
         _link(driver.config.network.l2_ip, before, after, seconds),

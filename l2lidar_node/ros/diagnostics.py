@@ -163,7 +163,7 @@ class HealthPublisher:
         before = self._before
         if driver is not self._driver:  # that of a replay's next lap counts from 0
             self._driver, before = driver, None
-        if before is not None and 0 <= after.now - before.now < _SHORTEST_NS:
+        if before is not None and 0 <= health.elapsed_ns(before, after) < _SHORTEST_NS:
             return [], asdict(metadata(driver)), now  # a slow replay: rates would say nothing
         self._before = after
         checks = health.judge(driver, before, after) if before is not None else []

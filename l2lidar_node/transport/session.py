@@ -265,9 +265,6 @@ class Session(Loop):
                     self._tap.received(data, arrival)
                 events += self.driver.receive(data, arrival)
             self._hand_out(events)
-            if not self._calls.empty():
-                self._run_calls()
-                self._send()
             before, now = now, self._now()
             if not 0 < next_tick - now <= _TICK_NS:  # the clock may have been set
                 step = self._clock.step_ns()
@@ -278,6 +275,9 @@ class Session(Loop):
                 next_tick = HostNs(now + _TICK_NS)
                 # More may wait in the socket than one batch holds.
                 self._tick(now, batch[-1].arrival if batch else before)
+            if not self._calls.empty():  # last: they are given the time by the clock as it was set
+                self._run_calls()
+                self._send()
         self._run_calls()
         self._send()
         self._hand_out(self.driver.flush())

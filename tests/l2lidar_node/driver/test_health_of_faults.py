@@ -96,6 +96,16 @@ def test_a_clock_that_was_set_back_a_little_is_an_event() -> None:
     assert (check.level, check.message) == (WARN, "locked; this host's clock was stepped")
 
 
+# The latter looks in the same turn of the session's loop in which the clock has been set.
+@pytest.mark.parametrize("end", [3.0, 2.0])
+@pytest.mark.parametrize("step", [-3600.0, -0.6, 0.8, 3600.0])
+def test_rates_are_right_where_the_clock_was_set(step: float, end: float) -> None:
+    checks = judged(end - 1.0, end, host_steps=((2.0 if end == 2.0 else 2.5, step),))
+    assert checks["device"].message == "streaming"
+    assert checks["link"].message == "no loss"
+    assert float(checks["device"].values["datagrams [1/s]"]) == pytest.approx(466, rel=0.02)
+
+
 def test_a_clock_that_locked_late_in_a_period_withholds_nothing() -> None:
     check = judged(0.05, 0.5)["clock"]
     assert (check.level, check.message) == (OK, "locked")

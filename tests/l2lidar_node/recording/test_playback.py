@@ -27,10 +27,12 @@ class Unhurried(Playback):
         super().__init__(*arguments)
         self.waits: list[float] = []
         self.nows: list[int] = []
+        self.elapsed: list[int] = []  # as the diagnostics count it
 
     def _wait(self, until: float) -> None:
         self.waits.append(until)
         self.nows.append(self._now())
+        self.elapsed.append(self._now() - self.driver.clock_status().stepped_ns)
 
 
 class Played:
@@ -188,6 +190,8 @@ def test_its_pace_does_not_depend_on_how_the_clock_was_set(
     jumps = [by for by in shown if abs(by) > 1e9]
     assert [round(by / 1e9) for by in jumps] == list(steps)
     assert all(by >= 0 for by in shown if by not in jumps)
+    assert playback.elapsed == sorted(playback.elapsed)
+    assert (playback.elapsed[-1] - playback.elapsed[0]) / 1e9 == pytest.approx(4.0, abs=0.1)
 
 
 @pytest.mark.parametrize("years", [-8, 8])
