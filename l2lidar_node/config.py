@@ -49,6 +49,11 @@ class NetworkConfig:
         hi=100,
     )
 
+    @property
+    def where(self) -> str:
+        """The L2's serial device, or its address where none is set."""
+        return self.serial_port or self.l2_ip
+
     def __post_init__(self) -> None:
         """Check the addresses."""
         for name in ("l2_ip", "host_ip"):

@@ -215,7 +215,7 @@ def require_unit(network: NetworkConfig, *, quiet: bool) -> None:
         If it is not there or does not measure.
     """
     if not quiet:
-        say(f"looking for the L2 at {network.serial_port or network.l2_ip} ...")
+        say(f"looking for the L2 at {network.where} ...")
     with Device(network) as device:
         if device.is_measuring(_HEARD_S):
             return

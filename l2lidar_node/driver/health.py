@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from l2lidar_node.clock import UNCERTAIN_NS, ClockEventKind, ClockStatus
+from l2lidar_node.config import NetworkConfig
 from l2lidar_node.driver.device import DeviceState
 from l2lidar_node.driver.driver import Counters, Driver
 from l2lidar_node.driver.orientation import GravityReport
@@ -209,7 +210,7 @@ def judge(driver: Driver, before: Period, after: Period) -> list[Check]:
     seconds = (elapsed if elapsed > 0 else _USUAL_NS) / 1e9
     checks = [
         _device(driver, before, after, seconds),
-        _link(driver.config.network.l2_ip, before, after, seconds),
+        _link(driver.config.network, before, after, seconds),
         _clock(driver.clock_status(), driver.round_trips, before, after),
         _points(before.counters, after.counters, seconds),
     ]
@@ -234,14 +235,14 @@ def _device(driver: Driver, before: Period, after: Period, seconds: float) -> Ch
         "datagrams [1/s]": f"{(new.datagrams - old.datagrams) / seconds:.1f}",
         "traffic [kB/s]": f"{(new.octets - old.octets) / seconds / 1e3:.1f}",
     }
-    address = driver.config.network.l2_ip
+    where = driver.config.network.where
     if state is DeviceState.WAITING:
-        message = f"no data from {address} yet"
+        message = f"no data from {where} yet"
         if after.foreign > before.foreign and after.stranger:
             message += f", but from {after.stranger}: if that is the L2, set l2_ip to it"
         return Check("device", Level.ERROR, message, values)
     if state is DeviceState.STALLED:
-        return Check("device", Level.ERROR, f"{address} has fallen silent", values)
+        return Check("device", Level.ERROR, f"{where} has fallen silent", values)
     if state is DeviceState.STANDBY:
         return Check("device", Level.OK, "in standby as asked", values)
     if state is DeviceState.SPINNING_UP:
@@ -273,7 +274,7 @@ def _measured(before: Period, after: Period) -> dict[Stream, int]:
     }
 
 
-def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
+def _link(network: NetworkConfig, before: Period, after: Period, seconds: float) -> Check:
     old, new = before.counters, after.counters
     values: dict[str, str] = {}
     lost = stale = 0
@@ -297,7 +298,7 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
     foreign = after.foreign - before.foreign
     unsent = after.send_errors - before.send_errors
     datagrams = (new.datagrams - old.datagrams) / seconds
-    is_forged = datagrams > _MAX_DATAGRAM_HZ
+    is_forged = datagrams > _MAX_DATAGRAM_HZ and not network.serial_port
     is_grave = lost > _LOSS_ERROR * (received + lost)
     troubles = [
         text
@@ -310,7 +311,7 @@ def _link(address: str, before: Period, after: Period, seconds: float) -> Check:
             (foreign, _of_strangers(foreign, seconds, after.stranger)),
             (
                 is_forged,
-                f"{datagrams:.0f} datagrams/s claim to come from {address}: an L2 sends "
+                f"{datagrams:.0f} datagrams/s claim to come from {network.l2_ip}: an L2 sends "
                 "470, so another host uses its address",
             ),
         )

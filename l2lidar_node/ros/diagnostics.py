@@ -149,8 +149,7 @@ class HealthPublisher:
 
     def _hardware_id(self) -> str:
         """Name the unit: its line or address, and its calibration block, which no other has."""
-        network = self._session.driver.config.network
-        where = network.serial_port or network.l2_ip
+        where = self._session.driver.config.network.where
         return f"L2 at {where}" + (f", calibration block {self._block}" if self._block else "")
 
     def _ended(self) -> None:

@@ -359,7 +359,7 @@ class DriverNode(ManagedNode):
     def _silent(self, silence: Silence) -> None:
         config = self._settings.value
         text = (
-            f"no data from the L2 at {config.network.l2_ip} for {silence.duration_ns / 1e9:.1f} s "
+            f"no data from the L2 at {config.network.where} for {silence.duration_ns / 1e9:.1f} s "
             f"(watchdog_timeout_ms {config.watchdog.timeout_ms})"
         )
         if config.watchdog.action == "wait" or not self.is_active:
@@ -437,9 +437,9 @@ class DriverNode(ManagedNode):
             for event in driver.reset_device(now):
                 self._handle(event)
             if not is_there:
-                address = driver.config.network.serial_port or driver.config.network.l2_ip
+                where = driver.config.network.where
                 return False, (
-                    f"no data from a device at {address} recently; the reset was sent anyway, "
+                    f"no data from a device at {where} recently; the reset was sent anyway, "
                     "but a device never acknowledges it"
                 )
             return True, "reset sent; the device does not acknowledge it and is back in about 25 s"

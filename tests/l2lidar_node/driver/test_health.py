@@ -106,6 +106,15 @@ def test_a_device_that_fell_silent() -> None:
     assert watched.verdict("device") == (Level.ERROR, "192.168.1.62 has fallen silent")
 
 
+def test_a_device_on_a_serial_line_is_named_by_that() -> None:
+    waiting = Watched(serial_port="/dev/ttyACM0")
+    waiting.run.wait(1)
+    assert waiting.verdict("device") == (Level.ERROR, "no data from /dev/ttyACM0 yet")
+    silent = streaming(1.5, serial_port="/dev/ttyACM0")
+    silent.run.wait(2)
+    assert silent.verdict("device") == (Level.ERROR, "/dev/ttyACM0 has fallen silent")
+
+
 def test_standby_is_as_asked() -> None:
     watched = streaming(1.5)
     watched.run.driver.stop_rotation(HostNs(watched.run.now))
@@ -207,6 +216,13 @@ def test_a_flood_under_the_devices_own_address_is_named() -> None:
     level, message = watched.verdict("link")
     assert level is Level.WARN
     assert "claim to come from 192.168.1.62: an L2 sends 470" in message
+
+
+def test_on_a_serial_line_there_is_no_other_host_however_small_the_pieces() -> None:
+    watched = streaming(1.0, serial_port="/dev/ttyACM0")
+    for _ in range(20_000):
+        watched.run.driver.receive(b"", HostNs(watched.run.now))
+    assert watched.verdict("link") == (Level.OK, "no loss")
 
 
 def test_a_clock_that_is_not_locked() -> None:

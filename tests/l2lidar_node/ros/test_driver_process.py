@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -128,6 +129,16 @@ def test_the_watchdog_ends_a_driver_without_device() -> None:
     assert result.returncode == 1
     assert "no data from the L2 at 127.0.0.1" in result.stdout + result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_the_watchdog_names_a_serial_line_without_device() -> None:
+    end, other = os.openpty()
+    name = os.ttyname(other)
+    result = _run(*assigned({"serial_port": name, "watchdog_timeout_ms": 300}))
+    os.close(end)
+    os.close(other)
+    assert result.returncode == 1
+    assert f"no data from the L2 at {name}" in result.stdout + result.stderr
 
 
 def test_a_driver_told_to_wait_takes_up_a_device_that_comes_late(rig: Rig) -> None:
