@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,7 +39,7 @@ def view(
         bool, typer.Option("--web", help="Serve it to a browser on this machine.")
     ] = False,
     save: Annotated[
-        Path | None, typer.Option(help="Write an .rrd file instead of showing.")
+        Path | None, typer.Option(help="Write a new .rrd file instead of showing.")
     ] = None,
     seconds: Annotated[
         float | None,
@@ -64,11 +65,13 @@ def view(
         raise UsageError(f"'{save}' ends in '{save.suffix}'; expected FILE.rrd")
     if save.is_dir():
         raise UsageError(f"'{save}' is a folder; expected FILE.rrd")
+    if os.path.lexists(save):
+        raise UsageError(f"'{save}' exists already; choose another name or remove it")
     save.parent.mkdir(parents=True, exist_ok=True)
     try:
         _open_and_show(file, namespace, seconds, save, web=False)
     except CommandError:
-        save.unlink(missing_ok=True)  # it shows nothing
+        save.unlink(missing_ok=True)  # made by this run, and shows nothing
         raise
     say(f"written to {save}")
 

@@ -183,6 +183,30 @@ def test_what_is_no_recording_is_refused(run: Run, tmp_path: Path) -> None:
     assert outcome.code == 2
 
 
+@pytest.mark.parametrize("is_viewer_there", [True, False], ids=["rerun", "no rerun"])
+def test_a_file_that_exists_stays(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_viewer_there: bool
+) -> None:
+    if not is_viewer_there:
+        monkeypatch.setitem(sys.modules, "rerun", None)
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    save = tmp_path / "a.rrd"
+    save.write_bytes(b"another run")
+    outcome = run("view", str(tmp_path / "a.mcap"), "--save", str(save))
+    assert save.read_bytes() == b"another run"
+    assert outcome.code == 2
+    assert f"'{save}' exists already" in outcome.err
+
+
+def test_a_link_that_leads_nowhere_stays(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    save = tmp_path / "a.rrd"
+    save.symlink_to(tmp_path / "none.rrd")
+    outcome = run("view", str(tmp_path / "a.mcap"), "--save", str(save))
+    assert save.is_symlink()
+    assert outcome.code == 2
+
+
 def test_without_a_display_it_says_what_else_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
