@@ -24,14 +24,6 @@ from rclpy.lifecycle import (
 from l2lidar_node.ros.program import StartError
 from l2lidar_node.settings import SettingError
 
-_IDS: Final = {
-    "configure": Transition.TRANSITION_CONFIGURE,
-    "activate": Transition.TRANSITION_ACTIVATE,
-    "deactivate": Transition.TRANSITION_DEACTIVATE,
-    "cleanup": Transition.TRANSITION_CLEANUP,
-}
-
-
 _DESTROYING: Final = frozenset(  # the services that set_up created
     (
         Transition.TRANSITION_CLEANUP,
@@ -249,9 +241,12 @@ class ManagedNode(LifecycleNode):
     ) -> ChangeState.Response:
         asked = request.transition
         response.success = False
-        transition = _IDS.get(asked.label, 0) if asked.label else int(asked.id)
-        possible = {item[0] for item in self._state_machine.available_transitions}
-        if transition in possible and not await self.allows(transition):
+        possible = {
+            label: number for number, label, *_ in self._state_machine.available_transitions
+        }
+        # The label counts where there are both, as for rclpy.
+        transition = possible.get(asked.label, 0) if asked.label else int(asked.id)
+        if transition in possible.values() and not await self.allows(transition):
             return response
         while self._answering and transition in _DESTROYING:
             await NextTurn()

@@ -452,9 +452,34 @@ def test_after_ctrl_c_the_worker_ends_without_a_traceback(
     assert len(atlas.load(tmp_path / "map")[0].nodes) == worker.submaps > 0
 
 
-def test_a_transition_waits_for_the_answers_that_are_under_way(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "transitions",
+    [
+        [
+            Transition(id=Transition.TRANSITION_DEACTIVATE),
+            Transition(id=Transition.TRANSITION_CLEANUP),
+        ],
+        [
+            Transition(id=Transition.TRANSITION_DEACTIVATE, label="deactivate"),
+            Transition(id=Transition.TRANSITION_CLEANUP, label="cleanup"),
+        ],
+        [Transition(id=Transition.TRANSITION_ACTIVE_SHUTDOWN, label="shutdown")],
+    ],
+    ids=["numbers", "labels of a clean-up", "label of a shutdown"],
+)
+def test_a_transition_waits_for_the_answers_that_are_under_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transitions: list[Transition]
+) -> None:
+    """``ros2 lifecycle`` sends the label together with the number."""
     bench = SlamBench(f"data_dir:={tmp_path}")
     busy = threading.Event()
+    taken: list[int] = []
+
+    async def allows(transition: int) -> bool:
+        taken.append(transition)
+        return True
+
+    monkeypatch.setattr(bench.node, "allows", allows)
     try:
         bench.node.worker.request(lambda: (busy.wait(60.0), ""), lambda answer: None)
         reset = bench.peer.create_client(Trigger, "slam_node/reset")
@@ -462,16 +487,14 @@ def test_a_transition_waits_for_the_answers_that_are_under_way(tmp_path: Path) -
         bench.until(lambda: reset.service_is_ready() and change.service_is_ready())
         asked = reset.call_async(Trigger.Request())
         bench.until(lambda: bench.node._answering)
-        down = [
-            change.call_async(ChangeState.Request(transition=Transition(id=number)))
-            for number in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
-        ]
-        bench.until(down[0].done)
+        down = [change.call_async(ChangeState.Request(transition=item)) for item in transitions]
+        bench.until(lambda: len(taken) == len(transitions) or down[-1].done())
+        assert taken == [item.id for item in transitions]
         busy.set()
-        bench.until(lambda: asked.done() and down[1].done())
+        bench.until(lambda: asked.done() and down[-1].done())
 
         assert asked.result().success
-        assert [item.result().success for item in down] == [True, True]
+        assert all(item.result().success for item in down)
         assert not bench.node.is_configured
     finally:
         busy.set()
