@@ -56,7 +56,7 @@ class ManagedNode(LifecycleNode):
         self._answering = 0  # calls of services that are waiting for something
         self._is_destroyed = False
         super().__init__(name)
-        self._problem: Exception | None = None
+        self._problem: Exception | None = None  # what start() has to raise
         self._before_set_up: set[Any] = set()
         self._before_begin: set[Any] = set()
         # rclpy's own answer raises where a transition is impossible now, which ends the program.
@@ -161,8 +161,9 @@ class ManagedNode(LifecycleNode):
             return
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() is not Return.SUCCESS:
-                assert self._problem is not None
-                raise self._problem
+                problem, self._problem = self._problem, None
+                assert problem is not None
+                raise problem
 
     def destroy_node(self) -> None:
         """Give everything up, then destroy the node."""
@@ -223,18 +224,19 @@ class ManagedNode(LifecycleNode):
         try:
             step()
         except Exception as error:
-            if not keeps_problem:
+            # What is in the log is not kept: its frames hold whatever the step had opened.
+            if not self._log(error) and not keeps_problem:
                 self._problem = error
-            self._log(error)
             return False
         return True
 
-    def _log(self, error: Exception) -> None:
-        """Name an error in the log, unless the program ends with it anyway."""
+    def _log(self, error: Exception) -> bool:
+        """Name an error in the log; return False where the program ends with it anyway."""
         if self.executor is None or not self.context.ok():
-            return
+            return False
         is_foreseen = isinstance(error, SettingError | StartError)
         self.get_logger().error(str(error) if is_foreseen else traceback.format_exc())
+        return True
 
     async def _change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
