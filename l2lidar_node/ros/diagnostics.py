@@ -108,7 +108,12 @@ class HealthPublisher:
         node.create_timer(PERIOD_S, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _ask(self) -> None:
-        """Ask the session's thread for the figures; it wakes the executor when it has them."""
+        """Ask the session's thread for the figures; it wakes the executor when it has them.
+
+        A replay's thread begins with the activation: until then there is nobody to ask.
+        """
+        if not self._session.is_started:
+            return
         if self._asked is not None:
             self._tell_silence()
             return

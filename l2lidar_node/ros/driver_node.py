@@ -229,14 +229,12 @@ class DriverNode(ManagedNode):
         self._open_publishers(config)
         self._session = open_loop(self, config, self._handle)
         self._health = HealthPublisher(self, self._session)
-        self._is_started = not config.files.replay_file
-        if self._is_started:
+        if not config.files.replay_file:
             self._session.start()
 
     def begin(self) -> None:
         """Begin a replay."""
-        if not self._is_started:
-            self._is_started = True
+        if not self.session.is_started:
             self.session.start()
 
     def tear_down(self) -> None:

@@ -53,6 +53,11 @@ class Loop(ABC):
         """Exception that ended the loop; None if there was none."""
         return self._failure
 
+    @property
+    def is_started(self) -> bool:
+        """Whether the loop has been started; before that it answers no call."""
+        return self._thread.ident is not None
+
     def start(self) -> None:
         """Start the loop."""
         # glibc gives freed blocks back to the system, and has every page of the next sweep cleared
@@ -65,7 +70,7 @@ class Loop(ABC):
         self._stopping.set()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join()
-        if self._thread.ident is None:
+        if not self.is_started:
             self._end()
 
     def wait(self, timeout_s: float | None = None) -> bool:

@@ -6,6 +6,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,10 +26,12 @@ from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from l2lidar_node.demo.processes import assigned, free_udp_ports  # noqa: E402
 from l2lidar_node.driver import device as device_module, driver  # noqa: E402
 from l2lidar_node.protocol import wire  # noqa: E402
-from l2lidar_node.ros import driver_node  # noqa: E402
+from l2lidar_node.ros import diagnostics, driver_node  # noqa: E402
+from l2lidar_node.ros.diagnostics import HealthPublisher  # noqa: E402
 from l2lidar_node.ros.driver_node import DriverNode  # noqa: E402
 from l2lidar_node.types import LAST_STAMP, HostNs, Sweep  # noqa: E402
 from tests.l2lidar_proc.motion.analytic import Motion, seen  # noqa: E402
+from tests.support import build  # noqa: E402
 from tests.support.build import PERIOD_NS, frames_3d, points_3d  # noqa: E402
 
 pytestmark = pytest.mark.ros
@@ -91,14 +95,22 @@ class Rig:
         return bool(future.result().success)
 
 
+@contextmanager
+def open_rig(**parameters: str) -> Iterator[Rig]:
+    made = Rig(**parameters)
+    try:
+        yield made
+    finally:
+        made.executor.shutdown()
+        made.peer.destroy_node()
+        made.node.destroy_node()
+        rclpy.shutdown()
+
+
 @pytest.fixture
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    made = Rig(**getattr(request, "param", {}))
-    yield made
-    made.executor.shutdown()
-    made.peer.destroy_node()
-    made.node.destroy_node()
-    rclpy.shutdown()
+    with open_rig(**getattr(request, "param", {})) as made:
+        yield made
 
 
 def test_while_a_device_does_not_acknowledge_everything_else_goes_on(
@@ -148,6 +160,31 @@ def test_a_receiving_thread_that_hangs_is_named_and_holds_nobody_up(
     rig.said.clear()
     rig.until(lambda: any("no data from 127.0.0.1" in text for text in rig.said))
     assert not any("has not responded" in text for text in rig.said[-5:])
+
+
+def test_a_replay_that_has_not_begun_is_not_taken_for_one_that_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.pcap"
+    build.write_capture(path, build.capture(3.0))
+    looks = 0
+    ask = HealthPublisher._ask
+
+    def counted(health: HealthPublisher) -> None:
+        nonlocal looks
+        ask(health)
+        looks += 1
+
+    monkeypatch.setattr(HealthPublisher, "_ask", counted)
+    monkeypatch.setattr(diagnostics, "PERIOD_S", 0.02)
+    with open_rig(replay_file=str(path), replay_loop="true", autostart="false") as rig:
+        with monkeypatch.context() as patch:
+            patch.setattr(diagnostics, "_SILENT_S", 0.0)
+            assert rig.change("configure")
+            rig.until(lambda: looks > 5)
+        assert rig.change("activate")
+        rig.until(lambda: rig.said)
+        assert not any("has not responded" in text for text in rig.said)
 
 
 @pytest.mark.parametrize("how", ["enable", "reset", "end"])
