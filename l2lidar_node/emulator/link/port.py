@@ -64,6 +64,11 @@ _GONE: Final = {
     errno.ECONNREFUSED,
     errno.EPERM,
 }
+_NO_WAY: Final = _GONE | {
+    errno.EINVAL,  # from 127.0.0.1 to another machine, or to port 0
+    errno.EACCES,  # to a broadcast address
+    errno.EADDRNOTAVAIL,
+}
 
 
 class PortError(Exception):
@@ -179,7 +184,7 @@ class UdpPort:
         try:
             self._socket.sendto(data, self._host)
         except OSError as error:
-            if error.errno in _GONE:
+            if error.errno in _NO_WAY:
                 return False
             raise
         return True

@@ -192,6 +192,19 @@ def test_it_can_answer_whoever_asks(host: Host) -> None:
     assert port.host == ("127.0.0.1", host.port)
 
 
+@pytest.mark.parametrize("stored", ["192.0.2.77", "255.255.255.255"])
+def test_a_stored_host_that_cannot_be_reached_is_no_reason_to_fail(stored: str) -> None:
+    """Neither a network that the unit's address has no way to, nor a broadcast address."""
+    addresses = AddressConfig(lidar_port=0, host=stored, host_port=9)
+    device = unit(config_for(9, addresses=addresses))
+    port = UdpPort(device.network)
+    server = Server(device, port, 20.0)
+    server.run(1.0)
+    port.close()
+    assert device.sent[wire.PacketType.IMU] == 250
+    assert server.unsent == server.latency.count
+
+
 def test_nobody_listening_is_no_reason_to_fail() -> None:
     (unused,) = free_udp_ports(1)
     device = unit(config_for(unused))
