@@ -1,8 +1,9 @@
-"""Atomic file writes, and the folder for the files of services."""
+"""Atomic file writes, files that the package shares, and the folder for those of services."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,27 @@ from typing import Final
 
 DATA_DIR: Final = "~/.ros/l2lidar"
 """Folder of what services write, where the user names no other."""
+
+
+def shared_file(name: str) -> Path | None:
+    """Return a file that this package shares, as installed by colcon or pip, or of a checkout.
+
+    Parameters
+    ----------
+    name : str
+        Path in the checkout, for example ``urdf/l2lidar.xacro``.
+
+    Returns
+    -------
+    Path or None
+        None if there is no such file.
+    """
+    prefixes = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":")]
+    folders = [prefix / "share/l2lidar_node" for prefix in [*prefixes, Path(sys.prefix)]]
+    for folder in [Path(__file__).resolve().parents[1], *folders]:
+        if (folder / name).is_file():
+            return folder / name
+    return None
 
 
 def free_name(path: Path) -> Path:

@@ -224,6 +224,28 @@ def test_the_programs_are_on_the_path_and_run_by_the_environment(
 
 
 @pytest.mark.ros
+def test_an_installed_package_finds_what_it_shares(workspace: Path) -> None:
+    """The example robots of the demo, and the consumers' profiles of ``l2lidar check``."""
+    program = (
+        "from l2lidar_node.demo import report; "
+        "from l2lidar_node.files import shared_file; "
+        "print(report.__file__, report.mount('forward').shape, "
+        "shared_file('config/consumers/lio_sam/driver.yaml'))"
+    )
+    done = subprocess.run(
+        ["sh", "-c", f'. install/setup.sh && {sys.executable} -c "{program}"'],
+        cwd=workspace, env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    prefix = workspace / "install" / NAME
+    (installed,) = prefix.glob("lib/python3*/site-packages")
+    assert done.stdout.split(maxsplit=1) == [
+        f"{installed}/l2lidar_node/demo/report.py",
+        f"(4, 4) {prefix}/share/{NAME}/config/consumers/lio_sam/driver.yaml\n",
+    ]
+
+
+@pytest.mark.ros
 def test_transforms_have_the_type_every_ros_2_has() -> None:
     """Another machine's ROS 2 takes our transforms only if the message's type hash is its own."""
     import rclpy

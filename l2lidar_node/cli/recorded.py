@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,6 +26,7 @@ from l2lidar_node.command_line import CommandError
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.driver.driver import Driver
 from l2lidar_node.driver.health import metadata
+from l2lidar_node.files import shared_file
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.recording import bag
 from l2lidar_node.recording.capture import CaptureError, is_capture_file
@@ -116,16 +115,6 @@ def observe_capture(
         is_leveled=config.imu.adjust,
     )
     return observation, Topics(topics.point_cloud_topic_id, topics.imu_topic_id)
-
-
-def shared_file(name: str) -> Path | None:
-    """Return a file that this package shares, as installed by colcon or pip, or of a checkout."""
-    prefixes = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":")]
-    folders = [prefix / "share/l2lidar_node" for prefix in [*prefixes, Path(sys.prefix)]]
-    for folder in [Path(__file__).parents[2], *folders]:
-        if (folder / name).is_file():
-            return folder / name
-    return None
 
 
 def describe(path: Path, l2_ip: str = "") -> dict[str, Any]:

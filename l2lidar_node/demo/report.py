@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
@@ -17,12 +18,11 @@ from scipy.spatial.transform import Rotation
 from l2lidar_node.config import FrameConfig
 from l2lidar_node.demo.observer import Observer
 from l2lidar_node.emulator.truth import Results
-from l2lidar_node.files import whole
+from l2lidar_node.files import shared_file, whole
 from l2lidar_node.protocol.wire import PacketType
 from l2lidar_node.types import F64
 
 BASE_FRAME: Final = "base_link"
-_EXAMPLES: Final = Path(__file__).resolve().parents[2] / "urdf" / "examples"
 _BIN_M: Final = 0.05
 
 
@@ -37,9 +37,13 @@ def mount(example: str) -> F64:
     Raises
     ------
     OSError
-        If there is no such robot: the demo runs from the repository.
+        If there is no such robot.
     """
-    robot = ElementTree.parse(_EXAMPLES / f"l2_{example}_mount_example.urdf").getroot()
+    name = f"urdf/examples/l2_{example}_mount_example.urdf"
+    path = shared_file(name)
+    if path is None:
+        raise FileNotFoundError(errno.ENOENT, "no such file in the package's share folder", name)
+    robot = ElementTree.parse(path).getroot()
     joints = {_attribute(joint, "child", "link"): joint for joint in robot.iter("joint")}
     pose, link = np.eye(4), FrameConfig().cloud
     while link != BASE_FRAME:
