@@ -558,6 +558,10 @@ class Playback(Loop):
         self._shift_ns = 0
         self.damage = ""
 
+    def stamp(self, now: HostNs) -> HostNs:
+        """Return a time of the driver, later by the laps before, as events are stamped."""
+        return HostNs(now + self._shift_ns)
+
     def _now(self) -> HostNs:
         """Return the recording's own time: the driver knows no other."""
         return self._time

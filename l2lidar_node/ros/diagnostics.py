@@ -133,7 +133,7 @@ class HealthPublisher:
         if asked is None:
             return
         try:
-            checks, about, now = asked.result()
+            checks, about, stamp = asked.result()
         except CancelledError:
             self._ended()
             return
@@ -141,15 +141,15 @@ class HealthPublisher:
         if checks:
             mount = self._mount.judge(self._session.driver.config.imu.adjust)
             checks += [mount] if mount is not None else []
-            self._send(checks, now)
+            self._send(checks, stamp)
         text = json.dumps(about, indent=2)
         if text != self._metadata:
             self._metadata = text
             self._about.publish(String(data=text))
 
-    def _send(self, checks: list[Check], now: HostNs) -> None:
+    def _send(self, checks: list[Check], stamp: HostNs) -> None:
         name = self._node.get_fully_qualified_name().lstrip("/")
-        stamp = HostNs(min(max(now, FIRST_STAMP), LAST_STAMP))
+        stamp = HostNs(min(max(stamp, FIRST_STAMP), LAST_STAMP))
         self._diagnostics.publish(diagnostic_array(checks, name, stamp, self._hardware_id()))
 
     def _hardware_id(self) -> str:
@@ -163,12 +163,13 @@ class HealthPublisher:
             raise StartError(f"the receive thread failed: {self._session.failure!r}")
 
     def _look(self, driver: Driver, now: HostNs) -> _Figures:
+        stamp = self._session.stamp(now)
         after = health.observe(driver, self._session.transport, now)
         before = self._before
         if driver is not self._driver:  # that of a replay's next lap counts from 0
             self._driver, before = driver, None
         if before is not None and 0 <= health.elapsed_ns(before, after) < _SHORTEST_NS:
-            return [], asdict(metadata(driver)), now  # a slow replay: rates would say nothing
+            return [], asdict(metadata(driver)), stamp  # a slow replay: rates would say nothing
         self._before = after
         checks = health.judge(driver, before, after) if before is not None else []
-        return checks, asdict(metadata(driver)), now
+        return checks, asdict(metadata(driver)), stamp

@@ -100,6 +100,10 @@ class Loop(ABC):
             self._run_calls()
         return future
 
+    def stamp(self, now: HostNs) -> HostNs:
+        """Return the stamp of what is true at a time of the driver; for calls of the loop."""
+        return now
+
     @abstractmethod
     def _now(self) -> HostNs:
         """Return the time that counts for the driver."""

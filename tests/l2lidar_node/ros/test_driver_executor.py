@@ -27,6 +27,7 @@ from l2lidar_node.demo.processes import assigned, free_udp_ports  # noqa: E402
 from l2lidar_node.driver import device as device_module, driver  # noqa: E402
 from l2lidar_node.protocol import wire  # noqa: E402
 from l2lidar_node.ros import diagnostics, driver_node  # noqa: E402
+from l2lidar_node.ros.conversions import from_time  # noqa: E402
 from l2lidar_node.ros.diagnostics import HealthPublisher  # noqa: E402
 from l2lidar_node.ros.driver_node import DriverNode  # noqa: E402
 from l2lidar_node.types import LAST_STAMP, HostNs, Sweep  # noqa: E402
@@ -55,6 +56,7 @@ class Rig:
         self.node = DriverNode()
         self.peer = rclpy.create_node("peer")
         self.said: list[str] = []
+        self.stamps: list[int] = []
         self.units: set[str] = set()
         self.clouds: list[PointCloud2] = []
         self.peer.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
@@ -72,6 +74,7 @@ class Rig:
             self.until(client.service_is_ready)
 
     def _hear(self, message: DiagnosticArray) -> None:
+        self.stamps.append(from_time(message.header.stamp))
         self.said.extend(status.message for status in message.status)
         self.units.update(status.hardware_id for status in message.status)
 
@@ -185,6 +188,21 @@ def test_a_replay_that_has_not_begun_is_not_taken_for_one_that_hangs(
         assert rig.change("activate")
         rig.until(lambda: rig.said)
         assert not any("has not responded" in text for text in rig.said)
+
+
+def test_the_health_of_a_replay_goes_on_in_time_from_lap_to_lap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.pcap"
+    build.write_capture(path, build.capture(1.5))
+    monkeypatch.setattr(diagnostics, "PERIOD_S", 0.05)
+    monkeypatch.setattr(diagnostics, "_SILENT_S", TIMEOUT_S)  # on the wall's time
+    in_third_lap = build.EPOCH_NS + 2 * 1_500_000_000
+    with open_rig(replay_file=str(path), replay_loop="true", replay_rate="2.0") as rig:
+        stamps = rig.stamps
+        rig.until(lambda: stamps and (stamps != sorted(stamps) or stamps[-1] > in_third_lap))
+        assert stamps == sorted(stamps)
+        assert build.EPOCH_NS < stamps[0] < build.EPOCH_NS + 1_600_000_000
 
 
 @pytest.mark.parametrize("how", ["enable", "reset", "end"])
