@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -167,13 +168,18 @@ def load(path: Path) -> CalibrationFile:
         raise CalibrationFileError(f"{path}: too large for a calibration file (1 MB at most)")
     try:
         content = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+    except Exception as error:  # PyYAML has its own, and any other for tags that do not fit
         first = str(error).partition("\n")[0]
         raise CalibrationFileError(f"{path}: not YAML ({first})") from None
     try:
         return _parsed(content, str(path))
     except CalibrationFileError as error:
         raise CalibrationFileError(f"{path}: {error}") from None
+    except ValueError:  # Python reads such integers in hexadecimal, but cannot name them
+        raise CalibrationFileError(
+            f"{path}: an integer of more than {sys.get_int_max_str_digits()} digits, expected "
+            "numbers of a calibration"
+        ) from None
 
 
 def _parsed(content: object, path: str) -> CalibrationFile:
@@ -258,14 +264,22 @@ def _vector(given: object, name: str, limit: float) -> tuple[float, float, float
 
 
 def _number(given: object, name: str, limit: float) -> float:
-    if isinstance(given, bool) or not isinstance(given, int | float) or not math.isfinite(given):
-        raise CalibrationFileError(f"{name} is {given!r:.80}, expected a number")
-    if abs(given) > limit:
+    value = math.nan
+    try:
+        if isinstance(given, int | float) and not isinstance(given, bool):
+            value = float(given)
+    except OverflowError:
         raise CalibrationFileError(
-            f"{name} is {given:g}, expected {-limit:.4g} to {limit:.4g}: larger errors are "
+            f"{name} is {given!r:.80}, expected a number of at most {sys.float_info.max:.2g}"
+        ) from None
+    if not math.isfinite(value):
+        raise CalibrationFileError(f"{name} is {given!r:.80}, expected a number")
+    if abs(value) > limit:
+        raise CalibrationFileError(
+            f"{name} is {value:g}, expected {-limit:.4g} to {limit:.4g}: larger errors are "
             "not calibration errors"
         )
-    return float(given)
+    return value
 
 
 def _short(value: float) -> float:

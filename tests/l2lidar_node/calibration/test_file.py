@@ -31,6 +31,9 @@ FILE = CalibrationFile(
     {"weakest": "xi and beta together", "captures": ["a.pcap"]},
 )
 
+BEYOND = "1" + 400 * "0"  # the range of a float
+ENDLESS = "0x" + 5000 * "f"  # Python reads it, but does not write it in decimal digits
+
 
 def test_a_file_comes_back_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "unit.yaml"
@@ -68,6 +71,15 @@ def test_a_block_is_corrected_to_the_bit_or_not_at_all() -> None:
         (("- 0.01\n", "- x\n"), "imu.rotation_rpy is 'x'"),
         (("reported:", "reported: 3\nother:"), "reported is not a mapping"),
         (("format: 1", "{"), "not YAML"),
+        (("xi_angle: 0.0033", f"xi_angle: {BEYOND}"), "correction.xi_angle is 1000"),
+        (("time: 0.0001", f"time: -{BEYOND}"), "imu.sd.time is -1000"),
+        (("- 0.01\n", f"- {BEYOND}\n"), "imu.rotation_rpy is 1000"),
+        (("format: 1", f"format: {ENDLESS}"), "an integer of more than 4300 digits"),
+        (("xi_angle: 0.0033", f"xi_angle: {ENDLESS}"), "an integer of more than 4300 digits"),
+        (("xi_angle: 0.0033", f"? {ENDLESS}\n  : 0.0033"), "an integer of more than 4300 digits"),
+        (("format: 1", f"format: 1{':00' * 200}.0"), "not YAML"),
+        (("format: 1", "format: !!int ''"), "not YAML"),
+        (("format: 1", "format: !!bool maybe"), "not YAML"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_named(
