@@ -92,7 +92,7 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
     Raises
     ------
     CalibrationError
-        If there is nothing to estimate from.
+        If there is nothing to estimate from, in all places or in one of them.
     """
     refusals = [refusal for place in places for refusal in problems(place)]
     refusals += _between(places)
@@ -104,8 +104,10 @@ def calibrate(places: Sequence[Place], keep_alpha: bool = False) -> StillResult:
         refusals += refused
         scene = _scene(places, taken)
         solution = solver.solve(scene, _unknowns(len(places)), coarse.values)
+        _check_seen(solution, places)
         whole = _scene(places, taken, _MOST_RETURNS_WHOLE)
         angles = _with_axis_distance(whole, solution)
+        _check_seen(angles, places)
         bias, reason = range_bias(whole, angles)
     except FewPlanesError:
         if refusals:
@@ -344,6 +346,17 @@ def _precession(
         else:
             notes.append(f"{text}: a spectral line of the gyro, not a motion")
     return taken, notes, refusals
+
+
+def _check_seen(solution: Solution, places: Sequence[Place]) -> None:
+    """Raise CalibrationError if nothing in a placement tells its alpha."""
+    information = np.diag(solution.hessian)[2:]
+    for place, told in zip(places, information, strict=False):  # b may follow the alphas
+        if told <= 0.0:
+            raise CalibrationError(
+                f"{place.name}: no flat surface is seen by both halves of the fan; check that "
+                "nothing covers the sensor, and record it again in a furnished room of 4 to 10 m"
+            )
 
 
 def _alone(

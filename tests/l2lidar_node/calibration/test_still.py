@@ -100,6 +100,15 @@ def test_a_scene_without_surfaces_is_refused() -> None:
         calibrate([replace(place, returns=cloudy)])
 
 
+@pytest.mark.parametrize("kept", [0, 50])
+def test_a_place_where_nothing_flat_is_seen_by_both_halves_is_named(kept: int) -> None:
+    good, covered = thinned(places(poses=("upright", "tilted"), seconds=2.2))
+    covered = replace(covered, name="covered", returns=covered.returns[:kept])
+    with pytest.raises(CalibrationError) as caught:
+        calibrate([good, covered])
+    assert str(caught.value).startswith("covered: no flat surface is seen by both halves")
+
+
 def test_a_corridor_does_not_tell_everything() -> None:
     result = calibrate(thinned(places(world="corridor", poses=("upright",))))
     assert result.refusals or result.estimates["bias"].verdict is Verdict.UNKNOWN
