@@ -191,6 +191,10 @@ class Recording:
                     if isinstance(item, Frame):
                         yield from _sent(item, datagram.time)
 
+    def close(self) -> None:
+        """Close the stream; may be called more than once."""
+        self._stream.close()
+
     def _from_start(self) -> Iterator[UdpDatagram]:
         self._stream.seek(0)
         self._reader = CaptureReader(self._stream)
@@ -515,6 +519,7 @@ class Playback(Loop):
     Parameters
     ----------
     recording : Recording
+        Closed when the loop ends.
     config : DriverConfig
         With ``replay_rate`` and ``replay_loop``.
     on_event : callable
@@ -578,6 +583,10 @@ class Playback(Loop):
             self._on_lap(self._shift_ns)
             self._time = self._reached = self._recording.start
             self.driver = Driver(self.driver.config, self.driver.blocks.file)
+
+    def _release(self) -> None:
+        super()._release()
+        self._recording.close()
 
     def _play(self) -> None:
         line = TimeLine(self._recording.start)

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -118,35 +119,54 @@ _CLOCK_DEPTH = 10
 def open_loop(node: Node, config: DriverConfig, on_event: Callable[[Event], None]) -> Loop:
     """Return the loop that the settings ask for, not started yet; says in the log what it is.
 
+    Nothing stays open where it raises.
+
     Raises
     ------
+    SettingError
+        If the calibration file cannot be used.
     StartError
         If a socket, device or file cannot be opened; the message says what to do.
     """
-    if config.files.replay_file:
-        return _playback(node, config, on_event)
+    with ExitStack() as opened:  # until the loop is there to close it
+        if config.files.replay_file:
+            loop: Loop = _playback(node, config, on_event, opened)
+        else:
+            loop = _live(node, config, on_event, opened)
+        opened.pop_all()
+    return loop
+
+
+def _live(
+    node: Node, config: DriverConfig, on_event: Callable[[Event], None], opened: ExitStack
+) -> Session:
+    driver = Driver(config)
+    try:
+        transport = session.open_transport(config.network)
+    except TransportError as error:
+        raise StartError(str(error.strerror)) from None
+    opened.callback(transport.close)
+    node.get_logger().info(session.describe_transport(config.network))
     taps: list[Tap] = []
-    if config.files.record_file:
+    if config.topics.publish_packets:
+        taps.append(PacketPublisher(node, config.topics.packet_topic_id, config.network))
+    if config.files.record_file:  # last: a start that fails must not leave an empty capture
         path = free_name(Path(config.files.record_file).expanduser())
         try:
             taps.append(Recorder(path, config.network, node.get_logger().error))
         except OSError as error:
             raise StartError(f"cannot record to {path}: {error.strerror}") from None
         node.get_logger().info(f"recording to {path}")
-    if config.topics.publish_packets:
-        taps.append(PacketPublisher(node, config.topics.packet_topic_id, config.network))
-    try:
-        transport = session.open_transport(config.network)
-    except TransportError as error:
-        raise StartError(str(error.strerror)) from None
-    node.get_logger().info(session.describe_transport(config.network))
-    return Session(Driver(config), transport, on_event, Taps(taps) if taps else None)
+    return Session(driver, transport, on_event, Taps(taps) if taps else None)
 
 
-def _playback(node: Node, config: DriverConfig, on_event: Callable[[Event], None]) -> Playback:
+def _playback(
+    node: Node, config: DriverConfig, on_event: Callable[[Event], None], opened: ExitStack
+) -> Playback:
     path = Path(config.files.replay_file).expanduser()
     try:
-        recording = Recording(open_packets(path), config.network.l2_ip)
+        stream = opened.enter_context(open_packets(path))
+        recording = Recording(stream, config.network.l2_ip)
         split_stamp(recording.start)
     except OSError as error:
         raise StartError(f"cannot replay {path}: {error.strerror}") from None

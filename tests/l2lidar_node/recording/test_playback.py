@@ -53,9 +53,8 @@ class Played:
         self.ended = threading.Event()
         self._laps = laps
         settings = change(config, {"replay_rate": 0.0, **files})
-        self.playback = kind(
-            Recording(stream), settings, self.events.append, self.times.append, self._lap
-        )
+        recording = Recording(io.BytesIO(stream.getvalue()))  # which is closed at the end
+        self.playback = kind(recording, settings, self.events.append, self.times.append, self._lap)
         self.playback.start()
 
     def _lap(self, shift: int | None) -> None:
