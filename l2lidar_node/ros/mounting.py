@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -82,6 +83,7 @@ def untied(frames: StaticFrames | None, target: str, source: str) -> str:
 
 
 _MAX_CLIENTS: Final = 8
+_MOST_PENDING: Final = 6  # questions to one publisher: a busy one may answer some rounds later
 _PARAMETER: Final = "imu_adjust"  # of this driver, and of upstream's
 
 
@@ -117,6 +119,7 @@ class ImuAdjustClient:
         self._topic = topic
         self._on_leveling = on_leveling
         self._clients: dict[str, Client] = {}
+        self._asked: dict[str, deque[Future]] = {}  # the last questions
         self._answers: dict[str, bool] = {}
         node.create_timer(period_s, self._ask, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -130,10 +133,16 @@ class ImuAdjustClient:
                 continue
             client = self._clients[name]
             if client.service_is_ready():
+                asked = self._asked[name]
+                if len(asked) == _MOST_PENDING:
+                    # rclpy keeps a request until it is answered, which may be never.
+                    client.remove_pending_request(asked.popleft())
                 future = client.call_async(GetParameters.Request(names=[_PARAMETER]))
                 future.add_done_callback(lambda done, name=name: self._answered(name, done))
+                asked.append(future)
         for name in set(self._clients) - publishers:
             self._node.destroy_client(self._clients.pop(name))
+            del self._asked[name]
             self._answers.pop(name, None)
         self._judge()
 
@@ -145,6 +154,7 @@ class ImuAdjustClient:
             self._clients[name] = self._node.create_client(GetParameters, f"{name}/get_parameters")
         except NameValidationException:  # a program that is not ROS may have any name
             return False
+        self._asked[name] = deque()
         return True
 
     def _answered(self, name: str, future: Future) -> None:
