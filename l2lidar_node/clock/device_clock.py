@@ -195,6 +195,10 @@ class DeviceClock:
     Stamps of a stream never go backwards and are never after the packet's arrival. Where both
     are impossible, after the host's clock was set back, packets get no stamp until it has passed
     the latest one. Stamps that count from the device's power-on begin anew when it restarts.
+
+    System time tells nothing about packets that arrive at once. They follow each other without
+    overlap, and so their measurements may end up to 1 s after the arrival; packets beyond that
+    get no stamp.
     """
 
     def __init__(self, config: ClockConfig) -> None:
@@ -258,8 +262,9 @@ class DeviceClock:
         Returns
         -------
         HostNs or None
-            After every earlier one of the stream and at least ``duration_ns`` before ``arrival``.
-            None while no trustworthy stamp can be told, see :class:`ClockStatus`.
+            After every earlier one of the stream and at least ``duration_ns`` before ``arrival``,
+            with system time up to 1 s later. None while no trustworthy stamp can be told, see
+            :class:`ClockStatus`.
         """
         host = self._host
         device = self._device

@@ -482,6 +482,29 @@ def test_system_time_never_goes_back_nor_overlaps() -> None:
     assert 400 < replay.clock.status().held < 1000  # until the clock has passed the latest stamp
 
 
+@pytest.mark.parametrize(("stream", "duration"), [(Stream.IMU, 0), (Stream.POINTS, 4_600_000)])
+def test_system_time_is_at_most_a_second_ahead_of_packets_that_arrive_at_once(
+    stream: Stream, duration: int
+) -> None:
+    clock = DeviceClock(ClockConfig(use_system_time=True))
+    arrival = 1_700_000_000 * 10**9
+    stamps = [
+        clock.observe(stream, seq, DeviceNs(seq * 2_000_000), HostNs(arrival), duration)
+        for seq in range(400)
+    ]
+    given = [stamp for stamp in stamps if stamp is not None]
+    assert given[0] == arrival - duration
+    assert np.all(np.diff(given) == duration + 1)
+    assert stamps[: len(given)] == given
+    if stream is Stream.POINTS:
+        # No more than fit into the second, and all that do.
+        assert arrival + 10**9 - duration <= given[-1] + duration <= arrival + 10**9
+        assert clock.status().held == len(stamps) - len(given) > 0
+    # Time that has passed is made good.
+    later = arrival + 2 * 10**9
+    assert clock.observe(stream, 400, DeviceNs(10**9), HostNs(later), duration) == later - duration
+
+
 def test_the_switch_to_system_time_and_back_is_live_and_never_goes_backwards() -> None:
     configs = [change(ClockConfig(), {"UseSystemTimeTS": value}) for value in (False, True)]
     clock = DeviceClock(configs[0])
