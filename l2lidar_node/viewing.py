@@ -28,6 +28,8 @@ _POSE_NS: Final = 100_000_000  # a cloud farther than that from any pose is not 
 _SIGMAS: Final = 3.0  # half axes of the ellipsoid
 _DEGENERATE_RATIO: Final = 5.0  # of the largest to the smallest standard deviation of position
 _ARROW_M: Final = 1.0
+_STRIP: Final = 100  # line segments of the path that one entity holds
+_PATH_COLOR: Final = (80, 170, 255)  # of all strips; rerun would give each another
 _DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _LEVELS: Final = ("OK", "WARN", "ERROR", "STALE")
 _LOG_LEVELS: Final = ("INFO", "WARN", "ERROR", "ERROR")
@@ -63,7 +65,8 @@ class Viewer:
         self.messages = 0
         self.refused = 0
         self._rerun = rerun
-        self._track: list[tuple[float, float, float]] = []
+        self._strip: list[tuple[float, float, float]] = []  # the end of the path
+        self._strips = 0
         self._poses: deque[tuple[int, F64]] = deque(maxlen=_POSES)
         self._map = _GrownMap()
         self._has_deskewed = False
@@ -104,8 +107,7 @@ class Viewer:
         q = np.array([turn.w, turn.x, turn.y, turn.z])
         rotation = rotations.matrices(rotations.normalised(q)) if q.any() else np.eye(3)
         rerun.log(_SENSOR, rerun.Transform3D(translation=position, mat3x3=rotation))
-        self._track.append(position)
-        rerun.log(f"{_ODOMETRY}/path", rerun.LineStrips3D([self._track]))
+        self._lengthen_path(position)
         T_odom_sensor = np.eye(4)
         T_odom_sensor[:3, :3] = rotation
         T_odom_sensor[:3, 3] = position
@@ -141,6 +143,17 @@ class Viewer:
         stamp = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
         self._rerun.set_time("stamp", timestamp=np.datetime64(stamp, "ns"))
         return stamp
+
+    def _lengthen_path(self, position: tuple[float, float, float]) -> None:
+        """Log the last strip of the path: the whole one at every pose would fill the disk."""
+        if len(self._strip) > _STRIP:
+            self._strips += 1
+            del self._strip[:-1]  # its end is where the next one begins
+        self._strip.append(position)
+        self._rerun.log(
+            f"{_ODOMETRY}/path/{self._strips}",
+            self._rerun.LineStrips3D([self._strip], colors=_PATH_COLOR),
+        )
 
     def _grow(self, xyz: F64, stamp: int) -> None:
         if not self._poses:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import shutil
 import sys
@@ -132,6 +133,27 @@ def test_uncertainty_and_the_directions_not_seen_are_shown(shown: Shown) -> None
     )
     assert first == []
     assert np.abs(second) == pytest.approx(np.array([[0, 1, 0], [0, 1, 0]]))  # along y, both ways
+
+
+def test_a_long_path_is_logged_in_strips(shown: Shown) -> None:
+    viewer = Viewer(shown)
+    poses = 1000
+    for number in range(poses):
+        viewer.odometry(odometry(START + number * STEP, float(number), (0.01, 0.01, 0.01)))
+    last: dict[str, list[float]] = {}
+    logged = 0
+    for entity, items in shown.logged.items():
+        if entity.startswith("world/path"):
+            for item in items:
+                (strip,) = item.strips.as_arrow_array().to_pylist()
+                logged += len(strip)
+                last[entity] = [point[0] for point in strip]
+    # What the viewer shows, the last of each entity, is the whole path, strips tied to each other.
+    strips = sorted(last.values())
+    assert all(before[-1] == after[0] for before, after in itertools.pairwise(strips))
+    assert sorted({x for strip in strips for x in strip}) == list(range(poses))
+    assert max(map(len, strips)) <= 101
+    assert logged < 60 * poses
 
 
 def test_a_status_is_logged_when_it_changes(shown: Shown) -> None:
