@@ -80,6 +80,8 @@ class Viewer:
             points = points_of(message)
             xyz = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
         except ValueError:  # fields that do not fit the data, or no x, y, z
+            xyz = np.empty(0)
+        if xyz.ndim != 2:  # or they are arrays
             self.refused += 1
             return
         xyz = xyz[np.isfinite(xyz).all(axis=1)]
@@ -112,7 +114,9 @@ class Viewer:
         T_odom_sensor[:3, :3] = rotation
         T_odom_sensor[:3, 3] = position
         self._poses.append((stamp, T_odom_sensor))
-        self._uncertainty(np.asarray(message.pose.covariance, np.float64).reshape(6, 6), position)
+        covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
+        if np.isfinite(covariance).all():
+            self._uncertainty(covariance, position)
 
     def diagnostics(self, message: Any) -> None:
         """Show a DiagnosticArray: each status, its changes, and its figures as curves."""

@@ -135,6 +135,18 @@ def test_uncertainty_and_the_directions_not_seen_are_shown(shown: Shown) -> None
     assert np.abs(second) == pytest.approx(np.array([[0, 1, 0], [0, 1, 0]]))  # along y, both ways
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_an_uncertainty_that_is_not_finite_is_left_out(shown: Shown, wrong: float) -> None:
+    viewer = Viewer(shown)
+    message = odometry(START, 0.0, (0.01, 0.02, 0.01))
+    message.pose.covariance[1] = wrong
+    viewer.odometry(message)
+    assert "sigma/position" not in shown.logged
+    viewer.odometry(odometry(START + STEP, 0.0, (0.01, 0.02, 0.01)))
+    assert len(shown.logged["world/sensor"]) == 2
+    assert len(shown.logged["sigma/position"]) == 1
+
+
 def test_a_long_path_is_logged_in_strips(shown: Shown) -> None:
     viewer = Viewer(shown)
     poses = 1000
@@ -172,7 +184,10 @@ def test_a_cloud_that_cannot_be_read_is_counted(shown: Shown) -> None:
     cloud = wall(START)
     viewer.cloud(SimpleNamespace(**{**vars(cloud), "width": 1000}), "raw")
     viewer.cloud(SimpleNamespace(**{**vars(cloud), "fields": []}), "raw")
-    assert viewer.refused == 2
+    pairs = [SimpleNamespace(name=name, offset=0, datatype=7, count=2) for name in "xyz"]
+    viewer.cloud(SimpleNamespace(**{**vars(cloud), "fields": pairs}), "raw")
+    assert viewer.refused == 3
+    assert viewing.ROLES["raw"] not in shown.logged
 
 
 def test_a_bag_is_shown_without_ros(run: Run, tmp_path: Path) -> None:
