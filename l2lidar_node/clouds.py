@@ -162,6 +162,11 @@ class Layout:
         names = self.dtype.names or ()
         return next((name for name in _TIME_FIELDS if name in names), "")
 
+    @property
+    def longest_ns(self) -> int | None:
+        """Largest time of a point that the layout can hold [ns]; None where any sweep fits."""
+        return _MOST_NS if self.time_field in _NS_FIELDS else None
+
     def without_time(self) -> Layout:
         """Return the layout without its time field, for points that need none any more."""
         fields = dict(self.dtype.fields or {})
@@ -206,12 +211,15 @@ class Layout:
 
 
 _TIME_FIELDS: Final = ("time", "t", "timestamp", "time_stamp")
+_NS_FIELDS: Final = ("t", "time_stamp")
+_MOST_NS: Final = (1 << 32) - 1  # they are uint32
 
 
 def _field(name: str, points: NDArray[np.void], start: HostNs) -> NDArray[Any]:
     """Return the values of one field of a layout."""
-    if name in ("t", "time_stamp"):  # ns after the header's stamp
-        return np.rint(points["time"].astype(np.float64) * 1e9)
+    if name in _NS_FIELDS:  # ns after the header's stamp
+        # The settings allow no longer sweeps, but where packets are lost one may become longer.
+        return np.minimum(np.rint(points["time"].astype(np.float64) * 1e9), _MOST_NS)
     if name == "timestamp":  # s since the epoch
         return np.float64(start / 1e9) + points["time"].astype(np.float64)
     if name in ("range", "distance"):

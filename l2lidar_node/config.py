@@ -429,3 +429,22 @@ class DriverConfig:
                 "parameter 'publish_packets': true cannot be combined with replay_file "
                 f"({self.files.replay_file!r}), which has no device; set only one of them"
             )
+        self._check_length()
+
+    def _check_length(self) -> None:
+        """Check that the times of a sweep's points fit into the point layout."""
+        longest = LAYOUTS[self.topics.point_layout].longest_ns
+        sweep = self.sweep
+        if longest is None or (sweep.frame3d and sweep.cut in ("turn", "half_turn")):
+            return
+        period = round((wire.MIRROR_PERIOD_S if sweep.frame3d else wire.PERIOD_2D_S) * 1e9)
+        name, value, most = "aggregateNframes", sweep.packets, longest // period
+        if sweep.cut != "packets":  # the last packet begins within the duration
+            name, value = "sweep_duration_ms", sweep.duration_ms
+            most = (longest - period) // 1_000_000
+        if value > most:
+            layout = self.topics.point_layout
+            raise SettingError(
+                f"parameter '{name}': {value} is out of range, expected at most {most} with "
+                f"point_layout {layout}, whose times end at {longest / 1e9:.2f} s"
+            )

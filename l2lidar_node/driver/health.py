@@ -128,7 +128,7 @@ def metadata(driver: Driver) -> Metadata:
 
 
 POINTS_3D_HZ: Final = 1 / wire.MIRROR_PERIOD_S
-POINTS_2D_HZ: Final = 50.0
+POINTS_2D_HZ: Final = 1 / wire.PERIOD_2D_S
 
 _USUAL_NS: Final = 1_000_000_000  # between two instants
 _RATE_TOLERANCE: Final = 0.1

@@ -34,6 +34,7 @@ HOST_PORT: Final = 6201
 
 IMU_RATE_HZ: Final = 250.0
 MIRROR_PERIOD_S: Final = 0.004639  # one fast-mirror turn, so one 3D packet
+PERIOD_2D_S: Final = 0.02  # of 2D packets
 IMU_POSITION_M: Final = (-0.007698, -0.014655, 0.00667)  # in the cloud frame; axes are parallel
 QUATERNION_NORM: Final = 0.9983  # what units really send
 

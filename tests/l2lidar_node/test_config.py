@@ -203,6 +203,36 @@ def test_groups_check_themselves_however_they_are_made() -> None:
         SweepConfig(range_min=5.0, range_max=1.0)
 
 
+@pytest.mark.parametrize("layout", ["ouster_legacy", "autoware"])
+@pytest.mark.parametrize(
+    ("name", "most", "more"),
+    [
+        ("aggregateNframes", 925, {}),
+        ("aggregateNframes", 214, {"frame3d": False}),
+        ("sweep_duration_ms", 4290, {"sweep_cut": "duration"}),
+        ("sweep_duration_ms", 4274, {"sweep_cut": "duration", "frame3d": False}),
+        ("sweep_duration_ms", 4274, {"sweep_cut": "half_turn", "frame3d": False}),
+    ],
+)
+def test_sweeps_fit_into_the_times_of_their_layout(
+    layout: str, name: str, most: int, more: dict[str, Any]
+) -> None:
+    config = build(DriverConfig, {"point_layout": layout, name: most, **more})
+    with pytest.raises(SettingError) as caught:
+        change(config, {name: most + 1})  # as a live change does
+    for word in (f"parameter '{name}'", str(most + 1), f"at most {most}", layout):
+        assert word in str(caught.value)
+    change(config, {name: most + 1, "point_layout": "velodyne"})
+
+
+def test_only_the_limit_of_the_cut_in_use_counts() -> None:
+    long = {"aggregateNframes": 4000, "sweep_duration_ms": 20_000, "point_layout": "autoware"}
+    config = build(DriverConfig, {**long, "sweep_cut": "half_turn"})
+    for cut, name in (("packets", "aggregateNframes"), ("duration", "sweep_duration_ms")):
+        with pytest.raises(SettingError, match=name):
+            change(config, {"sweep_cut": cut})
+
+
 def test_a_choice_means_itself_in_a_parameter_file() -> None:
     """YAML takes off, on, yes, no and null for other things, also after ``-p NAME:=``."""
     choices = [word for found in settings_of(DriverConfig) for word in found.choices]

@@ -20,7 +20,6 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.protocol.wire import PacketType, WorkMode
 
 _HEAD_PERIOD_S: Final = 0.229769
-_FLAT_PERIOD_S: Final = 0.02
 _WIDE_START_RAD: Final = -0.105  # of the mirror; 192 degrees instead of 180
 _STATE: Final = (4639, 229769, 0.0, 0.0, 0.0, 43.7, 154.16, 51.38, 60.8)
 """Inside state of a published unit, in the order of :data:`wire.INSIDE_STATE`."""
@@ -43,7 +42,7 @@ class PatternScanner:
         self._flat = flat
         dtype = wire.POINTS_2D_PAYLOAD if flat else wire.POINTS_3D_PAYLOAD
         slots = wire.POINTS_PER_2D_PACKET if flat else wire.POINTS_PER_3D_PACKET
-        self._period_s = _FLAT_PERIOD_S if flat else wire.MIRROR_PERIOD_S
+        self._period_s = wire.PERIOD_2D_S if flat else wire.MIRROR_PERIOD_S
         start = _WIDE_START_RAD if wide else 0.0
         row = np.zeros(1, dtype)
         row["state"] = _STATE

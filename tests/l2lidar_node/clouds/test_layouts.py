@@ -79,6 +79,16 @@ def test_times_are_in_the_consumers_unit(name: Any, points: Any) -> None:
         assert name == "xyzi"
 
 
+@pytest.mark.parametrize("name", ["ouster_legacy", "autoware"])
+def test_times_that_do_not_fit_do_not_begin_anew(name: str, points: Any) -> None:
+    late = points[:4].copy()
+    late["time"] = [0.0, 4.2, 4.4, 9.0]
+    layout = LAYOUTS[name]
+    times = layout.convert(late, START)[layout.time_field].tolist()
+    assert times[:2] == pytest.approx([0, 4.2e9], rel=1e-6)
+    assert times[2:] == [layout.longest_ns] * 2 == [2**32 - 1] * 2
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_without_time_only_the_time_is_missing(name: Any, points: Any) -> None:
     layout = LAYOUTS[name]
