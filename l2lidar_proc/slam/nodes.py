@@ -240,7 +240,7 @@ class CovarianceGrowth:
 
     Its covariance is that of the whole way since its start, and goes up and down a little from
     sweep to sweep. So what counts is by how much it exceeds the largest one since the odometry
-    was last sure: the ups alone would add up, at rest without end.
+    was last sure, at another place: the ups alone would add up, at rest without end.
     """
 
     def __init__(self) -> None:
@@ -250,19 +250,19 @@ class CovarianceGrowth:
     def add(self, sweep: OdometrySweep) -> F64:
         """Take the next sweep; return its share (6, 6): turn, translation; odometry axes.
 
-        It is zero where the covariance is not finite, and after a cut: what the odometry says
-        then is not the covariance of this motion.
+        Zero for a cut and where the covariance is not finite, and the next sweep begins anew:
+        what the odometry says there is not the covariance of a motion that counts.
         """
         now, grown = np.zeros((6, 6)), np.zeros((6, 6))
         now[TURN, TURN] = sweep.covariance[3:, 3:]
         now[SHIFT, SHIFT] = sweep.covariance[:3, :3]
-        if not np.isfinite(now).all():
+        if sweep.health is Health.CUT or not np.isfinite(now).all():
             self._counted = None
             return grown
         place = sweep.T_odom_body[:3, 3]
         is_sure = sweep.health in (Health.GOOD, Health.SKIPPED)
         has_moved = np.linalg.norm(place - self._place) > _HELD_M
-        if self._counted is None or sweep.health is Health.CUT or (is_sure and has_moved):
+        if self._counted is None or (is_sure and has_moved):
             self._counted, self._place = now, place
         elif not is_sure:
             variance, axes = np.linalg.eigh(now - self._counted)

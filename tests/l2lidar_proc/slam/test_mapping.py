@@ -14,7 +14,13 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc.slam import se3
 from l2lidar_proc.slam.config import LoopConfig, SlamConfig
 from l2lidar_proc.slam.loops import Admission, Graph, Loop
-from l2lidar_proc.slam.nodes import Health, Keyframe, OdometrySweep, SlamState
+from l2lidar_proc.slam.nodes import (
+    CovarianceGrowth,
+    Health,
+    Keyframe,
+    OdometrySweep,
+    SlamState,
+)
 from l2lidar_proc.slam.pose_graph import (
     CUT,
     EDGE,
@@ -401,3 +407,15 @@ def test_the_jump_of_a_cut_is_no_way() -> None:
     slam = chained(sweeps)
 
     assert slam.nodes[-1].way < 25.0
+
+
+def test_after_a_cut_the_covariance_grows_from_that_of_the_next_sweep() -> None:
+    growth = CovarianceGrowth()
+    bad = ((Health.CUT, 9999.0), (Health.DEGENERATE, 0.25), (Health.DEGENERATE, 0.3))
+    grown = [
+        growth.add(dataclasses.replace(sweep, health=health, covariance=variance * np.eye(6)))
+        for sweep, (health, variance) in zip(drive(3, 0.25), bad, strict=True)
+    ]
+
+    np.testing.assert_allclose(grown[:2], np.zeros((2, 6, 6)))
+    np.testing.assert_allclose(grown[2], 0.05 * np.eye(6), atol=1e-12)
