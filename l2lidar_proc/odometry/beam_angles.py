@@ -30,6 +30,7 @@ from l2lidar_proc.odometry.fan_halves import (
 )
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
+_RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
 _PRIOR: Final = np.eye(2) / tuning.BEAM_SIGMA**2  # information of units [1/rad^2]
 
 
@@ -48,7 +49,9 @@ class BeamAngles:
         self._weighted: F64  # information by estimate
         self.forget()
         self._rate: float | None = None
-        self._failures = 0
+        self._failures = 0  # sweeps in a row before the pattern has shown,
+        self._is_shown = False  # whether it has,
+        self._misses = 0  # and sweeps in a row without it since then
         self._sweeps = 0
         self._rested_ns = 0  # of the sweeps at rest that were compared last
         self._seen: tuple[Sweep, Halves | None] | None = None  # the latest sweep
@@ -65,9 +68,14 @@ class BeamAngles:
         if self._seen is None or self._seen[0] is not sweep:
             found = halves(sweep.points, self._rate)
             if found is not None:
-                self._failures, self._rate = 0, found.rate
-            elif self._rate is None:
+                self._failures, self._misses, self._rate = 0, 0, found.rate
+                self._is_shown = True
+            elif not self._is_shown:
                 self._failures += 1
+            else:
+                self._misses += 1
+                if self._misses >= _RATE_MISSES:
+                    self._rate = None
             self._seen = sweep, found
         return self._seen[1]
 

@@ -26,6 +26,7 @@ _HEAD_HZ: Final = np.arange(3.0, 8.0, 0.05)  # units were measured from 4.3 to 5
 _RATE_NEAR: Final = 1.0 + np.arange(-0.02, 0.0201, 0.004)  # of a head whose rate is known
 _NEAR_M: Final = 0.5  # from the head's axis; nearer, the azimuth says little
 _FAN_S: Final = 2e-4  # between points that follow each other in a fan
+_RATE_SPAN_S: Final = 0.04  # a sixth of a turn tells the head's rate to 3 %; in less any rate fits
 _MOST: Final = 200  # points that show the head's angle
 _SHOWN: Final = 3000  # points whose order tells the halves apart
 _FITS: Final = 0.9  # length of the mean of unit vectors; 1 where a line fits all points
@@ -70,6 +71,8 @@ def halves(points: NDArray[np.void], rate: float | None = None) -> Halves | None
     if len(far) < tuning.BEAM_POINTS:
         return None
     some = records.decimated(far, _MOST)
+    if rate is None and time[some[-1]] - time[some[0]] < _RATE_SPAN_S:
+        return None
     doubled = ((x[some] + 1j * y[some]) / radius[some]) ** 2
     rates = 2.0 * np.pi * _HEAD_HZ if rate is None else rate * _RATE_NEAR
     means = np.exp(-2j * np.outer(rates, time[some])) @ doubled / len(some)

@@ -101,6 +101,37 @@ def learned(unit: Any, at_rest: bool = True, drift: Any = (0.0, 0.0, 0.0)) -> Be
     return beams
 
 
+@pytest.mark.parametrize("seconds", [0.002, 0.01, 0.03, 0.05, 0.1])
+def test_a_first_sweep_that_is_cut_does_not_hide_the_pattern(seconds: float) -> None:
+    """A driver that starts within a turn: so short a part fits any rate of the head."""
+    whole, _ = turn(UNIT, 0)
+    part = dataclasses.replace(whole, points=whole.points[whole.points["time"] < seconds])
+    beams = BeamAngles()
+    beams.learn(beams.corrected(part), part.points, at_rest=True)
+    for number in range(1, 12):
+        sweep = beams.corrected(turn(UNIT, number)[0])
+        assert beams.head(sweep) is not None
+        beams.learn(sweep, sweep.points, at_rest=True)
+    expected = learned(UNIT).correction
+    assert expected.any()
+    np.testing.assert_allclose(np.degrees(beams.correction - expected), 0.0, atol=0.05)
+
+
+def test_a_rate_of_the_head_that_does_not_fit_is_searched_anew() -> None:
+    beams = BeamAngles()
+    for number in range(8):
+        assert beams.head(turn(UNIT, number, 27.1)[0]) is not None
+    found = [beams.head(turn(UNIT, number, 34.9)[0]) for number in range(8)]
+    assert found[0] is None
+    assert found[-1] is not None
+    assert found[-1].rate == pytest.approx(34.9, rel=0.02)
+    nothing = dataclasses.replace(turn(UNIT, 0)[0], points=turn(UNIT, 0)[0].points[:0])
+    for _ in range(50):  # covered, it stays an L2
+        assert beams.head(nothing) is None
+    assert beams.head(turn(UNIT, 9, 34.9)[0]) is not None
+    assert beams.sigmas is not None
+
+
 @pytest.mark.parametrize("rate", [27.1, 34.9])
 @pytest.mark.parametrize("number", range(4))
 def test_the_half_of_every_point_is_found(rate: float, number: int) -> None:
