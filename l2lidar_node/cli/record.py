@@ -23,6 +23,7 @@ from l2lidar_node.files import free_name
 from l2lidar_node.protocol import wire
 from l2lidar_node.recording.bag import BagWriter
 from l2lidar_node.recording.capture import CaptureError
+from l2lidar_node.recording.pacing import TimeLine
 from l2lidar_node.recording.packet_bag import PacketBag, PacketBagWriter, open_packets
 from l2lidar_node.recording.recording import (
     Received,
@@ -30,6 +31,7 @@ from l2lidar_node.recording.recording import (
     Recording,
     RecordingWriter,
     events,
+    timed,
     written,
 )
 from l2lidar_node.settings import build
@@ -345,10 +347,10 @@ def _paced(
 ) -> Iterator[tuple[bytes, float]]:
     """Yield datagrams with their time into the recording [s], each when it is due."""
     begun = time.monotonic()
-    for entry in recording:
+    for entry, due_ns in timed(recording, TimeLine(recording.start)):
         if not isinstance(entry, Received):
             continue
-        seconds = (entry.time - recording.start) / 1e9
+        seconds = due_ns / 1e9
         if seconds < start:
             begun = time.monotonic()
             continue

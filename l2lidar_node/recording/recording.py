@@ -12,7 +12,7 @@ import re
 import socket
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -444,6 +444,11 @@ def _check_time(time: HostNs) -> None:
         )
 
 
+def _checked(entry: Entry) -> Entry:
+    _check_time(entry.time)
+    return entry
+
+
 def events(recording: Recording, config: DriverConfig) -> Iterator[Event]:
     """Yield everything a driver hands out for a recording, in order.
 
@@ -511,6 +516,52 @@ class NoTransport:
 
     def close(self) -> None:
         """Do nothing."""
+
+
+def timed(entries: Iterable[Entry], line: TimeLine) -> Iterator[tuple[Entry, int]]:
+    """Yield the entries of a recording, each with when it is due.
+
+    Parameters
+    ----------
+    entries : iterable of Entry
+        Such as a :class:`Recording`.
+    line : TimeLine
+        Told of each step some entries before its note.
+
+    Yields
+    ------
+    entry : Entry
+    due_ns : int
+        After the first datagram, at the pace of the recording [ns].
+
+    Raises
+    ------
+    CaptureError
+        Where the recording is damaged, after all before that.
+    """
+    coming: deque[Entry] = deque()
+    damage: CaptureError | None = None
+    try:
+        for entry in entries:
+            if isinstance(entry, Stepped):
+                line.foresee(entry.by_ns)
+            coming.append(entry)
+            if len(coming) > _FORESEEN:
+                yield _placed(coming.popleft(), line)
+    except CaptureError as error:
+        damage = error
+    while coming:
+        yield _placed(coming.popleft(), line)
+    if damage is not None:
+        raise damage
+
+
+def _placed(entry: Entry, line: TimeLine) -> tuple[Entry, int]:
+    if isinstance(entry, Received) and not line.has_begun:
+        line.begin(entry.time)
+    elif isinstance(entry, Stepped):
+        line.step()
+    return entry, line.place(entry.time)
 
 
 class Playback(Loop):
@@ -592,12 +643,7 @@ class Playback(Loop):
         line = TimeLine(self._recording.start)
         begun = time.monotonic()
         next_clock = 0
-        for entry in self._entries(line):
-            if isinstance(entry, Received) and not line.has_begun:
-                line.begin(entry.time)
-            elif isinstance(entry, Stepped):
-                line.step()
-            due_ns = line.place(entry.time)
+        for entry, due_ns in self._entries(line):
             if self._rate:
                 self._wait(begun + due_ns / (1e9 * self._rate))
             self._run_calls()
@@ -611,20 +657,12 @@ class Playback(Loop):
             self._give(feed(self.driver, entry))
         self._give(self.driver.flush())
 
-    def _entries(self, line: TimeLine) -> Iterator[Entry]:
-        """Yield the entries, and tell the line of a step some entries before its note."""
-        coming: deque[Entry] = deque()
+    def _entries(self, line: TimeLine) -> Iterator[tuple[Entry, int]]:
         try:
-            for entry in self._recording:
-                _check_time(entry.time)  # before it is waited for
-                if isinstance(entry, Stepped):
-                    line.foresee(entry.by_ns)
-                coming.append(entry)
-                if len(coming) > _FORESEEN:
-                    yield coming.popleft()
+            # before they are waited for
+            yield from timed(map(_checked, self._recording), line)
         except CaptureError as error:
             self.damage = str(error)
-        yield from coming
 
     def _wait(self, until: float) -> None:
         while (left := until - time.monotonic()) > 0 and not self._stopping.is_set():

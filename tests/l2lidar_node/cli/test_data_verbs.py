@@ -25,6 +25,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from l2lidar_node.calibration.file import CalibrationFile
+from l2lidar_node.cli.record import _paced
 from l2lidar_node.config import DriverConfig, NetworkConfig
 from l2lidar_node.driver.driver import Driver, Event
 from l2lidar_node.files import free_name
@@ -479,6 +480,17 @@ def test_replay_seeks_and_stops(run: Run, capture: tuple[Path, list[Received]]) 
     assert listener.has_heard(
         [entry for entry, is_in in zip(entries, within, strict=True) if is_in]
     )
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, 60.0, 3600.0])
+def test_replay_keeps_the_pace_where_the_clock_was_set(step_s: float) -> None:
+    *_, tap = live_run(3.0, host_steps=((1.0, step_s),))
+    recording = Recording(tap.stream)
+    seconds = np.array([at for _, at in _paced(recording, 0.0, 0.0, None)])
+    assert seconds[0] == 0.0
+    assert (np.diff(seconds) >= 0.0).all()
+    assert np.diff(seconds).max() < 0.5
+    assert seconds[-1] == pytest.approx(3.0, abs=0.5)
 
 
 def test_replay_from_beyond_the_end_says_so(
