@@ -10,9 +10,8 @@ from l2lidar_node.types import HostNs
 LONGEST_PAUSE_NS: Final = 60_000_000_000
 """A longer one may be a step that nobody noted, and nobody wants to wait for the end of either."""
 
-_BACKLOG_NS: Final = (
-    10_000_000_000  # longest that datagrams wait in the kernel until they are read
-)
+_BACKLOG_NS: Final = 10_000_000_000
+"""Longest that datagrams wait in the kernel until they are read."""
 
 
 class TimeLine:

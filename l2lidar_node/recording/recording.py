@@ -422,7 +422,7 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
     CaptureError
         If its time is beyond what a ROS 2 stamp can hold.
     """
-    _check_time(entry.time)
+    _checked(entry)
     if isinstance(entry, Received):
         return driver.receive(entry.data, entry.time)
     if isinstance(entry, Sent):
@@ -435,17 +435,13 @@ def feed(driver: Driver, entry: Entry) -> list[Event]:
     return driver.settle(entry.time)
 
 
-def _check_time(time: HostNs) -> None:
-    if not is_ros_time(time):
+def _checked(entry: Entry) -> Entry:
+    if not is_ros_time(entry.time):
         raise CaptureError(
-            f"its times reach {time // 1_000_000_000} s after 1970; stamps of ROS 2 end at "
+            f"its times reach {entry.time // 1_000_000_000} s after 1970; stamps of ROS 2 end at "
             f"{(LAST_STAMP + 1) // 1_000_000_000} s, in January 2038; check whether the clock of "
             "that machine was set"
         )
-
-
-def _checked(entry: Entry) -> Entry:
-    _check_time(entry.time)
     return entry
 
 

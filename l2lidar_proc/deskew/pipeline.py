@@ -122,7 +122,6 @@ class Pipeline:
         self.odometry_motion: Callable[[Sweep], KnownMotion | None] | None = None
         self._is_known = False  # the motion of the latest sweep, by the odometry
         self.convention = ImuConvention()
-        self._factor = self.convention.factor  # of the samples that the tracker has
         self.odometry_convention: Callable[[], ImuConvention | None] | None = None
         self.configure(config)
 
@@ -159,16 +158,15 @@ class Pipeline:
 
     def _converted(self, samples: Samples) -> Samples:
         """Return samples in m/s^2, as specific force; put those right that came before."""
+        before = self.convention.factor
         theirs = self.odometry_convention() if self.odometry_convention is not None else None
         if theirs is not None and theirs.knows_unit:
             self.convention.adopt(theirs)
             samples = self.convention.applied(samples)
         else:
             samples = self.convention.in_unit(samples)
-        factor = self.convention.factor
-        if factor != self._factor:
-            self.tracker.rescale(factor / self._factor)
-            self._factor = factor
+        if self.convention.factor != before:
+            self.tracker.rescale(self.convention.factor / before)
         return samples
 
     def velocity(

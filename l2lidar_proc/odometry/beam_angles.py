@@ -49,13 +49,17 @@ class BeamAngles:
         self._weighted: F64  # information by estimate
         self.forget()
         self._rate: float | None = None
-        self._failures = 0  # sweeps in a row before the pattern has shown,
-        self._is_shown = False  # whether it has,
-        self._misses = 0  # and sweeps in a row without it since then
+        self._is_shown = False  # whether a sweep has had the pattern of an L2
+        self._misses = 0  # sweeps in a row without it
         self._sweeps = 0
         self._rested_ns = 0  # of the sweeps at rest that were compared last
         self._seen: tuple[Sweep, Halves | None] | None = None  # the latest sweep
         self._latest: tuple[Sweep, F64, F64] | None = None  # its halves, and what corrected it
+
+    @property
+    def _is_other(self) -> bool:
+        """Whether this is taken for another sensor, and looked at no more."""
+        return not self._is_shown and self._misses >= _GIVE_UP
 
     def head(self, sweep: Sweep) -> HeadAngle | None:
         """Return the angle of the head in a sweep, None where its points do not show it."""
@@ -63,15 +67,12 @@ class BeamAngles:
         return None if found is None else HeadAngle(sweep.start, found.angle, found.rate)
 
     def _halves_of(self, sweep: Sweep) -> Halves | None:
-        if self._failures >= _GIVE_UP:
+        if self._is_other:
             return None
         if self._seen is None or self._seen[0] is not sweep:
             found = halves(sweep.points, self._rate)
             if found is not None:
-                self._failures, self._misses, self._rate = 0, 0, found.rate
-                self._is_shown = True
-            elif not self._is_shown:
-                self._failures += 1
+                self._is_shown, self._misses, self._rate = True, 0, found.rate
             else:
                 self._misses += 1
                 if self._misses >= _RATE_MISSES:
@@ -164,7 +165,7 @@ class BeamAngles:
             As the unit reports them, from one place, oldest first.
         """
         self._rested_ns = sweeps[-1].end - sweeps[0].start
-        if self._failures >= _GIVE_UP:
+        if self._is_other:
             return
         shown = [(one.points, halves(one.points, self._rate)) for one in sweeps]
         whole = [(points, found.sign) for points, found in shown if found is not None]
@@ -189,7 +190,7 @@ class BeamAngles:
         Along the direction that is known best, and the other. What the estimate says but is not
         sure enough of to correct it counts as well. None for clouds without the pattern of an L2.
         """
-        if self._failures >= _GIVE_UP:
+        if self._is_other:
             return None
         left = self._estimate - self.correction
         squared = np.linalg.inv(self._information) + np.outer(left, left)

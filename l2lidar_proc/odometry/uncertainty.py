@@ -358,9 +358,8 @@ class MapDrift:
         self._group *= 2
         self._known = -(-self._known // 2)
         self._history = np.concatenate((merged, np.zeros_like(merged)))
-        for name in ("_ways", "_swings"):
-            later = getattr(self, name)[1::2]
-            setattr(self, name, np.concatenate((later, np.zeros_like(later))))
+        self._ways = np.pad(self._ways[1::2], (0, len(merged)))
+        self._swings = np.pad(self._swings[1::2], (0, len(merged)))
 
     def more_certain(self, place: F64) -> NDArray[np.bool_] | None:
         """Return which sweeps (S,) were far more certain of a place (3,) [m] than the latest.

@@ -65,6 +65,15 @@ class Played:
             self.ended.set()
 
 
+def assert_begins(live: list[Event], replayed: list[Event]) -> None:
+    """Assert that the samples of a replay are those with which the live run began."""
+    part, whole = (
+        [item for item in some if isinstance(item, ImuSample)] for some in (replayed, live)
+    )
+    assert part
+    assert part == whole[: len(part)]
+
+
 @pytest.fixture
 def recorded() -> Any:
     config, events, tap = live_run(2.5, faults={"loss": 0.01, "reorder": 0.02})
@@ -162,10 +171,7 @@ def test_a_time_that_cannot_be_is_damage(recorded: Any, rate: float) -> None:
     assert played.playback.wait(LIMIT_S)
     assert played.playback.failure is None
     assert "its times reach 4026531840 s after 1970" in played.playback.damage
-    part = [item for item in played.laps[0] if isinstance(item, ImuSample)]
-    whole = [item for item in live if isinstance(item, ImuSample)]
-    assert part
-    assert part == whole[: len(part)]
+    assert_begins(live, played.laps[0])
 
 
 @pytest.mark.parametrize("busy", [0.0, 0.05])
@@ -219,7 +225,4 @@ def test_damage_ends_it_with_a_reason(recorded: Any) -> None:
     assert played.playback.wait(LIMIT_S)
     assert played.playback.failure is None
     assert "claims 1073741824 bytes" in played.playback.damage
-    part = [item for item in played.laps[0] if isinstance(item, ImuSample)]
-    whole = [item for item in live if isinstance(item, ImuSample)]
-    assert part
-    assert part == whole[: len(part)]
+    assert_begins(live, played.laps[0])
