@@ -31,16 +31,17 @@ from l2lidar_proc.odometry.fan_halves import (
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
 _RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
-_PRIOR: Final = np.eye(2) / tuning.BEAM_SIGMA**2  # information of units [1/rad^2]
+_PRIOR: Final = np.eye(3) / tuning.BEAM_SIGMA**2  # information of units [1/rad^2]
 
 
 class BeamAngles:
-    """The estimate of xi and beta of one unit, and the correction of its clouds.
+    """The estimate of xi, beta and alpha of one unit, and the correction of its clouds.
 
     Attributes
     ----------
-    correction : ndarray, shape (2,)
-        Added to ``xi_angle`` and ``beta_angle`` [rad]; 0 along directions that are not known.
+    correction : ndarray, shape (3,)
+        Added to ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad]; 0 along directions
+        that are not known.
     """
 
     def __init__(self) -> None:
@@ -108,7 +109,7 @@ class BeamAngles:
         if found is None:
             return sweep
         points = sweep.points.copy()
-        for name, line in zip("xy", angle_derivatives(points, found.sign), strict=True):
+        for name, line in zip("xyz", angle_derivatives(points, found.sign), strict=True):
             points[name] += self.correction @ line
         return dataclasses.replace(sweep, points=points)
 
@@ -145,8 +146,8 @@ class BeamAngles:
                 own.T @ gaps.motion + np.diag(prior),
                 np.column_stack([own.T @ gaps.derivatives, own.T @ measured]),
             )
-            information -= weighted.T @ gaps.motion @ shared[:, :2]
-            gradient -= weighted.T @ gaps.motion @ shared[:, 2]
+            information -= weighted.T @ gaps.motion @ shared[:, :3]
+            gradient -= weighted.T @ gaps.motion @ shared[:, 3]
         self._information = self._information + information
         self._weighted = self._weighted + gradient
         self.correction = self._known()
@@ -180,22 +181,31 @@ class BeamAngles:
 
     def forget(self) -> None:
         """Forget what was learned, as after a rest that was none."""
-        self.correction = np.zeros(2)
-        self._information, self._weighted = _PRIOR, np.zeros(2)
+        self.correction = np.zeros(3)
+        self._information, self._weighted = _PRIOR, np.zeros(3)
 
     @property
     def sigmas(self) -> tuple[float, float] | None:
-        """What the angles of corrected clouds may be wrong by, 1 sigma [rad].
+        """What xi and beta of corrected clouds may be wrong by, 1 sigma [rad].
 
         Along the direction that is known best, and the other. What the estimate says but is not
         sure enough of to correct it counts as well. None for clouds without the pattern of an L2.
         """
         if self._is_other:
             return None
-        left = self._estimate - self.correction
-        squared = np.linalg.inv(self._information) + np.outer(left, left)
-        best, worst = np.sqrt(np.linalg.eigvalsh(squared)).tolist()
+        best, worst = np.sqrt(np.linalg.eigvalsh(self._errors[:2, :2])).tolist()
         return best, worst
+
+    @property
+    def alpha_sigma(self) -> float:
+        """What alpha of corrected clouds may be wrong by, 1 sigma [rad]; 0 as ``sigmas`` None."""
+        return 0.0 if self._is_other else float(np.sqrt(self._errors[2, 2]))
+
+    @property
+    def _errors(self) -> F64:
+        """Return the squared errors (3, 3) of the angles of corrected clouds [rad^2]."""
+        left = self._estimate - self.correction
+        return np.asarray(np.linalg.inv(self._information) + np.outer(left, left))
 
     def _teaches(self) -> bool:
         """Return whether the present sweep is worth the time that its gaps take."""
@@ -212,10 +222,13 @@ class BeamAngles:
     def _known(self) -> F64:
         """Return the estimate along those directions that are known, and differ from zero.
 
-        Both angles together move the halves apart only high above the sensor. No unit is off by
-        a degree: what seems so has another cause.
+        Of xi and beta, both angles together move the halves apart only high above the sensor;
+        alpha stands for itself. No unit is off by a degree: what seems so has another cause.
         """
-        variances, axes = np.linalg.eigh(np.linalg.inv(self._information))
+        covariance = np.linalg.inv(self._information)
+        variances, axes = np.ones(3), np.eye(3)
+        variances[:2], axes[:2, :2] = np.linalg.eigh(covariance[:2, :2])
+        variances[2] = covariance[2, 2]
         variances += tuning.BEAM_FLOOR**2
         parts = axes.T @ self._estimate
         sure = (variances < tuning.BEAM_KNOWN**2) & (parts**2 > tuning.BEAM_SIGMAS**2 * variances)

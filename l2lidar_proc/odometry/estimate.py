@@ -91,7 +91,7 @@ class AlignmentQuality:
     unobserved : tuple of tuple of float
         The other directions, orthonormal, map axes.
     beam_correction : tuple of float
-        What was added to the unit's ``xi_angle`` and ``beta_angle`` [rad].
+        What was added to the unit's ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad].
     """
 
     points: int = 0
@@ -107,7 +107,7 @@ class AlignmentQuality:
     variance_factor: float = 1.0
     velocity_factor: float = 1.0
     unobserved: tuple[tuple[float, float, float], ...] = ()
-    beam_correction: tuple[float, float] = (0.0, 0.0)
+    beam_correction: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def observes_all(self) -> bool:

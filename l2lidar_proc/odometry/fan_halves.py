@@ -6,7 +6,8 @@ head's angle but for half a turn, and the elevation rises in one half and falls 
 Clouds without that pattern, of other sensors or in other frames, have no halves.
 
 To first order (:mod:`l2lidar_node.calibration.model`) an error of xi moves a point at range D by
--D, and one of beta by its height z, along e_A, the horizontal direction across the fan.
+-D, and one of beta by its height z, along e_A, the horizontal direction across the fan. One of
+alpha turns the fan in its own plane: one half rises by it, the other one sinks.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import records
+from l2lidar_node.clouds import OPTICAL_CENTRE_M
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.cell_grid import begins_of_runs, distinct_in_runs
@@ -102,8 +104,8 @@ class Gaps(NamedTuple):
     ----------
     gap : ndarray, shape (C,)
         Of the rising half from the falling one along the normal [m].
-    derivatives : ndarray, shape (C, 2)
-        Derivatives of the gap by xi and beta [m/rad].
+    derivatives : ndarray, shape (C, 3)
+        Derivatives of the gap by xi, beta and alpha [m/rad].
     motion : ndarray, shape (C, 6)
         Derivatives by errors of velocity [s] and rate [m s/rad] of what deskewed the points.
     """
@@ -113,8 +115,8 @@ class Gaps(NamedTuple):
     motion: F64
 
 
-def angle_derivatives(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
-    """Return how points move along x and y with errors of xi and beta.
+def angle_derivatives(points: NDArray[np.void], sign: F64) -> F64:
+    """Return how points move with errors of xi, beta and alpha.
 
     Parameters
     ----------
@@ -125,14 +127,22 @@ def angle_derivatives(points: NDArray[np.void], sign: F64) -> tuple[F64, F64]:
 
     Returns
     -------
-    along_x, along_y : ndarray, shape (2, N)
-        Lines: xi, beta [m/rad].
+    ndarray, shape (3, 3, N)
+        Along x, y and z; by xi, beta and alpha [m/rad].
     """
     x, y, z = (points[name].astype(np.float64) for name in "xyz")
     flat = x * x + y * y
     radius = np.maximum(np.sqrt(flat), 1e-6)
-    lever = np.stack((-np.sqrt(flat + z * z), z)) * (sign / radius)
-    return lever * y, lever * -x
+    across, above = sign / radius, z - OPTICAL_CENTRE_M
+    xi, beta, alpha = -np.sqrt(flat + z * z) * across, z * across, -above * across
+    level = np.zeros_like(z)
+    return np.stack(
+        (
+            np.stack((xi * y, beta * y, alpha * x)),
+            np.stack((xi * -x, beta * -x, alpha * y)),
+            np.stack((level, level, sign * radius)),
+        )
+    )
 
 
 def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> Gaps | None:
@@ -156,10 +166,10 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
         return None
     kept = np.cumsum(both) - 1
     at, cell, rising = at[:, inside], kept[cell[inside]], rising[inside]
-    x_derivatives, y_derivatives = angle_derivatives(points[inside], sign[inside])
+    derivatives = angle_derivatives(points[inside], sign[inside]).reshape(9, -1)
     time = points["time"][inside].astype(np.float64)
     time -= 0.5 * (time.min() + time.max())
-    values = np.concatenate((at, x_derivatives, y_derivatives, time[None], time * at))
+    values = np.concatenate((at, derivatives, time[None], time * at))
     apart, spread, axes = _compared(values, cell, rising)
     normal = axes[:, 0].T
     gap = (normal * apart[:3]).sum(axis=0)
@@ -170,9 +180,9 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
     flat &= (beside < 0.5 * tuning.BEAM_CELL) & (np.abs(gap) < tuning.BEAM_GAP_MOST)
     if np.count_nonzero(flat) < tuning.BEAM_CELLS:
         return None
-    across = normal[0] * apart[3:5] + normal[1] * apart[5:7]
-    turned = np.cross(apart[8:11].T, normal.T)
-    motion = np.column_stack(((normal * apart[7]).T, turned))
+    across = np.einsum("jk,jak->ak", normal, apart[3:12].reshape(3, 3, -1))
+    turned = np.cross(apart[13:16].T, normal.T)
+    motion = np.column_stack(((normal * apart[12]).T, turned))
     return Gaps(gap[flat], across.T[flat], motion[flat])
 
 
@@ -194,27 +204,26 @@ def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64
         Of several sweeps from one place, cloud frame, as the unit reports them.
     sign : ndarray, shape (N,)
         As :class:`Halves` has it.
-    prior : ndarray, shape (2, 2)
+    prior : ndarray, shape (3, 3)
         Information of the angles' being zero [1/rad^2].
 
     Returns
     -------
-    angles : ndarray, shape (2,)
-        Corrections of xi and beta [rad].
-    information : ndarray, shape (2, 2)
+    angles : ndarray, shape (3,)
+        Corrections of xi, beta and alpha [rad].
+    information : ndarray, shape (3, 3)
         Of them, the prior's included [1/rad^2].
 
     None instead where no cell can be compared.
     """
     at = np.stack([points[name].astype(np.float64) for name in "xyz"])
-    along = np.concatenate(angle_derivatives(points, sign))
+    along = angle_derivatives(points, sign)
     line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)
     line -= line.min(initial=0)
-    angles, information = np.zeros(2), prior
+    angles, information = np.zeros(3), prior
     compared = False
     for number, scales in enumerate(_SCALES_AT_REST):
-        moved = at.copy()
-        moved[:2] += (along.reshape(2, 2, -1) * angles[:, None]).sum(axis=1)
+        moved = at + np.einsum("jan,a->jn", along, angles)
         shift = 0.5 * (number % 2)  # what a face of a cell cuts is whole in the next round
         seen = _seen_by_both(moved, along, sign, line, shift)
         if seen is None:
@@ -223,7 +232,7 @@ def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64
         unknown = np.einsum("kia,ab,kib->k", lever, np.linalg.inv(information), lever)
         inside = weight * (unknown < tuning.BEAM_REST_UNKNOWN**2)[:, None]
         compared |= bool(inside.any())
-        step = np.zeros(2)
+        step = np.zeros(3)
         for scale in scales:
             squared = (inside * (gap + lever @ step) ** 2).sum(axis=1)
             robust = inside / (1.0 + squared[:, None] / scale**2) ** 2
@@ -246,8 +255,8 @@ def _seen_by_both(
     ----------
     at : ndarray, shape (3, N)
         Points [m].
-    along : ndarray, shape (4, N)
-        Their :func:`angle_derivatives`, along x and along y.
+    along : ndarray, shape (3, 3, N)
+        Their :func:`angle_derivatives`.
     sign, line : ndarray, shape (N,)
         Their halves, and the numbers of the directions of the head in which they were seen.
     shift : float
@@ -257,8 +266,8 @@ def _seen_by_both(
     -------
     gap : ndarray, shape (C, 3)
         Of the rising half from the falling one [m].
-    derivatives : ndarray, shape (C, 3, 2)
-        Derivatives of the gap by xi and beta [m/rad].
+    derivatives : ndarray, shape (C, 3, 3)
+        Derivatives of the gap by xi, beta and alpha [m/rad].
     weight : ndarray, shape (C, 3)
         Of the gaps [1/m^2], 0 along what continues in the next cell.
     """
@@ -280,7 +289,7 @@ def _seen_by_both(
     if not inside.any():
         return None
     kept = np.cumsum(both) - 1
-    values = np.concatenate((at, along))[:, inside]
+    values = np.concatenate((at, along.reshape(9, -1)))[:, inside]
     apart, spread, axes = _compared(values, kept[cell[inside]], rising[inside])
     swept = [n[both] for n in swept]
     ends = 1.0 - spread / (tuning.BEAM_REST_WIDTH * tuning.BEAM_CELL) ** 2
@@ -288,7 +297,7 @@ def _seen_by_both(
     variance = tuning.BEAM_REST_SCATTER * spread * per_line + tuning.BEAM_GAP_SIGMA**2
     weight = np.maximum(ends, 0.0) ** 2 / variance
     gap = np.einsum("kij,jk->ki", axes, apart[:3])
-    lever = axes[..., :1] * apart[3:5].T[:, None] + axes[..., 1:2] * apart[5:7].T[:, None]
+    lever = np.einsum("kij,jak->kia", axes, apart[3:12].reshape(3, 3, -1))
     return gap, lever, weight
 
 

@@ -716,14 +716,15 @@ class Odometry:
         """Deskew a sweep with its motion and report it."""
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
-        xi, beta = self._beams.correction.tolist()
+        xi, beta, alpha = self._beams.correction.tolist()
         self.matcher.drift.beam_sigmas = self._beams.sigmas or tuning.OTHER_BEAM_SIGMAS
+        self.matcher.drift.alpha_sigma = self._beams.alpha_sigma
         self._last = estimate_of(
             motion,
             self._lever,
             self.matcher.deskewed(sweep, motion),
             tuple(status),
-            dataclasses.replace(quality, beam_correction=(xi, beta)),
+            dataclasses.replace(quality, beam_correction=(xi, beta, alpha)),
             self._predictor.gyro_noise,
             self._predictor.gyro_line,
             self._jump,

@@ -284,7 +284,7 @@ def judge(
         "innovations (NIS, 1 = as expected)": f"{quality.nis:.2f}",
         "innovations of the speed (NIS)": f"{quality.velocity_nis:.2f}",
         "tilt of the map [deg]": f"{float(np.degrees(last.tilt)):.2f}",
-        "beams corrected by (xi, beta) [deg]": " ".join(
+        "beams corrected by (xi, beta, alpha) [deg]": " ".join(
             f"{angle:.2f}" for angle in np.degrees(quality.beam_correction)
         ),
         "KISS-ICP threshold [m]": f"{quality.kiss_threshold_m:.3f}",

@@ -135,7 +135,7 @@ class OdometryRunner:
         self.notes: list[str] = [problem] if problem else []
         self.base = BaseFrame(np.eye(4))
         self.refused: Counter[str] = Counter()
-        self._beams = 0.0, 0.0  # correction of xi and beta [rad]
+        self._beams = 0.0, 0.0, 0.0  # correction of xi, beta and alpha [rad]
 
     def take(self, event: Event) -> None:
         """Take a sweep or samples."""
@@ -175,10 +175,11 @@ class OdometryRunner:
         finding = self.pipeline.check.finding
         found = [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
         if any(self._beams):
-            xi, beta = np.degrees(self._beams)
+            xi, beta, alpha = np.degrees(self._beams)
             found.append(
-                f"the unit's beams were corrected by {xi:+.2f} degrees (xi) and {beta:+.2f} "
-                "degrees (beta), estimated from the clouds: l2lidar calibrate still measures them"
+                f"the unit's beams were corrected by {xi:+.2f} degrees (xi), {beta:+.2f} degrees "
+                f"(beta) and {alpha:+.2f} degrees (alpha), estimated from the clouds: l2lidar "
+                "calibrate still measures them"
             )
         return found
 

@@ -165,6 +165,25 @@ def test_what_was_mapped_with_wrong_beam_angles_stays_turned() -> None:
     assert drift.reported_at(20.0 * way)[5, 5] == pytest.approx(others, rel=1e-3)
 
 
+def test_a_map_leans_by_what_alpha_may_be_wrong_by() -> None:
+    """It may be known later: what was mapped until then has leant."""
+    drift, way = upright(), np.array([1.0, 0.0, 0.0])
+    drift.alpha_sigma = 0.004
+    drift.record(0, ZERO, np.zeros((6, 6)))
+    drift.alpha_sigma = 0.001
+    drift.record(1, 5.0 * way, np.zeros((6, 6)))
+    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
+    turn = (tuning.ALPHA_TURN * 0.004) ** 2
+    expected = np.diag([0.0, 0.0, 25.0 * turn, turn, turn, 0.0])
+    expected[2, 4] = expected[4, 2] = -5.0 * turn
+    np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-15)
+    drift.clear()
+    drift.alpha_sigma = 0.0
+    drift.record(0, ZERO, np.zeros((6, 6)))
+    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
+    np.testing.assert_allclose(added, np.zeros((6, 6)), atol=1e-15)
+
+
 @pytest.mark.parametrize("first", [0.001, 0.005])
 @pytest.mark.parametrize("now", [0.001, 0.005])
 def test_a_map_is_turned_by_beam_angles_that_its_first_pose_did_not_know(
