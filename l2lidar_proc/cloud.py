@@ -51,7 +51,8 @@ def to_sweep(
     Sweep
         ``start`` is the stamp, or the first point where that is earlier; ``end`` the last point.
         The points keep their fields; the time field becomes ``time``, float32. Points that are not
-        finite are left out. The driver's own layouts are in seconds.
+        finite are left out, and so are points at the origin with the time 0 if that is far outside
+        the sweep. The driver's own layouts are in seconds.
 
     Raises
     ------
@@ -77,6 +78,7 @@ def to_sweep(
         points = _with_time(cloud, name, np.zeros(len(cloud)))
         points.flags.writeable = False
         return Sweep(stamp, stamp, points, 0, 0)
+    cloud = _measured(cloud, name)
     if unit == "auto" and (cloud.dtype.names or ())[:6] == POINT.names:
         unit = "s"  # the driver's own layouts, whose sweeps may last for many seconds
     times = _relative_ns(cloud[name], stamp, unit)
@@ -131,6 +133,24 @@ def _time_field(layout: np.dtype[Any], snapshots: bool) -> str:
     if layout[found[0]].kind not in "fiu" or layout[found[0]].shape:
         raise CloudError(f"field '{found[0]}' is not a number")
     return found[0]
+
+
+def _measured(cloud: NDArray[np.void], name: str) -> NDArray[np.void]:
+    """Return the points (N,) without those that are zero where the others have absolute times.
+
+    So drivers fill the places of beams without a return, and of lost packets. Zero is a time like
+    any other where it lies within the sweep.
+    """
+    times = cloud[name]
+    is_blank = times == 0
+    for axis in "xyz":
+        is_blank &= cloud[axis] == 0.0
+    if not is_blank.any() or is_blank.all():
+        return cloud
+    others = times[~is_blank]
+    first, last = float(others.min()), float(others.max())
+    is_outside = first > 2.0 * (last - first) > 0.0
+    return records.selected(cloud, ~is_blank) if is_outside else cloud
 
 
 def _relative_ns(times: NDArray[Any], stamp: HostNs, unit: str) -> NDArray[np.int64]:

@@ -81,6 +81,17 @@ def test_what_is_not_finite_is_left_out() -> None:
     assert to_sweep(points, STAMP).points["x"].tolist() == [0, 4]
 
 
+def test_what_was_not_measured_has_no_time() -> None:
+    # drivers that keep the place of a lost packet or of no return fill all of it with zeros
+    points = cloud("timestamp", "<f8", (STAMP + OFFSETS_NS) * 1e-9)
+    points["x"][0], points["timestamp"][0] = 0.0, 0.0
+    check(points, offsets=OFFSETS_NS[1:], atol=4e-7)
+    assert to_sweep(points, STAMP).points["x"].tolist() == [1, 2, 3]
+    points["x"][0] = 5.0  # a measured point whose time is wrong
+    with pytest.raises(CloudError, match="no obvious unit"):
+        to_sweep(points, STAMP)
+
+
 def test_organised_clouds_are_taken_row_by_row() -> None:
     points = cloud("t", "<u4", [0, 2_000_000, 1_000_000, 3_000_000]).reshape(2, 2)
     assert to_sweep(points, STAMP).points["x"].tolist() == [0, 2, 1, 3]
