@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -36,7 +37,9 @@ CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 _DATATYPES: Final = {code: number for number, code in DATATYPES.items()}
-_BAG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
+_METADATA: Final = "metadata.yaml"
+_FOLDER_SUFFIXES: Final = (".mcap", ".db3")  # of the files in a rosbag2 folder
+_BAG_SUFFIXES: Final = (*_FOLDER_SUFFIXES, ".bag")
 _NO_END: Final = "File end magic is invalid."  # of an MCAP file whose writer was killed
 
 
@@ -45,12 +48,45 @@ class RecordingError(ValueError):
 
 
 def open_bag(path: Path) -> AnyReader:
-    """Return a reader of a rosbag2 folder or an MCAP file; use it in a ``with``."""
-    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+    """Return a reader of a rosbag2 folder or a file of one; use it in a ``with``.
+
+    Where a folder has no metadata.yaml, which a recorder writes last, its files are read.
+    """
+    paths = [path]
+    if path.is_dir() and not (path / _METADATA).exists():
+        paths = _files(path) or paths
+    return AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY))
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(item for item in folder.iterdir() if item.suffix in _FOLDER_SUFFIXES)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[AnyReader]:
+    """Open a recording for a ``with``.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be opened; the message names the file.
+    """
+    try:
+        reader = open_bag(path)
+        reader.open()
+    except Exception as error:
+        # Of a damaged file, any byte may lead anywhere in its readers.
+        raise unreadable(path, error) from None
+    try:
+        yield reader
+    finally:
+        reader.close()
 
 
 def unreadable(path: Path, error: Exception) -> RecordingError:
     """Return the error for a recording whose reader failed; its message names the file."""
+    if isinstance(error, RecordingError):
+        return error
     return RecordingError(f"{path}: {why_unreadable(path, error)}")
 
 
@@ -58,7 +94,7 @@ def why_unreadable(path: Path, error: Exception) -> str:
     """Return what to tell the user of a recording whose reader failed."""
     if not path.exists():
         return "no such file or folder"
-    if path.is_dir() and not (path / "metadata.yaml").exists():
+    if path.is_dir() and not (path / _METADATA).exists() and not _files(path):
         return "not a rosbag2 folder: it has no metadata.yaml"
     if path.is_file() and path.suffix not in _BAG_SUFFIXES:
         return "cannot be read as a recording: neither a capture, nor MCAP, nor a rosbag2 folder"
@@ -69,8 +105,26 @@ def why_unreadable(path: Path, error: Exception) -> str:
 
 
 def messages(reader: AnyReader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield every message of a bag in the order it was recorded, with that instant [ns]."""
-    yield from reader.messages()
+    """Yield every message of a bag in the order it was recorded, with that instant [ns].
+
+    Raises
+    ------
+    RecordingError
+        If it is damaged.
+    """
+    try:
+        yield from reader.messages()
+    except Exception as error:  # only of the reader: what is done with a message is not in here
+        raise unreadable(Path(str(reader.paths[0])), error) from None
+
+
+def kinds_of(reader: AnyReader) -> dict[str, str]:
+    """Return the message types of a bag's topics, by name; topics without messages are left out.
+
+    All of them where the recorder has not counted.
+    """
+    counted = {item.topic: item.msgtype for item in reader.connections if item.msgcount}
+    return counted or {item.topic: item.msgtype for item in reader.connections}
 
 
 class BagFile:

@@ -14,8 +14,10 @@ from l2lidar_node.recording.bag import (
     TRANSFORMS as TRANSFORMS,
     BagFile as BagFile,
     RecordingError as RecordingError,
+    kinds_of as kinds_of,
     messages as messages,
     open_bag as open_bag,
+    opened as opened,
     unreadable as unreadable,
 )
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs
@@ -51,8 +53,14 @@ def chosen(kinds: dict[str, str], wanted: str, kind: str | tuple[str, ...], para
         return wanted
     if len(found) == 1:
         return found[0]
-    listed = ", ".join(found) or "none"
-    raise RecordingError(f"no {allowed[0]} on '{wanted}' ({parameter}); there are: {listed}")
+    problem = f"no {allowed[0]} on '{wanted}' ({parameter}); there are: "
+    if found:
+        raise RecordingError(
+            f"{problem}{', '.join(found)}: choose with {parameter} in a parameter file "
+            "(--params-file)"
+        )
+    others = ", ".join(f"{topic} ({its})" for topic, its in sorted(kinds.items())) or "none"
+    raise RecordingError(f"{problem}none; topics with messages: {others}")
 
 
 def stamp_of(message: Any) -> HostNs:

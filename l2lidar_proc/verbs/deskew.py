@@ -169,9 +169,8 @@ def deskew_recording(
         If the target exists.
     """
     try:
-        with bag.open_bag(source) as reader:
-            kinds = {item.topic: item.msgtype for item in reader.connections}
-            topics = _topics(config, kinds)
+        with bag.opened(source) as reader:
+            topics = _topics(config, bag.kinds_of(reader))
             with bag.BagFile(target, store=reader.typestore) as writer:
                 deskewer = _Deskewer(config, topics, writer)
                 for connection, recorded_ns, data in bag.messages(reader):
@@ -183,7 +182,7 @@ def deskew_recording(
                         deskewer.take(connection.topic, connection.msgtype, message, recorded_ns)
                 deskewer.finish(_END_NS)
                 return deskewer.pipeline.counts, deskewer.refused
-    except (AnyReaderError, FileNotFoundError) as error:
+    except AnyReaderError as error:
         raise bag.unreadable(source, error) from None
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.progress import Progress as Bar
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
 
 from l2lidar_node.command_line import CommandError, UsageError
 from l2lidar_node.config import DriverConfig
@@ -261,33 +262,30 @@ def run_bag(
     RecordingError
         If the bag cannot be read, or which topic to use is not plain.
     """
-    try:
-        with bag.open_bag(source) as reader:
-            kinds = {item.topic: item.msgtype for item in reader.connections}
-            cloud = bag.chosen(kinds, config.topics.cloud_topic, bag.CLOUDS, "cloud_topic")
-            imu = ""
-            if config.odometry.mode == "inertial":
-                imu = _imu_topic(kinds, config.topics.imu_topic, cloud)
+    with bag.opened(source) as reader:
+        kinds = bag.kinds_of(reader)
+        cloud = bag.chosen(kinds, config.topics.cloud_topic, bag.CLOUDS, "cloud_topic")
+        imu = ""
+        if config.odometry.mode == "inertial":
+            imu = _imu_topic(kinds, config.topics.imu_topic, cloud)
 
-            def listener(runner: OdometryRunner) -> _Listener:
-                made = _Listener(runner, config, cloud, imu)
-                made.look_ahead(reader)
-                return made
+        def listener(runner: OdometryRunner) -> _Listener:
+            made = _Listener(runner, config, cloud, imu)
+            made.look_ahead(reader)
+            return made
 
-            final = listener(OdometryRunner(config, observer))
-            opposite = final.may_be_opposite and not _heard(
-                reader, listener(OdometryRunner(config, accelerometer=False)), until_s=_SIGN_S
-            )
-            if opposite:
-                final = listener(OdometryRunner(config, observer, opposite=True))
-            # an observer cannot be told the same twice: for it a new map begins in between
-            if not _heard(reader, final, progress, stops=observer is None):
-                # what it took for up is down: from the beginning
-                final = listener(OdometryRunner(config, opposite=True))
-                _heard(reader, final, progress)
-            return final.finish()
-    except (AnyReaderError, FileNotFoundError) as error:
-        raise bag.unreadable(source, error) from None
+        final = listener(OdometryRunner(config, observer))
+        opposite = final.may_be_opposite and not _heard(
+            reader, listener(OdometryRunner(config, accelerometer=False)), until_s=_SIGN_S
+        )
+        if opposite:
+            final = listener(OdometryRunner(config, observer, opposite=True))
+        # an observer cannot be told the same twice: for it a new map begins in between
+        if not _heard(reader, final, progress, stops=observer is None):
+            # what it took for up is down: from the beginning
+            final = listener(OdometryRunner(config, opposite=True))
+            _heard(reader, final, progress)
+        return final.finish()
 
 
 def _heard(
@@ -314,7 +312,9 @@ def _heard(
             connection.topic in (listener.cloud, listener.imu)
             or connection.msgtype == bag.TRANSFORMS
         ):
-            listener.take(connection.topic, reader.deserialize(data, connection.msgtype), now)
+            message = listener.read(reader, connection, data)
+            if message is not None:
+                listener.take(connection.topic, message, now)
         else:
             continue
         if stops and convention.reversed and not known:
@@ -332,6 +332,14 @@ def _imu_topic(kinds: dict[str, str], wanted: str, cloud: str) -> str:
     if wanted not in found and len(beside) == 1:
         return beside[0]
     return bag.chosen(kinds, wanted, bag.IMU, "imu_topic")
+
+
+def _message(reader: AnyReader, connection: Connection, data: bytes) -> Any:
+    """Return a message, None if it is damaged."""
+    try:
+        return reader.deserialize(data, connection.msgtype)
+    except Exception:  # whatever bytes that are not this message lead to
+        return None
 
 
 class _Listener:
@@ -358,6 +366,7 @@ class _Listener:
         self._is_mounted = False
         self._force = np.zeros(3)
         self._snapshots = 0
+        self._damaged: Counter[str] = Counter()  # messages, by topic
 
     def look_ahead(self, reader: AnyReader) -> None:
         """Learn frames and mounts from the first seconds: a later mount begins a new map."""
@@ -368,7 +377,9 @@ class _Listener:
                 with suppress(ValueError):
                     self._cloud_frame = bag.livox_points(data, cdr=reader.is2)[0]
             elif connection.topic in (self.cloud, self.imu):
-                message: Any = reader.deserialize(data, connection.msgtype)
+                message = _message(reader, connection, data)
+                if message is None:
+                    continue
                 if connection.topic == self.cloud:
                     self._cloud_frame = message.header.frame_id
                 else:
@@ -377,7 +388,9 @@ class _Listener:
                     if np.isfinite(force).all():
                         self._force = self._force + force
             elif self._tells_mounts(connection.topic, connection.msgtype):
-                self._frames.take(reader.deserialize(data, connection.msgtype))
+                message = _message(reader, connection, data)
+                if message is not None:
+                    self._frames.take(message)
             if self._cloud_frame and self._imu_frame and not self._is_mounted:
                 self._mount(self._imu_frame)
 
@@ -392,6 +405,13 @@ class _Listener:
             return False
         up = odometry.T_cloud_imu[:3, :3] @ self._force / np.linalg.norm(self._force)
         return bool(up[2] < _UPRIGHT)
+
+    def read(self, reader: AnyReader, connection: Connection, data: bytes) -> Any:
+        """Return a message, None if it is damaged; then it is counted."""
+        message = _message(reader, connection, data)
+        if message is None:
+            self._damaged[connection.topic] += 1
+        return message
 
     def take(self, topic: str, message: Any, now: int) -> None:
         if topic == self.cloud:
@@ -435,6 +455,10 @@ class _Listener:
                 f"{self._snapshots} clouds without a time per point: each is taken as "
                 "measured at its stamp"
             )
+        notes += [
+            f"{count} damaged messages on '{topic}' were left out"
+            for topic, count in self._damaged.items()
+        ]
         return self.runner.finish()
 
     def _tells_mounts(self, topic: str, msgtype: str) -> bool:

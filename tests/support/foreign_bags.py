@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from l2lidar_node.clouds import DATATYPES
@@ -155,9 +155,11 @@ class BagMaker:
     Parameters
     ----------
     path : Path
+    compression : str
+        rosbag2's mode: FILE, MESSAGE or STORAGE; empty for none.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, compression: str = "") -> None:
         self.store = get_typestore(Stores.ROS2_JAZZY)
         self.store.register(
             {
@@ -166,6 +168,8 @@ class BagMaker:
             }
         )
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        if compression:
+            self._writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> BagMaker:
@@ -181,15 +185,22 @@ class BagMaker:
         time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
         return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
-    def write(self, topic: str, kind: str, message: Any, stamp: int) -> None:
+    def announce(self, topic: str, kind: str) -> None:
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=self.store
             )
-        data = self.store.serialize_cdr(message, kind)
+
+    def write(self, topic: str, kind: str, message: Any, stamp: int) -> None:
+        self.announce(topic, kind)
+        self.raw(topic, self.store.serialize_cdr(message, kind), stamp)
+
+    def raw(self, topic: str, data: bytes | memoryview, stamp: int) -> None:
         self._writer.write(self._connections[topic], int(stamp), data)
 
-    def imu(self, topic: str, stamp: int, frame: str, rate: F64, force: F64) -> None:
+    def imu(
+        self, topic: str, stamp: int, frame: str, rate: F64, force: F64, now: int | None = None
+    ) -> None:
         types = self.store.types
         vector = types["geometry_msgs/msg/Vector3"]
         unknown = np.array([-1.0, *[0.0] * 8])
@@ -202,7 +213,7 @@ class BagMaker:
             linear_acceleration=vector(*force.tolist()),
             linear_acceleration_covariance=np.zeros(9),
         )
-        self.write(topic, "sensor_msgs/msg/Imu", message, stamp)
+        self.write(topic, "sensor_msgs/msg/Imu", message, stamp if now is None else now)
 
     def cloud(self, topic: str, stamp: int, frame: str, points: Cloud, now: int) -> None:
         types, layout = self.store.types, points.dtype

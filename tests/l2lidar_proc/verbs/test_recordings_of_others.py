@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from tests.support.foreign_bags import (
     ouster,
     write_bag,
 )
+from tests.support.other_sensors import CLOUD_POINT
 
 pytest.importorskip("open3d")
 
@@ -155,3 +157,76 @@ def test_an_accelerometer_that_points_the_other_way(tmp_path: Path) -> None:
     way = found.poses["pose"][:, 2, 3] - found.poses["pose"][0, 2, 3]
     true = given.truth(found.poses["stamp"])[:, 2]
     assert np.abs(way - (true - true[0])).max() < 0.06
+
+
+def ouster_bag(path: Path, given: Measured, more: Callable[[BagMaker, int], None]) -> None:
+    """Write an Ouster's bag, and whatever else with every cloud."""
+
+    def put(maker: BagMaker, stamp: int, cloud: np.ndarray) -> None:
+        put_ouster(maker, stamp, cloud)
+        more(maker, stamp)
+
+    write_bag(path, given, put, imu_topic="/ouster/imu")
+
+
+def test_topics_without_messages_do_not_count(run: Any, tmp_path: Path) -> None:
+    given = measured()
+
+    def more(maker: BagMaker, stamp: int) -> None:
+        maker.announce("/filtered/points", bag.CLOUD)
+        maker.announce("/ouster/imu_filtered", bag.IMU)
+
+    ouster_bag(tmp_path / "bag", given, more)
+    assert len(run_bag(tmp_path / "bag", OdometryNodeConfig()).poses) == len(given.clouds)
+    write_bag(tmp_path / "none", given, lambda maker, *_: more(maker, 0), imu_topic="/imu")
+    done = run("odometry", str(tmp_path / "none"), str(tmp_path / "out"))
+    assert done.code == 1
+    assert "there are: none; topics with messages: /imu (sensor_msgs/msg/Imu)" in done.err
+
+
+def test_which_of_two_sensors_has_to_be_said_and_how(run: Any, tmp_path: Path) -> None:
+    def more(maker: BagMaker, stamp: int) -> None:
+        maker.cloud("/other", stamp, FRAME, depth(np.zeros(2, CLOUD_POINT), stamp), stamp)
+
+    ouster_bag(tmp_path / "bag", measured(), more)
+    done = run("odometry", str(tmp_path / "bag"), str(tmp_path / "out"))
+    assert done.code == 1
+    assert "there are: /ouster/points, /other: choose with cloud_topic" in done.err
+    assert "--params-file" in done.err
+
+
+def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
+    given = measured()
+
+    def more(maker: BagMaker, stamp: int) -> None:
+        if stamp == given.clouds[3][0]:
+            maker.raw("/ouster/points", b"\0\1\0\0damaged", stamp)
+            maker.raw("/ouster/imu", b"\0\1\0\0damaged", stamp)
+
+    ouster_bag(tmp_path / "bag", given, more)
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert len(found.poses) == len(given.clouds)
+    assert "1 damaged messages on '/ouster/points' were left out" in found.report
+    assert "1 damaged messages on '/ouster/imu' were left out" in found.report
+
+
+def test_a_folder_without_metadata_is_read_from_its_files(tmp_path: Path) -> None:
+    given = measured()
+    ouster_bag(tmp_path / "bag", given, lambda *_: None)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    assert len(run_bag(tmp_path / "bag", OdometryNodeConfig()).poses) == len(given.clouds)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.99])
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE", "STORAGE"])
+def test_a_compressed_bag_that_was_cut_off_names_the_file(
+    run: Any, tmp_path: Path, mode: str, share: float
+) -> None:
+    with BagMaker(tmp_path / "bag", compression=mode) as maker:
+        for stamp, cloud in measured().clouds[:3]:
+            put_ouster(maker, stamp, cloud)
+    (file,) = (path for path in (tmp_path / "bag").iterdir() if path.suffix != ".yaml")
+    file.write_bytes(file.read_bytes()[: round(share * file.stat().st_size)])
+    done = run("odometry", str(tmp_path / "bag"), str(tmp_path / "out"))
+    assert done.code == 1
+    assert f"{tmp_path / 'bag'}: cannot be read as a recording: " in done.err
