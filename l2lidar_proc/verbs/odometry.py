@@ -39,6 +39,7 @@ from l2lidar_proc.recording.outputs import StampedPoses, kitti, tum
 _END_NS: Final = 2**62
 _LOOK_AHEAD_NS: Final = 2_000_000_000
 _UPRIGHT: Final = 0.5  # cosine of the angle between the clouds' z and up
+_SAME_CLOCK_S: Final = 1.0  # apart at most; buffers and networks delay messages by less
 _SIGN_S: Final = 20.0  # of a recording in which the accelerometer's sign is looked for
 _FILES: Final = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
 _CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
@@ -366,6 +367,7 @@ class _Listener:
         self._is_mounted = False
         self._force = np.zeros(3)
         self._snapshots = 0
+        self._delays: dict[str, int] = {}  # smallest, from stamp to recording [ns], by topic
         self._damaged: Counter[str] = Counter()  # messages, by topic
 
     def look_ahead(self, reader: AnyReader) -> None:
@@ -420,7 +422,9 @@ class _Listener:
             )
         elif topic == self.imu:
             self._mount(message.header.frame_id)
-            self.runner.take((now, bag.sample_of(message)))
+            samples = bag.sample_of(message)
+            self._note_delay(topic, now - int(samples["stamp"][0]))
+            self.runner.take((now, samples))
         elif self._tells_mounts(topic, bag.TRANSFORMS):
             self.runner.refused.update(self._frames.take(message))
 
@@ -450,6 +454,8 @@ class _Listener:
                     f"no transform from '{self._imu_frame}' to '{self._cloud_frame}' in "
                     "/tf_static: the position of the IMU is imu_xyz"
                 )
+            if problem := self._two_clocks():
+                notes.append(problem)
         if self._snapshots:
             notes.append(
                 f"{self._snapshots} clouds without a time per point: each is taken as "
@@ -460,6 +466,31 @@ class _Listener:
             for topic, count in self._damaged.items()
         ]
         return self.runner.finish()
+
+    def _note_delay(self, topic: str, delay: int) -> None:
+        self._delays[topic] = min(delay, self._delays.get(topic, delay))
+
+    def _two_clocks(self) -> str:
+        """Return that the stamps of clouds and IMU are of two clocks; empty if they are not."""
+        if len(self._delays) < 2:
+            return ""
+        apart_s = (self._delays[self.cloud] - self._delays[self.imu]) / 1e9
+        if abs(apart_s) < _SAME_CLOCK_S:
+            return ""
+        pipeline = self.runner.pipeline
+        are_unused = 2 * pipeline.counts[Status.NO_IMU] > pipeline.sweeps
+        outcome = (
+            "no sample belongs to a cloud, and the motion comes from the clouds alone"
+            if are_unused
+            else "unless they were recorded so late, the samples are those of other instants, and "
+            "the trajectory is wrong"
+        )
+        return (
+            f"the stamps of '{self.imu}' are {abs(apart_s):.1f} s "
+            f"{'ahead of' if apart_s > 0.0 else 'behind'} those of '{self.cloud}', compared with "
+            f"the times of recording: {outcome}; record both with the stamps of one clock (the "
+            "host's, or PTP)"
+        )
 
     def _tells_mounts(self, topic: str, msgtype: str) -> bool:
         is_static = msgtype == bag.TRANSFORMS and topic.endswith("tf_static")
@@ -481,6 +512,7 @@ class _Listener:
             self.runner.refused[str(error)] += 1
             return
         self._snapshots += sweep.start == sweep.end
+        self._note_delay(self.cloud, now - sweep.end)
         self.runner.take((now, sweep))
 
     def _mount(self, imu_frame: str) -> None:

@@ -13,6 +13,7 @@ from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.verbs.odometry import OdometryRun, run_bag
 from tests.support.foreign_bags import (
+    EPOCH,
     FORMATS,
     LIVOX,
     BagMaker,
@@ -193,6 +194,30 @@ def test_which_of_two_sensors_has_to_be_said_and_how(run: Any, tmp_path: Path) -
     assert done.code == 1
     assert "there are: /ouster/points, /other: choose with cloud_topic" in done.err
     assert "--params-file" in done.err
+
+
+@pytest.mark.parametrize(
+    ("clock", "words"),
+    [
+        (1_234 * 10**9, "1699998766.0 s behind those of '/points'"),
+        (EPOCH + 37 * 10**9, "37.0 s ahead of those of '/points'"),
+        (EPOCH + 2 * 10**9, "2.0 s ahead of those of '/points'"),
+    ],
+)
+def test_an_imu_with_another_clock_is_said_not_to_belong(
+    clock: int, words: str, tmp_path: Path
+) -> None:
+    given = measured()
+    with BagMaker(tmp_path / "bag") as maker:
+        for stamp, cloud in given.clouds[:8]:
+            maker.cloud("/points", stamp, FRAME, ouster(cloud, stamp), stamp + 10**8)
+        for k, stamp in enumerate(given.stamps[:200].tolist()):
+            maker.imu("/imu", stamp - EPOCH + clock, "imu", given.rates[k], given.forces[k], stamp)
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert len(found.poses) == 8
+    (said,) = (line for line in found.report if "the stamps of '/imu' are" in line)
+    assert words in said
+    assert "record both with the stamps of one clock" in said
 
 
 def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
