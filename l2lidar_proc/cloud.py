@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from l2lidar_node import records
 from l2lidar_node.types import POINT, HostNs, Sweep, is_ros_time
 
-TIME_FIELDS: Final = ("time", "t", "timestamp", "offset_time")
+TIME_FIELDS: Final = ("time", "t", "timestamp", "offset_time", "time_stamp", "stamps")
+"""Names of drivers and of odometries: Velodyne, Ouster, Hesai, Livox, Autoware, KISS-ICP."""
 
 _UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
 _NEAR_NS: Final = 2_000_000_000  # how far times may be from the stamp
@@ -34,8 +35,7 @@ def to_sweep(
     Parameters
     ----------
     cloud : ndarray, shape (N,) or (H, W)
-        Structured, with ``x``, ``y``, ``z`` and exactly one of ``time``, ``t``, ``timestamp`` and
-        ``offset_time``.
+        Structured, with ``x``, ``y``, ``z`` and exactly one of :data:`TIME_FIELDS`.
     stamp : HostNs
         The cloud's stamp. Times may count from it or be absolute.
     unit : str

@@ -123,6 +123,13 @@ def offset_time(cloud: Cloud, stamp: int) -> Cloud:
     return made
 
 
+def autoware(cloud: Cloud, stamp: int) -> Cloud:
+    """``time_stamp`` uint32 nanoseconds, as Autoware's drivers name it."""
+    made = _xyz(cloud, [("intensity", "u1"), ("time_stamp", "<u4")])
+    made["time_stamp"] = np.round(cloud["time"].astype(np.float64) * 1e9)
+    return made
+
+
 def depth(cloud: Cloud, stamp: int) -> Cloud:
     """No time at all, as depth cameras have it; some points are not finite."""
     made = _xyz(cloud, [("rgb", "<f4")])
@@ -136,6 +143,7 @@ FORMATS: Final[dict[str, Formatter]] = {
     "hesai": hesai,
     "livox": livox,
     "offset_time": offset_time,
+    "autoware": autoware,
 }
 
 
