@@ -40,6 +40,7 @@ _END_NS: Final = 2**62
 _LOOK_AHEAD_NS: Final = 2_000_000_000
 _UPRIGHT: Final = 0.5  # cosine of the angle between the clouds' z and up
 _SAME_CLOCK_S: Final = 1.0  # apart at most; buffers and networks delay messages by less
+_ENOUGH_SAMPLES: Final = 10  # no gyro gives 0.0 about all axes in so many
 _SIGN_S: Final = 20.0  # of a recording in which the accelerometer's sign is looked for
 _FILES: Final = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
 _CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
@@ -366,6 +367,9 @@ class _Listener:
         self._imu_frame = ""
         self._is_mounted = False
         self._force = np.zeros(3)
+        self._samples = 0  # of those looked at in advance
+        self._turns = False  # whether one of them has a rate
+        self._mute = ""  # topic of an IMU without rates
         self._snapshots = 0
         self._delays: dict[str, int] = {}  # smallest, from stamp to recording [ns], by topic
         self._damaged: Counter[str] = Counter()  # messages, by topic
@@ -386,7 +390,10 @@ class _Listener:
                     self._cloud_frame = message.header.frame_id
                 else:
                     self._imu_frame = message.header.frame_id
-                    force = bag.sample_of(message)["linear_acceleration"][0]
+                    sample = bag.sample_of(message)
+                    self._samples += 1
+                    self._turns |= bool(sample["angular_velocity"].any())
+                    force = sample["linear_acceleration"][0]
                     if np.isfinite(force).all():
                         self._force = self._force + force
             elif self._tells_mounts(connection.topic, connection.msgtype):
@@ -395,6 +402,8 @@ class _Listener:
                     self._frames.take(message)
             if self._cloud_frame and self._imu_frame and not self._is_mounted:
                 self._mount(self._imu_frame)
+        if self._samples >= _ENOUGH_SAMPLES and not self._turns:
+            self.imu, self._mute = "", self.imu
 
     @property
     def may_be_opposite(self) -> bool:
@@ -441,7 +450,12 @@ class _Listener:
         """Return the result and the remarks on the recording."""
         notes = self.runner.notes
         if self._config.odometry.mode == "inertial":
-            if not self.imu:
+            if self._mute:
+                notes.append(
+                    f"the IMU on '{self._mute}' measures no angular velocity (all of it is 0): it "
+                    "is not used, and the motion comes from the clouds alone"
+                )
+            elif not self.imu:
                 notes.append("no IMU in the recording: the motion comes from the clouds alone")
             elif self._imu_frame and self._imu_frame == self._cloud_frame:
                 place = "its origin" if self._is_mounted else "imu_xyz"

@@ -117,6 +117,18 @@ def test_without_an_imu_it_runs_and_says_so(run: Any, tmp_path: Path) -> None:
     assert off(stamps, found[:, 1:4], given) < 0.06
 
 
+def test_an_imu_that_measures_an_orientation_only_is_not_used(tmp_path: Path) -> None:
+    given = measured()
+    with BagMaker(tmp_path / "bag") as maker:
+        for stamp, cloud in given.clouds:
+            put_ouster(maker, stamp, cloud)
+        for stamp in given.stamps.tolist():
+            maker.imu("/ouster/imu", stamp, "imu", np.zeros(3), np.zeros(3))
+    found = run_bag(tmp_path / "bag", OdometryNodeConfig())
+    assert "the IMU on '/ouster/imu' measures no angular velocity" in " ".join(found.report)
+    assert off_by(found, given) < 0.06
+
+
 def test_of_several_imus_that_beside_the_clouds_is_taken(tmp_path: Path) -> None:
     given = measured()
 
