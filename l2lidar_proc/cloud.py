@@ -173,7 +173,11 @@ def _relative_ns(times: NDArray[Any], stamp: HostNs, unit: str) -> NDArray[np.in
     if from_stamp and absolute:
         raise CloudError("the stamp is near 0, so the times may be absolute or relative to it")
     if not from_stamp and not absolute:
-        raise CloudError("the times are neither absolute nor relative to the stamp")
+        apart_s = (int(ends[0]) - stamp) / 1e9
+        raise CloudError(
+            f"the times are neither absolute nor relative to the stamp: taken as absolute, they "
+            f"are {abs(apart_s):.2g} s {'after' if apart_s > 0.0 else 'before'} it"
+        )
     return instants - stamp if absolute else instants
 
 
@@ -186,7 +190,8 @@ def _unit(layout: np.dtype[Any], spread: float) -> str:
     if 1e6 <= spread <= 1e9:
         return "ns"
     raise CloudError(
-        f"times of type {layout} that span {spread:g} have no obvious unit; set time_unit"
+        f"times of type {layout} that span {spread:g} have no obvious unit; set time_unit to "
+        "s, ms, us or ns"
     )
 
 

@@ -202,6 +202,12 @@ class OdometryTopics(ImuConfig):
         "/points", "input clouds with per-point times, not deskewed", form=TOPIC
     )
     imu_topic: str = setting("/imu/data", "IMU samples", form=TOPIC)
+    time_unit: str = setting(
+        "auto",
+        "unit of the per-point times; auto infers it from type and range",
+        choices=("auto", "s", "ms", "us", "ns"),
+        live=True,
+    )
     odometry_topic: str = setting(
         "odometry", "pose and twist of base_frame, once per sweep", form=TOPIC
     )

@@ -251,7 +251,7 @@ class OdometryNode(ManagedNode):
             self._begin_again()
         self._cloud_frame = frame
         try:
-            sweep = item.sweep(snapshots=True)
+            sweep = item.sweep(self._settings.value.topics.time_unit, snapshots=True)
         except CloudError as error:
             self.refuse_cloud(error)
             return

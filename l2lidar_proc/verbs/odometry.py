@@ -521,7 +521,8 @@ class _Listener:
             if T_cloud_base is not None and not np.allclose(T_cloud_base, known):
                 self.runner.base = BaseFrame(T_cloud_base)
         try:
-            sweep = to_sweep(points(), stamp, snapshots=True)
+            unit = self._config.topics.time_unit
+            sweep = to_sweep(points(), stamp, unit, snapshots=True)
         except (CloudError, ValueError) as error:
             self.runner.refused[str(error)] += 1
             return

@@ -419,6 +419,21 @@ def test_a_cloud_that_cannot_be_used_is_told_of(bench: Any) -> None:
     assert not bench.call("save_map").success
 
 
+@pytest.mark.parametrize("bench", [("time_unit:=us",)], indirect=True)
+def test_times_are_in_the_unit_that_is_set(bench: Any) -> None:
+    run = recording("room", "still", 3.0)
+    some = list(sweeps(run, "turn"))[:5]
+    for sweep in some:
+        kinds = [*((axis, "<f4") for axis in "xyz"), ("t", "<u4")]
+        points = np.zeros(len(sweep.points), kinds)
+        for axis in "xyz":
+            points[axis] = sweep.points[axis]
+        points["t"] = np.round(sweep.points["time"].astype(np.float64) * 1e6)
+        bench.send_cloud(points, sweep.start)
+    bench.until(lambda: len(bench.poses) == 5)
+    assert bench.node._pipeline.last.stamp - some[4].start < some[4].end - some[4].start
+
+
 def test_what_other_sensors_do_differently_is_recognized_and_said(bench: Any) -> None:
     run = recording("room", "still", 3.0)
     some = list(sweeps(run, "turn"))[:5]

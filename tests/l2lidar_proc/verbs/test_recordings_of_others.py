@@ -63,6 +63,26 @@ def test_each_maker_s_time_field(name: str, tmp_path: Path) -> None:
     assert off_by(found, given) < 0.015  # 0.025 where the times are not used
 
 
+def test_a_unit_that_is_not_plain_is_asked_for_and_can_be_set(run: Any, tmp_path: Path) -> None:
+    given = measured()
+
+    def put(bag: BagMaker, stamp: int, cloud: np.ndarray) -> None:
+        points = ouster(cloud, stamp)
+        points["t"] //= 1000
+        bag.cloud("/points", stamp, FRAME, points, stamp + 100_000_000)
+
+    write_bag(tmp_path / "bag", given, put)
+    done = run("odometry", str(tmp_path / "bag"), str(tmp_path / "out"))
+    assert done.code == 1
+    assert "no obvious unit; set time_unit to s, ms, us or ns" in done.out
+    settings = tmp_path / "params.yaml"
+    settings.write_text("odometry_node: {ros__parameters: {time_unit: us}}")
+    words = ("odometry", str(tmp_path / "bag"), str(tmp_path / "out"), "--overwrite")
+    done = run(*words, "--params-file", str(settings))
+    assert (done.code, done.err) == (0, "")
+    assert f"{len(given.clouds)} poses" in done.out
+
+
 def test_livox_s_own_messages(tmp_path: Path) -> None:
     given = measured()
     write_bag(
