@@ -466,7 +466,8 @@ class _Listener:
             elif self._imu_frame and self._cloud_frame and not self._is_mounted:
                 notes.append(
                     f"no transform from '{self._imu_frame}' to '{self._cloud_frame}' in "
-                    "/tf_static: the position of the IMU is imu_xyz"
+                    "/tf_static: the position of the IMU is imu_xyz, and its axes are those of "
+                    "the clouds; if they are not, set imu_rpy in a parameter file (--params-file)"
                 )
             if problem := self._two_clocks():
                 notes.append(problem)

@@ -149,6 +149,13 @@ def test_an_imu_that_measures_an_orientation_only_is_not_used(tmp_path: Path) ->
     assert off_by(found, given) < 0.06
 
 
+def test_what_an_imu_without_a_transform_is_taken_for_is_said(tmp_path: Path) -> None:
+    ouster_bag(tmp_path / "bag", measured(), lambda *_: None)
+    said = " ".join(run_bag(tmp_path / "bag", OdometryNodeConfig()).report)
+    assert f"no transform from 'imu' to '{FRAME}' in /tf_static" in said
+    assert "its axes are those of the clouds; if they are not, set imu_rpy" in said
+
+
 def test_of_several_imus_that_beside_the_clouds_is_taken(tmp_path: Path) -> None:
     given = measured()
 
