@@ -177,7 +177,10 @@ class MapInitializer:
     def add(self, sweep: Sweep) -> InitializedMap | None:
         """Hold a sweep; return the map if it can begin now."""
         held = self.held
-        if held and not 0 < sweep.start - held[-1].start < tuning.LONG_GAP_NS:
+        step = sweep.start - held[-1].start if held else 1
+        if -tuning.LONG_GAP_NS < step <= 0:
+            return None  # it came twice, or late
+        if abs(step) >= tuning.LONG_GAP_NS:
             held.clear()
         held.append(sweep)
         if held[-1].end - held[0].start < tuning.INITIAL_NS:

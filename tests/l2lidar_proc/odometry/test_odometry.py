@@ -349,6 +349,18 @@ def test_standing_still_stays_there() -> None:
     assert np.abs(estimates[-1].velocity).max() < 0.02
 
 
+def test_clouds_that_come_twice_or_late_do_not_keep_the_map_from_beginning() -> None:
+    run = recording("room", "still", 3.0)
+    some = list(sweeps(run, "turn"))[:8]
+    disordered = [one for k, sweep in enumerate(some) for one in (sweep, some[max(k - 1, 0)])]
+    orderly, found = (
+        feed(Odometry(OdometryConfig(), T_CLOUD_IMU), run, given) for given in (some, disordered)
+    )
+    used = [item.stamp for item in found if Status.REFUSED not in item.status]
+    assert used == [item.stamp for item in orderly]
+    assert len(used) == len(some)
+
+
 def test_without_imu_it_holds_and_says_so() -> None:
     run = recording("room", "walk")
     estimates = drive(run, imu=run.imu[:0])
