@@ -21,7 +21,8 @@ from benchmarks.hard_scenarios import Imperfections, Scenario, Setting, prepare
 from l2lidar_node.driver.geometry import Projector
 from l2lidar_node.emulator.unit.inertial import Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
-from l2lidar_node.emulator.unit.scanner import Scanner
+from l2lidar_node.emulator.unit.scanner import Scanner, on_its_mount
+from l2lidar_node.emulator.unit.units import Unit, unit as named_unit
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, IMU_SAMPLE, HostNs, Sweep
 from tests.support.other_sensors import CLOUD_POINT, SENSORS
@@ -179,8 +180,14 @@ def _l2(
 ) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.int64]]:
     """Measure with the virtual L2; return points, edges and spans of full turns."""
     noise = RangeNoise(particles=given.particles, dropout=2.0 if given.imperfect else 1.0)
+    unit = _unit(given)
     scanner = Scanner(
-        setting.world, setting.motion, noise=noise, seed=given.seed, view=setting.view
+        setting.world,
+        on_its_mount(setting.motion, unit, given.seed),
+        noise=noise,
+        seed=given.seed,
+        unit=unit,
+        view=setting.view,
     )
     rng = np.random.default_rng((given.seed, 22))
     total = int(given.seconds / scanner.period_s)
@@ -239,10 +246,15 @@ def _other(
     return np.concatenate(clouds), edges, spans
 
 
+def _unit(given: Scenario) -> Unit:
+    """Return the unit that measures."""
+    return named_unit(str(given.seed) if given.drawn_unit else "perfect")
+
+
 def _reported(given: Scenario, true: NDArray[np.void]) -> NDArray[np.void]:
     """Return the calibration that the packets carry, which is not the unit's own."""
     reported = true.copy()
-    if given.imperfect:
+    if given.imperfect and not given.drawn_unit:
         fault = Imperfections()
         signs = np.random.default_rng((given.seed, 23)).choice([-1.0, 1.0], 3)
         reported["beta_angle"] += signs[0] * fault.beam_rad
@@ -261,7 +273,9 @@ def _lost(rng: np.random.Generator, total: int) -> NDArray[np.bool_]:
 
 def _samples(given: Scenario, setting: Setting) -> NDArray[np.void]:
     """Return the IMU samples, with the unit's imperfections."""
-    inertial = Inertial(setting.motion, setting.imu, given.seed)
+    unit = _unit(given)
+    motion = on_its_mount(setting.motion, unit, given.seed)
+    inertial = Inertial(motion, setting.imu, given.seed, unit)
     raw, times = inertial.samples(0, int(given.seconds * wire.IMU_RATE_HZ))
     samples = np.zeros(len(raw), IMU_SAMPLE)
     samples["orientation_wxyz"] = raw["quaternion_wxyz"] / wire.QUATERNION_NORM
@@ -275,8 +289,9 @@ def _samples(given: Scenario, setting: Setting) -> NDArray[np.void]:
             force += fault.shake_force * rng.normal(size=3) * np.sin(phase)
             rate += fault.shake_rate * rng.normal(size=3) * np.sin(phase + 1.0)
         turn = _small_turn(rng, fault.extrinsic_rad)
-        rate, force = rate @ turn, force @ turn
-        times = times + fault.imu_late_s
+        if not given.drawn_unit:
+            rate, force = rate @ turn, force @ turn
+            times = times + fault.imu_late_s
         kept = np.ones(len(times), np.bool_)
         for at in rng.uniform(3.0, given.seconds, round(fault.imu_gaps * given.seconds / 60.0)):
             kept &= (times < at) | (times > at + rng.uniform(0.02, 0.06))

@@ -66,6 +66,9 @@ class Scenario:
         Rest at the beginning [s].
     imperfect : bool
         Whether the unit has every fault of :class:`Imperfections`.
+    drawn_unit : bool
+        Whether the unit is one of the virtual L2's population, which the seed draws, instead of
+        one with the beam angles, ranges and IMU of :class:`Imperfections`.
     """
 
     family: str = ""
@@ -85,6 +88,7 @@ class Scenario:
     hits: int = 0
     rest_s: float = 2.0
     imperfect: bool = False
+    drawn_unit: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +163,20 @@ FAMILIES: Final[dict[str, Scenario]] = {
     "in motion from the first sweep": Scenario(
         scene="yard", motion="walk", speed=1.2, rest_s=0.0, imperfect=True
     ),
+    # units of the population: alpha, range bias and head wave are off as well
+    "room, drawn unit": Scenario(
+        scene="room", motion="walk", imperfect=True, drawn_unit=True, people=2
+    ),
+    "corridor, drawn unit": Scenario(
+        scene="office_corridor", motion="drive", imperfect=True, drawn_unit=True
+    ),
+    "hall, drawn unit": Scenario(
+        scene="hall", motion="walk", speed=1.2, imperfect=True, drawn_unit=True, people=4
+    ),
+    "wood, drawn unit": Scenario(
+        scene="wood", motion="walk", speed=1.2, imperfect=True, drawn_unit=True
+    ),
+    "flat, drawn unit": Scenario(scene="flat", motion="look", imperfect=True, drawn_unit=True),
     # other sensors
     "spinning lidar, corridor": Scenario(
         scene="office_corridor", motion="drive", sensor="spinning_16"
@@ -183,6 +201,7 @@ SHORT: Final = (
     "wood in rain",
     "covered, room",
     "hits, hall",
+    "room, drawn unit",
     "rosette lidar, flat",
 )
 """Families of the short version."""

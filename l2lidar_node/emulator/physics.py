@@ -28,8 +28,8 @@ from l2lidar_node.emulator.motion.motion import MOUNTS, Motion, from_tum
 from l2lidar_node.emulator.truth import write_points, write_trajectory
 from l2lidar_node.emulator.unit.inertial import ImuNoise, Inertial
 from l2lidar_node.emulator.unit.returns import RangeNoise
-from l2lidar_node.emulator.unit.scanner import Scanner, mean_angle
-from l2lidar_node.emulator.unit.units import RockingMotion, Unit, unit as named_unit
+from l2lidar_node.emulator.unit.scanner import Scanner, on_its_mount
+from l2lidar_node.emulator.unit.units import Unit, unit as named_unit
 from l2lidar_node.emulator.world import scenes
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.programs import held
@@ -129,11 +129,7 @@ def assemble(config: PhysicsConfig, own: Unit | None = None) -> Physics:
             seed=config.seed,
         )
     unit = named_unit(config.unit, config.power_up) if own is None else own
-    if unit.errors.rocks:
-        rate = 2.0 * np.pi / unit.head_period_s
-        bias = float(unit.calibration_record["theta_angle_bias"])
-        start = float(mean_angle(np.zeros(1), unit, config.seed)[0]) + bias
-        motion = RockingMotion(motion, unit.errors, start, rate)
+    motion = on_its_mount(motion, unit, config.seed)
     scanner = Scanner(world, motion, unit, config.ranges, config.seed)
     return Physics(world, motion, scanner, Inertial(motion, config.imu, config.seed, unit))
 

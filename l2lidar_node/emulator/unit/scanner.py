@@ -17,7 +17,7 @@ from l2lidar_node.emulator.motion.motion import Motion
 from l2lidar_node.emulator.rng import Stream, generator
 from l2lidar_node.emulator.unit import returns
 from l2lidar_node.emulator.unit.returns import RangeNoise
-from l2lidar_node.emulator.unit.units import UNITS, Unit
+from l2lidar_node.emulator.unit.units import UNITS, RockingMotion, Unit
 from l2lidar_node.emulator.world.scene import Triangles, box, cone, ellipsoid
 from l2lidar_node.emulator.world.world import World
 from l2lidar_node.protocol import wire
@@ -129,6 +129,16 @@ ADVANCE_REST_RAD: Final = np.deg2rad(0.087)
 PERIOD_JITTER: Final = 1e-3
 
 _TURN = 2.0 * np.pi
+
+
+def on_its_mount(motion: Motion, unit: Unit, seed: int) -> Motion:
+    """Return the motion of a unit on a mount that is moved so; the head may rock it."""
+    if not unit.errors.rocks:
+        return motion
+    rate = 2.0 * np.pi / unit.head_period_s
+    bias = float(unit.calibration_record["theta_angle_bias"])
+    start = float(mean_angle(np.zeros(1), unit, seed)[0]) + bias
+    return RockingMotion(motion, unit.errors, start, rate)
 
 
 def mean_angle(t_s: NDArray[np.float64], unit: Unit, seed: int) -> NDArray[np.float64]:
