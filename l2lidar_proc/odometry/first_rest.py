@@ -43,7 +43,7 @@ class FirstRest:
         self._initializer = initializer
         self._zero_velocity = zero_velocity
         self._beams = beams
-        self._mapped_with: F64 = np.zeros(2)  # the correction of the sweeps in the map
+        self._mapped_with: F64 = np.zeros(3)  # the correction of the sweeps in the map
         self.sweeps: list[Sweep] = []
 
     def begin(self, sweeps: list[Sweep]) -> None:
