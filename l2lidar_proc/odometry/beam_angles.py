@@ -28,6 +28,7 @@ from l2lidar_proc.odometry.fan_halves import (
     between_halves,
     halves,
 )
+from l2lidar_proc.odometry.range_bias import RangeBias
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
 _RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
@@ -42,9 +43,12 @@ class BeamAngles:
     correction : ndarray, shape (3,)
         Added to ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad]; 0 along directions
         that are not known.
+    ranges : RangeBias
+        Corrected along with them.
     """
 
     def __init__(self) -> None:
+        self.ranges = RangeBias()
         self.correction: F64
         self._information: F64
         self._weighted: F64  # information by estimate
@@ -105,12 +109,14 @@ class BeamAngles:
         sweep : Sweep
             As for :meth:`corrected`.
         """
-        found = self._halves_of(sweep) if self.correction.any() else None
+        is_corrected = self.correction.any() or self.ranges.correction
+        found = self._halves_of(sweep) if is_corrected else None
         if found is None:
             return sweep
         points = sweep.points.copy()
         for name, line in zip("xyz", angle_derivatives(points, found.sign), strict=True):
             points[name] += self.correction @ line
+        self.ranges.applied_to(points)
         return dataclasses.replace(sweep, points=points)
 
     def learn(self, sweep: Sweep, moved: NDArray[np.void], *, at_rest: bool) -> None:
@@ -131,6 +137,7 @@ class BeamAngles:
         if self._latest is None or self._latest[0] is not sweep or len(moved) != len(sweep.points):
             return
         _, sign, used = self._latest
+        self.ranges.learn(moved)
         gaps = between_halves(sweep.points, moved, sign)
         if gaps is None:
             return
@@ -178,9 +185,12 @@ class BeamAngles:
             angles, self._information = found
             self._weighted = self._information @ angles
             self.correction = self._known()
+        self.ranges.forget()
+        self.ranges.learn_at_rest([self.applied_to(one) for one in sweeps])
 
     def forget(self) -> None:
         """Forget what was learned, as after a rest that was none."""
+        self.ranges.forget()
         self.correction = np.zeros(3)
         self._information, self._weighted = _PRIOR, np.zeros(3)
 
@@ -200,6 +210,11 @@ class BeamAngles:
     def alpha_sigma(self) -> float:
         """What alpha of corrected clouds may be wrong by, 1 sigma [rad]; 0 as ``sigmas`` None."""
         return 0.0 if self._is_other else float(np.sqrt(self._errors[2, 2]))
+
+    @property
+    def range_sigma(self) -> float:
+        """What corrected ranges may be wrong by, 1 sigma [m]; 0 as ``sigmas`` None."""
+        return 0.0 if self._is_other else self.ranges.sigma
 
     @property
     def _errors(self) -> F64:

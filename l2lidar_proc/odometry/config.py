@@ -169,8 +169,8 @@ class OdometryConfig:
     )
     correct_beams: bool = setting(
         True,
-        "estimate the unit's errors of xi and beta from the clouds, and correct these; a cloud "
-        "without the pattern of an L2 is left as it is",
+        "estimate the unit's errors of xi, beta, alpha and the ranges from the clouds, and "
+        "correct these; a cloud without the pattern of an L2 is left as it is",
     )
     max_speed: float = setting(
         30.0,

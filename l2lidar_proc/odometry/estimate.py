@@ -92,6 +92,8 @@ class AlignmentQuality:
         The other directions, orthonormal, map axes.
     beam_correction : tuple of float
         What was added to the unit's ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad].
+    range_correction : float
+        What was added to its ranges [m].
     """
 
     points: int = 0
@@ -108,6 +110,7 @@ class AlignmentQuality:
     velocity_factor: float = 1.0
     unobserved: tuple[tuple[float, float, float], ...] = ()
     beam_correction: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    range_correction: float = 0.0
 
     @property
     def observes_all(self) -> bool:

@@ -43,12 +43,12 @@ class FirstRest:
         self._initializer = initializer
         self._zero_velocity = zero_velocity
         self._beams = beams
-        self._mapped_with: F64 = np.zeros(3)  # the correction of the sweeps in the map
+        self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
         self.sweeps: list[Sweep] = []
 
     def begin(self, sweeps: list[Sweep]) -> None:
         """Take the sweeps with which a map has begun at rest."""
-        self.sweeps, self._mapped_with = sweeps, self._beams.correction
+        self.sweeps, self._mapped_with = sweeps, self._corrections
 
     def note(self, sweep: Sweep) -> None:
         """Take another sweep of this rest, if it is still the first one."""
@@ -84,9 +84,10 @@ class FirstRest:
             return None
         if doubted or self._beams.is_due_at_rest(self.sweeps):
             self._beams.learn_at_rest(self.sweeps)
-        if np.abs(self._beams.correction - self._mapped_with).max() <= tuning.BEAM_CHANGE:
+        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
+        if max(angles) <= tuning.BEAM_CHANGE and ranges <= tuning.RANGE_BIAS_CHANGE:
             return None
-        self._mapped_with = self._beams.correction
+        self._mapped_with = self._corrections
         better = [self._beams.applied_to(one) for one in self.sweeps]
         return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
 
@@ -153,4 +154,9 @@ class FirstRest:
     def _forget_beams(self) -> None:
         """Forget what the beams have shown of themselves: the sensor moved."""
         self._beams.forget()
-        self._mapped_with = self._beams.correction
+        self._mapped_with = self._corrections
+
+    @property
+    def _corrections(self) -> F64:
+        """Of the beam angles [rad] and of the ranges [m], shape (4,)."""
+        return np.append(self._beams.correction, self._beams.ranges.correction)

@@ -717,14 +717,18 @@ class Odometry:
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
         xi, beta, alpha = self._beams.correction.tolist()
+        ranges = self._beams.ranges.correction
         self.matcher.drift.beam_sigmas = self._beams.sigmas or tuning.OTHER_BEAM_SIGMAS
         self.matcher.drift.alpha_sigma = self._beams.alpha_sigma
+        self.matcher.drift.range_sigma = self._beams.range_sigma
         self._last = estimate_of(
             motion,
             self._lever,
             self.matcher.deskewed(sweep, motion),
             tuple(status),
-            dataclasses.replace(quality, beam_correction=(xi, beta, alpha)),
+            dataclasses.replace(
+                quality, beam_correction=(xi, beta, alpha), range_correction=ranges
+            ),
             self._predictor.gyro_noise,
             self._predictor.gyro_line,
             self._jump,

@@ -287,6 +287,7 @@ def judge(
         "beams corrected by (xi, beta, alpha) [deg]": " ".join(
             f"{angle:.2f}" for angle in np.degrees(quality.beam_correction)
         ),
+        "ranges corrected by [mm]": f"{1e3 * quality.range_correction:.0f}",
         "KISS-ICP threshold [m]": f"{quality.kiss_threshold_m:.3f}",
         "map cells": str(quality.map_cells),
         "gyro bias [rad/s]": " ".join(f"{axis:.4f}" for axis in last.gyro_bias),

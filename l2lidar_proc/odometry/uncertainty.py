@@ -39,7 +39,7 @@ class MapError:
         The better of them when the surroundings of the origin were mapped [rad].
     swung : float
         The worse of them, added up along ``behind`` [rad m].
-    alpha_sigma : float
+    alpha_sigma, range_sigma : float
         As of :class:`MapDrift`; not less than when the surroundings of the origin were mapped.
     lean : ndarray, shape (3,)
         By which the map has bent since it was begun, as gravity shows [rad].
@@ -56,6 +56,7 @@ class MapError:
     beam_began: float
     swung: float
     alpha_sigma: float
+    range_sigma: float
     lean: F64
     up: F64 | None
     first_pose: F64
@@ -81,11 +82,11 @@ class MapError:
 
         As :meth:`at`, but for a unit as good as its clouds show it to be. Beam angles that move
         the halves of the fan apart turn the map against its first pose at once; alpha, which moves
-        them apart in height, only lets it lean. Those that do not move them apart,
-        and hence are hardly known, turn it about the vertical as it grows, and bend the way by
-        that; gravity and the ground do not let it lean. What a scale of the ranges is wrong by
-        moves places along the line from the origin, and nothing else. What only the IMU holds is
-        part of the drift.
+        them apart in height, only lets it lean, and so does a bias of the ranges. Those that do
+        not move them apart, and hence are hardly known, turn it about the vertical as it grows,
+        and bend the way by that; gravity and the ground do not let it lean. What a scale of the
+        ranges is wrong by moves places along the line from the origin, and nothing else. What only
+        the IMU holds is part of the drift.
         """
         better, worse = self.beam_sigmas
         away = float(np.linalg.norm(place))
@@ -101,7 +102,10 @@ class MapError:
         unit[:3, :3] += swing * way**2 * level  # as if all of it had come about at the beginning
         unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
         unit[3:, 3:] += swing * up
-        leaning = (tuning.ALPHA_TURN * self.alpha_sigma * left) ** 2 * level
+        leans = np.hypot(
+            tuning.ALPHA_TURN * self.alpha_sigma, tuning.RANGE_BIAS_TURN * self.range_sigma
+        )
+        leaning = (leans * left) ** 2 * level
         return self._with(place, unit, self.expected_drift, first**2 * np.eye(3) + leaning)
 
     def _with(self, place: F64, unit: F64, drift: F64, first: F64 | None = None) -> F64:
@@ -138,8 +142,8 @@ class MapDrift:
     beam_sigmas : tuple of float
         What the beam angles of the sweeps to come may be wrong by, 1 sigma [rad], along their
         best known direction and the other.
-    alpha_sigma : float
-        What alpha may be wrong by, 1 sigma [rad].
+    alpha_sigma, range_sigma : float
+        What alpha and the ranges may be wrong by, 1 sigma [rad, m].
     is_doubted : bool
         Whether the drift is known to be larger than expected: then as much as has to be allowed
         for is expected.
@@ -150,7 +154,7 @@ class MapDrift:
         self._ways = np.zeros(64)  # on which they were [m]
         self._swings = np.zeros(64)  # the worse of the beam angles, added up along it [rad m]
         self.beam_sigmas = tuning.BEAM_SIGMA, tuning.BEAM_SIGMA
-        self.alpha_sigma = 0.0
+        self.alpha_sigma = self.range_sigma = 0.0
         self.clear()
 
     def clear(self) -> None:
@@ -168,7 +172,7 @@ class MapDrift:
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
         self._swung = 0.0  # the worse of the beam angles, added up until then [rad m]
         self._began = 0.0  # the better of them, when the surroundings of the origin were mapped
-        self._alpha_began = 0.0  # likewise of alpha
+        self._alpha_began = self._range_began = 0.0  # likewise of alpha and the ranges
         self._vertical: F64 | None = None  # gravity when it was first known [m/s^2]
         self._lean: F64 = np.zeros(3)  # by which the map has bent since, as gravity shows [rad]
         self._up: F64 | None = None  # as gravity shows it now, unit; None while it does not
@@ -339,6 +343,7 @@ class MapDrift:
             self._swing += step * worse
         if self._way < tuning.UNIT_FROM_M:
             self._began, self._alpha_began = better, self.alpha_sigma
+            self._range_began = self.range_sigma
         self._before = place
         self._ways[self._known : row + 1] = self._way
         self._swings[self._known : row + 1] = self._swing
@@ -441,6 +446,7 @@ class MapDrift:
             beam_began=self._began,
             swung=self._swung,
             alpha_sigma=max(self.alpha_sigma, self._alpha_began),
+            range_sigma=max(self.range_sigma, self._range_began),
             lean=self._lean,
             up=self._up,
             first_pose=self.first_pose,

@@ -139,6 +139,7 @@ class OdometryRunner:
         self.base = BaseFrame(np.eye(4))
         self.refused: Counter[str] = Counter()
         self._beams = 0.0, 0.0, 0.0  # correction of xi, beta and alpha [rad]
+        self._ranges = 0.0  # correction of the ranges [m]
 
     def take(self, event: Event) -> None:
         """Take a sweep or samples."""
@@ -152,6 +153,7 @@ class OdometryRunner:
     def _poll(self, now: int) -> None:
         for estimate in self.pipeline.poll(now):
             self._beams = estimate.quality.beam_correction
+            self._ranges = estimate.quality.range_correction
             if self._observer is not None:
                 self._observer(estimate, self.base)
 
@@ -174,7 +176,7 @@ class OdometryRunner:
         )
 
     def _finding(self) -> list[str]:
-        """Return what is wrong with IMU and beams, and what to do."""
+        """Return what is wrong with IMU, beams and ranges, and what to do."""
         finding = self.pipeline.check.finding
         found = [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
         if any(self._beams):
@@ -183,6 +185,11 @@ class OdometryRunner:
                 f"the unit's beams were corrected by {xi:+.2f} degrees (xi), {beta:+.2f} degrees "
                 f"(beta) and {alpha:+.2f} degrees (alpha), estimated from the clouds: l2lidar "
                 "calibrate still measures them"
+            )
+        if self._ranges:
+            found.append(
+                f"the unit's ranges were corrected by {1e3 * self._ranges:+.0f} mm, estimated "
+                "from walls in the clouds: l2lidar calibrate still measures that as well"
             )
         return found
 

@@ -30,6 +30,7 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.motion import trajectories
 from l2lidar_node.emulator.motion.motion import MOUNTS
 from l2lidar_node.emulator.unit import scanner
+from l2lidar_node.emulator.unit.units import UNITS, UnitErrors
 from l2lidar_node.types import HostNs
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -522,6 +523,29 @@ def test_the_first_pose_stays_where_it_is_when_the_map_begins_again(
     assert lead * np.linalg.norm(state.rotation.T @ state.velocity - first.velocity) > 0.06
     here = cloud_pose(state, given.T_cloud_imu[:3, 3])
     assert np.linalg.norm(here[:3, 3] - first.T_map_lidar[:3, 3]) < 0.01
+
+
+def test_the_map_of_a_unit_with_a_range_bias_does_not_lean(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """34 mm let the map of this room lean by 0.25 degrees, where 0.03 were reported."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    unit = replace(UNITS["a"], errors=UnitErrors(range_bias=0.034))
+    monkeypatch.setattr(hard_recordings, "_unit", lambda _: unit)
+    given = recording(scenario("room, drawn unit", 0, 10.0))
+    track = tracked(given)
+    assert score(given, track)["nees_pose"] > 0.8
+    turned = np.linalg.norm(errors(given, track).turn, axis=1)
+    assert turned[-20:].mean() < np.radians(0.1)
+
+
+def test_a_drawn_unit_has_other_errors_than_it_reports() -> None:
+    given = [scenario("room, drawn unit", seed, 1.0) for seed in (0, 1)]
+    one, other = (hard_recordings._unit(some).errors for some in given)
+    assert one != other
+    assert one.range_bias
+    assert one.alpha
+    assert hard_recordings._unit(scenario("room, imperfect", 0, 1.0)).errors.are_none
 
 
 def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:

@@ -1,0 +1,148 @@
+"""A bias of the ranges is found from the planes of clouds, and none where there is none."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from l2lidar_node.types import F64
+from l2lidar_proc import tuning
+from l2lidar_proc.odometry.beam_angles import BeamAngles
+from l2lidar_proc.odometry.range_bias import RangeBias, bend_of_planes
+from tests.l2lidar_proc.odometry.test_beam_angles import CLOUD, turn
+
+BOX = np.array([4.2, 3.3, 2.7])  # [m] half the edges
+SEEDS = range(24)
+
+
+def box(bias: float, seed: int, *, rough: float = 0.0, edges: F64 = BOX) -> NDArray[np.void]:
+    """Return points of a box, whose ranges are too long by a bias [m], seen from near its middle.
+
+    Parameters
+    ----------
+    rough : float
+        1 sigma of how far each patch of a wall, 0.7 m wide, is off its plane [m].
+    """
+    rng = np.random.default_rng(seed)
+    sights = rng.normal(size=(20000, 3))
+    sights /= np.linalg.norm(sights, axis=1)[:, None]
+    place = rng.uniform(-0.3, 0.3, 3)
+    reach = (np.sign(sights) * edges - place) / sights
+    wall = reach.argmin(axis=1)
+    ranges = reach.min(axis=1)
+    at = place + ranges[:, None] * sights
+    patch = np.floor(at / 0.7).astype(np.int64) @ (1, 100, 10000)
+    _, number = np.unique(patch, return_inverse=True)
+    off = rough * rng.normal(size=number.max() + 1)[number]
+    ranges = ranges + off / np.abs(sights[np.arange(len(wall)), wall])
+    ranges += bias + 0.012 * rng.normal(size=len(ranges))
+    cloud = np.zeros(len(ranges), CLOUD)
+    for name, line in zip("xyz", (ranges[:, None] * sights).T, strict=True):
+        cloud[name] = line
+    return cloud
+
+
+@pytest.mark.parametrize("bias", [0.03, 0.0, -0.02])
+def test_the_bias_of_a_box_is_found_from_one_sweep(bias: float) -> None:
+    information, gradient = bend_of_planes(box(bias, 0))
+    assert information > 1.0 / 0.005**2
+    assert gradient / information == pytest.approx(-bias, abs=0.005)
+
+
+def test_a_bias_is_known_as_well_as_it_says() -> None:
+    """Rough walls bend as well; NEES over boxes of which a sweep each was seen."""
+    rng = np.random.default_rng(7)
+    nees = []
+    for seed in SEEDS:
+        bias = tuning.RANGE_BIAS_SIGMA * rng.normal()
+        ranges = RangeBias()
+        ranges.learn(box(bias, seed, rough=0.012, edges=rng.uniform(2.5, 6.0, 3)))
+        nees.append(((ranges._estimate + bias) ** 2) / ranges._variance)
+    assert np.mean(nees) < 1.5
+    assert max(nees) < 10.8  # 99.9 % of one degree of freedom
+
+
+def test_points_move_along_their_rays() -> None:
+    ranges = RangeBias()
+    points = box(0.03, 1)
+    ranges.learn(points)
+    assert ranges.correction == pytest.approx(-0.03, abs=0.003)
+    moved = points.copy()
+    ranges.applied_to(moved)
+    before, after = (np.stack([some[name] for name in "xyz"], axis=1) for some in (points, moved))
+    lengths = np.linalg.norm(before, axis=1)
+    np.testing.assert_allclose(
+        np.linalg.norm(after, axis=1) - lengths, ranges.correction, atol=1e-5
+    )
+    np.testing.assert_allclose(np.cross(before, after) / lengths[:, None], 0.0, atol=1e-5)
+
+
+def test_what_was_corrected_is_not_corrected_again() -> None:
+    ranges = RangeBias()
+    for seed in range(20):
+        points = box(0.03, seed)
+        ranges.applied_to(points)
+        ranges.learn(points)
+    assert ranges.correction == pytest.approx(-0.03, abs=0.002)
+    assert tuning.RANGE_BIAS_FLOOR <= ranges.sigma < 0.005
+
+
+def test_without_planes_nothing_is_known() -> None:
+    rng = np.random.default_rng(0)
+    cloud = np.zeros(20000, CLOUD)
+    for name in "xyz":
+        cloud[name] = rng.uniform(-6.0, 6.0, len(cloud))
+    assert bend_of_planes(cloud)[0] < 1.0 / tuning.RANGE_BIAS_SIGMA**2
+    for some in (cloud[:0], cloud[:5]):
+        assert bend_of_planes(some) == (0.0, 0.0)
+    ranges = RangeBias()
+    ranges.learn(cloud[:0])
+    assert ranges.correction == 0.0
+    assert ranges.sigma == pytest.approx(tuning.RANGE_BIAS_SIGMA, rel=0.02)
+
+
+def test_what_is_very_near_tells_nothing() -> None:
+    """Ranges are not linear there, which bends what is near as a bias does."""
+    near = box(0.0, 0, edges=np.full(3, 0.8))
+    assert bend_of_planes(near) == (0.0, 0.0)
+
+
+def test_a_bias_that_may_as_well_be_zero_is_left() -> None:
+    ranges = RangeBias()
+    ranges.learn(box(0.002, 3))
+    assert ranges.correction == 0.0
+    assert ranges.sigma < tuning.RANGE_BIAS_KNOWN
+
+
+def test_clouds_of_another_sensor_are_left_as_they_are() -> None:
+    beams = BeamAngles()
+    sweep, _ = turn((0.0, 0.0, 0.0), 0)
+    for seed in range(25):
+        other = dataclasses.replace(sweep, points=box(0.03, seed))
+        assert beams.corrected(other) is other
+        beams.learn(other, other.points, at_rest=False)
+    assert beams.range_sigma == 0.0
+    assert beams.ranges.correction == 0.0
+
+
+def test_a_rest_shows_the_bias_and_ends_with_what_it_taught() -> None:
+    beams = BeamAngles()
+    sweeps = []
+    for number in range(12):
+        sweep, _ = turn((0.0, 0.0, 0.0), number)
+        at = np.stack([sweep.points[name] for name in "xyz"], axis=1)
+        longer = at * (1.0 + 0.03 / np.linalg.norm(at, axis=1))[:, None]
+        for name, line in zip("xyz", longer.T, strict=True):
+            sweep.points[name] = line
+        sweeps.append(sweep)
+        beams.head(sweep)
+    beams.learn_at_rest(sweeps)
+    assert beams.ranges.correction == pytest.approx(-0.03, abs=0.004)
+    corrected = beams.applied_to(sweeps[0]).points
+    information, gradient = bend_of_planes(corrected)
+    assert abs(gradient / information) < 0.004
+    beams.forget()
+    assert beams.ranges.correction == 0.0
