@@ -403,6 +403,9 @@ LEAN_FROM: Final = 0.015  # [rad]
 # ---- odometry: beam angles. Tuned on: imperfect rooms, halls and woods, seeds 0 to 2
 
 BEAM_SIGMA: Final = 0.009  # [rad] of units; source: captures of a real one, 0.4 degrees
+# [rad] of alpha, 0.23 degrees; source: 0.27 between two captures of a real one. With BEAM_SIGMA,
+# the cells of a wood were too far away to tell which things were the same
+ALPHA_SIGMA: Final = 0.004
 BEAM_POINTS: Final = 200  # of a cloud that show the turning of the head
 BEAM_CELL: Final = 0.5  # [m] edge of the cells in which halves are compared
 BEAM_CELL_POINTS: Final = 12  # of either half in a cell
@@ -705,6 +708,10 @@ STILL_TURN_NS: Final = 200_000_000  # [ns] shorter sweeps are averaged into a tu
 STILL_COMPARED: Final = 40  # turns whose deviations are compared,
 STILL_TESTED: Final = 12  # of these up to so many of the latest with all before
 STILL_DRIFT: Final = 160.0  # squared Mahalanobis distance of a drift (6) that is not chance
+# Share of the points that fixed the weakest direction at first, to tell that motion has blurred it
+# since. A creep of 0.05 m/s through a room: 0.1 at first, 0.01 after 2 s; at rest 0.06 to 0.12
+STILL_FIXED: Final = 0.04
+STILL_BLURRED: Final = 0.4  # of that share is left
 STILL_DRIFT_S: Final = 0.5  # [s] how quickly a drift may have come about
 STILL_IMU_NS: Final = 250_000_000  # [ns] in which the IMU shows that rest has ended
 STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have begun to end

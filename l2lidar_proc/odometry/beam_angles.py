@@ -32,7 +32,10 @@ from l2lidar_proc.odometry.range_bias import RangeBias
 
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
 _RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
-_PRIOR: Final = np.eye(3) / tuning.BEAM_SIGMA**2  # information of units [1/rad^2]
+# information of units [1/rad^2]
+_PRIOR: Final = np.diag((1.0, 1.0, (tuning.BEAM_SIGMA / tuning.ALPHA_SIGMA) ** 2)) / (
+    tuning.BEAM_SIGMA**2
+)
 
 
 class BeamAngles:
@@ -137,7 +140,8 @@ class BeamAngles:
         if self._latest is None or self._latest[0] is not sweep or len(moved) != len(sweep.points):
             return
         _, sign, used = self._latest
-        self.ranges.learn(moved)
+        if not at_rest:  # a rest shows the same walls again and again
+            self.ranges.learn(moved)
         gaps = between_halves(sweep.points, moved, sign)
         if gaps is None:
             return

@@ -28,7 +28,7 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.static import StaticReference, static_reference
-from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
+from l2lidar_proc.odometry.alignment import Alignment, degeneracy_ratio, unobserved_directions
 
 
 class ZeroVelocityTest:
@@ -144,6 +144,10 @@ class ZeroVelocityTest:
         """
         assert self.anchor is not None
         deviation = found.state.boxminus(self.anchor)[POSE]
+        if self._is_blurred(found):
+            self._drift = deviation
+            self._doubt()
+            return False
         free = unobserved_directions(found.claimed)
         if free.size:
             # along a bare corridor rest looks like motion: there it is up to the IMU
@@ -183,6 +187,13 @@ class ZeroVelocityTest:
         self._doubt()
         return False
 
+    def _is_blurred(self, found: Alignment) -> bool:
+        """Return whether what fixed a direction at first has become blurred, as by motion."""
+        share = degeneracy_ratio(found.claimed)
+        if self._fixed is None:
+            self._fixed = share
+        return self._fixed > tuning.STILL_FIXED and share < tuning.STILL_BLURRED * self._fixed
+
     def resume(self, state: InertialState) -> None:
         """Take the hypothesis up again at a state; no earlier sweep is compared any more."""
         self._drift = np.zeros(6)
@@ -205,6 +216,8 @@ class ZeroVelocityTest:
 
     def _release(self) -> None:
         self.anchor = None
+        # how well the first sweep there fixed the weakest direction, as a share of all
+        self._fixed: float | None = None
         self._turned = 0
         self._turn: list[F64] = []
         # the first sweep at the anchor made the map

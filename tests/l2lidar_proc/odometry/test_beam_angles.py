@@ -209,7 +209,7 @@ def test_a_unit_that_is_right_is_left_alone() -> None:
 def test_how_wrong_the_angles_may_still_be_is_told() -> None:
     """What is found but not sure enough to be corrected is an error that stays."""
     assert BeamAngles().sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
-    assert BeamAngles().alpha_sigma == pytest.approx(tuning.BEAM_SIGMA)
+    assert BeamAngles().alpha_sigma == pytest.approx(tuning.ALPHA_SIGMA)
     units = ((0.0, 0.0, 0.0), (0.5, -0.2, 0.0), (0.4, 0.8, 0.0))
     right, across, along = (learned(unit).sigmas for unit in units)
     assert right is not None
