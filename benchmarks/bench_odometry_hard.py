@@ -306,7 +306,9 @@ without any status was off by more than 3 sigma and 0.1 m. NEES is the share of 
 and attitude, 6) and of velocities (3) whose normalized squared error is within the bound that 95
 % should keep. ATE is after an SE(3) alignment; ends and NEES are relative to the first pose. A
 unit called *imperfect* has beam angles 0.4 degrees off, ranges 0.2 % off, an IMU rotated by 0.5
-degrees and 2 ms late, vibration, lost packets and gaps in its IMU samples.
+degrees and 2 ms late, vibration, lost packets and gaps in its IMU samples. A *drawn unit* is one
+of the virtual L2's population, which is off in alpha, the range bias, the head's wave and the
+scale of the gyro as well.
 """
 
 
