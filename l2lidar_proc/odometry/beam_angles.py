@@ -33,8 +33,8 @@ from l2lidar_proc.odometry.range_bias import RangeBias
 _GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
 _RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
 # information of units [1/rad^2]
-_PRIOR: Final = np.diag((1.0, 1.0, (tuning.BEAM_SIGMA / tuning.ALPHA_SIGMA) ** 2)) / (
-    tuning.BEAM_SIGMA**2
+_PRIOR: Final = np.diag(
+    1.0 / np.square((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA, tuning.ALPHA_SIGMA))
 )
 
 
@@ -62,7 +62,8 @@ class BeamAngles:
         self._sweeps = 0
         self._rested_ns = 0  # of the sweeps at rest that were compared last
         self._seen: tuple[Sweep, Halves | None] | None = None  # the latest sweep
-        self._latest: tuple[Sweep, F64, F64] | None = None  # its halves, and what corrected it
+        # the one to learn from: its halves, and what corrected angles and ranges
+        self._latest: tuple[Sweep, F64, F64, float] | None = None
 
     @property
     def _is_other(self) -> bool:
@@ -101,7 +102,7 @@ class BeamAngles:
         corrected = self.applied_to(sweep)
         found = self._halves_of(sweep) if self._teaches() else None
         if found is not None:
-            self._latest = corrected, found.sign, self.correction
+            self._latest = corrected, found.sign, self.correction, self.ranges.correction
         return corrected
 
     def applied_to(self, sweep: Sweep) -> Sweep:
@@ -139,9 +140,9 @@ class BeamAngles:
         """
         if self._latest is None or self._latest[0] is not sweep or len(moved) != len(sweep.points):
             return
-        _, sign, used = self._latest
+        _, sign, used, used_range = self._latest
         if not at_rest:  # a rest shows the same walls again and again
-            self.ranges.learn(moved)
+            self.ranges.learn(moved, used=used_range)
         gaps = between_halves(sweep.points, moved, sign)
         if gaps is None:
             return
@@ -190,7 +191,8 @@ class BeamAngles:
             self._weighted = self._information @ angles
             self.correction = self._known()
         self.ranges.forget()
-        self.ranges.learn_at_rest([self.applied_to(one) for one in sweeps])
+        step = -(-len(sweeps) // tuning.RANGE_BIAS_SWEEPS)
+        self.ranges.learn(*(self.applied_to(one).points for one in sweeps[::step]))
 
     def forget(self) -> None:
         """Forget what was learned, as after a rest that was none."""

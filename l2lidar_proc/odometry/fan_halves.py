@@ -156,7 +156,7 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
         As :class:`Halves` has it.
     """
     at = np.stack([moved[name].astype(np.float64) for name in "xyz"])
-    cell = _cells(at, 0.0)
+    cell = cell_numbers(at)
     count = int(cell.max()) + 1 if len(cell) else 0
     rising = sign > 0.0
     numbers = np.stack([np.bincount(cell[some], minlength=count) for some in (rising, ~rising)])
@@ -271,7 +271,7 @@ def _seen_by_both(
     weight : ndarray, shape (C, 3)
         Of the gaps [1/m^2], 0 along what continues in the next cell.
     """
-    cell = _cells(at, shift)
+    cell = cell_numbers(at, shift)
     count = int(cell.max()) + 1 if len(cell) else 0
     rising = sign > 0.0
     lines = int(line.max(initial=0)) + 1
@@ -329,7 +329,10 @@ def _compared(values: F64, cell: I64, rising: NDArray[np.bool_]) -> tuple[F64, F
     return means[:, 1::2] - means[:, ::2], spread, axes
 
 
-def _cells(at: F64, shift: float) -> I64:
-    """Return the number of the cell of each point (3, N), from 0 on; the grid may be shifted."""
+def cell_numbers(at: F64, shift: float = 0.0) -> I64:
+    """Return the number (N,) of the cell of each point (3, N) [m], from 0 on.
+
+    Cells have edges of BEAM_CELL; the grid may be shifted, by a share of them.
+    """
     x, y, z = np.floor(at / tuning.BEAM_CELL + shift).astype(np.int64)
     return distinct_in_runs((x << 40) + (y << 20) + z)[1]

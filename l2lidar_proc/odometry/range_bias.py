@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node.types import F64, Sweep
+from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.cell_grid import distinct_in_runs
+from l2lidar_proc.odometry.fan_halves import cell_numbers
 from l2lidar_proc.odometry.principal_axes import principal_axes, products
 
 
@@ -57,21 +57,20 @@ class RangeBias:
         for name, line in zip("xyz", at, strict=True):
             points[name] = line + share * line
 
-    def learn(self, points: NDArray[np.void]) -> None:
-        """Take the planes of a corrected and deskewed sweep (N,)."""
-        information, gradient = bend_of_planes(points)
-        self._information += information
-        self._weighted += gradient + information * self.correction
-        self.correction = self._known()
+    def learn(self, *sweeps: NDArray[np.void], used: float = 0.0) -> None:
+        """Take the planes of sweeps.
 
-    def learn_at_rest(self, sweeps: list[Sweep]) -> None:
-        """Estimate the bias anew from sweeps of a sensor at rest, whose beam angles are right."""
-        self.forget()
-        step = -(-len(sweeps) // tuning.RANGE_BIAS_SWEEPS)
-        for sweep in sweeps[:: max(step, 1)]:
-            information, gradient = bend_of_planes(sweep.points)
+        Parameters
+        ----------
+        *sweeps : ndarray, shape (N,)
+            Points of each, deskewed, with the right beam angles [m].
+        used : float
+            Correction of their ranges [m].
+        """
+        for points in sweeps:
+            information, gradient = bend_of_planes(points)
             self._information += information
-            self._weighted += gradient
+            self._weighted += gradient + information * used
         self.correction = self._known()
 
     @property
@@ -178,8 +177,7 @@ def _planes(flat: _Flat) -> Iterator[tuple[F64, F64, F64]]:
 def _flat_cells(at: F64) -> _Flat:
     """Return the flat cells of points (3, N), without those that are too near to be right."""
     at = at[:, np.linalg.norm(at, axis=0) > tuning.RANGE_BIAS_NEAREST]
-    x, y, z = np.floor(at / tuning.BEAM_CELL).astype(np.int64)
-    cell = distinct_in_runs((x << 40) + (y << 20) + z)[1]
+    cell = cell_numbers(at)
     counts = np.bincount(cell).astype(np.float64)
     means = np.stack([np.bincount(cell, line) for line in at]) / counts
     around = at - means[:, cell]

@@ -108,15 +108,14 @@ class MapError:
         leaning = (leans * left) ** 2 * level
         return self._with(place, unit, self.expected_drift, first**2 * np.eye(3) + leaning)
 
-    def _with(self, place: F64, unit: F64, drift: F64, first: F64 | None = None) -> F64:
+    def _with(self, place: F64, unit: F64, drift: F64, first: F64 | float = 0.0) -> F64:
         """Return the covariance (6, 6) at a place of a map with a drift and of a unit's faults.
 
         ``first`` is that of the turn (3, 3) by these of the first pose against the map [rad^2].
         """
         moved = _carried(place)
         begun = drift + self.first_pose
-        if first is not None:
-            begun[3:, 3:] += first
+        begun[3:, 3:] += first
         unit[3:, 3:] += np.outer(self.lean, self.lean)
         return np.asarray(moved @ begun @ moved.T + unit)
 

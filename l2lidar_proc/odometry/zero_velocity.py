@@ -43,6 +43,8 @@ class ZeroVelocityTest:
     def __init__(self) -> None:
         self.anchor: InertialState | None = None
         self._turned = 0  # the instant of the last sweep of a turn
+        # how well the first sweep at the anchor fixed the weakest direction, as a share of all
+        self._fixed: float | None = None
         self.clear()
 
     def clear(self) -> None:
@@ -190,9 +192,9 @@ class ZeroVelocityTest:
     def _is_blurred(self, found: Alignment) -> bool:
         """Return whether what fixed a direction at first has become blurred, as by motion."""
         share = degeneracy_ratio(found.claimed)
-        if self._fixed is None:
-            self._fixed = share
-        return self._fixed > tuning.STILL_FIXED and share < tuning.STILL_BLURRED * self._fixed
+        first = share if self._fixed is None else self._fixed
+        self._fixed = first
+        return first > tuning.STILL_FIXED and share < tuning.STILL_BLURRED * first
 
     def resume(self, state: InertialState) -> None:
         """Take the hypothesis up again at a state; no earlier sweep is compared any more."""
@@ -216,8 +218,7 @@ class ZeroVelocityTest:
 
     def _release(self) -> None:
         self.anchor = None
-        # how well the first sweep there fixed the weakest direction, as a share of all
-        self._fixed: float | None = None
+        self._fixed = None
         self._turned = 0
         self._turn: list[F64] = []
         # the first sweep at the anchor made the map

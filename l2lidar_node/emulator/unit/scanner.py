@@ -132,7 +132,7 @@ _TURN = 2.0 * np.pi
 
 
 def on_its_mount(motion: Motion, unit: Unit, seed: int) -> Motion:
-    """Return the motion of a unit on a mount that is moved so; the head may rock it."""
+    """Return the motion of a unit on a moving mount, which its spinning head may rock."""
     if not unit.errors.rocks:
         return motion
     rate = 2.0 * np.pi / unit.head_period_s
