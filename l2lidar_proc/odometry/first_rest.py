@@ -14,8 +14,8 @@ from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.correspondences import Source
+from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
 
@@ -28,7 +28,7 @@ class FirstRest:
     initializer : MapInitializer
         Begins the map again.
     zero_velocity : ZeroVelocityTest
-    beams : BeamAngles
+    intrinsics : LidarIntrinsics
 
     Attributes
     ----------
@@ -38,11 +38,14 @@ class FirstRest:
     """
 
     def __init__(
-        self, initializer: MapInitializer, zero_velocity: ZeroVelocityTest, beams: BeamAngles
+        self,
+        initializer: MapInitializer,
+        zero_velocity: ZeroVelocityTest,
+        intrinsics: LidarIntrinsics,
     ) -> None:
         self._initializer = initializer
         self._zero_velocity = zero_velocity
-        self._beams = beams
+        self._intrinsics = intrinsics
         self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
         self.sweeps: list[Sweep] = []
 
@@ -82,13 +85,13 @@ class FirstRest:
         """
         if not self.sweeps:
             return None
-        if doubted or self._beams.is_due_at_rest(self.sweeps):
-            self._beams.learn_at_rest(self.sweeps)
+        if doubted or self._intrinsics.is_due_at_rest(self.sweeps):
+            self._intrinsics.learn_at_rest(self.sweeps)
         *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
         if max(angles) <= tuning.BEAM_CHANGE and ranges <= tuning.RANGE_BIAS_CHANGE:
             return None
         self._mapped_with = self._corrections
-        better = [self._beams.applied_to(one) for one in self.sweeps]
+        better = [self._intrinsics.applied_to(one) for one in self.sweeps]
         return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
 
     def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
@@ -101,7 +104,7 @@ class FirstRest:
         seen : Source
             Its points.
         """
-        sigmas = self._beams.sigmas if self.sweeps else None
+        sigmas = self._intrinsics.sigmas if self.sweeps else None
         if sigmas is None:
             return False
         turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
@@ -129,7 +132,7 @@ class FirstRest:
         motions = self._initializer.begin_again_in_motion(sweeps, state, covariance)
         if not motions:
             return None
-        self._forget_beams()
+        self._forget_intrinsics()
         return InitializedMap(motions, sweeps, 0, sweeps[0].start)
 
     def retried(self, sweeps: list[Sweep]) -> InitializedMap | None:
@@ -142,7 +145,7 @@ class FirstRest:
         sweeps : list of Sweep
             All those of the rest, as :meth:`end` returns them.
         """
-        self._forget_beams()
+        self._forget_intrinsics()
         for may_rest in (False, True):
             motions = self._initializer.begin(sweeps, sweeps[0].start, may_rest)
             if motions:
@@ -151,12 +154,12 @@ class FirstRest:
                     return InitializedMap(motions, sweeps, 0, sweeps[0].start)
         return None
 
-    def _forget_beams(self) -> None:
+    def _forget_intrinsics(self) -> None:
         """Forget what the beams have shown of themselves: the sensor moved."""
-        self._beams.forget()
+        self._intrinsics.forget()
         self._mapped_with = self._corrections
 
     @property
     def _corrections(self) -> F64:
         """Of the beam angles [rad] and of the ranges [m], shape (4,)."""
-        return np.append(self._beams.correction, self._beams.ranges.correction)
+        return np.append(self._intrinsics.angles, self._intrinsics.ranges.correction)

@@ -18,7 +18,6 @@ from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
 from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
-from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Relocalization
@@ -31,6 +30,7 @@ from l2lidar_proc.odometry.estimate import (
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
 from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, with_loose_motion
+from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor, blur_of
@@ -100,7 +100,7 @@ class Odometry:
         self._predictor.reset()
         self._zero_velocity = ZeroVelocityTest()
         self._innovations = InnovationTest()
-        self._beams = BeamAngles()
+        self._intrinsics = LidarIntrinsics()
         self._use(SweepMatcher(self.config, self._lever))
         self._start = StartVelocity(self._lever)
         self._peak_speed = 0.0  # of this carrier [m/s]
@@ -119,7 +119,7 @@ class Odometry:
         self._initializer = MapInitializer(
             self._predictor, matcher, self._zero_velocity, self.config.min_points
         )
-        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._beams)
+        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._intrinsics)
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
@@ -149,11 +149,11 @@ class Odometry:
                 status.append(Status.RESTARTED)
         sweep = cropped(sweep, self.config.min_range, self.config.max_range)
         self._reported = sweep  # as the unit reports it, for what is mapped again
-        head = self._beams.head(sweep)
+        head = self._intrinsics.head(sweep)
         if head is not None:
             self._predictor.note_head(head, sweep.end)
         if self.config.correct_beams:
-            sweep = self._beams.corrected(sweep)
+            sweep = self._intrinsics.corrected(sweep)
         if self.phase is Phase.INITIALIZING:
             return self._initialize(sweep)
         if may_skip and not status:
@@ -291,7 +291,7 @@ class Odometry:
         quality = self._consistency(quality, found, motion.state.stamp)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
-            self._beams.learn(sweep, estimate.points, at_rest=False)
+            self._intrinsics.learn(sweep, estimate.points, at_rest=False)
         is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
         if not is_mapped and (found is not None or is_new):
             expected_share = self._innovations.expected_share
@@ -630,7 +630,7 @@ class Odometry:
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
         if remapped is None:  # else the beams have learned from all sweeps of this rest
-            self._beams.learn(sweep, estimate.points, at_rest=True)
+            self._intrinsics.learn(sweep, estimate.points, at_rest=True)
             self.matcher.extend(estimate.points, still, still.state)
         return estimate
 
@@ -716,11 +716,11 @@ class Odometry:
         """Deskew a sweep with its motion and report it."""
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
-        xi, beta, alpha = self._beams.correction.tolist()
-        ranges = self._beams.ranges.correction
-        self.matcher.drift.beam_sigmas = self._beams.sigmas or tuning.OTHER_BEAM_SIGMAS
-        self.matcher.drift.alpha_sigma = self._beams.alpha_sigma
-        self.matcher.drift.range_sigma = self._beams.range_sigma
+        xi, beta, alpha = self._intrinsics.angles.tolist()
+        ranges = self._intrinsics.ranges.correction
+        self.matcher.drift.beam_sigmas = self._intrinsics.sigmas or tuning.OTHER_BEAM_SIGMAS
+        self.matcher.drift.alpha_sigma = self._intrinsics.alpha_sigma
+        self.matcher.drift.range_sigma = self._intrinsics.range_sigma
         self._last = estimate_of(
             motion,
             self._lever,

@@ -356,7 +356,7 @@ def test_both_beam_angles_of_a_narrow_view_are_corrected_within_seconds(
     odometry.imu(given.imu)
     for sweep in given.sweeps():
         odometry.register(sweep)
-    found = np.degrees(odometry._beams.correction)
+    found = np.degrees(odometry._intrinsics.angles)
     true = np.degrees(Imperfections().beam_rad)
     assert found == pytest.approx([true, true, 0.0], abs=0.15)
 
@@ -390,15 +390,15 @@ def test_beams_that_nobody_knows_yet_do_not_end_a_rest_between_trees(
     starting = [Status.STARTING in item.status for item in estimates]
     assert starting == sorted(starting, reverse=True)  # the map has begun only once
     signs = np.random.default_rng((seed, 23)).choice([-1.0, 1.0], 3)
-    found = np.degrees(odometry._beams.correction)
+    found = np.degrees(odometry._intrinsics.angles)
     assert found[2] == pytest.approx(0.0, abs=0.15)
     found = found[:2]
     true = -signs[[1, 0]] * np.degrees(Imperfections().beam_rad)
     if shown:
         np.testing.assert_allclose(found, true, atol=0.15)
     elif found.any():
-        assert odometry._beams.sigmas is not None
-        assert (np.abs(found - true) < 2.0 * np.degrees(odometry._beams.sigmas)).all()
+        assert odometry._intrinsics.sigmas is not None
+        assert (np.abs(found - true) < 2.0 * np.degrees(odometry._intrinsics.sigmas)).all()
 
 
 def test_a_rest_outlasts_a_sweep_that_meets_nothing_of_so_young_a_map(

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.beam_angles import BeamAngles
+from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.range_bias import RangeBias, bend_of_planes
-from tests.l2lidar_proc.odometry.test_beam_angles import CLOUD, turn
+from tests.l2lidar_proc.odometry.test_lidar_intrinsics import CLOUD, turn
 
 BOX = np.array([4.2, 3.3, 2.7])  # [m] half the edges
 SEEDS = range(24)
@@ -119,18 +119,18 @@ def test_a_bias_that_may_as_well_be_zero_is_left() -> None:
 
 
 def test_clouds_of_another_sensor_are_left_as_they_are() -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     sweep, _ = turn((0.0, 0.0, 0.0), 0)
     for seed in range(25):
         other = dataclasses.replace(sweep, points=box(0.03, seed))
-        assert beams.corrected(other) is other
-        beams.learn(other, other.points, at_rest=False)
-    assert beams.range_sigma == 0.0
-    assert beams.ranges.correction == 0.0
+        assert intrinsics.corrected(other) is other
+        intrinsics.learn(other, other.points, at_rest=False)
+    assert intrinsics.range_sigma == 0.0
+    assert intrinsics.ranges.correction == 0.0
 
 
 def test_a_rest_shows_the_bias_and_ends_with_what_it_taught() -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     sweeps = []
     for number in range(12):
         sweep, _ = turn((0.0, 0.0, 0.0), number)
@@ -139,11 +139,11 @@ def test_a_rest_shows_the_bias_and_ends_with_what_it_taught() -> None:
         for name, line in zip("xyz", longer.T, strict=True):
             sweep.points[name] = line
         sweeps.append(sweep)
-        beams.head(sweep)
-    beams.learn_at_rest(sweeps)
-    assert beams.ranges.correction == pytest.approx(-0.03, abs=0.004)
-    corrected = beams.applied_to(sweeps[0]).points
+        intrinsics.head(sweep)
+    intrinsics.learn_at_rest(sweeps)
+    assert intrinsics.ranges.correction == pytest.approx(-0.03, abs=0.004)
+    corrected = intrinsics.applied_to(sweeps[0]).points
     information, gradient = bend_of_planes(corrected)
     assert abs(gradient / information) < 0.004
-    beams.forget()
-    assert beams.ranges.correction == 0.0
+    intrinsics.forget()
+    assert intrinsics.ranges.correction == 0.0

@@ -15,9 +15,9 @@ from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GYRO_BIAS, POSE, POSITION, VELOCITY, InertialState
 from l2lidar_proc.odometry.alignment import Alignment
-from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import MapInitializer
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
@@ -145,13 +145,13 @@ def test_a_start_in_slow_motion_is_not_taken_for_wrong_beams(
     since = EPOCH + round((RESTED + 2.0) * 1e9)
     moving = [one for one in sweeps(run, "turn") if one.start > since]
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
-    forget, forgot = BeamAngles.forget, []
+    forget, forgot = LidarIntrinsics.forget, []
 
-    def counted(beams: BeamAngles) -> None:
-        forgot.append(beams.correction.copy())
-        forget(beams)
+    def counted(intrinsics: LidarIntrinsics) -> None:
+        forgot.append(intrinsics.angles.copy())
+        forget(intrinsics)
 
-    monkeypatch.setattr(BeamAngles, "forget", counted)
+    monkeypatch.setattr(LidarIntrinsics, "forget", counted)
     estimates = feed(odometry, run, moving)
     assert len(forgot) == 1
     begun = [k for k, item in enumerate(estimates) if Status.STARTING in item.status]
@@ -161,7 +161,7 @@ def test_a_start_in_slow_motion_is_not_taken_for_wrong_beams(
     assert np.abs(gone).max() < 0.12
     assert np.abs(gone[begun[-1] :]).max() < 0.02
     wrong = 0.4 if unit == "typical" else 0.0
-    assert np.abs(np.degrees(odometry._beams.correction)).max() < wrong + 0.05
+    assert np.abs(np.degrees(odometry._intrinsics.angles)).max() < wrong + 0.05
 
 
 @pytest.mark.parametrize("vibration", [0.0, 0.65])

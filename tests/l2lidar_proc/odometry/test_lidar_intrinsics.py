@@ -15,9 +15,9 @@ from l2lidar_node.calibration.model import ALPHA, BETA, NAMES, RETURN, XI, Block
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.beam_angles import BeamAngles
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.fan_halves import between_halves, halves
+from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.verbs.odometry import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
@@ -93,12 +93,12 @@ def _to_trunks(direction: Any, trunks: Any) -> Any:
     return np.where((into > 0.0) & (ahead > depth), ahead - depth, np.inf)
 
 
-def learned(unit: Any, at_rest: bool = True, drift: Any = (0.0, 0.0, 0.0)) -> BeamAngles:
-    beams = BeamAngles()
+def learned(unit: Any, at_rest: bool = True, drift: Any = (0.0, 0.0, 0.0)) -> LidarIntrinsics:
+    intrinsics = LidarIntrinsics()
     for number in range(12):
-        sweep = beams.corrected(turn(unit, number, drift=drift)[0])
-        beams.learn(sweep, sweep.points, at_rest=at_rest)
-    return beams
+        sweep = intrinsics.corrected(turn(unit, number, drift=drift)[0])
+        intrinsics.learn(sweep, sweep.points, at_rest=at_rest)
+    return intrinsics
 
 
 @pytest.mark.parametrize("seconds", [0.002, 0.01, 0.03, 0.05, 0.1])
@@ -106,30 +106,30 @@ def test_a_first_sweep_that_is_cut_does_not_hide_the_pattern(seconds: float) -> 
     """A driver that starts within a turn: so short a part fits any rate of the head."""
     whole, _ = turn(UNIT, 0)
     part = dataclasses.replace(whole, points=whole.points[whole.points["time"] < seconds])
-    beams = BeamAngles()
-    beams.learn(beams.corrected(part), part.points, at_rest=True)
+    intrinsics = LidarIntrinsics()
+    intrinsics.learn(intrinsics.corrected(part), part.points, at_rest=True)
     for number in range(1, 12):
-        sweep = beams.corrected(turn(UNIT, number)[0])
-        assert beams.head(sweep) is not None
-        beams.learn(sweep, sweep.points, at_rest=True)
-    expected = learned(UNIT).correction
+        sweep = intrinsics.corrected(turn(UNIT, number)[0])
+        assert intrinsics.head(sweep) is not None
+        intrinsics.learn(sweep, sweep.points, at_rest=True)
+    expected = learned(UNIT).angles
     assert expected.any()
-    np.testing.assert_allclose(np.degrees(beams.correction - expected), 0.0, atol=0.05)
+    np.testing.assert_allclose(np.degrees(intrinsics.angles - expected), 0.0, atol=0.05)
 
 
 def test_a_rate_of_the_head_that_does_not_fit_is_searched_anew() -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     for number in range(8):
-        assert beams.head(turn(UNIT, number, 27.1)[0]) is not None
-    found = [beams.head(turn(UNIT, number, 34.9)[0]) for number in range(8)]
+        assert intrinsics.head(turn(UNIT, number, 27.1)[0]) is not None
+    found = [intrinsics.head(turn(UNIT, number, 34.9)[0]) for number in range(8)]
     assert found[0] is None
     assert found[-1] is not None
     assert found[-1].rate == pytest.approx(34.9, rel=0.02)
     nothing = dataclasses.replace(turn(UNIT, 0)[0], points=turn(UNIT, 0)[0].points[:0])
     for _ in range(50):  # covered, it stays an L2
-        assert beams.head(nothing) is None
-    assert beams.head(turn(UNIT, 9, 34.9)[0]) is not None
-    assert beams.sigmas is not None
+        assert intrinsics.head(nothing) is None
+    assert intrinsics.head(turn(UNIT, 9, 34.9)[0]) is not None
+    assert intrinsics.sigmas is not None
 
 
 @pytest.mark.parametrize("rate", [27.1, 34.9])
@@ -149,27 +149,27 @@ def test_the_half_of_every_point_is_found(rate: float, number: int) -> None:
 
 def test_the_angle_of_the_head_is_known_for_the_whole_turn() -> None:
     """Not but for half a turn: the half that rises is on the other side by then."""
-    beams, offsets = BeamAngles(), []
+    intrinsics, offsets = LidarIntrinsics(), []
     for number in range(18):
         sweep = turn(UNIT, number)[0]
-        head = beams.head(sweep)
+        head = intrinsics.head(sweep)
         assert head is not None
         assert head.stamp == sweep.start
-        assert beams.head(sweep) == head
+        assert intrinsics.head(sweep) == head
         offsets.append(head.angle - (1.7 + 0.37 * number))
     # a rate that is 0.4 % off moves the angle at the beginning by half of that in a turn
     assert np.ptp(np.unwrap(offsets)) < 0.03
     room = sweep.points.copy()
     rng = np.random.default_rng(1)
     room["x"], room["y"] = rng.permutation(room["x"]), rng.permutation(room["y"])
-    assert BeamAngles().head(dataclasses.replace(sweep, points=room)) is None
+    assert LidarIntrinsics().head(dataclasses.replace(sweep, points=room)) is None
 
 
 @pytest.mark.parametrize("at_rest", [True, False])
 @pytest.mark.parametrize("unit", [UNIT, (-0.4, 0.4, 0.0), (0.5, 0.1, 0.0)])
 def test_what_moves_the_halves_apart_is_found(unit: Any, at_rest: bool) -> None:
     """Along the other direction, both angles together, 12 turns tell nothing: it is not used."""
-    found = np.degrees(learned(unit, at_rest).correction)
+    found = np.degrees(learned(unit, at_rest).angles)
     size = float(np.linalg.norm(found))
     axis = found / size
     assert abs(axis[0]) > 0.9
@@ -183,12 +183,12 @@ def test_where_the_turn_of_the_mirror_begins_is_found(
     others: Any, alpha: float, at_rest: bool
 ) -> None:
     """It differs from one power-up of a unit to the next, and makes ceilings double."""
-    beams = learned((*others, alpha), at_rest)
-    found = np.degrees(beams.correction)
+    intrinsics = learned((*others, alpha), at_rest)
+    found = np.degrees(intrinsics.angles)
     assert found[2] == pytest.approx(alpha, abs=0.05)
     size = float(np.linalg.norm(found[:2]))
     assert size == pytest.approx(np.dot(others, found[:2] / max(size, 1e-9)), abs=0.05)
-    assert np.degrees(beams.alpha_sigma) < 0.05
+    assert np.degrees(intrinsics.alpha_sigma) < 0.05
     sweep, _ = turn((*others, alpha), 30)
 
     def off(cloud: Any) -> float:
@@ -196,20 +196,20 @@ def test_where_the_turn_of_the_mirror_begins_is_found(
         ceiling &= (np.abs(cloud["x"]) < ROOM[0] - 0.3) & (np.abs(cloud["y"]) < ROOM[1] - 0.3)
         return float(np.std(cloud["z"][ceiling]))
 
-    assert off(beams.applied_to(sweep).points) < 0.75 * off(sweep.points)
+    assert off(intrinsics.applied_to(sweep).points) < 0.75 * off(sweep.points)
 
 
 def test_a_unit_that_is_right_is_left_alone() -> None:
-    beams = learned((0.0, 0.0, 0.0), at_rest=False)
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
+    intrinsics = learned((0.0, 0.0, 0.0), at_rest=False)
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
     sweep, _ = turn((0.0, 0.0, 0.0), 20)
-    assert beams.corrected(sweep) is sweep
+    assert intrinsics.corrected(sweep) is sweep
 
 
 def test_how_wrong_the_angles_may_still_be_is_told() -> None:
     """What is found but not sure enough to be corrected is an error that stays."""
-    assert BeamAngles().sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
-    assert BeamAngles().alpha_sigma == pytest.approx(tuning.ALPHA_SIGMA)
+    assert LidarIntrinsics().sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
+    assert LidarIntrinsics().alpha_sigma == pytest.approx(tuning.ALPHA_SIGMA)
     units = ((0.0, 0.0, 0.0), (0.5, -0.2, 0.0), (0.4, 0.8, 0.0))
     right, across, along = (learned(unit).sigmas for unit in units)
     assert right is not None
@@ -231,10 +231,12 @@ OUT_OF_STEP = 0.4  # [rad] the lines of one turn lie between those of the others
 IN_STEP = 3.0 * HEAD_RATE * 1.53e-5 * SLOTS  # [rad] they lie on them
 
 
-def rested(unit: Any, turns: int, trunks: Any, advance: float = OUT_OF_STEP) -> BeamAngles:
-    beams = BeamAngles()
-    beams.learn_at_rest([turn(unit, k, trunks=trunks, advance=advance)[0] for k in range(turns)])
-    return beams
+def rested(unit: Any, turns: int, trunks: Any, advance: float = OUT_OF_STEP) -> LidarIntrinsics:
+    intrinsics = LidarIntrinsics()
+    intrinsics.learn_at_rest(
+        [turn(unit, k, trunks=trunks, advance=advance)[0] for k in range(turns)]
+    )
+    return intrinsics
 
 
 @pytest.mark.parametrize(
@@ -242,7 +244,7 @@ def rested(unit: Any, turns: int, trunks: Any, advance: float = OUT_OF_STEP) -> 
 )
 def test_sweeps_at_rest_show_both_angles_together(unit: Any) -> None:
     """Single sweeps show only one direction of them in a room."""
-    np.testing.assert_allclose(np.degrees(rested(unit, 12, None).correction), unit, atol=0.06)
+    np.testing.assert_allclose(np.degrees(rested(unit, 12, None).angles), unit, atol=0.06)
 
 
 def test_sweeps_that_deviate_are_compared_at_once() -> None:
@@ -250,12 +252,12 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
     odometry.imu(resting())
     for k in range(4):
         odometry.register(turn(UNIT, k)[0])
-    assert odometry._beams._rested_ns == 0
+    assert odometry._intrinsics._rested_ns == 0
     assert odometry.motion is not None
     odometry._first_rest.map_with_known_beams(odometry.motion, doubted=False)
-    assert odometry._beams._rested_ns == 0
+    assert odometry._intrinsics._rested_ns == 0
     odometry._first_rest.map_with_known_beams(odometry.motion, doubted=True)
-    assert odometry._beams._rested_ns > 600_000_000
+    assert odometry._intrinsics._rested_ns > 600_000_000
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -264,10 +266,10 @@ def test_sweeps_at_rest_show_what_moves_the_halves_apart_even_among_trunks(
     unit: Any, seed: int
 ) -> None:
     """No cell there is flat: trunks are 12 to 30 cm thick."""
-    beams = rested(unit, 12, _some_trunks(seed))
-    assert beams.sigmas is not None
-    assert np.degrees(beams.sigmas[0]) < 0.08
-    apart = np.degrees(beams.correction) - unit
+    intrinsics = rested(unit, 12, _some_trunks(seed))
+    assert intrinsics.sigmas is not None
+    assert np.degrees(intrinsics.sigmas[0]) < 0.08
+    apart = np.degrees(intrinsics.angles) - unit
     assert apart @ (0.82, -0.57, 0.0) == pytest.approx(0.0, abs=0.17)
 
 
@@ -278,9 +280,9 @@ def test_what_sweeps_at_rest_show_is_as_uncertain_as_it_says() -> None:
         alpha = np.random.default_rng(number).normal(0.0, 0.2)
         unit = np.append(rng.normal(0.0, 0.4, 2), alpha)
         trunks = _some_trunks(number) if number % 2 else None
-        beams = rested(unit, int(rng.integers(6, 14)), trunks, float(rng.uniform(0.3, 0.5)))
-        error = beams._estimate - np.radians(unit)
-        nees.append(float(error @ beams._information @ error))
+        intrinsics = rested(unit, int(rng.integers(6, 14)), trunks, float(rng.uniform(0.3, 0.5)))
+        error = intrinsics._estimate - np.radians(unit)
+        nees.append(float(error @ intrinsics._information @ error))
     assert 0.1 < np.mean(nees) < 4.0  # three angles
     assert max(nees) < 16.3  # the bound of 99.9 %
 
@@ -297,12 +299,12 @@ def test_a_head_in_step_with_its_packets_tells_no_more_than_one_turn_does() -> N
 
 
 def test_sweeps_at_rest_are_compared_again_when_there_are_many_more() -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     turns = [turn(UNIT, k, trunks=_some_trunks(0), advance=OUT_OF_STEP)[0] for k in range(20)]
     compared = []
     for count in range(1, 21):
-        if beams.is_due_at_rest(turns[:count]):
-            beams.learn_at_rest(turns[:count])
+        if intrinsics.is_due_at_rest(turns[:count]):
+            intrinsics.learn_at_rest(turns[:count])
             compared.append(count)
     lasted = [(turns[count - 1].end - turns[0].start) for count in compared]
     assert tuning.BEAM_REST_NS <= lasted[0] < tuning.BEAM_REST_NS + 230_000_000
@@ -310,40 +312,40 @@ def test_sweeps_at_rest_are_compared_again_when_there_are_many_more() -> None:
     for before, after in itertools.pairwise(lasted):
         assert before * tuning.BEAM_REST_AGAIN <= after
         assert after < before * tuning.BEAM_REST_AGAIN + 230_000_000
-    beams.forget()
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
-    assert beams.sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
+    intrinsics.forget()
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
+    assert intrinsics.sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
 
 
 def test_of_other_sensors_nothing_is_learned_at_rest() -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     some = [Sweep(HostNs(k), HostNs(k + 1), _camera(k), 0, 0) for k in range(12)]
-    beams.learn_at_rest(some)
-    beams.learn_at_rest([dataclasses.replace(turn(UNIT, 0)[0], points=_camera(0)[:0])])
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
+    intrinsics.learn_at_rest(some)
+    intrinsics.learn_at_rest([dataclasses.replace(turn(UNIT, 0)[0], points=_camera(0)[:0])])
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
     far = [turn(UNIT, k, trunks=[[20.0, 0.0, 0.1]])[0] for k in range(6)]
-    beams.learn_at_rest(far)  # nothing that both halves see often enough
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
+    intrinsics.learn_at_rest(far)  # nothing that both halves see often enough
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("drift", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (-0.1, 0.1, 0.0)])
 def test_a_velocity_that_is_off_does_not_pass_for_beam_angles(drift: Any) -> None:
     """10 cm/s move the halves apart by 12 mm where they see the same surface half a turn later."""
     right = learned((0.0, 0.0, 0.0), at_rest=False, drift=drift)
-    np.testing.assert_array_equal(right.correction, (0.0, 0.0, 0.0))
-    assert learned((0.0, 0.0, 0.0), at_rest=True, drift=(0.0, 0.1, 0.0)).correction.any()
+    np.testing.assert_array_equal(right.angles, (0.0, 0.0, 0.0))
+    assert learned((0.0, 0.0, 0.0), at_rest=True, drift=(0.0, 0.1, 0.0)).angles.any()
 
 
 def test_no_unit_is_off_by_more_than_a_degree() -> None:
     off = np.array((1.3, -1.0, 0.0))
-    np.testing.assert_array_equal(learned(off).correction, (0.0, 0.0, 0.0))
-    assert learned(0.5 * off).correction.any()
+    np.testing.assert_array_equal(learned(off).angles, (0.0, 0.0, 0.0))
+    assert learned(0.5 * off).angles.any()
 
 
 def test_corrected_clouds_lie_on_the_walls() -> None:
-    beams = learned(UNIT)
+    intrinsics = learned(UNIT)
     sweep, _ = turn(UNIT, 30)
-    better = beams.corrected(sweep)
+    better = intrinsics.corrected(sweep)
     assert better is not sweep
 
     def off(cloud: Any) -> float:
@@ -382,49 +384,49 @@ def _camera(number: int) -> Any:
 
 @pytest.mark.parametrize("measure", [_spinning, _camera])
 def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     for number in range(30):
         sweep = Sweep(HostNs(number), HostNs(number + 1), measure(number), 0, 0)
-        assert beams.corrected(sweep) is sweep
-        beams.learn(sweep, sweep.points, at_rest=True)
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
-    assert beams.sigmas is None
+        assert intrinsics.corrected(sweep) is sweep
+        intrinsics.learn(sweep, sweep.points, at_rest=True)
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
+    assert intrinsics.sigmas is None
     # it has given up: an L2 later is not looked at
     sweep, _ = turn(UNIT, 0)
-    beams.corrected(sweep)
-    beams.learn(sweep, sweep.points, at_rest=True)
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
+    intrinsics.corrected(sweep)
+    intrinsics.learn(sweep, sweep.points, at_rest=True)
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
 
 
 def test_other_sweeps_may_be_corrected_without_being_learned() -> None:
-    beams, other = BeamAngles(), BeamAngles()
+    intrinsics, other = LidarIntrinsics(), LidarIntrinsics()
     for number in range(12):
         sweep, _ = turn(UNIT, number)
-        corrected = beams.corrected(sweep)
+        corrected = intrinsics.corrected(sweep)
         for _ in range(30):
-            beams.applied_to(turn(UNIT, 0)[0])
-        beams.learn(corrected, corrected.points, at_rest=True)
+            intrinsics.applied_to(turn(UNIT, 0)[0])
+        intrinsics.learn(corrected, corrected.points, at_rest=True)
         corrected = other.corrected(sweep)
         other.learn(corrected, corrected.points, at_rest=True)
-    np.testing.assert_array_equal(beams.correction, other.correction)
-    assert beams.sigmas == other.sigmas
-    assert beams.correction.any()
-    shown, again = beams.applied_to(sweep), beams.corrected(sweep)
+    np.testing.assert_array_equal(intrinsics.angles, other.angles)
+    assert intrinsics.sigmas == other.sigmas
+    assert intrinsics.angles.any()
+    shown, again = intrinsics.applied_to(sweep), intrinsics.corrected(sweep)
     np.testing.assert_array_equal(shown.points, again.points)
     assert (shown.points["x"] != sweep.points["x"]).any()
 
 
 def test_nonsense_does_no_harm() -> None:
-    beams = BeamAngles()
+    intrinsics = LidarIntrinsics()
     sweep, _ = turn(UNIT, 0)
     for points in (sweep.points[:0], sweep.points[:100], sweep.points[::-1].copy()):
         odd = dataclasses.replace(sweep, points=points)
-        assert beams.corrected(odd) is odd
-        beams.learn(odd, points, at_rest=False)
-    kept = beams.corrected(sweep)
-    beams.learn(kept, kept.points[:-1], at_rest=True)  # not the same points
-    beams.learn(turn(UNIT, 1)[0], kept.points, at_rest=True)  # not the latest sweep
-    np.testing.assert_array_equal(beams.correction, (0.0, 0.0, 0.0))
+        assert intrinsics.corrected(odd) is odd
+        intrinsics.learn(odd, points, at_rest=False)
+    kept = intrinsics.corrected(sweep)
+    intrinsics.learn(kept, kept.points[:-1], at_rest=True)  # not the same points
+    intrinsics.learn(turn(UNIT, 1)[0], kept.points, at_rest=True)  # not the latest sweep
+    np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
 
 
 def _captured(number: int, first: int) -> Sweep:
@@ -444,11 +446,11 @@ def _captured(number: int, first: int) -> Sweep:
 @pytest.mark.skipif(not REAL.exists(), reason="the recordings are not here")
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_halves_of_a_real_unit_come_together_within_a_second(number: int) -> None:
-    beams, gaps = BeamAngles(), []
+    intrinsics, gaps = LidarIntrinsics(), []
     for first in range(0, 500, 50):
         sweep = _captured(number, first)
-        better = beams.corrected(sweep)
-        beams.learn(better, better.points, at_rest=True)
+        better = intrinsics.corrected(sweep)
+        intrinsics.learn(better, better.points, at_rest=True)
         sides = halves(sweep.points)
         assert sides is not None
         found = [between_halves(one.points, one.points, sides.sign) for one in (sweep, better)]
@@ -463,9 +465,9 @@ def test_two_captures_of_a_real_unit_agree_but_for_where_the_mirror_begins() -> 
     """`l2lidar calibrate still` finds 0.36 and 0.39 degrees, and alpha 0.27 degrees apart."""
     found = []
     for number in (1, 2):
-        beams = BeamAngles()
-        beams.learn_at_rest([_captured(number, first) for first in range(0, 1000, 50)])
-        found.append(np.degrees(beams._estimate))
+        intrinsics = LidarIntrinsics()
+        intrinsics.learn_at_rest([_captured(number, first) for first in range(0, 1000, 50)])
+        found.append(np.degrees(intrinsics._estimate))
     apart = np.array(found) @ (1.0, -0.7, 0.0)
     assert apart == pytest.approx([0.375, 0.375], abs=0.03)
     assert abs(found[0][2] - found[1][2]) == pytest.approx(0.23, abs=0.05)

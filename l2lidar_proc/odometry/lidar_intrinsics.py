@@ -1,4 +1,4 @@
-"""Beam angles of an L2, estimated from its clouds while the odometry runs.
+"""Online intrinsic calibration of an L2: what its clouds show of its own errors.
 
 The fan of the head points both ways: within one turn it sees every surface twice, with the half
 that rises and with the half that falls. Units are off from their own calibration block by up to
@@ -6,7 +6,8 @@ that rises and with the half that falls. Units are off from their own calibratio
 Registration then follows the pattern of the lines instead of the walls: a sensor at rest seems to
 turn by half a degree in a second. ``l2lidar calibrate still`` measures the angles once and for
 all; here they are estimated without it, from the gaps between the halves of each sweep
-(:mod:`l2lidar_proc.odometry.fan_halves`). Clouds of other sensors are left as they are.
+(:mod:`l2lidar_proc.odometry.fan_halves`). How far all ranges are off is estimated beside them
+(:mod:`l2lidar_proc.odometry.range_bias`). Clouds of other sensors are left as they are.
 """
 
 from __future__ import annotations
@@ -38,21 +39,21 @@ _PRIOR: Final = np.diag(
 )
 
 
-class BeamAngles:
-    """The estimate of xi, beta and alpha of one unit, and the correction of its clouds.
+class LidarIntrinsics:
+    """The estimate of beam angles and range bias of one unit, and the correction of its clouds.
 
     Attributes
     ----------
-    correction : ndarray, shape (3,)
+    angles : ndarray, shape (3,)
         Added to ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad]; 0 along directions
         that are not known.
     ranges : RangeBias
-        Corrected along with them.
+        Estimated beside them.
     """
 
     def __init__(self) -> None:
         self.ranges = RangeBias()
-        self.correction: F64
+        self.angles: F64
         self._information: F64
         self._weighted: F64  # information by estimate
         self.forget()
@@ -66,8 +67,8 @@ class BeamAngles:
         self._latest: tuple[Sweep, F64, F64, float] | None = None
 
     @property
-    def _is_other(self) -> bool:
-        """Whether this is taken for another sensor, and looked at no more."""
+    def is_other(self) -> bool:
+        """Whether the clouds are taken for those of another sensor, and looked at no more."""
         return not self._is_shown and self._misses >= _GIVE_UP
 
     def head(self, sweep: Sweep) -> HeadAngle | None:
@@ -76,7 +77,7 @@ class BeamAngles:
         return None if found is None else HeadAngle(sweep.start, found.angle, found.rate)
 
     def _halves_of(self, sweep: Sweep) -> Halves | None:
-        if self._is_other:
+        if self.is_other:
             return None
         if self._seen is None or self._seen[0] is not sweep:
             found = halves(sweep.points, self._rate)
@@ -102,7 +103,7 @@ class BeamAngles:
         corrected = self.applied_to(sweep)
         found = self._halves_of(sweep) if self._teaches() else None
         if found is not None:
-            self._latest = corrected, found.sign, self.correction, self.ranges.correction
+            self._latest = corrected, found.sign, self.angles, self.ranges.correction
         return corrected
 
     def applied_to(self, sweep: Sweep) -> Sweep:
@@ -113,13 +114,13 @@ class BeamAngles:
         sweep : Sweep
             As for :meth:`corrected`.
         """
-        is_corrected = self.correction.any() or self.ranges.correction
+        is_corrected = self.angles.any() or self.ranges.correction
         found = self._halves_of(sweep) if is_corrected else None
         if found is None:
             return sweep
         points = sweep.points.copy()
         for name, line in zip("xyz", angle_derivatives(points, found.sign), strict=True):
-            points[name] += self.correction @ line
+            points[name] += self.angles @ line
         self.ranges.applied_to(points)
         return dataclasses.replace(sweep, points=points)
 
@@ -162,7 +163,7 @@ class BeamAngles:
             gradient -= weighted.T @ gaps.motion @ shared[:, 3]
         self._information = self._information + information
         self._weighted = self._weighted + gradient
-        self.correction = self._known()
+        self.angles = self._known()
 
     def is_due_at_rest(self, sweeps: list[Sweep]) -> bool:
         """Return whether a rest has lasted long enough to :meth:`learn_at_rest`, again perhaps."""
@@ -178,7 +179,7 @@ class BeamAngles:
             As the unit reports them, from one place, oldest first.
         """
         self._rested_ns = sweeps[-1].end - sweeps[0].start
-        if self._is_other:
+        if self.is_other:
             return
         shown = [(one.points, halves(one.points, self._rate)) for one in sweeps]
         whole = [(points, found.sign) for points, found in shown if found is not None]
@@ -189,7 +190,7 @@ class BeamAngles:
         if found is not None:
             angles, self._information = found
             self._weighted = self._information @ angles
-            self.correction = self._known()
+            self.angles = self._known()
         self.ranges.forget()
         step = -(-len(sweeps) // tuning.RANGE_BIAS_SWEEPS)
         self.ranges.learn(*(self.applied_to(one).points for one in sweeps[::step]))
@@ -197,7 +198,7 @@ class BeamAngles:
     def forget(self) -> None:
         """Forget what was learned, as after a rest that was none."""
         self.ranges.forget()
-        self.correction = np.zeros(3)
+        self.angles = np.zeros(3)
         self._information, self._weighted = _PRIOR, np.zeros(3)
 
     @property
@@ -207,7 +208,7 @@ class BeamAngles:
         Along the direction that is known best, and the other. What the estimate says but is not
         sure enough of to correct it counts as well. None for clouds without the pattern of an L2.
         """
-        if self._is_other:
+        if self.is_other:
             return None
         best, worst = np.sqrt(np.linalg.eigvalsh(self._errors[:2, :2])).tolist()
         return best, worst
@@ -215,17 +216,17 @@ class BeamAngles:
     @property
     def alpha_sigma(self) -> float:
         """What alpha of corrected clouds may be wrong by, 1 sigma [rad]; 0 as ``sigmas`` None."""
-        return 0.0 if self._is_other else float(np.sqrt(self._errors[2, 2]))
+        return 0.0 if self.is_other else float(np.sqrt(self._errors[2, 2]))
 
     @property
     def range_sigma(self) -> float:
         """What corrected ranges may be wrong by, 1 sigma [m]; 0 as ``sigmas`` None."""
-        return 0.0 if self._is_other else self.ranges.sigma
+        return 0.0 if self.is_other else self.ranges.sigma
 
     @property
     def _errors(self) -> F64:
         """Return the squared errors (3, 3) of the angles of corrected clouds [rad^2]."""
-        left = self._estimate - self.correction
+        left = self._estimate - self.angles
         return np.asarray(np.linalg.inv(self._information) + np.outer(left, left))
 
     def _teaches(self) -> bool:
