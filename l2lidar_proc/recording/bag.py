@@ -6,6 +6,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
 
 from l2lidar_node import clouds
 from l2lidar_node.recording.bag import (
@@ -61,6 +63,14 @@ def chosen(kinds: dict[str, str], wanted: str, kind: str | tuple[str, ...], para
         )
     others = ", ".join(f"{topic} ({its})" for topic, its in sorted(kinds.items())) or "none"
     raise RecordingError(f"{problem}none; topics with messages: {others}")
+
+
+def message_of(reader: AnyReader, connection: Connection, data: bytes) -> Any:
+    """Return a message, None if it is damaged."""
+    try:
+        return reader.deserialize(data, connection.msgtype)
+    except Exception:  # whatever bytes that are not this message lead to
+        return None
 
 
 def stamp_of(message: Any) -> HostNs:

@@ -19,7 +19,7 @@ from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.fan_halves import between_halves, halves
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.odometry import Odometry, Phase
-from l2lidar_proc.verbs.odometry import run_events
+from l2lidar_proc.verbs.recorded import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
 from tests.support.odometry_runs import record, sweeps
 

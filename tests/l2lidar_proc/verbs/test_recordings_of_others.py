@@ -11,7 +11,7 @@ import pytest
 
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
-from l2lidar_proc.verbs.odometry import OdometryRun, run_bag
+from l2lidar_proc.verbs.recorded import OdometryRun, run_bag
 from tests.support.foreign_bags import (
     EPOCH,
     FORMATS,

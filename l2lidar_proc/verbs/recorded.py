@@ -1,0 +1,539 @@
+"""Odometry of recordings: of bags of any maker, and of captures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+
+from l2lidar_node.config import DriverConfig
+from l2lidar_node.frames import FrameTree
+from l2lidar_node.recording.packet_bag import open_packets
+from l2lidar_node.recording.recording import Recording, measurements
+from l2lidar_node.settings import build
+from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
+from l2lidar_proc.cloud import CloudError, to_sweep
+from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
+from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
+from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate, Status
+from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.pipeline import OdometryPipeline
+from l2lidar_proc.recording import bag
+from l2lidar_proc.recording.outputs import StampedPoses
+
+_END_NS: Final = 2**62
+_LOOK_AHEAD_NS: Final = 2_000_000_000
+_UPRIGHT: Final = 0.5  # cosine of the angle between the clouds' z and up
+_SAME_CLOCK_S: Final = 1.0  # apart at most; buffers and networks delay messages by less
+_ENOUGH_SAMPLES: Final = 10  # no gyro gives 0.0 about all axes in so many
+_SIGN_S: Final = 20.0  # of a recording in which the accelerometer's sign is looked for
+_CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
+
+Progress = Callable[[float], None]
+"""Told the share of the recording that is done, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryRun:
+    """Result of the odometry of a recording.
+
+    Attributes
+    ----------
+    poses : ndarray of STAMPED_POSE, shape (N,)
+        Of the base frame in the odometry frame.
+    map_points : ndarray, shape (N, 3)
+        Local map at the end [m], odometry frame.
+    sweeps : int
+    counts : Counter of Status
+        Sweeps by what was remarkable about them.
+    refused : Counter of str
+        Clouds that could not be used, by reason.
+    notes : tuple of str
+        What was recognized about the recording.
+    """
+
+    poses: StampedPoses
+    map_points: NDArray[np.float64]
+    sweeps: int
+    counts: Counter[Status]
+    refused: Counter[str]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def report(self) -> list[str]:
+        """Lines of a report for people."""
+        return [
+            f"{len(self.poses)} poses from {self.sweeps} sweeps",
+            *self.notes,
+            *(f"{count} sweeps: {status.value}" for status, count in self.counts.items()),
+            *(f"{count} clouds not used: {reason}" for reason, count in self.refused.items()),
+        ]
+
+
+Observer = Callable[[OdometryEstimate, BaseFrame], None]
+"""Given every estimate, and the frame that is meant by its pose."""
+
+Event = tuple[int, Sweep | NDArray[np.void]]
+"""Instant of arrival [ns], and a sweep or IMU samples."""
+
+
+class OdometryRunner:
+    """Feeds a pipeline with the sweeps and samples of any recording.
+
+    Parameters
+    ----------
+    config : OdometryNodeConfig
+    observer : callable, optional
+        Given the estimates one by one.
+    opposite : bool
+        Whether the accelerometer is known to point the other way.
+    accelerometer : bool
+        False: the accelerometer is watched, for its sign, but not used.
+
+    Attributes
+    ----------
+    pipeline : OdometryPipeline
+    base : BaseFrame
+    refused : Counter of str
+        Clouds that could not be used, by reason.
+    notes : list of str
+        What was recognized about the recording.
+    """
+
+    def __init__(
+        self,
+        config: OdometryNodeConfig,
+        observer: Observer | None = None,
+        *,
+        opposite: bool = False,
+        accelerometer: bool = True,
+    ) -> None:
+        self._observer = observer
+        topics = config.topics
+        self.pipeline = OdometryPipeline(
+            config.odometry,
+            topics.T_cloud_imu,
+            topics.imu_wait_ms,
+            ImuExtrinsics.of(topics),
+            accelerometer=accelerometer,
+        )
+        self.pipeline.convention.reversed = opposite
+        problem = self.pipeline.extrinsics.problem
+        self.notes: list[str] = [problem] if problem else []
+        self.base = BaseFrame(np.eye(4))
+        self.refused: Counter[str] = Counter()
+        self._beams = 0.0, 0.0, 0.0  # correction of xi, beta and alpha [rad]
+        self._ranges = 0.0  # correction of the ranges [m]
+
+    def take(self, event: Event) -> None:
+        """Take a sweep or samples."""
+        now, what = event
+        if isinstance(what, Sweep):
+            self.pipeline.sweep(what, now)
+        else:
+            self.pipeline.imu(what)
+        self._poll(now)
+
+    def _poll(self, now: int) -> None:
+        for estimate in self.pipeline.poll(now):
+            self._beams = estimate.quality.beam_correction
+            self._ranges = estimate.quality.range_correction
+            if self._observer is not None:
+                self._observer(estimate, self.base)
+
+    def finish(self) -> OdometryRun:
+        """Return the result."""
+        self._poll(_END_NS)
+        found = self.pipeline.trajectory.poses
+        poses = self.base.poses(found)
+        points = self.pipeline.odometry.map_points()
+        if len(found):
+            turn = self.base.odom_from_map(found["pose"][0])
+            points = points @ turn[:3, :3].T + turn[:3, 3]
+        return OdometryRun(
+            poses,
+            points,
+            self.pipeline.sweeps,
+            self.pipeline.counts,
+            self.refused,
+            (*self.notes, *self.pipeline.convention.notes, *self._finding()),
+        )
+
+    def _finding(self) -> list[str]:
+        """Return what is wrong with IMU, beams and ranges, and what to do."""
+        finding = self.pipeline.check.finding
+        found = [f"{finding}: l2lidar calibrate imu measures it"] if finding else []
+        if any(self._beams):
+            xi, beta, alpha = np.degrees(self._beams)
+            found.append(
+                f"the unit's beams were corrected by {xi:+.2f} degrees (xi), {beta:+.2f} degrees "
+                f"(beta) and {alpha:+.2f} degrees (alpha), estimated from the clouds: l2lidar "
+                "calibrate still measures them"
+            )
+        if self._ranges:
+            found.append(
+                f"the unit's ranges were corrected by {1e3 * self._ranges:+.0f} mm, estimated "
+                "from walls in the clouds: l2lidar calibrate still measures that as well"
+            )
+        return found
+
+
+def run_events(
+    events: Iterator[Event], config: OdometryNodeConfig, observer: Observer | None = None
+) -> OdometryRun:
+    """Return the odometry of sweeps and samples in arrival order."""
+    runner = OdometryRunner(config, observer)
+    for event in events:
+        runner.take(event)
+    return runner.finish()
+
+
+def run_capture(
+    source: Path,
+    config: OdometryNodeConfig,
+    progress: Progress = lambda share: None,
+    l2_ip: str = "",
+    observer: Observer | None = None,
+) -> OdometryRun:
+    """Return the odometry of a capture, cut into sweeps of a full turn.
+
+    Parameters
+    ----------
+    source : Path
+        pcap or pcapng file, or a bag of raw packets.
+    config : OdometryNodeConfig
+    progress : callable
+        Told how far it is.
+    l2_ip : str
+        Whose packets; empty if the capture holds those of one unit.
+    observer : callable, optional
+        Given the estimates one by one.
+
+    Raises
+    ------
+    CaptureError
+        If the capture cannot be read.
+    """
+    size = max(sum(file.stat().st_size for file in (source, *source.rglob("*"))), 1)
+    with open_packets(source) as stream:
+        recording = Recording(stream, l2_ip, is_selected=True)
+
+        def taken() -> Iterator[Event]:
+            for now, event in measurements(recording, build(DriverConfig, _CAPTURE)):
+                if isinstance(event, Sweep):
+                    progress(min(recording.position / size, 1.0))
+                    yield now, event
+                else:
+                    yield now, np.array([tuple(event)], IMU_SAMPLE)
+
+        return run_events(taken(), config, observer)
+
+
+def run_bag(
+    source: Path,
+    config: OdometryNodeConfig,
+    progress: Progress = lambda share: None,
+    observer: Observer | None = None,
+) -> OdometryRun:
+    """Return the odometry of a bag.
+
+    Parameters
+    ----------
+    source : Path
+        Rosbag2 folder or MCAP file.
+    config : OdometryNodeConfig
+        As for the node. A topic that is not in the bag is replaced by the only one of its kind;
+        of several IMUs the only one in the namespace of the clouds is taken. Without any IMU the
+        odometry runs on clouds alone. Livox's own messages are clouds as well.
+    progress : callable
+        Told how far it is.
+    observer : callable, optional
+        Given the estimates one by one.
+
+    Raises
+    ------
+    RecordingError
+        If the bag cannot be read, or which topic to use is not plain.
+    """
+    with bag.opened(source) as reader:
+        kinds = bag.kinds_of(reader)
+        cloud = bag.chosen(kinds, config.topics.cloud_topic, bag.CLOUDS, "cloud_topic")
+        imu = ""
+        if config.odometry.mode == "inertial":
+            imu = _imu_topic(kinds, config.topics.imu_topic, cloud)
+
+        def listener(runner: OdometryRunner) -> _Listener:
+            made = _Listener(runner, config, cloud, imu)
+            made.look_ahead(reader)
+            return made
+
+        final = listener(OdometryRunner(config, observer))
+        opposite = final.may_be_opposite and not _heard(
+            reader, listener(OdometryRunner(config, accelerometer=False)), until_s=_SIGN_S
+        )
+        if opposite:
+            final = listener(OdometryRunner(config, observer, opposite=True))
+        # an observer cannot be told the same twice: for it a new map begins in between
+        if not _heard(reader, final, progress, stops=observer is None):
+            # what it took for up is down: from the beginning
+            final = listener(OdometryRunner(config, opposite=True))
+            _heard(reader, final, progress)
+        return final.finish()
+
+
+def _heard(
+    reader: AnyReader,
+    listener: _Listener,
+    progress: Progress = lambda share: None,
+    until_s: float = np.inf,
+    *,
+    stops: bool = True,
+) -> bool:
+    """Pass a bag's messages on; return False if the accelerometer's sign was found wrong.
+
+    Then it stops at once, if it ``stops`` at all; else it goes on with a new map.
+    """
+    span = max(reader.end_time - reader.start_time, 1)
+    convention = listener.runner.pipeline.convention
+    known = convention.reversed
+    for connection, now, data in bag.messages(reader):
+        if now > reader.start_time + until_s * 1e9:
+            break
+        if connection.msgtype in bag.LIVOX and connection.topic == listener.cloud:
+            listener.livox(data, now, cdr=reader.is2)
+        elif (
+            connection.topic in (listener.cloud, listener.imu)
+            or connection.msgtype == bag.TRANSFORMS
+        ):
+            message = listener.read(reader, connection, data)
+            if message is not None:
+                listener.take(connection.topic, message, now)
+        else:
+            continue
+        if stops and convention.reversed and not known:
+            return False
+        progress(min(max((now - reader.start_time) / span, 0.0), 1.0))
+    return True
+
+
+def _imu_topic(kinds: dict[str, str], wanted: str, cloud: str) -> str:
+    """Return the topic of the IMU that belongs to the clouds, empty where there is no IMU."""
+    found = [topic for topic, its in kinds.items() if its == bag.IMU]
+    if not found:
+        return ""
+    beside = [topic for topic in found if topic.rpartition("/")[0] == cloud.rpartition("/")[0]]
+    if wanted not in found and len(beside) == 1:
+        return beside[0]
+    return bag.chosen(kinds, wanted, bag.IMU, "imu_topic")
+
+
+class _Listener:
+    """Converts messages to events, and reads the mounts from /tf_static.
+
+    Parameters
+    ----------
+    runner : OdometryRunner
+    config : OdometryNodeConfig
+    cloud, imu : str
+        Topics; ``imu`` is empty where there is none.
+    """
+
+    def __init__(
+        self, runner: OdometryRunner, config: OdometryNodeConfig, cloud: str, imu: str
+    ) -> None:
+        self.runner = runner
+        self.cloud = cloud
+        self.imu = imu
+        self._config = config
+        self._frames = FrameTree()
+        self._cloud_frame = ""
+        self._imu_frame = ""
+        self._is_mounted = False
+        self._force = np.zeros(3)
+        self._samples = 0  # of those looked at in advance
+        self._turns = False  # whether one of them has a rate
+        self._mute = ""  # topic of an IMU without rates
+        self._snapshots = 0
+        self._delays: dict[str, int] = {}  # smallest, from stamp to recording [ns], by topic
+        self._damaged: Counter[str] = Counter()  # messages, by topic
+
+    def look_ahead(self, reader: AnyReader) -> None:
+        """Learn frames and mounts from the first seconds: a later mount begins a new map."""
+        for connection, now, data in bag.messages(reader):
+            if now > reader.start_time + _LOOK_AHEAD_NS:
+                break
+            if connection.topic == self.cloud and connection.msgtype in bag.LIVOX:
+                with suppress(ValueError):
+                    self._cloud_frame = bag.livox_points(data, cdr=reader.is2)[0]
+            elif connection.topic in (self.cloud, self.imu):
+                message = bag.message_of(reader, connection, data)
+                if message is None:
+                    continue
+                if connection.topic == self.cloud:
+                    self._cloud_frame = message.header.frame_id
+                else:
+                    self._imu_frame = message.header.frame_id
+                    sample = bag.sample_of(message)
+                    self._samples += 1
+                    self._turns |= bool(sample["angular_velocity"].any())
+                    force = sample["linear_acceleration"][0]
+                    if np.isfinite(force).all():
+                        self._force = self._force + force
+            elif self._tells_mounts(connection.topic, connection.msgtype):
+                message = bag.message_of(reader, connection, data)
+                if message is not None:
+                    self._frames.take(message)
+            if self._cloud_frame and self._imu_frame and not self._is_mounted:
+                self._mount(self._imu_frame)
+        if self._samples >= _ENOUGH_SAMPLES and not self._turns:
+            self.imu, self._mute = "", self.imu
+
+    @property
+    def may_be_opposite(self) -> bool:
+        """Whether the clouds' z does not point up, if the accelerometer is to be believed.
+
+        Sensors are seldom mounted like that: then their motion has to tell whether it is so.
+        """
+        odometry = self.runner.pipeline.odometry
+        if not isinstance(odometry, Odometry) or not self._force.any():
+            return False
+        up = odometry.T_cloud_imu[:3, :3] @ self._force / np.linalg.norm(self._force)
+        return bool(up[2] < _UPRIGHT)
+
+    def read(self, reader: AnyReader, connection: Connection, data: bytes) -> Any:
+        """Return a message, None if it is damaged; then it is counted."""
+        message = bag.message_of(reader, connection, data)
+        if message is None:
+            self._damaged[connection.topic] += 1
+        return message
+
+    def take(self, topic: str, message: Any, now: int) -> None:
+        if topic == self.cloud:
+            self._sweep(
+                message.header.frame_id, bag.stamp_of(message), now, lambda: bag.points_of(message)
+            )
+        elif topic == self.imu:
+            self._mount(message.header.frame_id)
+            samples = bag.sample_of(message)
+            self._note_delay(topic, now - int(samples["stamp"][0]))
+            self.runner.take((now, samples))
+        elif self._tells_mounts(topic, bag.TRANSFORMS):
+            self.runner.refused.update(self._frames.take(message))
+
+    def livox(self, data: bytes, now: int, *, cdr: bool) -> None:
+        """Take one of Livox's own messages."""
+        try:
+            frame, stamp, points = bag.livox_points(data, cdr=cdr)
+        except ValueError as error:
+            self.runner.refused[str(error)] += 1
+            return
+        self._sweep(frame, stamp, now, lambda: points)
+
+    def finish(self) -> OdometryRun:
+        """Return the result and the remarks on the recording."""
+        notes = self.runner.notes
+        if self._config.odometry.mode == "inertial":
+            if self._mute:
+                notes.append(
+                    f"the IMU on '{self._mute}' measures no angular velocity (all of it is 0): it "
+                    "is not used, and the motion comes from the clouds alone"
+                )
+            elif not self.imu:
+                notes.append("no IMU in the recording: the motion comes from the clouds alone")
+            elif self._imu_frame and self._imu_frame == self._cloud_frame:
+                place = "its origin" if self._is_mounted else "imu_xyz"
+                notes.append(
+                    f"IMU and clouds have the same frame '{self._imu_frame}': the IMU is taken to "
+                    f"be at {place}"
+                )
+            elif self._imu_frame and self._cloud_frame and not self._is_mounted:
+                notes.append(
+                    f"no transform from '{self._imu_frame}' to '{self._cloud_frame}' in "
+                    "/tf_static: the position of the IMU is imu_xyz, and its axes are those of "
+                    "the clouds; if they are not, set imu_rpy in a parameter file (--params-file)"
+                )
+            if problem := self._two_clocks():
+                notes.append(problem)
+        if self._snapshots:
+            notes.append(
+                f"{self._snapshots} clouds without a time per point: each is taken as "
+                "measured at its stamp"
+            )
+        notes += [
+            f"{count} damaged messages on '{topic}' were left out"
+            for topic, count in self._damaged.items()
+        ]
+        return self.runner.finish()
+
+    def _note_delay(self, topic: str, delay: int) -> None:
+        self._delays[topic] = min(delay, self._delays.get(topic, delay))
+
+    def _two_clocks(self) -> str:
+        """Return that the stamps of clouds and IMU are of two clocks; empty if they are not."""
+        if len(self._delays) < 2:
+            return ""
+        apart_s = (self._delays[self.cloud] - self._delays[self.imu]) / 1e9
+        if abs(apart_s) < _SAME_CLOCK_S:
+            return ""
+        pipeline = self.runner.pipeline
+        are_unused = 2 * pipeline.counts[Status.NO_IMU] > pipeline.sweeps
+        outcome = (
+            "no sample belongs to a cloud, and the motion comes from the clouds alone"
+            if are_unused
+            else "unless they were recorded so late, the samples are those of other instants, and "
+            "the trajectory is wrong"
+        )
+        return (
+            f"the stamps of '{self.imu}' are {abs(apart_s):.1f} s "
+            f"{'ahead of' if apart_s > 0.0 else 'behind'} those of '{self.cloud}', compared with "
+            f"the times of recording: {outcome}; record both with the stamps of one clock (the "
+            "host's, or PTP)"
+        )
+
+    def _tells_mounts(self, topic: str, msgtype: str) -> bool:
+        is_static = msgtype == bag.TRANSFORMS and topic.endswith("tf_static")
+        return is_static and self._config.topics.use_tf
+
+    def _sweep(
+        self, frame: str, stamp: HostNs, now: int, points: Callable[[], NDArray[np.void]]
+    ) -> None:
+        self._cloud_frame = frame
+        base = self._config.topics.base_frame
+        if base:
+            T_cloud_base = self._frames.find(self._cloud_frame, base)
+            known = self.runner.base.T_lidar_base
+            if T_cloud_base is not None and not np.allclose(T_cloud_base, known):
+                self.runner.base = BaseFrame(T_cloud_base)
+        try:
+            unit = self._config.topics.time_unit
+            sweep = to_sweep(points(), stamp, unit, snapshots=True)
+        except (CloudError, ValueError) as error:
+            self.runner.refused[str(error)] += 1
+            return
+        self._snapshots += sweep.start == sweep.end
+        self._note_delay(self.cloud, now - sweep.end)
+        self.runner.take((now, sweep))
+
+    def _mount(self, imu_frame: str) -> None:
+        self._imu_frame = imu_frame
+        odometry = self.runner.pipeline.odometry
+        if not self._cloud_frame or not isinstance(odometry, Odometry):
+            return
+        T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
+        if imu_frame == self._cloud_frame:
+            # a place that was set by hand counts more than a frame's name
+            is_set = self._config.topics.imu_xyz != OdometryTopics().imu_xyz
+            T_cloud_imu = None if is_set else np.eye(4)
+        if T_cloud_imu is None:
+            return
+        self._is_mounted = True
+        if not self.runner.pipeline.is_mounted(T_cloud_imu):
+            self.runner.pipeline.mount(T_cloud_imu)
