@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -42,12 +43,45 @@ class Topics:
     velocity: str
 
 
+@dataclass(frozen=True, slots=True)
+class DeskewRun:
+    """Result of the deskewing of a recording.
+
+    Attributes
+    ----------
+    counts : PipelineCounts
+    refused : Counter of str
+        Clouds that could not be deskewed, by reason.
+    damaged : Counter of str
+        Messages that could not be read, by topic.
+    """
+
+    counts: PipelineCounts
+    refused: Counter[str]
+    damaged: Counter[str]
+
+    @property
+    def report(self) -> list[str]:
+        """Lines of a report for people."""
+        counts = self.counts
+        return [
+            f"{counts.sweeps} clouds: {counts.deskewed} deskewed, {counts.still} at rest, "
+            f"{counts.passed_on} passed on because IMU samples are missing",
+            *(f"{count} not deskewed: {reason}" for reason, count in self.refused.items()),
+            *(
+                f"{count} damaged messages on '{topic}' were not used"
+                for topic, count in self.damaged.items()
+            ),
+        ]
+
+
 class _Deskewer:
     """Feeds the pipeline with the messages of a recording and writes its output."""
 
     def __init__(self, config: DeskewNodeConfig, topics: Topics, writer: bag.BagFile) -> None:
         self.pipeline = Pipeline(config.proc)
-        self.refused: dict[str, int] = {}
+        self.refused: Counter[str] = Counter()
+        self.damaged: Counter[str] = Counter()  # messages, by topic
         self._unit = config.proc.deskew.time_unit
         self._uses_tf = config.topics.use_tf
         # A bag names topics in full; relative to the node they are below the root here.
@@ -128,7 +162,7 @@ class _Deskewer:
             self.pipeline.sweep(sweep, now)
 
     def _refuse(self, reason: str) -> None:
-        self.refused[reason] = self.refused.get(reason, 0) + 1
+        self.refused[reason] += 1
 
     def _velocity(self, message: Any) -> None:
         twist = bag.twist_of(message)
@@ -142,9 +176,7 @@ class _Deskewer:
             )
 
 
-def deskew_recording(
-    source: Path, target: Path, config: DeskewNodeConfig
-) -> tuple[PipelineCounts, dict[str, int]]:
+def deskew_recording(source: Path, target: Path, config: DeskewNodeConfig) -> DeskewRun:
     """Deskew the clouds of a recording into another one.
 
     Parameters
@@ -157,9 +189,7 @@ def deskew_recording(
 
     Returns
     -------
-    PipelineCounts
-    dict of int
-        Clouds that could not be deskewed, by reason.
+    DeskewRun
 
     Raises
     ------
@@ -178,10 +208,13 @@ def deskew_recording(
                     if connection.topic in (topics.cloud, topics.imu, topics.velocity) or (
                         connection.msgtype == bag.TRANSFORMS
                     ):
-                        message = reader.deserialize(data, connection.msgtype)
+                        message = bag.message_of(reader, connection, data)
+                        if message is None:
+                            deskewer.damaged[connection.topic] += 1
+                            continue
                         deskewer.take(connection.topic, connection.msgtype, message, recorded_ns)
                 deskewer.finish(_END_NS)
-                return deskewer.pipeline.counts, deskewer.refused
+                return DeskewRun(deskewer.pipeline.counts, deskewer.refused, deskewer.damaged)
     except AnyReaderError as error:
         raise bag.unreadable(source, error) from None
 
@@ -229,16 +262,12 @@ def deskew(
         )
     try:
         config = settings_for(params_file, "deskew_node", DeskewNodeConfig)
-        counts, refused = deskew_recording(source, target, config)
+        run = deskew_recording(source, target, config)
     except OSError as error:
         raise CommandError(f"{error.filename or target}: {error.strerror}") from None
     except RecordingError as error:
         raise CommandError(str(error)) from None
     except ValueError as error:
         raise UsageError(str(error)) from None
-    typer.echo(
-        f"{target}: {counts.sweeps} clouds: {counts.deskewed} deskewed, {counts.still} at rest, "
-        f"{counts.passed_on} passed on because IMU samples are missing"
-    )
-    for reason, count in refused.items():
-        typer.echo(f"{count} not deskewed: {reason}")
+    for line in (f"{target}: {run.report[0]}", *run.report[1:]):
+        typer.echo(line)

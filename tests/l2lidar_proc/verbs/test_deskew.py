@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -111,9 +112,9 @@ def test_clouds_are_deskewed_and_the_rest_is_kept(
     recording: Path, tmp_path: Path, name: str
 ) -> None:
     target = tmp_path / name
-    counts, refused = deskew_recording(recording, target, DeskewNodeConfig())
-    assert (counts.sweeps, counts.deskewed) == (5, 5)
-    assert refused == {}
+    run = deskew_recording(recording, target, DeskewNodeConfig())
+    assert (run.counts.sweeps, run.counts.deskewed) == (5, 5)
+    assert len(run.report) == 1, "nothing was refused, nothing damaged"
     assert target.is_file() == name.endswith(".mcap")
     before, after = read(recording), read(target)
     for topic, messages in before.items():
@@ -139,6 +140,26 @@ def changed(recording: Path, path: Path, kind: str, change: Callable[[Any], None
                 raw = bytes(TYPES.serialize_cdr(message, kind))
             writer.copy(connection, recorded, raw)
     return path
+
+
+def test_damaged_messages_are_kept_but_not_used(recording: Path, tmp_path: Path) -> None:
+    source, target = tmp_path / "damaged", tmp_path / "out"
+    damaged = {bag.CLOUD: 2, bag.IMU: 20, bag.ODOMETRY: 3}  # which of its kind
+    with bag.open_bag(recording) as reader, bag.BagFile(source) as writer:
+        before = Counter[str]()
+        for connection, recorded, data in bag.messages(reader):
+            raw = bytes(data)
+            if damaged.get(connection.msgtype) == before[connection.msgtype]:
+                raw = b"\0\1\0\0damaged"
+            before[connection.msgtype] += 1
+            writer.copy(connection, recorded, raw)
+    run = deskew_recording(source, target, DeskewNodeConfig())
+    assert (run.counts.sweeps, run.counts.deskewed) == (4, 4)
+    assert run.damaged == {"/scan_points": 1, "/imu/data": 1, "/odometry": 1}
+    assert "1 damaged messages on '/imu/data' were not used" in run.report
+    with bag.open_bag(target) as reader:
+        kept = [bytes(data) for *_, data in bag.messages(reader)]
+    assert kept.count(b"\0\1\0\0damaged") == 3
 
 
 def test_an_accelerometer_in_g_gives_the_same_clouds(recording: Path, tmp_path: Path) -> None:
@@ -281,9 +302,9 @@ def test_clouds_without_plain_times_are_passed_on_without_them(
             if connection.msgtype != bag.CLOUD:
                 writer.copy(connection, recorded, data)
         writer.cloud("/points", at(3.5), points, at(3.3), "lidar")
-    counts, refused = deskew_recording(source, tmp_path / "x", build(DeskewNodeConfig, {}))
-    assert counts.sweeps == 0
-    assert refused == {"all 5 times are equal": 1}
+    run = deskew_recording(source, tmp_path / "x", build(DeskewNodeConfig, {}))
+    assert run.counts.sweeps == 0
+    assert run.refused == {"all 5 times are equal": 1}
     (cloud,) = read(tmp_path / "x")["/points_deskewed"]
     assert "time" not in [item.name for item in cloud.fields]
 
