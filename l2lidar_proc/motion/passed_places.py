@@ -1,6 +1,8 @@
 """Places that a state has passed: kept for a while, and moved along with what corrects the state.
 
-The difference of two of them then depends on the velocity, not on the place.
+The difference of two of them then depends on the velocity, not on the place. They are moved along
+the way only. Across it, each sweep has measured where it was, better than a velocity tells that is
+carried back over seconds.
 """
 
 from __future__ import annotations
@@ -39,10 +41,16 @@ class PassedPlaces:
     ----------
     layout : dtype
         With ``stamp`` [ns] and ``place`` [m], map frame, shape (3,).
+
+    Attributes
+    ----------
+    along : ndarray, shape (3,)
+        Unit vector of the way, map axes.
     """
 
     def __init__(self, layout: np.dtype[np.void]) -> None:
         self._kept: NDArray[np.void] = np.zeros(0, layout)
+        self.along: F64 = np.zeros(3)
 
     def __len__(self) -> int:
         """Return the number of places kept."""
@@ -61,4 +69,5 @@ class PassedPlaces:
             At the same instant, not before the places'.
         """
         if len(self._kept):
-            self._kept["place"] += correction_of_passed(before, after, self._kept["stamp"])
+            moves = correction_of_passed(before, after, self._kept["stamp"])
+            self._kept["place"] += np.outer(moves @ self.along, self.along)

@@ -144,6 +144,7 @@ class VerticalLines(PassedPlaces):
         axes : ndarray, shape (3, 3)
             As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
         """
+        self.along = axes[0]
         oldest = int(state.stamp) - tuning.LINE_KEPT_NS
         kept = np.flatnonzero(self._kept["stamp"] >= oldest)[-tuning.LINE_KEPT :]
         self._kept = records.joined((records.selected(self._kept, kept), found))

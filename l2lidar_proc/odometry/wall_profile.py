@@ -142,6 +142,7 @@ class WallProfile(PassedPlaces):
         axes : ndarray, shape (3, 3)
             As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
         """
+        self.along = axes[0]
         now = int(state.stamp)
         kept = np.flatnonzero(self._kept["stamp"] >= now - tuning.PROFILE_KEPT_NS)
         self._kept = records.joined((records.selected(self._kept, kept), found))
@@ -296,12 +297,15 @@ def _samples(spots: Spots, now: int, axes: F64) -> NDArray[np.void]:
     for side in (is_left, ~is_left):
         if side.sum() < tuning.PROFILE_SIDE:
             continue
-        bright = _without_trend(spots["brightness"][side], np.log(reach[side]))
-        samples["brightness"][side, 0] = bright
         # walls are straight or bend a little; errors of the beams depend on where they point
         behind = _without_trend(depth[side], samples["along"][side], sight[side, 0])
         samples["depth"][side, 0] = behind
-        is_wall[side] = _is_wall(behind, variance[side])
+        # what comes back depends on the range, and on the incidence: distance over range. The
+        # distance is that of the wall, or it would explain how bright a recessed door is
+        distance = np.maximum(np.abs(sight[side, 1]) - behind, tuning.PROFILE_BESIDE)
+        terms = np.log(reach[side]), np.log(distance)
+        samples["brightness"][side, 0] = _without_trend(spots["brightness"][side], *terms)
+        is_wall[side] = (behind < tuning.PROFILE_BEHIND) & _is_wall(behind, variance[side])
     return samples[is_wall]
 
 

@@ -74,11 +74,12 @@ def swept(
     error: float,
     *,
     bend: float = 0.0,
+    sway: float = 0.0,
     has_intensity: bool = True,
 ) -> Spots:
     """Return what a sweep sees of a corridor, where a sensor with a wrong velocity places it.
 
-    Upright lines at a random phase, seven rows of the wall each.
+    Upright lines at a random phase, seven rows of the wall each. The sensor sways by so much [m].
     """
     x, places = SPEED * seconds, []
     for side in (-1.0, 1.0):
@@ -103,15 +104,17 @@ def swept(
     found["stamp"] = state.stamp
     found["points"] = 8
     noise = 0.006 * rng.standard_normal(len(at))
-    lateral = side * (HALF_WIDTH + depth + noise)
+    beside = sway * np.sin(2.0 * np.pi * seconds / 2.5)
+    lateral = side * (HALF_WIDTH + depth + noise) - beside
     up = np.tile(0.15 + 0.3 * np.arange(7.0), len(places)) - 0.5
     sight = found["sight"]
     sight[:, 0], sight[:, 1], sight[:, 2] = at - x, lateral, up
-    found["place"] = sight + state.position
+    found["place"] = sight + state.position + (0.0, beside, 0.0)
     found["place"][:, 1] += bend * (at - 5.0) ** 2
     if has_intensity:
         reach = np.linalg.norm(sight, axis=1)
         found["brightness"] = brightness - 0.4 * np.log(reach)
+        found["brightness"] += 0.5 * np.log(np.abs(lateral) / HALF_WIDTH)  # the incidence
         found["brightness"] += 0.02 * rng.standard_normal(len(at))
     return found[np.linalg.norm(sight, axis=1) < tuning.PROFILE_RANGE]
 
@@ -122,6 +125,7 @@ def passed(
     error: float,
     *,
     bend: float = 0.0,
+    sway: float = 0.0,
     has_intensity: bool = True,
     seconds: float = 5.5,
 ) -> Spots:
@@ -129,7 +133,7 @@ def passed(
     rng = np.random.default_rng(seed)
     return np.concatenate(
         [
-            swept(rng, time, openings, error, bend=bend, has_intensity=has_intensity)
+            swept(rng, time, openings, error, bend=bend, sway=sway, has_intensity=has_intensity)
             for time in np.arange(0.0, seconds, SWEEP_S).tolist()
         ]
     )
@@ -553,16 +557,44 @@ def test_spots_are_compared_about_once_a_second(monkeypatch: pytest.MonkeyPatch)
     assert pauses.max() <= tuning.PROFILE_PAUSE_NS + SWEEP_S * 1e9 + 1
 
 
+def test_walls_do_not_change_with_the_incidence_of_a_sensor_that_sways() -> None:
+    """Bare walls tell no velocity then, and doors the same one as without."""
+    now, errors = int(state_at(2.2).stamp), np.linspace(-2.0, 2.0, 41)
+    for seed in range(4):
+        spots = passed(seed, (), 0.0, sway=0.25, seconds=2.2)
+        assert np.ptp(log_likelihood(spots, now, AXES, errors)) < 100.0
+        steady, swaying = (
+            log_likelihood(
+                passed(seed, DOORS, 0.1, sway=sway), int(state_at(5.5).stamp), AXES, ERRORS
+            )
+            for sway in (0.0, 0.25)
+        )
+        assert ERRORS[swaying.argmax()] == pytest.approx(ERRORS[steady.argmax()], abs=0.02)
+
+
+def test_what_is_seen_through_an_opening_is_no_part_of_the_wall() -> None:
+    """Of a doorway beside a sensor at rest, each view of the next room is another one."""
+    spots = passed(1, DOORS, 0.0)
+    now = int(state_at(5.5).stamp)
+    through = spots[::20].copy()
+    for name in ("place", "sight"):
+        through[name][:, 1] *= 4.0
+    both = wall_profile._samples(np.concatenate((spots, through)), now, AXES)
+    assert len(both) == len(wall_profile._samples(spots, now, AXES))
+    assert both["depth"][:, 0].max() < tuning.PROFILE_BEHIND
+
+
 def test_spots_follow_what_the_state_has_passed() -> None:
     """A correction of place and velocity moves spots as it does the places passed."""
     profile, state = WallProfile(), state_at(2.0)
     found = swept(np.random.default_rng(1), 1.0, DOORS, 0.0)
     profile.update(state, known(0.01), found.copy(), AXES)
     change = np.zeros(eskf.ERRORS)
-    change[eskf.POSITION], change[eskf.VELOCITY] = (0.5, 0.1, 0.0), (0.2, 0.0, 0.0)
+    change[eskf.POSITION], change[eskf.VELOCITY] = (0.5, 0.1, 0.0), (0.2, 0.3, 0.1)
     profile.correct(state, state.boxplus(change))
     moved: NDArray[np.float64] = profile._kept["place"] - found["place"]
-    assert moved == pytest.approx(np.broadcast_to([0.3, 0.1, 0.0], moved.shape))
+    # across the way the sweep has measured where it was
+    assert moved == pytest.approx(np.broadcast_to([0.3, 0.0, 0.0], moved.shape))
 
 
 def test_spots_are_forgotten() -> None:
