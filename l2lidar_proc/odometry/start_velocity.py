@@ -319,7 +319,8 @@ def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> Sw
     """Return a motion with gravity along the vertical of the place, the same if it is there.
 
     It leaves it where a young map confirms a velocity that grows: the acceleration passes for a
-    tilt. The place is then more certain than what has been learned about gravity.
+    tilt. The place is then more certain than what has been learned about gravity. And it was
+    never there where the carrier accelerated at the start.
 
     Parameters
     ----------
@@ -334,7 +335,8 @@ def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> Sw
     tilt = axes @ state.gravity
     noise = tuning.START_LEVEL_SIGMA**2 * np.eye(2)
     known = axes @ covariance[GRAVITY, GRAVITY] @ axes.T
-    if tilt @ np.linalg.solve(known + noise, tilt) < tuning.START_LEVEL_SIGMAS**2:
+    is_known = float(np.linalg.eigvalsh(known)[-1]) < tuning.START_LEVEL_KNOWN**2
+    if is_known and tilt @ np.linalg.solve(known + noise, tilt) < tuning.START_LEVEL_SIGMAS**2:
         return motion
     error = _accelerated(tilt @ axes, seconds)
     covariance = covariance + np.outer(error, error)

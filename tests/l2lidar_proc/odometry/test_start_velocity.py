@@ -103,6 +103,16 @@ def test_gravity_that_has_run_away_returns_to_the_vertical_of_the_place(degrees:
     assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
 
 
+def test_gravity_of_an_accelerated_start_is_put_to_the_vertical_of_the_place() -> None:
+    """A carrier that set off at 1.2 m/s^2, which is within what such a start leaves open."""
+    motion = tilted_motion(-7.0, 0.5, 2.2)
+    found = with_level_gravity(motion, UP, 2.2)
+    assert np.abs(found.state.gravity[:2]).max() < 0.1
+    error = found.state.velocity - SPEED
+    assert np.abs(error).max() < 0.5, "it was 2.6 m/s"
+    assert np.abs(error / np.sqrt(np.diag(found.covariance)[6:9])).max() < 2.0
+
+
 def test_gravity_within_its_sigma_is_left_alone() -> None:
     for degrees, sigma in ((0.5, 0.05), (-2.5, 0.2)):
         motion = tilted_motion(degrees, sigma)
