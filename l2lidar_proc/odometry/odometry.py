@@ -326,7 +326,7 @@ class Odometry:
             if start.is_first:
                 first = start.beginning(whole.with_state(better.state, better.covariance))
                 motions = self._initializer.begin_with(start.sweeps, start.since, *first)
-        elif start.is_first and not start.began_open:
+        elif start.is_first and not start.is_open:
             fitted = start.fitted(whole)
             if fitted is not None:
                 motions = self._initializer.begin_as_fitted(

@@ -117,8 +117,6 @@ class StartVelocity:
         Whether nothing has been searched so far.
     is_open : bool
         Whether the velocity was open at the start, and has not become known since.
-    began_open : bool
-        Whether it was open at the start.
     """
 
     def __init__(self, lever: F64) -> None:
@@ -133,7 +131,7 @@ class StartVelocity:
         self._next = self._last = 0
         self.since = HostNs(0)
         self.is_first = False
-        self.is_open = self.began_open = False
+        self.is_open = False
 
     @property
     def is_awaited(self) -> bool:
@@ -166,7 +164,7 @@ class StartVelocity:
         """
         self.clear()
         self.since, self.is_first = since, True
-        self.is_open = self.began_open = len(open_axes) > 0
+        self.is_open = len(open_axes) > 0
         # the first motion has the prior's covariance
         self._begun_with = motions[0].with_state(motions[0].state, motions[1].covariance)
         self._open_axes = open_axes
