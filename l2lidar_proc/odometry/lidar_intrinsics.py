@@ -29,9 +29,13 @@ from l2lidar_proc.odometry.fan_halves import (
     between_halves,
     halves,
 )
+from l2lidar_proc.odometry.map_initialization import joined
 from l2lidar_proc.odometry.range_bias import RangeBias
 
-_GIVE_UP: Final = 20  # sweeps in a row without the pattern: it is another sensor
+# A whole turn of a slow head shows the pattern in any view, shorter clouds seldom in narrow ones.
+_TURN_NS: Final = 250_000_000
+_GIVE_UP: Final = 3  # of such without the pattern: it is another sensor
+_ENOUGH: Final = 1000  # points of one: fewer, as of a covered sensor, show nothing
 _RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
 # information of units [1/rad^2]
 _PRIOR: Final = np.diag(
@@ -58,8 +62,10 @@ class LidarIntrinsics:
         self._weighted: F64  # information by estimate
         self.forget()
         self._rate: float | None = None
-        self._is_shown = False  # whether a sweep has had the pattern of an L2
+        self._is_shown = False  # whether clouds have had the pattern of an L2
         self._misses = 0  # sweeps in a row without it
+        self._unshown: list[Sweep] = []  # the first of all, until they last for a turn
+        self._turns = 0  # without the pattern
         self._sweeps = 0
         self._rested_ns = 0  # of the sweeps at rest that were compared last
         self._seen: tuple[Sweep, Halves | None] | None = None  # the latest sweep
@@ -69,7 +75,7 @@ class LidarIntrinsics:
     @property
     def is_other(self) -> bool:
         """Whether the clouds are taken for those of another sensor, and looked at no more."""
-        return not self._is_shown and self._misses >= _GIVE_UP
+        return not self._is_shown and self._turns >= _GIVE_UP
 
     def head(self, sweep: Sweep) -> HeadAngle | None:
         """Return the angle of the head in a sweep, None where its points do not show it."""
@@ -87,8 +93,20 @@ class LidarIntrinsics:
                 self._misses += 1
                 if self._misses >= _RATE_MISSES:
                     self._rate = None
+                if not self._is_shown:
+                    self._search_pattern(sweep)
             self._seen = sweep, found
         return self._seen[1]
+
+    def _search_pattern(self, sweep: Sweep) -> None:
+        """Search the pattern in a whole turn of the first sweeps."""
+        self._unshown.append(sweep)
+        for turn in joined(self._unshown, _TURN_NS):
+            self._unshown = []
+            if halves(turn.points) is not None:
+                self._is_shown = True
+            elif len(turn.points) >= _ENOUGH:
+                self._turns += 1
 
     def corrected(self, sweep: Sweep) -> Sweep:
         """Return the next sweep with corrected angles; remember it, if it is to :meth:`learn`.

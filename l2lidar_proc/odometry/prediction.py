@@ -53,6 +53,8 @@ class Predictor:
         Rate without bias where there is no gyro [rad/s], cloud axes.
     gyro_noise : float
         Of the samples that were used last [rad/s], each axis.
+    has_head : bool
+        Whether a head may turn beside the IMU, whose lines in the gyro show at rest only.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
@@ -64,6 +66,7 @@ class Predictor:
     def reset(self) -> None:
         """Forget what was found out about the motion; the samples stay."""
         self.trusts_gravity = False
+        self.has_head = True
         self.steady_rate: F64 = np.zeros(3)
         self.gyro_noise = self.config.inertial.gyro_noise
         self._rest: tuple[F64, int] = np.zeros(3), 0  # mean squares of the gyro at rest, samples
@@ -196,7 +199,7 @@ class Predictor:
         accel = noise_spectrum(samples["linear_acceleration"], period)
         least = self._least_gyro_noise
         if least is None:
-            least = settings.gyro_noise * stated
+            least = settings.gyro_noise * stated if self.has_head else tuning.LEAST_GYRO_NOISE
         self.gyro_noise = max(least, tuning.GYRO_NOISE_FACTOR * gyro.floor)
         scale = float(np.sqrt(period))
         return Noise(

@@ -386,9 +386,11 @@ def _camera(number: int) -> Any:
 def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
     intrinsics = LidarIntrinsics()
     for number in range(30):
-        sweep = Sweep(HostNs(number), HostNs(number + 1), measure(number), 0, 0)
+        start, end = (HostNs(100_000_000 * k) for k in (number, number + 1))
+        sweep = Sweep(start, end, measure(number), 0, 0)
         assert intrinsics.corrected(sweep) is sweep
         intrinsics.learn(sweep, sweep.points, at_rest=True)
+        assert intrinsics.is_other == (number >= 8), "known after three turns of a head"
     np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
     assert intrinsics.sigmas is None
     # it has given up: an L2 later is not looked at

@@ -120,8 +120,8 @@ def test_a_bias_that_may_as_well_be_zero_is_left() -> None:
 
 def test_clouds_of_another_sensor_are_left_as_they_are() -> None:
     intrinsics = LidarIntrinsics()
-    sweep, _ = turn((0.0, 0.0, 0.0), 0)
     for seed in range(25):
+        sweep, _ = turn((0.0, 0.0, 0.0), seed)
         other = dataclasses.replace(sweep, points=box(0.03, seed))
         assert intrinsics.corrected(other) is other
         intrinsics.learn(other, other.points, at_rest=False)
