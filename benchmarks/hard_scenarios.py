@@ -213,6 +213,27 @@ MIXED: Final = "mixed"
 STARTS: Final = "starts"
 """Name of the family whose runs begin in motion, as :func:`starts` draws it."""
 
+NARROW_STARTS: Final = "narrow starts"
+"""Name of the family whose runs begin in motion with a narrow view or another sensor."""
+
+_NARROW: Final = (
+    FAMILIES["camera, looking into rooms"],
+    FAMILIES["camera, stairs"],
+    FAMILIES["camera, room"],
+    FAMILIES["rosette lidar, flat"],
+    FAMILIES["spinning lidar, corridor"],
+    FAMILIES["flat, cone of 70 degrees"],
+    FAMILIES["corridor, 120 degrees, imperfect"],
+    FAMILIES["corridor, 80 degrees"],
+    Scenario(scene="flat", motion="look", sector_deg=120.0, imperfect=True, drawn_unit=True),
+    Scenario(scene="hall", motion="walk", speed=1.2, sector_deg=120.0, imperfect=True),
+    Scenario(scene="wood", motion="walk", speed=1.2, sector_deg=120.0, imperfect=True),
+    Scenario(scene="yard", motion="drone", sector_deg=120.0, imperfect=True),
+    Scenario(
+        scene="office_corridor", motion="walk", mount="forward", sector_deg=140.0, imperfect=True
+    ),
+)
+
 _PLACES: Final = (
     ("flat", "look"),
     ("office_corridor", "drive"),
@@ -284,7 +305,25 @@ def starts(seed: int, seconds: float) -> Scenario:
     return replace(drawn, family=STARTS, rest_s=0.0, covers=0, hits=0)
 
 
-DRAWN: Final[dict[str, Callable[[int, float], Scenario]]] = {MIXED: mixed, STARTS: starts}
+def narrow_starts(seed: int, seconds: float) -> Scenario:
+    """Return a run of a narrow view or of another sensor that is in motion from the first sweep.
+
+    Parameters
+    ----------
+    seed : int
+        Takes one of the scenarios after the other, and draws everything else.
+    seconds : float
+        Length of the run [s].
+    """
+    drawn = _NARROW[seed % len(_NARROW)]
+    return replace(drawn, family=NARROW_STARTS, seed=seed, seconds=seconds, rest_s=0.0)
+
+
+DRAWN: Final[dict[str, Callable[[int, float], Scenario]]] = {
+    MIXED: mixed,
+    STARTS: starts,
+    NARROW_STARTS: narrow_starts,
+}
 """Families whose seed draws the scenario itself, with what draws it from seed and length [s]."""
 
 
