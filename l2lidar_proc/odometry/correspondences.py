@@ -105,6 +105,8 @@ class Correspondences:
         Likewise in the finest cells.
     latest : int
         Number of the sweep that was added to the map last.
+    sweep_s : float
+        From one sweep to the next [s].
     young : YoungSurfaces
         Of that map.
     """
@@ -125,6 +127,7 @@ class Correspondences:
     met: int
     met_fine: int
     latest: int
+    sweep_s: float
     young: YoungSurfaces
 
     def part(self, first: int, last: int, met: int, met_fine: int) -> Correspondences:
@@ -147,6 +150,7 @@ class Correspondences:
             met,
             met_fine,
             self.latest,
+            self.sweep_s,
             self.young,
         )
 
@@ -175,11 +179,12 @@ class Correspondences:
         """Sweeps that were the first where the surfaces are, and their shares of the weight."""
         return support_of(self.born, self.weights)
 
-    def settled(self, age: int, *, strict: bool = False) -> NDArray[np.bool_]:
-        """Return which surfaces are in the map for so many sweeps already, shape (M,).
+    def settled(self, age_s: float, *, strict: bool = False) -> NDArray[np.bool_]:
+        """Return which surfaces are in the map for so long [s] already, shape (M,).
 
         A young map has no old ones: there half of its age is enough, unless that is strict.
         """
+        age = round(age_s / self.sweep_s)
         if not strict:
             age = min(age, self.latest // 2)
         return np.asarray(self.latest - self.opened >= age)
@@ -324,6 +329,7 @@ def correspondences_of(
         len(matches.index),
         int(np.count_nonzero(matches.is_fine)),
         surfaces.latest,
+        surfaces.sweep_s,
         surfaces.young,
     )
     if is_single:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import records
-from l2lidar_node.types import F64, Sweep
+from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.deskew.deskew import coordinates, deskew
 from l2lidar_proc.motion.carrier_priors import is_driving_speed
@@ -119,6 +119,7 @@ class SweepMatcher:
         self._sweeps = 0
         self._way = 0.0
         self._before: F64 | None = None  # place of the sweep before
+        self._added = 0  # stamp of the sweep before
         self._oldest = 0  # sweep from which on places are still in the map
         self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
         self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
@@ -353,12 +354,22 @@ class SweepMatcher:
         # what is ahead of a carrier that drives was seen from afar first, and tells its way:
         # points from nearby, which the errors of that way have moved, must not take its place
         weighted = not self.driving
+        self._note_pace(state.stamp)
         fresh = self.surfaces.add(placed, self._sweeps, apart, state.position, weighted=weighted)
         measured = not motion.imu.missing.all()
         self.kiss.update(points, state.pose, guess.pose, keyframes=measured)
         self._walk(state.position)
         self._sweeps += 1
         return fresh
+
+    def _note_pace(self, stamp: HostNs) -> None:
+        """Take the instant of a sweep, for the time from one to the next."""
+        seconds = (stamp - self._added) * 1e-9
+        if self._sweeps and seconds > 0.0:
+            now = min(max(seconds, tuning.SWEEP_LEAST_S), tuning.SWEEP_MOST_S)
+            blend = max(tuning.SWEEP_BLEND, 1.0 / self._sweeps)
+            self.surfaces.sweep_s += blend * (now - self.surfaces.sweep_s)
+        self._added = stamp
 
     def _walk(self, place: F64) -> None:
         """Count the way to a place; drop what is far, or was left behind long ago.

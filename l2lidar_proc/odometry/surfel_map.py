@@ -68,6 +68,8 @@ class SurfelMap:
     ----------
     latest : int
         Number of the sweep that was added last.
+    sweep_s : float
+        From one sweep to the next [s].
     young : YoungSurfaces
         Of a map that has only just begun.
     """
@@ -85,6 +87,7 @@ class SurfelMap:
         self._least = least
         self._capacity = capacity
         self.latest = 0
+        self.sweep_s = tuning.SWEEP_S
         self.young = YoungSurfaces.TRUSTED
         self._index = CellIndex()
         # row 0 is that of all places without a cell
@@ -439,7 +442,7 @@ class SurfelMap:
             least=self._least,
             capacity=self._capacity,
         )
-        part.latest = self.latest
+        part.latest, part.sweep_s = self.latest, self.sweep_s
         part.young = self.young
         born = self._planes["born"][1 : len(self) + 1]
         part._take(self, sweeps[np.minimum(born, len(sweeps) - 1)])
