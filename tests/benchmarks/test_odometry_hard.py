@@ -18,6 +18,7 @@ from benchmarks.hard_recordings import EPOCH, Recording, recording
 from benchmarks.hard_scenarios import (
     FAMILIES,
     MIXED,
+    NARROW_STARTS,
     SCENES,
     SHORT,
     STARTS,
@@ -467,6 +468,54 @@ def test_starts_that_ran_away_are_right_within_seconds(
     given = recording(scenario(STARTS, seed, 5.0))
     off = np.linalg.norm(errors(given, tracked(given)).position, axis=1)
     assert off[-5:].max() < 0.3
+
+
+def in_motion(family: str, seed: int, seconds: float) -> Recording:
+    """Return a run of a family that is in motion from the first sweep on."""
+    return recording(replace(scenario(family, seed, seconds), rest_s=0.0))
+
+
+@pytest.mark.parametrize(
+    ("family", "seed"),
+    [
+        # what it saw through a doorway at rest looked like 2 m/s: 184 m off after 30 s
+        ("rosette lidar, flat", 0),
+        # it began to drive at 1.2 m/s^2, which its accelerometer took for a tilt: 86 m
+        ("spinning lidar, corridor", 0),
+        # rims of its view counted after 0.8 s, eight sweeps: 37 m
+        ("spinning lidar, corridor", 17),
+        # its gyro counted as one beside a head: 0.9 m
+        ("camera, looking into rooms", 1),
+    ],
+)
+def test_narrow_views_and_other_sensors_begin_in_motion(
+    family: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = in_motion(family, seed, 7.0)
+    off = np.linalg.norm(errors(given, tracked(given)).position, axis=1)
+    assert off[-10:].max() < 0.25
+
+
+def test_bare_walls_tell_a_walker_nothing_that_is_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sensor that sways saw walls go by at 4 m/s, sure to 0.5: it ended 490 m off."""
+    monkeypatch.setattr(hard_recordings, "FOLDER", tmp_path)
+    given = recording(replace(scenario(NARROW_STARTS, 12, 7.0), seed=0))
+    track = tracked(given)
+    assert track.covariances is not None
+    off, covariance = errors(given, track).position[-1], track.covariances[-1, :3, :3]
+    assert off @ np.linalg.solve(covariance, off) < 16.3  # 99.9 % of three degrees of freedom
+
+
+def test_narrow_starts_take_one_view_after_the_other() -> None:
+    drawn = [scenario(NARROW_STARTS, seed, 12.0) for seed in range(26)]
+    assert len({(one.scene, one.motion, one.sensor, one.sector_deg) for one in drawn}) > 10
+    for one, again in zip(drawn[:13], drawn[13:], strict=True):
+        assert again == replace(one, seed=one.seed + 13)
+        assert one.rest_s == 0.0
+        assert one.sensor != "l2" or one.sector_deg < 150.0 or one.cone_deg < 90.0
 
 
 def test_a_start_with_a_wrong_velocity_that_nothing_left_open_begins_again(
