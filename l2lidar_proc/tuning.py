@@ -194,15 +194,15 @@ WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off i
 # tells nothing about it. Tuned on: narrow views, seeds 100 to 115; 8 do as well, 0 worse
 FREE_FACING: Final = 4
 FREE_LEFT: Final = 0.5  # length that is left of a weak direction beside the free ones
-# [s] from one sweep to the next before it is known, as of an L2; its bounds, and the share of each
-# newer step in its mean
+# [s] from one sweep to the next of an L2: in a map that began with an open velocity, ages count in
+# such sweeps. Counted in its own, the rims of a spinning lidar had half the time, and two drives
+# ended 37 and 125 m off; counted so in all maps, cameras that began at rest were 1.5 times as far
+# off. And the bounds of that time, and the share of each newer step in its mean
 SWEEP_S: Final = 0.23
 SWEEP_LEAST_S: Final = 0.01
 SWEEP_MOST_S: Final = 0.5
 SWEEP_BLEND: Final = 0.05
-# [s] since a surface was opened, eight turns of an L2: until then it is a rim of the view. Counted
-# in sweeps, a spinning lidar's had half the time, and drives begun in motion ended 37 to 125 m off
-WEAK_AGE_S: Final = 1.85
+WEAK_AGE: Final = 8  # sweeps since a surface was opened: until then it is a rim of the view
 WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above the noise
 WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller
 WEAK_STEPS: Final = 2  # iterations with the weak directions known
@@ -213,7 +213,7 @@ WEAK_LEAST_ARM: Final = 0.3  # [m] however near the points are
 # are 2 to 5 sigma from the wall's normal, reveals of doors more than 15.
 DRIVING_WAY: Final = 0.9  # of a direction's unit is place, not turn
 DRIVING_SLOPE: Final = 0.5  # sine of it against the horizontal
-DRIVING_AGE_S: Final = 0.7  # [s] as WEAK_AGE_S
+DRIVING_AGE: Final = 3  # as WEAK_AGE
 DRIVING_POINTS: Final = 1600  # of a sweep; with fewer, it is thinned by
 DRIVING_VOXEL: Final = 0.5  # of source_voxel
 FACING_VOXEL: Final = 0.25  # of source_voxel: what faces the direction

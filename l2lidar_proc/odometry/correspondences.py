@@ -179,12 +179,15 @@ class Correspondences:
         """Sweeps that were the first where the surfaces are, and their shares of the weight."""
         return support_of(self.born, self.weights)
 
-    def settled(self, age_s: float, *, strict: bool = False) -> NDArray[np.bool_]:
-        """Return which surfaces are in the map for so long [s] already, shape (M,).
+    def settled(self, age: int, *, strict: bool = False) -> NDArray[np.bool_]:
+        """Return which surfaces are in the map for so many sweeps already, shape (M,).
 
-        A young map has no old ones: there half of its age is enough, unless that is strict.
+        A young map has no old ones: there half of its age is enough, unless that is strict. In one
+        that began with an open velocity they have to last for as long as those of an L2, however
+        many sweeps that are.
         """
-        age = round(age_s / self.sweep_s)
+        if self.young is not YoungSurfaces.TRUSTED:
+            age = round(age * tuning.SWEEP_S / self.sweep_s)
         if not strict:
             age = min(age, self.latest // 2)
         return np.asarray(self.latest - self.opened >= age)

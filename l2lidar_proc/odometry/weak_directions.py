@@ -7,7 +7,7 @@ wall, so the pose stays where it was predicted, and velocity, biases and gravity
 that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
 * only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
-  them for some seconds: the rim of what has just been seen moves along with the view;
+  them for some sweeps: the rim of what has just been seen moves along with the view;
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
@@ -119,7 +119,7 @@ class WeakAxes:
         derivatives : ndarray, shape (M,)
             Derivatives of the residuals along the direction.
         """
-        age = tuning.WEAK_AGE_S if self.scatter is None else tuning.DRIVING_AGE_S
+        age = tuning.WEAK_AGE if self.scatter is None else tuning.DRIVING_AGE
         is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
         settled = found.settled(age, strict=is_ignored)
         faces = (np.abs(derivatives) > tuning.WEAK_FACING) & settled
@@ -195,7 +195,7 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     places = places[:, strength < tuning.WEAK_SHARE * strength[-1]]
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
-    faces &= found.settled(tuning.WEAK_AGE_S, strict=strict)[:, None]
+    faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
         return axes, 0

@@ -226,7 +226,7 @@ def test_normals_that_are_hardly_known_do_not_bend_the_direction() -> None:
 
 def test_surfaces_count_sooner_where_the_carrier_drives() -> None:
     rng = np.random.default_rng(13)
-    surfaces = mapped(rng, facing=600, since=12 - round(tuning.DRIVING_AGE_S / tuning.SWEEP_S) - 2)
+    surfaces = mapped(rng, facing=600, since=12 - tuning.DRIVING_AGE - 2)
     seen = np.vstack((walls(rng, 2000), reveals(rng, 90)))
     found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
     by_hand, driven = weak_axes(at(), found, surfaces), weak_axes(at(), found, surfaces, NOTHING)
@@ -385,9 +385,15 @@ def test_rims_of_a_map_that_has_only_just_begun_may_be_ignored(young: YoungSurfa
     if young is not YoungSurfaces.TRUSTED:
         assert np.linalg.norm(weak.axes[:3, 0]) == 0.0  # nothing of a turn is mixed with it
         assert abs(weak.axes[3, 0]) > 0.99
-    for number in range(4, 4 + 2 * round(tuning.WEAK_AGE_S / tuning.SWEEP_S)):
+    for number in range(4, 4 + 2 * tuning.WEAK_AGE):
         surfaces.add(walls(rng, 100), number)
     found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
     old = weak_axes(state, found, surfaces)
     assert old is not None
     assert old.facing(state, found)[:, 0].any()  # whatever was said of it when it was young
+    surfaces.sweep_s = 0.05  # of a sensor that sweeps faster, its rims are as old in seconds
+    found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    fast = weak_axes(state, found, surfaces)
+    assert fast is not None
+    assert fast.free == (young is not YoungSurfaces.TRUSTED)
+    assert fast.facing(state, found)[:, 0].any() == (young is not YoungSurfaces.IGNORED)
