@@ -150,7 +150,9 @@ class Odometry:
         sweep = cropped(sweep, self.config.min_range, self.config.max_range)
         self._reported = sweep  # as the unit reports it, for what is mapped again
         head = self._intrinsics.head(sweep)
-        self._predictor.has_head = not self._intrinsics.is_other
+        # at rest the samples show it themselves
+        moves = self.phase is Phase.TRACKING
+        self._predictor.has_head = not (moves and self._intrinsics.is_other)
         if head is not None:
             self._predictor.note_head(head, sweep.end)
         if self.config.correct_beams:

@@ -20,7 +20,7 @@ from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import cloud_pose
 from l2lidar_proc.odometry.map_initialization import MapInitializer
 from l2lidar_proc.odometry.odometry import Odometry
-from tests.support.hard_runs import tracked
+from tests.benchmarks.hard_runs import tracked
 
 pytest.importorskip("open3d")
 pytestmark = pytest.mark.usefixtures("recordings")

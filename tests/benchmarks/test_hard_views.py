@@ -21,7 +21,7 @@ from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.vertical_lines import LINE
 from l2lidar_proc.odometry.wall_profile import SPOT
-from tests.support.hard_runs import end_of, tracked
+from tests.benchmarks.hard_runs import end_of, tracked
 
 pytest.importorskip("open3d")
 pytestmark = pytest.mark.usefixtures("recordings")
