@@ -23,6 +23,7 @@ from l2lidar_node.recording.bag import BagFile
 from l2lidar_proc.recording import outputs
 from l2lidar_proc.recording.outputs import Trajectory
 from l2lidar_proc.verbs import odometry
+from l2lidar_proc.verbs.recorded import OdometryRun
 
 ROOT = Path(__file__).parents[2]
 needs_open3d = pytest.mark.skipif(find_spec("open3d") is None, reason="needs open3d")
@@ -67,7 +68,7 @@ def test_the_name_to_write_to_tells_the_format(tmp_path: Path) -> None:
 
 
 def _way(folder: Path) -> None:
-    run = odometry.OdometryRun(Trajectory().poses, POINTS, 0, Counter(), Counter())
+    run = OdometryRun(Trajectory().poses, POINTS, 0, Counter(), Counter())
     odometry.write(run, folder)
 
 
