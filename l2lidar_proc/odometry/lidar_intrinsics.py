@@ -100,6 +100,8 @@ class LidarIntrinsics:
 
     def _search_pattern(self, sweep: Sweep) -> None:
         """Search the pattern in a whole turn of the first sweeps."""
+        if self._unshown and sweep.start <= self._unshown[-1].start:
+            self._unshown = []  # the clock was set, and they might never last for a turn
         self._unshown.append(sweep)
         for turn in joined(self._unshown, _TURN_NS):
             self._unshown = []

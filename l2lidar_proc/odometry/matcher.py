@@ -354,7 +354,7 @@ class SweepMatcher:
         # what is ahead of a carrier that drives was seen from afar first, and tells its way:
         # points from nearby, which the errors of that way have moved, must not take its place
         weighted = not self.driving
-        self._note_pace(state.stamp)
+        self._note_period(state.stamp)
         fresh = self.surfaces.add(placed, self._sweeps, apart, state.position, weighted=weighted)
         measured = not motion.imu.missing.all()
         self.kiss.update(points, state.pose, guess.pose, keyframes=measured)
@@ -362,7 +362,7 @@ class SweepMatcher:
         self._sweeps += 1
         return fresh
 
-    def _note_pace(self, stamp: HostNs) -> None:
+    def _note_period(self, stamp: HostNs) -> None:
         """Take the instant of a sweep, for the time from one to the next."""
         seconds = (stamp - self._added) * 1e-9
         if self._sweeps and seconds > 0.0:

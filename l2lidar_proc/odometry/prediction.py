@@ -54,7 +54,7 @@ class Predictor:
     gyro_noise : float
         Of the samples that were used last [rad/s], each axis.
     has_head : bool
-        Whether a head may turn beside the IMU, whose lines in the gyro show at rest only.
+        Whether the gyro may have lines of a head that its samples do not show.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:

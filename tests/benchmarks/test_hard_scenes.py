@@ -11,10 +11,7 @@ import pytest
 
 from benchmarks import hard_recordings
 from benchmarks.hard_recordings import recording
-from benchmarks.hard_scenarios import (
-    Imperfections,
-    scenario,
-)
+from benchmarks.hard_scenarios import Imperfections, scenario
 from benchmarks.hard_scores import errors, score
 from l2lidar_node.emulator.unit.units import UNITS, UnitErrors
 from l2lidar_proc.odometry.config import OdometryConfig

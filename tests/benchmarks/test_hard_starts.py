@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.hard_recordings import Recording, recording
-from benchmarks.hard_scenarios import (
-    NARROW_STARTS,
-    STARTS,
-    scenario,
-)
+from benchmarks.hard_scenarios import NARROW_STARTS, STARTS, scenario
 from benchmarks.hard_scores import errors
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.hard_recordings import EPOCH, Recording, recording
-from benchmarks.hard_scenarios import (
-    Imperfections,
-    scenario,
-)
+from benchmarks.hard_scenarios import Imperfections, scenario
 from benchmarks.hard_scores import Track, errors
 from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig

@@ -382,6 +382,16 @@ def _camera(number: int) -> Any:
     return cloud
 
 
+@pytest.mark.parametrize("backwards", [0, 100_000_000])
+def test_clouds_whose_clock_does_not_advance_are_not_kept(backwards: int) -> None:
+    intrinsics = LidarIntrinsics()
+    for number in range(50):
+        start = 10_000_000_000 - backwards * number
+        cloud = _camera(number)
+        intrinsics.head(Sweep(HostNs(start), HostNs(start + 50_000_000), cloud, 0, 0))
+        assert len(intrinsics._unshown) == 1
+
+
 @pytest.mark.parametrize("measure", [_spinning, _camera])
 def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
     intrinsics = LidarIntrinsics()
