@@ -157,16 +157,17 @@ class Pipeline:
             self._sequencer.jump()
 
     def _converted(self, samples: Samples) -> Samples:
-        """Return samples in m/s^2, as specific force; put those right that came before."""
-        before = self.convention.factor
+        """Return samples in rad/s and m/s^2; put those right that came before."""
+        convention = self.convention
+        rates, forces = convention.rate_factor, convention.factor
         theirs = self.odometry_convention() if self.odometry_convention is not None else None
         if theirs is not None and theirs.knows_unit:
-            self.convention.adopt(theirs)
-            samples = self.convention.applied(samples)
+            convention.adopt(theirs)
+            samples = convention.applied(samples)
         else:
-            samples = self.convention.in_unit(samples)
-        if self.convention.factor != before:
-            self.tracker.rescale(self.convention.factor / before)
+            samples = convention.in_units(samples)
+        if (rates, forces) != (convention.rate_factor, convention.factor):
+            self.tracker.rescale(convention.rate_factor / rates, convention.factor / forces)
         return samples
 
     def velocity(

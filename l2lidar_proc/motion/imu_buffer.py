@@ -122,9 +122,10 @@ class ImuBuffer:
         for name in ("angular_velocity", "linear_acceleration"):
             kept[name] = kept[name] @ rotation.T
 
-    def scale_forces(self, factor: float) -> None:
-        """Multiply the forces of all samples."""
-        self.samples["linear_acceleration"] *= factor
+    def scale(self, rates: float, forces: float) -> None:
+        """Multiply the angular velocities and the forces of all samples by a factor each."""
+        self.samples["angular_velocity"] *= rates
+        self.samples["linear_acceleration"] *= forces
 
     def push(self, samples: Samples) -> Samples:
         """Take samples in any order.

@@ -1,6 +1,7 @@
 """Corrections of IMU samples: unit and sign, rotation, delay of stamps, gyro scale.
 
-:class:`ImuConvention` recognizes accelerometers that measure in g, or with the opposite sign.
+:class:`ImuConvention` recognizes accelerometers that measure in g, or with the opposite sign, and
+gyros that measure in degrees per second.
 :class:`ImuExtrinsics` is what a calibration file and the settings say of an IMU beside its place.
 """
 
@@ -22,6 +23,18 @@ from l2lidar_proc.motion.imu_buffer import Samples, earlier
 
 _G_NORMS: Final = (0.7, 1.4)  # median |a| of an accelerometer that measures in g
 _DECIDED: Final = 100  # samples after which the unit stays as it is
+# The unit of the gyro is told by what its rates make of gravity, window by window. Observed shares
+# of it that are left: 0.98 and more in rad/s, 0.1 to 0.5 (median) in degrees, on walks and drones
+_WINDOW_NS: Final = 2_000_000_000
+_WINDOW_LEAST_S: Final = 1.5  # of it, with samples
+_WINDOW_GAP_S: Final = 0.1  # between them, at most
+_WINDOW_MOST: Final = 10_000  # samples
+_TUMBLED: Final = 0.7  # share of gravity that is left. To be right it takes a fall to 6 m/s
+_STEADY: Final = 0.8  # share that is left of it in degrees
+# [rad/s] median of a window, in which a carrier would turn five times: no scan could be followed.
+# For carriers that turn about the vertical alone, which leaves gravity where it is
+_FASTEST_TURN: Final = 15.0
+_IN_DEGREES: Final = 2  # windows that show it
 _KEPT_NS: Final = 2_000_000_000
 _MOST_KEPT: Final = 10_000  # samples
 # The sign is decided by comparing the changes of the velocity: 20 of them are 4 to 5 s, and
@@ -35,23 +48,31 @@ _SHORTEST_NS: Final = 190_000_000
 
 
 class ImuConvention:
-    """Converts samples to m/s^2 and specific force (+9.8 upwards at rest, REP 145).
+    """Converts samples to rad/s, m/s^2 and specific force (+9.8 upwards at rest, REP 145).
 
-    The unit is told from the norm of the first samples. The sign can only be told from motion:
-    how the poses of the odometry bend says which way the sensor was accelerated.
+    The unit of the accelerometer is told from the norm of the first samples. That of the gyro is
+    told by gravity, which stays where it is while the sensor turns: rates that are too large by 57
+    make it tumble, or the sensor would turn faster than any carrier. The sign can only be told
+    from motion: how the poses of the odometry bend says which way the sensor was accelerated.
 
     Attributes
     ----------
     in_g : bool
-        Whether samples are multiplied by 9.80665.
+        Whether forces are multiplied by 9.80665.
+    in_degrees : bool
+        Whether rates are multiplied by pi / 180.
     reversed : bool
-        Whether the sign of samples is changed.
+        Whether the sign of forces is changed.
     """
 
     def __init__(self) -> None:
         self.in_g = False
+        self.in_degrees = False
         self.reversed = False
         self._norms = np.empty(0)
+        self._window: list[Samples] = []  # up to _WINDOW_MOST in all
+        self._window_number = 0  # its stamps, divided by its length
+        self._in_degrees = 0  # windows that show degrees
         self.forget_motion()
 
     @property
@@ -66,9 +87,16 @@ class ImuConvention:
         return -size if self.reversed else size
 
     @property
+    def rate_factor(self) -> float:
+        """What angular velocities are multiplied by, by the detections so far."""
+        return float(np.pi / 180.0) if self.in_degrees else 1.0
+
+    @property
     def notes(self) -> list[str]:
         """Descriptions of what was detected."""
         found = []
+        if self.in_degrees:
+            found.append("the gyro measures in degrees per second: multiplied by pi / 180")
         if self.in_g:
             found.append("the accelerometer measures in g: multiplied by 9.80665")
         if self.reversed:
@@ -85,22 +113,26 @@ class ImuConvention:
         self._changes: list[tuple[F64, F64]] = []
 
     def applied(self, samples: Samples) -> Samples:
-        """Return samples (N,) in m/s^2, as specific force, by the detections so far."""
-        if not self.in_g and not self.reversed:
+        """Return samples (N,) in rad/s and m/s^2, as specific force, by the detections so far."""
+        if not (self.in_g or self.in_degrees or self.reversed):
             return samples
         samples = samples.copy()
+        samples["angular_velocity"] *= self.rate_factor
         samples["linear_acceleration"] *= self.factor
         return samples
 
     def adopt(self, other: ImuConvention) -> None:
-        """Take over what was detected with the poses of an odometry."""
-        self.in_g, self.reversed = other.in_g, other.reversed
+        """Take over what was detected elsewhere with the same IMU."""
+        self.in_g, self.in_degrees = other.in_g, other.in_degrees
+        self.reversed = other.reversed
 
-    def in_unit(self, samples: Samples) -> Samples:
-        """Learn the unit from samples (N,); return them as :meth:`applied` does.
+    def in_units(self, samples: Samples) -> Samples:
+        """Learn the units from samples (N,); return them as :meth:`applied` does.
 
         This is enough where no poses come that could tell the sign.
         """
+        if not self.in_degrees:
+            self._note_turns(samples)
         if len(self._norms) < _DECIDED and len(samples):
             norms = np.linalg.norm(samples["linear_acceleration"], axis=1)
             norms = norms[np.isfinite(norms)]
@@ -109,9 +141,21 @@ class ImuConvention:
                 self.in_g = bool(_G_NORMS[0] < np.median(self._norms) < _G_NORMS[1])
         return self.applied(samples)
 
+    def _note_turns(self, samples: Samples) -> None:
+        """Learn the unit of the gyro from samples (N,), window by window."""
+        numbers = samples["stamp"] // _WINDOW_NS
+        for number in np.unique(numbers).tolist():
+            if number != self._window_number:
+                whole = records.joined(self._window) if self._window else samples[:0]
+                self._in_degrees += _are_in_degrees(whole)
+                self.in_degrees |= self._in_degrees >= _IN_DEGREES
+                self._window, self._window_number = [], number
+            if sum(map(len, self._window)) < _WINDOW_MOST:
+                self._window.append(samples[numbers == number][:_WINDOW_MOST])
+
     def corrected(self, samples: Samples) -> Samples:
-        """Learn from samples (N,); return them in m/s^2, as specific force."""
-        samples = self.in_unit(samples)
+        """Learn from samples (N,); return them in rad/s and m/s^2, as specific force."""
+        samples = self.in_units(samples)
         if len(samples) and len(self._recent):
             step = int(samples["stamp"][0]) - int(self._recent["stamp"][-1])
             if abs(step) > _KEPT_NS:
@@ -186,6 +230,34 @@ class ImuConvention:
         energy = np.sqrt((by_poses**2).sum() * (by_samples**2).sum())
         strong = np.sqrt((by_poses**2).sum(axis=1).mean()) > _LEAST_CHANGE
         return bool(strong and (by_poses * by_samples).sum() < _OPPOSITE * energy)
+
+
+def _are_in_degrees(samples: Samples) -> bool:
+    """Return whether rates of a window (N,) must be in degrees per second.
+
+    In rad/s they would be too fast, or gravity would tumble which stays in degrees.
+    """
+    samples = samples[np.argsort(samples["stamp"], kind="stable")]
+    rates = samples["angular_velocity"].astype(np.float64)
+    forces = samples["linear_acceleration"].astype(np.float64)
+    good = np.isfinite(rates).all(axis=1) & np.isfinite(forces).all(axis=1)
+    rates, forces = rates[good], forces[good]
+    steps = np.diff(samples["stamp"][good]) * 1e-9
+    if steps.sum() < _WINDOW_LEAST_S or steps.max() > _WINDOW_GAP_S:
+        return False
+    if np.linalg.norm(np.median(rates, axis=0)) > _FASTEST_TURN:
+        return True
+    if not np.ptp(forces, axis=0).all():
+        return False  # it measures nothing
+
+    def mean_force(factor: float) -> float:
+        turns = rotations.exp(factor * rates[1:] * steps[:, None])
+        q = rotations.cumulative(np.vstack(([1.0, 0.0, 0.0, 0.0], turns)))
+        return float(np.linalg.norm(rotations.rotate(q, forces).mean(axis=0)))
+
+    steady = mean_force(np.pi / 180.0)
+    size = float(np.median(np.linalg.norm(forces, axis=1)))
+    return steady > _STEADY * size and mean_force(1.0) < _TUMBLED * steady
 
 
 @dataclass(frozen=True, slots=True, eq=False)

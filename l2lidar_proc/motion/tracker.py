@@ -139,9 +139,9 @@ class MotionTracker:
         self._learn_anew()
         return True
 
-    def rescale(self, factor: float) -> None:
-        """Multiply the forces of all samples so far; what was learned from them is void."""
-        self.buffer.scale_forces(factor)
+    def rescale(self, rates: float, forces: float) -> None:
+        """Multiply all samples so far by a factor each; what was learned from them is void."""
+        self.buffer.scale(rates, forces)
         self._learn_anew()
 
     def _learn_anew(self) -> None:

@@ -62,7 +62,7 @@ class OdometryPipeline:
         How often what was reported.
     last : OdometryEstimate or None
     convention : ImuConvention
-        In which unit and with which sign the accelerometer measures.
+        In which units the IMU measures, and with which sign its accelerometer.
     check : ExtrinsicCheck
         Whether the gyro turns as the clouds do.
     extrinsics : ImuExtrinsics
@@ -177,8 +177,15 @@ class OdometryPipeline:
         return samples
 
     def imu(self, samples: Samples) -> None:
-        """Take IMU samples (N,) in any order and state."""
+        """Take IMU samples (N,) in any order and state.
+
+        Where they show that the gyro measures in degrees per second, everything begins again.
+        """
+        was_in_degrees = self.convention.in_degrees
         samples = self._usable(self.convention.corrected(self.extrinsics.corrected(samples)))
+        odometry = self.odometry
+        if self.convention.in_degrees != was_in_degrees and isinstance(odometry, Odometry):
+            self.mount(odometry.T_cloud_imu)
         self.odometry.imu(samples)
         self.check.imu(samples)
 

@@ -21,7 +21,7 @@ from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
-from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
+from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate, Status
 from l2lidar_proc.odometry.odometry import Odometry
@@ -93,8 +93,8 @@ class OdometryRunner:
     config : OdometryNodeConfig
     observer : callable, optional
         Given the estimates one by one.
-    opposite : bool
-        Whether the accelerometer is known to point the other way.
+    known : ImuConvention, optional
+        What is known of the IMU's units and sign.
     accelerometer : bool
         False: the accelerometer is watched, for its sign, but not used.
 
@@ -113,7 +113,7 @@ class OdometryRunner:
         config: OdometryNodeConfig,
         observer: Observer | None = None,
         *,
-        opposite: bool = False,
+        known: ImuConvention | None = None,
         accelerometer: bool = True,
     ) -> None:
         self._observer = observer
@@ -125,7 +125,8 @@ class OdometryRunner:
             ImuExtrinsics.of(topics),
             accelerometer=accelerometer,
         )
-        self.pipeline.convention.reversed = opposite
+        if known is not None:
+            self.pipeline.convention.adopt(known)
         problem = self.pipeline.extrinsics.problem
         self.notes: list[str] = [problem] if problem else []
         self.base = BaseFrame(np.eye(4))
@@ -275,17 +276,19 @@ def run_bag(
             made.look_ahead(reader)
             return made
 
+        known = ImuConvention()
         final = listener(OdometryRunner(config, observer))
-        opposite = final.may_be_opposite and not _heard(
-            reader, listener(OdometryRunner(config, accelerometer=False)), until_s=_SIGN_S
-        )
-        if opposite:
-            final = listener(OdometryRunner(config, observer, opposite=True))
+        while final.may_be_opposite and not known.reversed:
+            trial = listener(OdometryRunner(config, known=known, accelerometer=False))
+            if _heard(reader, trial, until_s=_SIGN_S):
+                break
+            known.adopt(trial.runner.pipeline.convention)
+            final = listener(OdometryRunner(config, observer, known=known))
         # an observer cannot be told the same twice: for it a new map begins in between
-        if not _heard(reader, final, progress, stops=observer is None):
-            # what it took for up is down: from the beginning
-            final = listener(OdometryRunner(config, opposite=True))
-            _heard(reader, final, progress)
+        while not _heard(reader, final, progress, stops=observer is None):
+            # it took down for up, or degrees for radians: from the beginning
+            known.adopt(final.runner.pipeline.convention)
+            final = listener(OdometryRunner(config, known=known))
         return final.finish()
 
 
@@ -297,13 +300,13 @@ def _heard(
     *,
     stops: bool = True,
 ) -> bool:
-    """Pass a bag's messages on; return False if the accelerometer's sign was found wrong.
+    """Pass a bag's messages on; return False if sign or unit of the IMU were found wrong.
 
     Then it stops at once, if it ``stops`` at all; else it goes on with a new map.
     """
     span = max(reader.end_time - reader.start_time, 1)
     convention = listener.runner.pipeline.convention
-    known = convention.reversed
+    known = convention.reversed, convention.in_degrees
     for connection, now, data in bag.messages(reader):
         if now > reader.start_time + until_s * 1e9:
             break
@@ -318,7 +321,7 @@ def _heard(
                 listener.take(connection.topic, message, now)
         else:
             continue
-        if stops and convention.reversed and not known:
+        if stops and (convention.reversed, convention.in_degrees) != known:
             return False
         progress(min(max((now - reader.start_time) / span, 0.0), 1.0))
     return True

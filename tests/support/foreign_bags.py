@@ -274,6 +274,7 @@ def write_bag(
     *,
     clouds: list[tuple[int, Cloud]] | None = None,
     imu: Callable[[F64], F64] | None = lambda force: force,
+    gyro: Callable[[F64], F64] = lambda rate: rate,
     imu_topic: str = "/imu/data",
     imu_frame: str = "imu",
 ) -> None:
@@ -289,6 +290,8 @@ def write_bag(
         In place of those of ``given``.
     imu : callable, optional
         What becomes of the accelerometer's samples; None: no IMU at all.
+    gyro : callable
+        What becomes of the gyro's samples.
     imu_topic, imu_frame : str
     """
     with BagMaker(path) as bag:
@@ -298,7 +301,7 @@ def write_bag(
             elif imu is not None:
                 k = int(np.searchsorted(given.stamps, stamp))
                 force = imu(given.forces[k])
-                bag.imu(imu_topic, stamp, imu_frame, given.rates[k], force)
+                bag.imu(imu_topic, stamp, imu_frame, gyro(given.rates[k]), force)
 
 
 def _in_order(

@@ -272,6 +272,17 @@ def test_an_accelerometer_in_g_is_as_good_as_any() -> None:
     assert in_g["linear_acceleration"][0, 2] < 2.0  # what came in was not changed
 
 
+def test_a_gyro_in_degrees_is_as_good_as_any_once_it_is_known() -> None:
+    samples = WALK.imu(0, 8.0)
+    in_degrees = samples.copy()
+    in_degrees["angular_velocity"] = np.rad2deg(in_degrees["angular_velocity"])
+    _, expected = run(WALK, 8.0, samples=samples)
+    pipeline, done = run(WALK, 8.0, samples=in_degrees)
+    assert pipeline.convention.in_degrees
+    assert "the gyro measures in degrees" in pipeline.convention.notes[0]
+    np.testing.assert_allclose(xyz(done[-1].points), xyz(expected[-1].points), atol=0.02)
+
+
 def upright(pipeline: Pipeline, t: float) -> float:
     """Return how much of the vertical is along the cloud's z axis."""
     up = pipeline.tracker.up(at(t))

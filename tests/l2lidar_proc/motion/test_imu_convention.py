@@ -96,7 +96,7 @@ def test_where_no_poses_come_the_unit_is_found_and_no_sample_is_kept() -> None:
     convention = ImuConvention()
     assert not convention.knows_unit
     assert convention.factor == 1.0
-    found = convention.in_unit(given)
+    found = convention.in_units(given)
     assert convention.knows_unit
     assert convention.factor == 9.80665
     np.testing.assert_allclose(
@@ -107,6 +107,98 @@ def test_where_no_poses_come_the_unit_is_found_and_no_sample_is_kept() -> None:
     another.adopt(convention)
     assert another.in_g
     assert not another.reversed
+
+
+def moved(name: str, seconds: float = 12.0) -> np.ndarray:
+    """Return samples of a motion; "yaw" is a turn about the vertical at 0.5 rad/s."""
+    if name == "yaw":
+        samples = np.zeros(round(250 * seconds), IMU_SAMPLE)
+        samples["angular_velocity"][:, 2] = 0.5
+        samples["linear_acceleration"][:, 2] = 9.8
+    else:
+        motion = trajectories.make(name, scenes.make("room"), seed=1)
+        samples = samples_of(motion, seconds)
+        raw, _ = Inertial(motion, ImuNoise(), 3).samples(0, len(samples))
+        samples["angular_velocity"] = raw["angular_velocity"]
+    samples["stamp"] = 10**18 + 4_000_000 * np.arange(len(samples))
+    return samples
+
+
+def in_parts(convention: ImuConvention, samples: np.ndarray, size: int) -> np.ndarray:
+    parts = [convention.corrected(samples[k : k + size]) for k in range(0, len(samples), size)]
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("at_once", [1, 40, 3000])
+@pytest.mark.parametrize("name", ["walk", "trot", "drone", "yaw"])
+def test_a_gyro_in_degrees_is_recognized(name: str, at_once: int) -> None:
+    true = moved(name)
+    given = true.copy()
+    given["angular_velocity"] = np.rad2deg(given["angular_velocity"])
+    rng = np.random.default_rng(3)
+    given = given[np.argsort(given["stamp"] + rng.uniform(0.0, 8e6, len(given)))]  # some are late
+    came = given.copy()
+    convention = ImuConvention()
+    found = in_parts(convention, given, at_once)
+    assert convention.in_degrees
+    assert convention.notes == ["the gyro measures in degrees per second: multiplied by pi / 180"]
+    np.testing.assert_allclose(
+        found["angular_velocity"][-200:],
+        np.deg2rad(given["angular_velocity"][-200:]),
+        rtol=1e-6,
+        atol=1e-9,
+    )
+    np.testing.assert_array_equal(found["linear_acceleration"], given["linear_acceleration"])
+    np.testing.assert_array_equal(given, came)
+    another = ImuConvention()
+    another.adopt(convention)
+    assert another.in_degrees
+
+
+@pytest.mark.parametrize("name", ["walk", "trot", "drone", "spin", "shake", "still", "yaw"])
+def test_a_gyro_in_radians_stays_as_it_is(name: str) -> None:
+    convention = ImuConvention()
+    given = moved(name, 30.0)
+    assert convention.corrected(given) is given
+    assert convention.notes == []
+
+
+@pytest.mark.parametrize(
+    "spoil", ["flips", "spikes", "frozen", "no forces", "gaps", "slow", "not a number", "once"]
+)
+def test_nothing_else_is_taken_for_degrees(spoil: str) -> None:
+    given = moved("yaw")
+    rates, forces = given["angular_velocity"], given["linear_acceleration"]
+    if spoil == "flips":  # of a drone, twice at 25 rad/s for 0.25 s
+        rates[300:363, 0] = rates[900:963, 0] = 25.0
+    elif spoil == "spikes":
+        rates[::3] = 1e6
+    elif spoil == "frozen":
+        rates[:, 0] = 2.0
+    elif spoil == "no forces":
+        rates[:, 0], forces[:] = 2.0, 0.0
+    elif spoil == "gaps":
+        rates[:] = 28.0
+        given["stamp"] += given["stamp"] // 1_000_000_000 * 200_000_000
+    elif spoil == "slow":
+        rates[:] = 28.0
+        given = given[::30]
+    elif spoil == "not a number":
+        rates[:, 1] = np.nan
+    elif spoil == "once":
+        rates[300:1000, 2] = 28.0
+    convention = ImuConvention()
+    assert in_parts(convention, given, 10).tobytes() == given.tobytes()
+    assert not convention.in_degrees
+
+
+def test_samples_whose_stamps_do_not_advance_do_not_pile_up() -> None:
+    samples = np.zeros(500, IMU_SAMPLE)
+    samples["linear_acceleration"][:, 2] = 9.8
+    convention = ImuConvention()
+    for _ in range(60):
+        convention.in_units(samples)
+    assert sum(map(len, convention._window)) <= 10_500
 
 
 def test_the_known_fault_of_the_l2_is_not_taken_for_a_unit() -> None:

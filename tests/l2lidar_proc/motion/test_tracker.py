@@ -260,7 +260,7 @@ def test_another_scale_of_the_accelerometer_holds_for_the_samples_so_far() -> No
     tracker = tracked(samples)
     assert tracker.filter.is_faulty
     learned = tracker.filter
-    tracker.rescale(-2.0)
+    tracker.rescale(1.0, -2.0)
     assert tracker.filter is not learned
     _, quality = tracker.trajectory(at(START), at(END))
     assert quality.flags == ()

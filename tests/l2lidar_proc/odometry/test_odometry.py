@@ -15,7 +15,7 @@ from l2lidar_node import rotations
 from l2lidar_node.types import F64, POINT, HostNs, Level, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.estimate import Status
+from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.free_space import SeenThrough
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.odometry import Odometry, Phase
@@ -470,6 +470,28 @@ def test_only_a_backlog_makes_a_pipeline_skip_and_never_many_in_a_row() -> None:
         begun = skipped.index(True) if "1" in expected else 4
         assert begun < 8
         assert "".join("01"[one] for one in skipped[begun : begun + 4]) == expected
+
+
+def test_a_live_odometry_begins_again_when_its_gyro_turns_out_to_measure_in_degrees() -> None:
+    run = recording("yard", "walk", 11.5)
+    imu = run.imu.copy()
+    imu["angular_velocity"] = np.rad2deg(imu["angular_velocity"])
+    pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU)
+    first, since = 0, 0
+    estimates: list[OdometryEstimate] = []
+    for sweep in sweeps(run, "turn"):
+        last = int(np.searchsorted(imu["stamp"], sweep.end)) + 1
+        for sample in imu[first:last].reshape(-1, 1):
+            pipeline.imu(sample)
+            if not since and pipeline.convention.in_degrees:
+                since = int(sample["stamp"][0])
+                estimates.clear()
+        first = last
+        pipeline.sweep(sweep, sweep.end)
+        estimates += pipeline.poll(sweep.end)
+    assert 0 < since < imu["stamp"][-1] - 2_000_000_000
+    assert errors(run, estimates).max() < 0.02
+    assert len(pipeline.trajectory.poses) == len(estimates)
 
 
 def test_the_newest_sample_is_not_the_one_that_comes_last() -> None:

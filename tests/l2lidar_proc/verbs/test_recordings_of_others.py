@@ -186,6 +186,20 @@ def test_a_depth_camera_whose_clouds_have_no_times(tmp_path: Path) -> None:
     assert off_by(found, given) < 0.05
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_gyro_that_measures_in_degrees(sign: float, tmp_path: Path) -> None:
+    """Also where the accelerometer points the other way besides."""
+    given = measured("small", 9.2)
+    path = tmp_path / "bag"
+    write_bag(path, given, put_ouster, imu=lambda force: sign * force, gyro=np.rad2deg)
+    found = run_bag(path, OdometryNodeConfig())
+    said = " ".join(found.report)
+    assert "the gyro measures in degrees per second: multiplied by pi / 180" in said
+    assert ("has the opposite sign" in said) == (sign < 0.0)
+    assert len(found.poses) == len(given.clouds)
+    assert off_by(found, given) < 0.025
+
+
 def test_an_accelerometer_that_points_the_other_way(tmp_path: Path) -> None:
     given = measured("small", 5.2)
     write_bag(tmp_path / "bag", given, put_ouster, imu=lambda force: -force)
