@@ -30,6 +30,7 @@ from l2lidar_proc.odometry.estimate import (
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
 from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, with_loose_motion
+from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
@@ -98,6 +99,7 @@ class Odometry:
         # posteriors of the present rest, oldest first
         self._at_rest: deque[tuple[InertialState, F64]] = deque()
         self._predictor.reset()
+        self._late_gravity = LateGravity(self._predictor)
         self._zero_velocity = ZeroVelocityTest()
         self._innovations = InnovationTest()
         self._intrinsics = LidarIntrinsics()
@@ -289,6 +291,8 @@ class Odometry:
         elif self._revisit.is_contradicted and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
         motion, is_mapped = self._with_start_velocity(sweep, motion, found, status)
+        if found is not None:
+            motion = self._late_gravity.added(motion)
         self._keep(motion)
         quality = self.matcher.quality(len(source.points), found)
         quality = self._consistency(quality, found, motion.state.stamp)
@@ -552,6 +556,7 @@ class Odometry:
             self._use(SweepMatcher(self.config, self._lever))
         self._walls.clear()
         self._start.clear()
+        self._late_gravity.clear()
         self._forget_unmatched()
         self._innovations.clear()
         self.phase = Phase.LOST
@@ -578,6 +583,7 @@ class Odometry:
         self._zero_velocity.clear()
         self._walls.clear()
         self._start.clear()
+        self._late_gravity.clear()
         self._innovations.clear()
         self._forget_unmatched()
         self._leave_rest()
@@ -628,6 +634,7 @@ class Odometry:
             status.append(Status.RETURNED)
             self._keep(still)
         else:
+            still = self._late_gravity.added(still)
             self._keep_at_rest(still)
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
@@ -702,6 +709,7 @@ class Odometry:
         self._zero_velocity.clear()
         self._walls.clear()
         self._start.clear()
+        self._late_gravity.clear()
         self._innovations.clear()
         self._next_check = int(reference)
         self._earlier.restart(reference)
