@@ -40,7 +40,9 @@ class Status(Enum):
     SUSPECT = "contradicts max_speed, the IMU, earlier sweeps or walls: the covariance is widened"
     IMU_GAP = "IMU samples are missing within the span of this estimate"
     NO_IMU = "no IMU samples: constant motion is assumed"
-    GRAVITY_UNTRUSTED = "the accelerometer's norm is not that of gravity: it is not used"
+    GRAVITY_UNTRUSTED = (
+        "no force of the size of gravity was measured: the accelerometer is not used"
+    )
     RESTARTED = "time jumped: the motion is unknown, pose and map are kept"
     LOST = "too long without a match: a new map begins at the predicted pose"
     RETURNED = "an earlier map, or part of it, was matched again: the pose jumped back into it"

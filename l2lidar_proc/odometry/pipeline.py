@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import Check, HostNs, Level, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples, Sequencer
 from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.motion.sweep_motion import still_trajectory
@@ -129,6 +130,7 @@ class OdometryPipeline:
         mount = odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
         self.check = ExtrinsicCheck(mount[:3, :3])
         self.last: OdometryEstimate | None = None
+        self._start: HostNs | None = None  # of the sweep that was registered last
 
     def motion_of(self, sweep: Sweep) -> KnownMotion | None:
         """Return the motion that was estimated for a sweep, None if there is none."""
@@ -209,6 +211,9 @@ class OdometryPipeline:
         for release in self._sequencer.release(self.newest_imu, now):
             registered = self._registered(release.sweep)
             self._remember(release.sweep, registered)
+            if not registered:
+                self._note_held(release.sweep)
+            self._start = release.sweep.start
             for estimate in registered:
                 self.counts.update(estimate.status)
                 if Status.REFUSED in estimate.status:
@@ -218,6 +223,11 @@ class OdometryPipeline:
                 estimates.append(estimate)
                 self._watch(estimate)
         return estimates
+
+    def _note_held(self, sweep: Sweep) -> None:
+        """Count a sweep without an estimate if it will never have one: its clock stands still."""
+        if self._start is not None and -tuning.LONG_GAP_NS < sweep.start - self._start <= 0:
+            self.counts[Status.REFUSED] += 1
 
     def _registered(self, sweep: Sweep) -> list[OdometryEstimate]:
         """Register a sweep, or let it pass where too many others wait."""
@@ -276,6 +286,8 @@ def judge(
     values |= {f"clouds refused: {reason}": str(count) for reason, count in refused.items()}
     if last is None:
         text = "waiting until the first sweeps match" if since else "no clouds"
+        if since and counts[Status.REFUSED] >= since:
+            text = "the stamps of the clouds do not advance"
         return Check("odometry", Level.WARN, text, values)
     quality = last.quality
     sigma = np.sqrt(np.diag(last.covariance))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -338,6 +338,38 @@ def _imu_topic(kinds: dict[str, str], wanted: str, cloud: str) -> str:
     return bag.chosen(kinds, wanted, bag.IMU, "imu_topic")
 
 
+class _Clock:
+    """What the messages of a topic show of the clock of their stamps.
+
+    Attributes
+    ----------
+    count : int
+        Messages.
+    first : int
+        Stamp of the first one [ns].
+    advances : bool
+        Whether another one has another stamp.
+    least_delay : int or None
+        From the stamp of what was measured to its recording [ns].
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first = 0
+        self.advances = False
+        self.least_delay: int | None = None
+
+    def note(self, stamp: int) -> None:
+        if not self.count:
+            self.first = stamp
+        self.count += 1
+        self.advances |= stamp != self.first
+
+    def note_delay(self, delay: int) -> None:
+        known = self.least_delay
+        self.least_delay = delay if known is None else min(delay, known)
+
+
 class _Listener:
     """Converts messages to events, and reads the mounts from /tf_static.
 
@@ -365,7 +397,7 @@ class _Listener:
         self._turns = False  # whether one of them has a rate
         self._mute = ""  # topic of an IMU without rates
         self._snapshots = 0
-        self._delays: dict[str, int] = {}  # smallest, from stamp to recording [ns], by topic
+        self._clocks: defaultdict[str, _Clock] = defaultdict(_Clock)  # by topic
         self._damaged: Counter[str] = Counter()  # messages, by topic
 
     def look_ahead(self, reader: AnyReader) -> None:
@@ -426,7 +458,9 @@ class _Listener:
         elif topic == self.imu:
             self._mount(message.header.frame_id)
             samples = bag.sample_of(message)
-            self._note_delay(topic, now - int(samples["stamp"][0]))
+            stamp = int(samples["stamp"][0])
+            self._clocks[topic].note(stamp)
+            self._clocks[topic].note_delay(now - stamp)
             self.runner.take((now, samples))
         elif self._tells_mounts(topic, bag.TRANSFORMS):
             self.runner.refused.update(self._frames.take(message))
@@ -463,8 +497,11 @@ class _Listener:
                     "/tf_static: the position of the IMU is imu_xyz, and its axes are those of "
                     "the clouds; if they are not, set imu_rpy in a parameter file (--params-file)"
                 )
-            if problem := self._two_clocks():
-                notes.append(problem)
+        standing = self._standing_clocks()
+        notes += standing
+        is_inertial = self._config.odometry.mode == "inertial"
+        if is_inertial and not standing and (problem := self._two_clocks()):
+            notes.append(problem)
         if self._snapshots:
             notes.append(
                 f"{self._snapshots} clouds without a time per point: each is taken as "
@@ -476,14 +513,22 @@ class _Listener:
         ]
         return self.runner.finish()
 
-    def _note_delay(self, topic: str, delay: int) -> None:
-        self._delays[topic] = min(delay, self._delays.get(topic, delay))
+    def _standing_clocks(self) -> list[str]:
+        """Return which topics have messages of one and the same stamp."""
+        return [
+            f"all {clock.count} messages on '{topic}' have the stamp {clock.first / 1e9:.3f} s: "
+            "they cannot be used, since nothing tells when each was measured; let the driver "
+            "stamp them"
+            for topic, clock in self._clocks.items()
+            if clock.count > 1 and not clock.advances
+        ]
 
     def _two_clocks(self) -> str:
         """Return that the stamps of clouds and IMU are of two clocks; empty if they are not."""
-        if len(self._delays) < 2:
+        delays = (self._clocks[self.cloud].least_delay, self._clocks[self.imu].least_delay)
+        if delays[0] is None or delays[1] is None:
             return ""
-        apart_s = (self._delays[self.cloud] - self._delays[self.imu]) / 1e9
+        apart_s = (delays[0] - delays[1]) / 1e9
         if abs(apart_s) < _SAME_CLOCK_S:
             return ""
         pipeline = self.runner.pipeline
@@ -509,6 +554,7 @@ class _Listener:
         self, frame: str, stamp: HostNs, now: int, points: Callable[[], NDArray[np.void]]
     ) -> None:
         self._cloud_frame = frame
+        self._clocks[self.cloud].note(stamp)
         base = self._config.topics.base_frame
         if base:
             T_cloud_base = self._frames.find(self._cloud_frame, base)
@@ -522,7 +568,7 @@ class _Listener:
             self.runner.refused[str(error)] += 1
             return
         self._snapshots += sweep.start == sweep.end
-        self._note_delay(self.cloud, now - sweep.end)
+        self._clocks[self.cloud].note_delay(now - sweep.end)
         self.runner.take((now, sweep))
 
     def _mount(self, imu_frame: str) -> None:

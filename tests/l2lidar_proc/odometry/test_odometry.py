@@ -506,6 +506,34 @@ def test_the_newest_sample_is_not_the_one_that_comes_last() -> None:
     assert pipeline.newest_imu == run.imu["stamp"][59]
 
 
+def test_a_clock_of_clouds_that_stands_still_is_said_to() -> None:
+    run = recording("room", "walk")
+    some = list(sweeps(run, "turn"))[:9]
+    pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU)
+    for number, sweep in enumerate(some):
+        length = sweep.end - sweep.start
+        still = dataclasses.replace(sweep, start=some[0].start, end=HostNs(some[0].start + length))
+        pipeline.imu(run.imu[100 * number : 100 * (number + 1)])
+        pipeline.sweep(still, sweep.end)
+        pipeline.poll(HostNs(sweep.end + 1_000_000_000))
+    assert pipeline.counts == {Status.REFUSED: 8}
+    found = judge(pipeline.last, pipeline.sweeps, 4, pipeline.counts, Counter())
+    assert (found.level, found.message) == (Level.WARN, "the stamps of the clouds do not advance")
+
+
+def test_sweeps_that_are_held_until_the_map_begins_are_not_refused() -> None:
+    run = recording("room", "walk")
+    pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU)
+    first = 0
+    for sweep in list(sweeps(run, "turn"))[:2]:
+        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
+        pipeline.imu(run.imu[first:last])
+        first = last
+        pipeline.sweep(sweep, sweep.end)
+        assert pipeline.poll(sweep.end) == []
+    assert not pipeline.counts
+
+
 def test_a_skipped_sweep_is_a_warning_and_a_blocked_sensor_an_error() -> None:
     last = driven("room", "walk")[-1]
     for status, expected in (

@@ -273,6 +273,24 @@ def test_an_imu_with_another_clock_is_said_not_to_belong(
     assert "record both with the stamps of one clock" in said
 
 
+@pytest.mark.parametrize("stamp_s", [0, 1_700_000_000])
+def test_stamps_that_stand_still_are_said_to(run: Any, stamp_s: int, tmp_path: Path) -> None:
+    given = measured()
+    with BagMaker(tmp_path / "bag") as maker:
+        for stamp, cloud in given.clouds[:8]:
+            put = ouster(cloud, stamp)
+            maker.cloud("/points", stamp_s * 10**9, FRAME, put, stamp + 10**8)
+        for k, stamp in enumerate(given.stamps[:200].tolist()):
+            force = given.forces[k]
+            maker.imu("/imu", stamp_s * 10**9, "imu", given.rates[k], force, stamp)
+    done = run("odometry", str(tmp_path / "bag"), str(tmp_path / "out"))
+    assert done.code == 1
+    assert f"all 8 messages on '/points' have the stamp {stamp_s}.000 s: " in done.out + done.err
+    assert f"all 200 messages on '/imu' have the stamp {stamp_s}.000 s: " in done.out + done.err
+    assert "7 sweeps: not later than the previous sweep: ignored" in done.out + done.err
+    assert "record both" not in done.out + done.err
+
+
 def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     given = measured()
 
