@@ -44,6 +44,16 @@ _LONGEST_NS: Final = 1_000_000_000  # between poses: longer ones span a gap
 _LARGEST_GAP_NS: Final = 30_000_000  # between samples within such an interval
 _FEWEST: Final = 4 * _PARTS  # intervals
 _HEAD_TURN_NS: Final = 230_000_000
+# ---- of a rotation that may be large
+_COARSE_NS: Final = 380_000_000  # between poses: shorter turns are hardly more than their noise
+_COARSE_LEAST: Final = 12  # turns
+_COARSE_UNEXPLAINED: Final = 0.5  # share, at most. Scan matching of walks leaves 0.1
+_COARSE_SD: Final = 0.16  # [rad] at most: five of them tell apart two that map axes to axes
+_COARSE_LEAST_ANGLE: Final = np.deg2rad(15.0)  # a smaller one is a matter of calibration
+_COARSE_EXCESS: Final = 40.0  # of three degrees of freedom; right axes reach 15 by chance
+# [rad] within which it may be one that maps axes to axes, at least, and in standard deviations
+_COARSE_SNAP: Final = 0.05
+_COARSE_SNAP_SDS: Final = 2.5
 _STRAY: Final = 0.5  # [rad^2/s] of an axis that is not turned about: it explains nothing
 
 
@@ -335,6 +345,100 @@ def align(
         model.values + parts,
         parts_sd,
         excitation(samples["stamp"], samples["angular_velocity"].astype(np.float64)),
+    )
+
+
+class CoarseRotation(NamedTuple):
+    """How the axes of a gyro lie in those of clouds, from their turns alone.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (3, 3)
+        IMU axes to cloud axes.
+    sd : float
+        Standard deviation of it, about the axis about which it is known worst [rad].
+    unexplained : float
+        Share of the turns' squares that it leaves.
+    drawn_excess : float
+        Squared Mahalanobis distance that the turns have more with the axes of the clouds.
+    """
+
+    matrix: F64
+    sd: float
+    unexplained: float
+    drawn_excess: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the gyro turns as the clouds do, and would not with the clouds' axes."""
+        return (
+            self.unexplained < _COARSE_UNEXPLAINED
+            and self.sd < _COARSE_SD
+            and self.contradicts_drawn
+        )
+
+    @property
+    def contradicts_drawn(self) -> bool:
+        """Whether the axes of the clouds cannot be those of the gyro, by far."""
+        angle = float(np.arccos(np.clip((np.trace(self.matrix) - 1.0) / 2.0, -1.0, 1.0)))
+        return angle > _COARSE_LEAST_ANGLE and self.drawn_excess > _COARSE_EXCESS
+
+
+def coarse_rotation(
+    stamps: NDArray[np.int64], orientations: F64, samples: Samples
+) -> CoarseRotation | None:
+    """Return how a gyro lies in the axes of clouds, however far it is turned.
+
+    The rotation that takes its turns to those of the poses best, in the sense of least squares
+    (Kabsch 1976; the problem of Wahba 1965). Where it may be one that maps axes to axes, as
+    drivers and mounts have them, it is that one.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (N,), int64
+        Of the poses [ns], ascending.
+    orientations : ndarray, shape (N, 4)
+        Cloud axes to fixed axes, w, x, y, z.
+    samples : ndarray, shape (M,), dtype IMU_SAMPLE
+        As measured, ascending.
+
+    Returns
+    -------
+    CoarseRotation or None
+        None where there are too few turns.
+    """
+    from scipy.spatial.transform import Rotation
+
+    kept = [0] if len(stamps) else []
+    for number, stamp in enumerate(stamps.tolist()):
+        if stamp - stamps[kept[-1]] >= _COARSE_NS:
+            kept.append(number)
+    at, poses = stamps[kept], orientations[kept]
+    standing = np.tile([1.0, 0.0, 0.0, 0.0], (len(at), 1))
+    drawn = GyroModel.ideal()
+    by_gyro = turns_between(at, standing, samples, drawn)
+    within = np.isin(at[1:], by_gyro.ends)
+    by_poses = rotations.log(
+        rotations.multiply(rotations.conjugate(poses[:-1]), poses[1:])[within]
+    )
+    if len(by_poses) < _COARSE_LEAST:
+        return None
+    # without their means: a bias of the gyro is in these
+    theirs, ours = (turns - turns.mean(axis=0) for turns in (-by_gyro.residual, by_poses))
+    strengths = np.linalg.svd(theirs.T @ ours, compute_uv=False)
+    matrix = Rotation.align_vectors(ours, theirs)[0].as_matrix()
+    left = float(((ours - theirs @ matrix.T) ** 2).sum())
+    variance = max(left / (3 * len(ours) - 6), _LEAST_RESIDUAL**2)
+    # about the axis of the most turns the others tell, whose third may count negative (a mirror)
+    told = strengths[1] + np.sign(np.linalg.det(theirs.T @ ours)) * strengths[2]
+    sd = float(np.sqrt(variance / max(told, variance)))
+    group = Rotation.create_group("O").as_matrix()
+    angles = Rotation.from_matrix(group @ matrix.T).magnitude()
+    if angles.min() < max(_COARSE_SNAP, _COARSE_SNAP_SDS * sd):
+        matrix = group[int(np.argmin(angles))]
+    drawn_left = float(((ours - theirs) ** 2).sum())
+    return CoarseRotation(
+        matrix, sd, left / max(float((ours**2).sum()), variance), (drawn_left - left) / variance
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 
+from l2lidar_node import rotations
 from l2lidar_node.config import DriverConfig
 from l2lidar_node.frames import FrameTree
 from l2lidar_node.recording.packet_bag import open_packets
@@ -21,6 +22,7 @@ from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc.cloud import CloudError, to_sweep
+from l2lidar_proc.motion.gyro_alignment import CoarseRotation, coarse_rotation
 from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate, Status
@@ -35,6 +37,8 @@ _UPRIGHT: Final = 0.5  # cosine of the angle between the clouds' z and up
 _SAME_CLOCK_S: Final = 1.0  # apart at most; buffers and networks delay messages by less
 _ENOUGH_SAMPLES: Final = 10  # no gyro gives 0.0 about all axes in so many
 _SIGN_S: Final = 20.0  # of a recording in which the accelerometer's sign is looked for
+_AXES_S: Final = 30.0  # of a recording in which the IMU's axes are looked for
+_DOUBTFUL_SHARE: Final = 0.2  # of the sweeps, with which they are. Right axes leave 0.0 to 0.05
 _CAPTURE: Final = {"imu_adjust": False, "sweep_cut": "turn"}
 
 Progress = Callable[[float], None]
@@ -95,6 +99,8 @@ class OdometryRunner:
         Given the estimates one by one.
     known : ImuConvention, optional
         What is known of the IMU's units and sign.
+    rotation : ndarray, shape (3, 3), optional
+        IMU axes to cloud axes, in place of what mounts and settings say.
     accelerometer : bool
         False: the accelerometer is watched, for its sign, but not used.
 
@@ -114,15 +120,19 @@ class OdometryRunner:
         observer: Observer | None = None,
         *,
         known: ImuConvention | None = None,
+        rotation: NDArray[np.float64] | None = None,
         accelerometer: bool = True,
     ) -> None:
         self._observer = observer
         topics = config.topics
+        extrinsics = ImuExtrinsics.of(topics)
+        if rotation is not None:
+            extrinsics = replace(extrinsics, rotation=rotation)
         self.pipeline = OdometryPipeline(
             config.odometry,
             topics.T_cloud_imu,
             topics.imu_wait_ms,
-            ImuExtrinsics.of(topics),
+            extrinsics,
             accelerometer=accelerometer,
         )
         if known is not None:
@@ -276,20 +286,85 @@ def run_bag(
             made.look_ahead(reader)
             return made
 
-        known = ImuConvention()
-        final = listener(OdometryRunner(config, observer))
-        while final.may_be_opposite and not known.reversed:
-            trial = listener(OdometryRunner(config, known=known, accelerometer=False))
-            if _heard(reader, trial, until_s=_SIGN_S):
-                break
-            known.adopt(trial.runner.pipeline.convention)
-            final = listener(OdometryRunner(config, observer, known=known))
-        # an observer cannot be told the same twice: for it a new map begins in between
-        while not _heard(reader, final, progress, stops=observer is None):
-            # it took down for up, or degrees for radians: from the beginning
-            known.adopt(final.runner.pipeline.convention)
-            final = listener(OdometryRunner(config, known=known))
+        final = _followed(reader, listener, config, progress, observer)
+        if final.may_be_turned:
+            axes = _axes_of_imu(reader, config, cloud, final)
+            if axes is not None and not axes.is_clear and axes.contradicts_drawn:
+                final.runner.notes.append(
+                    "the gyro does not turn as the clouds do: set imu_rpy to how the IMU's axes "
+                    "lie in those of the clouds; longer turns about two axes would show it"
+                )
+            elif axes is not None and axes.is_clear:
+                # nor can an observer be told of this: it has seen how the odometry failed
+                final = _followed(reader, listener, config, progress, None, axes.matrix)
+                final.runner.notes.append(_axes_note(axes.matrix))
         return final.finish()
+
+
+def _followed(
+    reader: AnyReader,
+    listener: Callable[[OdometryRunner], _Listener],
+    config: OdometryNodeConfig,
+    progress: Progress,
+    observer: Observer | None,
+    rotation: NDArray[np.float64] | None = None,
+) -> _Listener:
+    """Return a listener that has heard all of a bag, with sign and units of the IMU as found."""
+    known = ImuConvention()
+    final = listener(OdometryRunner(config, observer, rotation=rotation))
+    while final.may_be_opposite and not known.reversed:
+        trial = listener(
+            OdometryRunner(config, known=known, rotation=rotation, accelerometer=False)
+        )
+        if _heard(reader, trial, until_s=_SIGN_S):
+            break
+        known.adopt(trial.runner.pipeline.convention)
+        final = listener(OdometryRunner(config, observer, known=known, rotation=rotation))
+    # an observer cannot be told the same twice: for it a new map begins in between
+    while not _heard(reader, final, progress, stops=observer is None):
+        # it took down for up, or degrees for radians: from the beginning
+        known.adopt(final.runner.pipeline.convention)
+        final = listener(OdometryRunner(config, known=known, rotation=rotation))
+    return final
+
+
+def _axes_of_imu(
+    reader: AnyReader, config: OdometryNodeConfig, cloud: str, failed: _Listener
+) -> CoarseRotation | None:
+    """Return how an IMU lies in the clouds' axes; None if it is as assumed, or does not show.
+
+    The clouds alone are followed through the first seconds, and their turns compared with the
+    gyro's.
+    """
+    poses: list[tuple[int, NDArray[np.float64]]] = []
+    plain = replace(config, odometry=replace(config.odometry, mode="plain"))
+    alone = OdometryRunner(plain, lambda item, _: poses.append((item.stamp, item.T_map_lidar)))
+    _heard(reader, _Listener(alone, plain, cloud, ""), until_s=_AXES_S)
+    samples = []
+    for connection, now, data in bag.messages(reader):
+        if now > reader.start_time + _AXES_S * 1e9:
+            break
+        if connection.topic == failed.imu:
+            message = bag.message_of(reader, connection, data)
+            if message is not None:
+                samples.append(bag.sample_of(message))
+    if not samples or not poses:
+        return None
+    ordered = np.concatenate(samples)
+    ordered = ordered[np.argsort(ordered["stamp"], kind="stable")]
+    return coarse_rotation(
+        np.array([stamp for stamp, _ in poses], np.int64),
+        np.array([rotations.from_matrix(pose[:3, :3]) for _, pose in poses]),
+        failed.runner.pipeline.convention.applied(ordered),
+    )
+
+
+def _axes_note(rotation: NDArray[np.float64]) -> str:
+    rpy = [round(angle) for angle in np.degrees(rotations.to_rpy(rotation)).tolist()]
+    return (
+        f"the IMU's axes are turned against those of the clouds: imu_rpy {rpy} was found by "
+        "comparing their turns, and used; set it in the parameter file of a live node"
+    )
 
 
 def _heard(
@@ -442,6 +517,17 @@ class _Listener:
             return False
         up = odometry.T_cloud_imu[:3, :3] @ self._force / np.linalg.norm(self._force)
         return bool(up[2] < _UPRIGHT)
+
+    @property
+    def may_be_turned(self) -> bool:
+        """Whether the odometry failed, and nothing tells how the IMU's axes lie."""
+        topics, pipeline = self._config.topics, self.runner.pipeline
+        is_told = any(topics.imu_rpy) or pipeline.extrinsics.rotation is not None
+        is_told |= self._is_mounted and self._imu_frame != self._cloud_frame
+        if is_told or not self.imu or self._config.odometry.mode != "inertial":
+            return False
+        failed = max(pipeline.counts[status] for status in (Status.SUSPECT, Status.UNMATCHED))
+        return failed > _DOUBTFUL_SHARE * pipeline.sweeps
 
     def read(self, reader: AnyReader, connection: Connection, data: bytes) -> Any:
         """Return a message, None if it is damaged; then it is counted."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from l2lidar_node import rotations
+from l2lidar_node.types import F64
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.gyro_alignment import GyroError, GyroModel
 from tests.l2lidar_proc.motion.turned_gyro import EPOCH, TRUE, recording
@@ -130,3 +133,68 @@ def test_gaps_and_strays_do_not_spoil_it() -> None:
         gyro.align(stamps[:20], q[:20], samples)
     with pytest.raises(GyroError, match="0 turns"):
         gyro.align(stamps, q, samples[:0])
+
+
+def turned(samples: NDArray[np.void], rotation: F64) -> NDArray[np.void]:
+    """Return the samples of an IMU whose axes lie in the clouds' as a rotation (3, 3) says."""
+    out = samples.copy()
+    out["angular_velocity"] = samples["angular_velocity"] @ TRUE.rotation.T @ rotation
+    return out
+
+
+def test_a_large_rotation_is_found_and_its_deviation_is_that_of_the_errors() -> None:
+    squares = []
+    for seed in range(30):
+        rotation = Rotation.random(random_state=seed).as_matrix()
+        stamps, q, samples = recording(axes=(0.05, 0.04, 0.3), noise=5e-3, seed=seed)
+        found = gyro.coarse_rotation(stamps, q, turned(samples, rotation))
+        assert found is not None
+        assert found.is_clear
+        off = float(Rotation.from_matrix(found.matrix @ rotation.T).magnitude())
+        squares.append((off / found.sd) ** 2)
+    assert 0.2 < np.mean(squares) < 2.0  # of the worst axis, and two better ones
+
+
+@pytest.mark.parametrize("rpy", [(180, 0, 0), (0, 0, 90), (-90, 0, 90), (0, 90, 0)])
+def test_axes_that_lie_along_others_are_found_exactly(rpy: tuple[float, ...]) -> None:
+    rotation = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()
+    stamps, q, samples = recording(axes=(0.05, 0.04, 0.3), noise=5e-3)
+    found = gyro.coarse_rotation(stamps, q, turned(samples, rotation))
+    assert found is not None
+    assert found.is_clear
+    np.testing.assert_allclose(found.matrix, rotation, atol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 8.0])
+def test_axes_near_those_of_the_clouds_are_no_finding(degrees: float) -> None:
+    """What is off by some degrees, calibrate measures."""
+    rotation = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    for seed in range(10):
+        stamps, q, samples = recording(axes=(0.05, 0.04, 0.3), noise=5e-3, seed=seed)
+        found = gyro.coarse_rotation(stamps, q, turned(samples, rotation))
+        assert found is not None
+        assert not found.is_clear
+        assert not found.contradicts_drawn
+
+
+def test_turns_about_one_axis_alone_tell_no_rotation_about_it() -> None:
+    rotation = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    stamps, q, samples = recording(axes=(0.0, 0.0, 1.0), noise=5e-3)
+    found = gyro.coarse_rotation(stamps, q, turned(samples, rotation))
+    assert found is not None
+    assert not found.is_clear
+
+
+def test_a_gyro_that_does_not_turn_with_the_clouds_has_no_rotation() -> None:
+    stamps, q, samples = recording()
+    samples["angular_velocity"] = samples["angular_velocity"][::-1]
+    found = gyro.coarse_rotation(stamps, q, samples)
+    assert found is not None
+    assert not found.is_clear
+
+
+def test_a_few_turns_are_too_few() -> None:
+    stamps, q, samples = recording()
+    assert gyro.coarse_rotation(stamps[:12], q[:12], samples) is None
+    assert gyro.coarse_rotation(stamps[:0], q[:0], samples) is None
+    assert gyro.coarse_rotation(stamps, q, samples[:0]) is None
