@@ -23,7 +23,7 @@ from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording.bag import points_of, stamp_of
 from l2lidar_proc.verbs.deskew import deskew_recording
-from l2lidar_proc.verbs.recorded import run_bag
+from l2lidar_proc.verbs.recorded_bag import run_bag
 from tests.support.odometry_runs import Run, record, sweeps
 
 PAGE: Final = Path("docs/demo.gif")

@@ -17,7 +17,8 @@ from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import outputs
 from l2lidar_proc.recording.bag import RecordingError
 from l2lidar_proc.recording.outputs import kitti, tum
-from l2lidar_proc.verbs.recorded import OdometryRun, run_bag, run_capture
+from l2lidar_proc.verbs.recorded import OdometryRun, run_capture
+from l2lidar_proc.verbs.recorded_bag import run_bag
 
 _FILES: Final = ("trajectory.tum", "trajectory.kitti", "map.ply", "trajectory.png")
 

@@ -23,7 +23,8 @@ from l2lidar_proc.slam.config import SlamNodeConfig
 from l2lidar_proc.slam.nodes import OdometrySweep
 from l2lidar_proc.slam.pose_graph import GtsamMissingError
 from l2lidar_proc.slam.slam import Slam
-from l2lidar_proc.verbs.recorded import run_bag, run_capture
+from l2lidar_proc.verbs.recorded import run_capture
+from l2lidar_proc.verbs.recorded_bag import run_bag
 
 _MAP: Final = "map"
 _EXPORTS: Final = ("tum", "kitti", "g2o", "ply")

@@ -13,7 +13,8 @@ from l2lidar_node.types import Sweep
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
-from l2lidar_proc.verbs.recorded import run_bag, run_events
+from l2lidar_proc.verbs.recorded import run_events
+from l2lidar_proc.verbs.recorded_bag import run_bag
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.support.odometry_runs import sweeps, truth
 

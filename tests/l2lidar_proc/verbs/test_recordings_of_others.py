@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
-from l2lidar_proc.verbs.recorded import OdometryRun, run_bag
+from l2lidar_proc.verbs.recorded import OdometryRun
+from l2lidar_proc.verbs.recorded_bag import run_bag
 from tests.support.foreign_bags import (
     EPOCH,
     FORMATS,
