@@ -85,9 +85,10 @@ def run_bag(
                     "lie in those of the clouds; longer turns about two axes would show it"
                 )
             elif axes is not None and axes.is_clear:
-                # nor can an observer be told of this: it has seen how the odometry failed
-                final = _followed(reader, listener, config, progress, None, axes.matrix)
-                final.runner.notes.append(_axes_note(axes.matrix))
+                # an observer has seen how the odometry failed: with one, it has to be run again
+                if observer is None:
+                    final = _followed(reader, listener, config, progress, None, axes.matrix)
+                final.runner.notes.append(_axes_note(axes.matrix, is_used=observer is None))
         return final.finish()
 
 
@@ -149,11 +150,16 @@ def _axes_of_imu(
     )
 
 
-def _axes_note(rotation: NDArray[np.float64]) -> str:
+def _axes_note(rotation: NDArray[np.float64], *, is_used: bool) -> str:
     rpy = [round(angle) for angle in np.degrees(rotations.to_rpy(rotation)).tolist()]
+    advice = (
+        "and used; set it in the parameter file of a live node"
+        if is_used
+        else "but not used: set it in a parameter file (--params-file), and run again"
+    )
     return (
         f"the IMU's axes are turned against those of the clouds: imu_rpy {rpy} was found by "
-        "comparing their turns, and used; set it in the parameter file of a live node"
+        f"comparing their turns, {advice}"
     )
 
 

@@ -175,6 +175,8 @@ def test_an_imu_with_other_axes_and_no_transform(tmp_path: Path) -> None:
     assert "imu_rpy [-90, 0, 90] was found by comparing" in " ".join(found.report)
     assert len(found.poses) == len(given.clouds)
     assert off_by(found, given) < 0.025
+    watched = run_bag(path, OdometryNodeConfig(), observer=lambda estimate, base: None)
+    assert "but not used: set it in a parameter file" in " ".join(watched.report)
 
 
 def test_too_short_to_tell_how_the_imu_lies_it_says_what_to_set(tmp_path: Path) -> None:
