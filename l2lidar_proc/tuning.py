@@ -734,6 +734,10 @@ STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have be
 RETRY_NS: Final = 4_000_000_000  # [ns] until then a rest that was none is begun again, as motion,
 RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] or, if the IMU ends it by then, if that fits closer
 RETRY_FARTHEST_M: Final = 0.5  # [m] if that went no farther
+# A rest that has ended is mapped again with what the first sweeps in motion tell about the unit,
+# until then, and if it went no farther. Derived: a walker's first steps, which still see the place
+REST_LEFT_NS: Final = 5_000_000_000  # [ns]
+REST_LEFT_M: Final = 4.0  # [m]
 
 # ---- odometry: lost, and jumps of time
 

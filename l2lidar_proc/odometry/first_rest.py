@@ -8,6 +8,8 @@ them when the beam angles are known better than in the map.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from l2lidar_node.types import F64, Sweep
@@ -18,6 +20,26 @@ from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
+
+
+class LeftRest(NamedTuple):
+    """A rest that motion has ended.
+
+    Attributes
+    ----------
+    sweeps : list of Sweep
+        As the unit would have measured them with what is known of it now.
+    state : InertialState
+        At rest, at any stamp.
+    covariance : ndarray, shape (18, 18)
+    moved : ndarray, shape (6, 6)
+        Covariance of the shift and turn by which this may move poses [m, rad].
+    """
+
+    sweeps: list[Sweep]
+    state: InertialState
+    covariance: F64
+    moved: F64
 
 
 class FirstRest:
@@ -48,10 +70,13 @@ class FirstRest:
         self._intrinsics = intrinsics
         self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
         self.sweeps: list[Sweep] = []
+        # its sweeps, and state and covariance at its end, for a moment
+        self._left: tuple[list[Sweep], InertialState, F64] | None = None
 
     def begin(self, sweeps: list[Sweep]) -> None:
         """Take the sweeps with which a map has begun at rest."""
         self.sweeps, self._mapped_with = sweeps, self._corrections
+        self._left = None
 
     def note(self, sweep: Sweep) -> None:
         """Take another sweep of this rest, if it is still the first one."""
@@ -60,8 +85,50 @@ class FirstRest:
 
     def end(self) -> list[Sweep]:
         """Return the sweeps, and keep none."""
-        sweeps, self.sweeps = self.sweeps, []
+        sweeps, self.sweeps, self._left = self.sweeps, [], None
         return sweeps
+
+    def leave(self, sweeps: list[Sweep], state: InertialState, covariance: F64) -> None:
+        """Take that motion has ended the rest.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            All those of the rest, as :meth:`end` returned them.
+        state : InertialState
+            At rest, at any stamp.
+        covariance : ndarray, shape (18, 18)
+        """
+        self._left = (sweeps, state, covariance) if sweeps else None
+
+    def known_better(self, now: InertialState) -> LeftRest | None:
+        """Return the rest that has just ended, if the unit is known better than in its map.
+
+        Where the sensor sees to one side only, corrected angles and ranges shift it against a map
+        without them, and nothing would undo that: half a hall and 38 mm made 40 mm.
+
+        Parameters
+        ----------
+        now : InertialState
+            In motion.
+        """
+        if self._left is None:
+            return None
+        sweeps, state, covariance = self._left
+        far = float(np.linalg.norm(now.position - state.position))
+        if now.stamp - sweeps[-1].end > tuning.REST_LEFT_NS or far > tuning.REST_LEFT_M:
+            self._left = None
+        if self._left is None or not self._is_known_better:
+            return None
+        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
+        turn = tuning.BEAM_DRIFT_TURN * max(angles)
+        shift = tuning.BEAM_DRIFT_SHIFT * max(angles) + ranges
+        return LeftRest(
+            [self._intrinsics.applied_to(one) for one in sweeps],
+            state,
+            covariance,
+            np.diag(np.square([shift] * 3 + [turn] * 3)),
+        )
 
     def end_doubt(self) -> None:
         """Keep no sweeps of a rest that has lasted so long that it was one."""
@@ -87,8 +154,7 @@ class FirstRest:
             return None
         if doubted or self._intrinsics.is_due_at_rest(self.sweeps):
             self._intrinsics.learn_at_rest(self.sweeps)
-        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
-        if max(angles) <= tuning.BEAM_CHANGE and ranges <= tuning.RANGE_BIAS_CHANGE:
+        if not self._is_known_better:
             return None
         self._mapped_with = self._corrections
         better = [self._intrinsics.applied_to(one) for one in self.sweeps]
@@ -158,6 +224,12 @@ class FirstRest:
         """Forget what the beams have shown of themselves: the sensor moved."""
         self._intrinsics.forget()
         self._mapped_with = self._corrections
+
+    @property
+    def _is_known_better(self) -> bool:
+        """Whether the unit is known to be wrong by more than in the map."""
+        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
+        return bool(max(angles) > tuning.BEAM_CHANGE or ranges > tuning.RANGE_BIAS_CHANGE)
 
     @property
     def _corrections(self) -> F64:

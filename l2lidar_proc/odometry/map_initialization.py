@@ -274,6 +274,17 @@ class MapInitializer:
             self._zero_velocity.clear()  # a sweep met nothing of those before it
         return agree
 
+    def map_rest(self, sweeps: list[Sweep], state: InertialState, covariance: F64) -> None:
+        """Begin the map again with a rest that is over, and was one beyond doubt.
+
+        Parameters
+        ----------
+        sweeps, state, covariance
+            As for :meth:`begin_again_at_rest`.
+        """
+        start = dataclasses.replace(state, stamp=self._predictor.reference(sweeps[0]))
+        self._at_rest(sweeps, sweeps[0].start, start, covariance, is_known=True)
+
     def begin_again_in_motion(
         self, sweeps: list[Sweep], state: InertialState, covariance: F64
     ) -> list[SweepMotion]:

@@ -299,12 +299,42 @@ class Odometry:
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._intrinsics.learn(sweep, estimate.points, at_rest=False)
+            is_mapped |= self._rest_is_mapped_anew(motion)
         is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
         if not is_mapped and (found is not None or is_new):
             expected_share = self._innovations.expected_share
             fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
             self._anchor_anew(fresh)
         return estimate
+
+    def _rest_is_mapped_anew(self, motion: SweepMotion) -> bool:
+        """Begin a map with the rest that has just ended, if the unit is known better by now.
+
+        Return whether it is used, and has the latest sweep; it is if that meets it.
+        """
+        left = self._first_rest.known_better(motion.state)
+        if left is None:
+            return False
+        matcher = SweepMatcher(self.config, self._lever)
+        initializer = MapInitializer(
+            self._predictor, matcher, ZeroVelocityTest(), self.config.min_points
+        )
+        initializer.map_rest(left.sweeps, left.state, left.covariance)
+        sweep = self._intrinsics.applied_to(self._reported)
+        covariance = eskf.with_loose_pose(motion.state, motion.covariance, left.moved)
+        loose = dataclasses.replace(motion, covariance=covariance)
+        found = matcher.match(matcher.source(sweep, loose), loose).alignment
+        if found is None:
+            return False
+        self._use(matcher)
+        matcher.meet(found, 0.0)
+        self._walls.clear()
+        self._innovations.clear()
+        motion = motion.with_state(found.state, found.covariance)
+        self._keep(motion)
+        fresh = matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
+        self._anchor_anew(fresh)
+        return True
 
     def _with_start_velocity(
         self, sweep: Sweep, motion: SweepMotion, found: Alignment | None, status: list[Status]
@@ -653,7 +683,10 @@ class Odometry:
             if self._at_rest:
                 # the onset of the motion is in samples that passed for rest
                 self._posterior = self._at_rest[0]
+            sweeps = self._first_rest.end()
             self._leave_rest()
+            assert self._posterior is not None
+            self._first_rest.leave(sweeps, *self._posterior)
             return False
         self._first_rest.note(self._reported)
         return True
@@ -679,7 +712,9 @@ class Odometry:
                     sweep, begun.motions[-1], [*status, Status.STARTING], quality
                 )
             self._discard_map()
+            sweeps = []
         self._leave_rest()
+        self._first_rest.leave(sweeps[:-1], state, covariance)
         return None
 
     # ---- steps

@@ -18,6 +18,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
 from l2lidar_proc.odometry.fan_halves import between_halves, halves
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
+from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.verbs.recorded import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
@@ -258,6 +259,34 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
     assert odometry._intrinsics._rested_ns == 0
     odometry._first_rest.map_with_known_beams(odometry.motion, doubted=True)
     assert odometry._intrinsics._rested_ns > 600_000_000
+
+
+def test_a_rest_that_has_just_ended_is_known_better_if_the_unit_is() -> None:
+    odometry = Odometry(OdometryConfig(), np.eye(4))
+    odometry.imu(resting())
+    some = [turn(UNIT, k)[0] for k in range(4)]
+    for sweep in some:
+        odometry.register(sweep)
+    rest, intrinsics = odometry._first_rest, odometry._intrinsics
+    assert odometry._posterior is not None
+    state, covariance = odometry._posterior
+    assert rest.known_better(state) is None  # it has not ended
+    rest.leave(rest.end(), state, covariance)
+    assert rest.known_better(state) is None  # no more than in its map
+    intrinsics.ranges.correction += 0.03
+    found = rest.known_better(state)
+    assert found is not None
+    assert len(found.sweeps) == len(some)
+    shift = float(np.sqrt(found.moved[0, 0]))
+    assert shift == pytest.approx(0.03, abs=0.005)
+    for better, one in zip(found.sweeps, some, strict=True):
+        further = np.linalg.norm(xyz(better.points), axis=1) - np.linalg.norm(
+            xyz(one.points), axis=1
+        )
+        assert np.median(further) == pytest.approx(0.03, abs=0.005)
+    far = dataclasses.replace(state, position=state.position + tuning.REST_LEFT_M)
+    assert rest.known_better(far) is None
+    assert rest.known_better(state) is None  # it is over
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
