@@ -43,12 +43,11 @@ def up_by_truth(run: Run, estimate: OdometryEstimate) -> F64:
     return up
 
 
-@pytest.mark.parametrize("late_s", [0.8, 2.5, 5.0])
-@pytest.mark.parametrize(("scene", "motion"), [("room", "walk"), ("room", "still")])
+@pytest.mark.parametrize(("motion", "late_s"), [("walk", 0.8), ("walk", 5.0), ("still", 2.5)])
 def test_gravity_is_known_within_two_seconds_of_the_first_sample(
-    scene: str, motion: str, late_s: float
+    motion: str, late_s: float
 ) -> None:
-    run = recording(scene, motion, 11.5)
+    run = recording("room", motion, 11.5)
     samples = without_first(run, late_s)
     odometry, estimates = followed(run, samples)
     untrusted = [item.stamp for item in estimates if Status.GRAVITY_UNTRUSTED in item.status]
@@ -69,10 +68,10 @@ def test_in_a_corridor_the_imu_then_carries_the_way_along_it() -> None:
     assert errors(run, estimates).max() < 0.15  # 2.2 m without gravity
 
 
-@pytest.mark.parametrize("size", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("size", [0.0, 2.0])
 def test_what_is_not_gravity_is_not_taken_for_it(size: float) -> None:
     """The fault of a unit that was started on its side doubles its forces."""
-    run = recording("room", "walk", 11.5)
+    run = recording("room", "walk")
     samples = without_first(run, 0.8)
     samples["linear_acceleration"] *= size
     odometry, estimates = followed(run, samples)
@@ -82,7 +81,7 @@ def test_what_is_not_gravity_is_not_taken_for_it(size: float) -> None:
 
 
 def test_with_gaps_in_the_samples_it_waits() -> None:
-    run = recording("room", "walk", 11.5)
+    run = recording("room", "walk")
     samples = without_first(run, 0.8)
     is_kept = samples["stamp"] % SECOND > SECOND // 4
     odometry, _ = followed(run, samples[is_kept])

@@ -455,7 +455,7 @@ def test_the_covariance_tells_the_error(openings: tuple[Opening, ...]) -> None:
     """The mean of the NEES is 1 if it is right."""
     rng = np.random.default_rng(2)
     nees = []
-    for seed in range(60):
+    for seed in range(40):
         error = 0.1 * rng.standard_normal()
         state, covariance = driven(seed, openings, error, 0.1)
         nees.append((state.velocity[0] - SPEED) ** 2 / covariance[6, 6])
