@@ -736,8 +736,8 @@ RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] or, if the IMU ends it by then, if
 RETRY_FARTHEST_M: Final = 0.5  # [m] if that went no farther
 # A rest that has ended is mapped again with what the first sweeps in motion tell about the unit,
 # until then, and if it went no farther. Derived: a walker's first steps, which still see the place
-REST_LEFT_NS: Final = 5_000_000_000  # [ns]
-REST_LEFT_M: Final = 4.0  # [m]
+ENDED_REST_NS: Final = 5_000_000_000  # [ns]
+ENDED_REST_M: Final = 4.0  # [m]
 
 # ---- odometry: lost, and jumps of time
 

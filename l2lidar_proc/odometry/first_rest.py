@@ -22,7 +22,7 @@ from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitiali
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
 
 
-class LeftRest(NamedTuple):
+class EndedRest(NamedTuple):
     """A rest that motion has ended.
 
     Attributes
@@ -71,38 +71,39 @@ class FirstRest:
         self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
         self.sweeps: list[Sweep] = []
         # its sweeps, and state and covariance at its end, for a moment
-        self._left: tuple[list[Sweep], InertialState, F64] | None = None
+        self._ended: tuple[list[Sweep], InertialState, F64] | None = None
 
     def begin(self, sweeps: list[Sweep]) -> None:
         """Take the sweeps with which a map has begun at rest."""
         self.sweeps, self._mapped_with = sweeps, self._corrections
-        self._left = None
+        self._ended = None
 
     def note(self, sweep: Sweep) -> None:
         """Take another sweep of this rest, if it is still the first one."""
         if self.sweeps:
             self.sweeps.append(sweep)
 
-    def end(self) -> list[Sweep]:
-        """Return the sweeps, and keep none."""
-        sweeps, self.sweeps, self._left = self.sweeps, [], None
-        return sweeps
+    def end(self) -> None:
+        """Forget all of it."""
+        self.sweeps, self._ended = [], None
 
-    def leave(self, sweeps: list[Sweep], state: InertialState, covariance: F64) -> None:
-        """Take that motion has ended the rest.
+    def end_with(self, state: InertialState, covariance: F64, *, but: int = 0) -> None:
+        """Take that motion has ended the rest; its sweeps are kept for a moment.
 
         Parameters
         ----------
-        sweeps : list of Sweep
-            All those of the rest, as :meth:`end` returned them.
         state : InertialState
             At rest, at any stamp.
         covariance : ndarray, shape (18, 18)
+        but : int
+            So many of the latest sweeps were no longer at rest.
         """
-        self._left = (sweeps, state, covariance) if sweeps else None
+        rested = self.sweeps[: len(self.sweeps) - but]
+        self.end()
+        self._ended = (rested, state, covariance) if rested else None
 
-    def known_better(self, now: InertialState) -> LeftRest | None:
-        """Return the rest that has just ended, if the unit is known better than in its map.
+    def recalibrated(self, now: InertialState) -> EndedRest | None:
+        """Return the rest that has just ended with what is known of the unit now, if that is more.
 
         Where the sensor sees to one side only, corrected angles and ranges shift it against a map
         without them, and nothing would undo that: half a hall and 38 mm made 40 mm.
@@ -112,18 +113,18 @@ class FirstRest:
         now : InertialState
             In motion.
         """
-        if self._left is None:
+        if self._ended is None:
             return None
-        sweeps, state, covariance = self._left
+        sweeps, state, covariance = self._ended
         far = float(np.linalg.norm(now.position - state.position))
-        if now.stamp - sweeps[-1].end > tuning.REST_LEFT_NS or far > tuning.REST_LEFT_M:
-            self._left = None
-        if self._left is None or not self._is_known_better:
+        if now.stamp - sweeps[-1].end > tuning.ENDED_REST_NS or far > tuning.ENDED_REST_M:
+            self._ended = None
+        if self._ended is None or not self._is_known_better:
             return None
         *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
         turn = tuning.BEAM_DRIFT_TURN * max(angles)
         shift = tuning.BEAM_DRIFT_SHIFT * max(angles) + ranges
-        return LeftRest(
+        return EndedRest(
             [self._intrinsics.applied_to(one) for one in sweeps],
             state,
             covariance,
@@ -133,7 +134,7 @@ class FirstRest:
     def end_doubt(self) -> None:
         """Keep no sweeps of a rest that has lasted so long that it was one."""
         if self.sweeps and self.sweeps[-1].end - self.sweeps[0].start > tuning.RETRY_NS:
-            self.end()
+            self.sweeps = []
 
     def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> bool | None:
         """Begin the map again, if the beams are known better than in it.
@@ -188,7 +189,7 @@ class FirstRest:
         Parameters
         ----------
         sweeps : list of Sweep
-            All those of the rest, as :meth:`end` returns them.
+            All those of the rest.
         state : InertialState
             At rest, at any stamp.
         covariance : ndarray, shape (18, 18)
@@ -209,7 +210,7 @@ class FirstRest:
         Parameters
         ----------
         sweeps : list of Sweep
-            All those of the rest, as :meth:`end` returns them.
+            All those of the rest.
         """
         self._forget_intrinsics()
         for may_rest in (False, True):

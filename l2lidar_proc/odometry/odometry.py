@@ -299,7 +299,7 @@ class Odometry:
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._intrinsics.learn(sweep, estimate.points, at_rest=False)
-            is_mapped |= self._rest_is_mapped_anew(motion)
+            is_mapped |= self._map_ended_rest(motion)
         is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
         if not is_mapped and (found is not None or is_new):
             expected_share = self._innovations.expected_share
@@ -307,21 +307,21 @@ class Odometry:
             self._anchor_anew(fresh)
         return estimate
 
-    def _rest_is_mapped_anew(self, motion: SweepMotion) -> bool:
-        """Begin a map with the rest that has just ended, if the unit is known better by now.
+    def _map_ended_rest(self, motion: SweepMotion) -> bool:
+        """Map a rest that has just ended again, if the unit is known better by now.
 
-        Return whether it is used, and has the latest sweep; it is if that meets it.
+        Return whether that map is used from now on, and has the latest sweep: if this meets it.
         """
-        left = self._first_rest.known_better(motion.state)
-        if left is None:
+        ended = self._first_rest.recalibrated(motion.state)
+        if ended is None:
             return False
         matcher = SweepMatcher(self.config, self._lever)
         initializer = MapInitializer(
             self._predictor, matcher, ZeroVelocityTest(), self.config.min_points
         )
-        initializer.map_rest(left.sweeps, left.state, left.covariance)
+        initializer.map_rest(ended.sweeps, ended.state, ended.covariance)
         sweep = self._intrinsics.applied_to(self._reported)
-        covariance = eskf.with_loose_pose(motion.state, motion.covariance, left.moved)
+        covariance = eskf.with_loose_pose(motion.state, motion.covariance, ended.moved)
         loose = dataclasses.replace(motion, covariance=covariance)
         found = matcher.match(matcher.source(sweep, loose), loose).alignment
         if found is None:
@@ -642,6 +642,7 @@ class Odometry:
         status = [*status, *gaps]
         if found is None and (gaps or matched is not MatchStatus.NEW_MAP):
             self._zero_velocity.clear()
+            self._first_rest.end()
             self._leave_rest()
             return None
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
@@ -683,16 +684,14 @@ class Odometry:
             if self._at_rest:
                 # the onset of the motion is in samples that passed for rest
                 self._posterior = self._at_rest[0]
-            sweeps = self._first_rest.end()
-            self._leave_rest()
             assert self._posterior is not None
-            self._first_rest.leave(sweeps, *self._posterior)
+            self._first_rest.end_with(*self._posterior)
+            self._leave_rest()
             return False
         self._first_rest.note(self._reported)
         return True
 
     def _leave_rest(self) -> None:
-        self._first_rest.end()
         self._at_rest.clear()
         self.phase = Phase.TRACKING
 
@@ -701,7 +700,8 @@ class Odometry:
         assert self._posterior is not None
         state, covariance = self._posterior
         self._posterior = state, self._zero_velocity.widened(covariance)
-        sweeps = self._first_rest.end()
+        sweeps = self._first_rest.sweeps
+        self._first_rest.end_with(state, covariance, but=1)
         if sweeps and self._zero_velocity.drifted:
             begun = self._first_rest.retried(sweeps)
             if begun is not None:
@@ -712,9 +712,8 @@ class Odometry:
                     sweep, begun.motions[-1], [*status, Status.STARTING], quality
                 )
             self._discard_map()
-            sweeps = []
+            self._first_rest.end()
         self._leave_rest()
-        self._first_rest.leave(sweeps[:-1], state, covariance)
         return None
 
     # ---- steps
@@ -749,6 +748,7 @@ class Odometry:
         self._next_check = int(reference)
         self._earlier.restart(reference)
         self._revisit.restart(reference)
+        self._first_rest.end()
         if self.phase is Phase.STATIONARY:
             self._leave_rest()
 

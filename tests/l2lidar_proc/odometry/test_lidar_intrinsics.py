@@ -261,7 +261,7 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
     assert odometry._intrinsics._rested_ns > 600_000_000
 
 
-def test_a_rest_that_has_just_ended_is_known_better_if_the_unit_is() -> None:
+def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better() -> None:
     odometry = Odometry(OdometryConfig(), np.eye(4))
     odometry.imu(resting())
     some = [turn(UNIT, k)[0] for k in range(4)]
@@ -270,11 +270,11 @@ def test_a_rest_that_has_just_ended_is_known_better_if_the_unit_is() -> None:
     rest, intrinsics = odometry._first_rest, odometry._intrinsics
     assert odometry._posterior is not None
     state, covariance = odometry._posterior
-    assert rest.known_better(state) is None  # it has not ended
-    rest.leave(rest.end(), state, covariance)
-    assert rest.known_better(state) is None  # no more than in its map
+    assert rest.recalibrated(state) is None  # it has not ended
+    rest.end_with(state, covariance)
+    assert rest.recalibrated(state) is None  # no more than in its map
     intrinsics.ranges.correction += 0.03
-    found = rest.known_better(state)
+    found = rest.recalibrated(state)
     assert found is not None
     assert len(found.sweeps) == len(some)
     shift = float(np.sqrt(found.moved[0, 0]))
@@ -284,9 +284,9 @@ def test_a_rest_that_has_just_ended_is_known_better_if_the_unit_is() -> None:
             xyz(one.points), axis=1
         )
         assert np.median(further) == pytest.approx(0.03, abs=0.005)
-    far = dataclasses.replace(state, position=state.position + tuning.REST_LEFT_M)
-    assert rest.known_better(far) is None
-    assert rest.known_better(state) is None  # it is over
+    far = dataclasses.replace(state, position=state.position + tuning.ENDED_REST_M)
+    assert rest.recalibrated(far) is None
+    assert rest.recalibrated(state) is None  # it is over
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
