@@ -70,7 +70,8 @@ class ImuConvention:
         self.in_degrees = False
         self.reversed = False
         self._norms = np.empty(0)
-        self._window: list[Samples] = []  # up to _WINDOW_MOST in all
+        self._window: list[Samples] = []
+        self._window_count = 0  # samples in it, up to _WINDOW_MOST
         self._window_number = 0  # its stamps, divided by its length
         self._in_degrees = 0  # windows that show degrees
         self.forget_motion()
@@ -144,14 +145,19 @@ class ImuConvention:
     def _note_turns(self, samples: Samples) -> None:
         """Learn the unit of the gyro from samples (N,), window by window."""
         numbers = samples["stamp"] // _WINDOW_NS
-        for number in np.unique(numbers).tolist():
+        # one at a time is how a live IMU comes, up to a thousand times a second
+        several = np.unique(numbers) if len(samples) > 1 else numbers
+        for number in several.tolist():
             if number != self._window_number:
                 whole = records.joined(self._window) if self._window else samples[:0]
                 self._in_degrees += _are_in_degrees(whole)
                 self.in_degrees |= self._in_degrees >= _IN_DEGREES
-                self._window, self._window_number = [], number
-            if sum(map(len, self._window)) < _WINDOW_MOST:
-                self._window.append(samples[numbers == number][:_WINDOW_MOST])
+                self._window, self._window_count, self._window_number = [], 0, number
+            some = samples[numbers == number] if len(several) > 1 else samples
+            some = some[: _WINDOW_MOST - self._window_count]
+            if len(some):
+                self._window.append(some)
+                self._window_count += len(some)
 
     def corrected(self, samples: Samples) -> Samples:
         """Learn from samples (N,); return them in rad/s and m/s^2, as specific force."""

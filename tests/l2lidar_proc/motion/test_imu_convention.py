@@ -198,7 +198,7 @@ def test_samples_whose_stamps_do_not_advance_do_not_pile_up() -> None:
     convention = ImuConvention()
     for _ in range(60):
         convention.in_units(samples)
-    assert sum(map(len, convention._window)) <= 10_500
+    assert sum(map(len, convention._window)) <= 10_000
 
 
 def test_the_known_fault_of_the_l2_is_not_taken_for_a_unit() -> None:
