@@ -400,7 +400,7 @@ def coarse_rotation(
     orientations : ndarray, shape (N, 4)
         Cloud axes to fixed axes, w, x, y, z.
     samples : ndarray, shape (M,), dtype IMU_SAMPLE
-        As measured, ascending.
+        As measured, ascending; those that are not finite are left out.
 
     Returns
     -------
@@ -409,6 +409,7 @@ def coarse_rotation(
     """
     from scipy.spatial.transform import Rotation
 
+    samples = samples[np.isfinite(samples["angular_velocity"]).all(axis=1)]
     kept = [0] if len(stamps) else []
     for number, stamp in enumerate(stamps.tolist()):
         if stamp - stamps[kept[-1]] >= _COARSE_NS:
@@ -425,12 +426,13 @@ def coarse_rotation(
         return None
     # without their means: a bias of the gyro is in these
     theirs, ours = (turns - turns.mean(axis=0) for turns in (-by_gyro.residual, by_poses))
-    strengths = np.linalg.svd(theirs.T @ ours, compute_uv=False)
-    matrix = Rotation.align_vectors(ours, theirs)[0].as_matrix()
+    u, strengths, vt = np.linalg.svd(ours.T @ theirs)
+    handed = float(np.linalg.det(u @ vt))  # -1 where a mirror would fit better
+    matrix = (u * (1.0, 1.0, handed)) @ vt
     left = float(((ours - theirs @ matrix.T) ** 2).sum())
     variance = max(left / (3 * len(ours) - 6), _LEAST_RESIDUAL**2)
-    # about the axis of the most turns the others tell, whose third may count negative (a mirror)
-    told = strengths[1] + np.sign(np.linalg.det(theirs.T @ ours)) * strengths[2]
+    # about the axis of the most turns the others tell
+    told = strengths[1] + handed * strengths[2]
     sd = float(np.sqrt(variance / max(told, variance)))
     group = Rotation.create_group("O").as_matrix()
     angles = Rotation.from_matrix(group @ matrix.T).magnitude()

@@ -177,6 +177,18 @@ def test_axes_near_those_of_the_clouds_are_no_finding(degrees: float) -> None:
         assert not found.contradicts_drawn
 
 
+def test_samples_that_are_not_finite_do_not_hide_a_rotation() -> None:
+    rotation = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    stamps, q, samples = recording(axes=(0.05, 0.04, 0.3), noise=5e-3)
+    samples = turned(samples, rotation)
+    samples["angular_velocity"][::7, 1] = np.nan
+    samples["angular_velocity"][3::90] = np.inf
+    found = gyro.coarse_rotation(stamps, q, samples)
+    assert found is not None
+    assert found.is_clear
+    np.testing.assert_allclose(found.matrix, rotation, atol=1e-9)
+
+
 def test_turns_about_one_axis_alone_tell_no_rotation_about_it() -> None:
     rotation = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     stamps, q, samples = recording(axes=(0.0, 0.0, 1.0), noise=5e-3)
