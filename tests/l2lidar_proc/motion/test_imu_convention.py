@@ -164,7 +164,8 @@ def test_a_gyro_in_radians_stays_as_it_is(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "spoil", ["flips", "spikes", "frozen", "no forces", "gaps", "slow", "not a number", "once"]
+    "spoil",
+    ["flips", "spikes", "frozen", "no forces", "shaken", "gaps", "slow", "not a number", "once"],
 )
 def test_nothing_else_is_taken_for_degrees(spoil: str) -> None:
     given = moved("yaw")
@@ -177,6 +178,9 @@ def test_nothing_else_is_taken_for_degrees(spoil: str) -> None:
         rates[:, 0] = 2.0
     elif spoil == "no forces":
         rates[:, 0], forces[:] = 2.0, 0.0
+    elif spoil == "shaken":  # so much that no gravity shows
+        rates[:, 0] = 2.0
+        forces[:] = np.random.default_rng(1).normal(0.0, 20.0, forces.shape)
     elif spoil == "gaps":
         rates[:] = 28.0
         given["stamp"] += given["stamp"] // 1_000_000_000 * 200_000_000

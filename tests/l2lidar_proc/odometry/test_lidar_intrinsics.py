@@ -285,8 +285,29 @@ def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better(
         )
         assert np.median(further) == pytest.approx(0.03, abs=0.005)
     far = dataclasses.replace(state, position=state.position + tuning.ENDED_REST_M)
-    assert rest.recalibrated(far) is None
-    assert rest.recalibrated(state) is None  # it is over
+    late = dataclasses.replace(state, stamp=HostNs(some[-1].end + tuning.ENDED_REST_NS + 1))
+    for now in (far, late):
+        rest.begin(list(some))
+        rest.end_with(state, covariance)
+        intrinsics.ranges.correction += 0.03
+        assert rest.recalibrated(now) is None
+        assert rest.recalibrated(state) is None  # it is over
+
+
+def test_what_showed_that_a_rest_had_ended_is_not_part_of_it() -> None:
+    odometry = Odometry(OdometryConfig(), np.eye(4))
+    odometry.imu(resting())
+    some = [turn(UNIT, k)[0] for k in range(4)]
+    for sweep in some:
+        odometry.register(sweep)
+    rest = odometry._first_rest
+    assert odometry._posterior is not None
+    rest.end_with(*odometry._posterior, but=1)
+    odometry._intrinsics.ranges.correction += 0.03
+    found = rest.recalibrated(odometry._posterior[0])
+    assert found is not None
+    assert [one.start for one in found.sweeps] == [one.start for one in some[:-1]]
+    assert rest.sweeps == []
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
