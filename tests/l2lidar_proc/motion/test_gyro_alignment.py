@@ -177,6 +177,38 @@ def test_axes_near_those_of_the_clouds_are_no_finding(degrees: float) -> None:
         assert not found.contradicts_drawn
 
 
+def test_a_bias_of_the_gyro_does_not_turn_it() -> None:
+    rotation = Rotation.from_euler("xyz", (30, -50, 110), degrees=True).as_matrix()
+    stamps, q, samples = recording(axes=(0.05, 0.04, 0.3), noise=5e-3)
+    samples = turned(samples, rotation)
+    samples["angular_velocity"] += (0.4, -0.3, 0.2)
+    found = gyro.coarse_rotation(stamps, q, samples)
+    assert found is not None
+    assert found.is_clear
+    off = Rotation.from_matrix(found.matrix @ rotation.T).magnitude()
+    assert off < 4.0 * found.sd
+
+
+def test_an_imu_that_also_turns_by_itself_has_no_rotation() -> None:
+    """As one below a head that pans."""
+    rotation = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    stamps, q, samples = recording(seconds=200.0)
+    samples = turned(samples, rotation)
+    samples["angular_velocity"] += samples["angular_velocity"][::-1].copy()
+    found = gyro.coarse_rotation(stamps, q, samples)
+    assert found is not None
+    assert found.contradicts_drawn
+    assert not found.is_clear
+
+
+def test_left_handed_axes_are_no_rotation() -> None:
+    stamps, q, samples = recording()
+    samples["angular_velocity"][:, 0] *= -1.0
+    found = gyro.coarse_rotation(stamps, q, samples)
+    assert found is not None
+    assert not found.is_clear
+
+
 def test_samples_that_are_not_finite_do_not_hide_a_rotation() -> None:
     rotation = Rotation.from_euler("x", 180, degrees=True).as_matrix()
     stamps, q, samples = recording(axes=(0.05, 0.04, 0.3), noise=5e-3)

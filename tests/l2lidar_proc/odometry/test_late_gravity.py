@@ -7,13 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from l2lidar_node import rotations
-from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs
+from l2lidar_node.types import F64, IMU_SAMPLE, STANDARD_GRAVITY, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ACCEL_BIAS, ERRORS, GRAVITY, VELOCITY, InertialState
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
-from l2lidar_proc.odometry.late_gravity import with_gravity
+from l2lidar_proc.odometry.late_gravity import LateGravity, with_gravity
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.prediction import Predictor
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, recording
 from tests.support.odometry_runs import Run, sweeps, truth
 
@@ -83,9 +84,33 @@ def test_what_is_not_gravity_is_not_taken_for_it(size: float) -> None:
 def test_with_gaps_in_the_samples_it_waits() -> None:
     run = recording("room", "walk")
     samples = without_first(run, 0.8)
-    is_kept = samples["stamp"] % SECOND > SECOND // 4
+    is_kept = samples["stamp"] % SECOND > 80_000_000
     odometry, _ = followed(run, samples[is_kept])
     assert not odometry._predictor.trusts_gravity
+
+
+def test_what_accelerates_the_sensor_is_not_gravity() -> None:
+    """At 2 m/s^2, of which the velocities tell."""
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    samples = np.zeros(500, IMU_SAMPLE)
+    samples["stamp"] = SECOND + 4_000_000 * np.arange(len(samples))
+    samples["linear_acceleration"] = 2.0, 0.0, STANDARD_GRAVITY
+    predictor.imu(samples)
+    late, nothing = LateGravity(predictor), np.zeros(3)
+    for seconds in np.arange(1.1, 2.5, 0.23):
+        stamp = HostNs(round(seconds * SECOND))
+        speed = np.array([2.0 * seconds, 0.0, 0.0])
+        state = InertialState(stamp, np.eye(3), nothing, speed, nothing, nothing, nothing)
+        motion = predictor.over(
+            state, 1e-4 * np.eye(ERRORS), (stamp, HostNs(stamp + 100_000_000)), stamp
+        )
+        found = late.added(motion)
+        assert predictor.trusts_gravity == (seconds > 2.1)
+        if predictor.trusts_gravity:
+            break
+        assert found is motion
+    np.testing.assert_allclose(found.state.gravity, [0.0, 0.0, -STANDARD_GRAVITY], atol=1e-3)
+    assert late.added(found) is found
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:
