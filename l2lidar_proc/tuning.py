@@ -735,7 +735,8 @@ RETRY_NS: Final = 4_000_000_000  # [ns] until then a rest that was none is begun
 RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] or, if the IMU ends it by then, if that fits closer
 RETRY_FARTHEST_M: Final = 0.5  # [m] if that went no farther
 # A rest that has ended is mapped again with what the first sweeps in motion tell about the unit,
-# until then, and if it went no farther. Derived: a walker's first steps, which still see the place
+# until then, and if it went no farther. Tuned on: halls, seeds 222 to 228, where walks at 1.2 m/s
+# had known the range bias 0.2 to 1.9 s after the rest
 ENDED_REST_NS: Final = 5_000_000_000  # [ns]
 ENDED_REST_M: Final = 4.0  # [m]
 

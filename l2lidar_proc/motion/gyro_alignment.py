@@ -44,6 +44,7 @@ _LONGEST_NS: Final = 1_000_000_000  # between poses: longer ones span a gap
 _LARGEST_GAP_NS: Final = 30_000_000  # between samples within such an interval
 _FEWEST: Final = 4 * _PARTS  # intervals
 _HEAD_TURN_NS: Final = 230_000_000
+_STRAY: Final = 0.5  # [rad^2/s] of an axis that is not turned about: it explains nothing
 # ---- of a rotation that may be large
 _COARSE_NS: Final = 380_000_000  # between poses: shorter turns are hardly more than their noise
 _COARSE_LEAST: Final = 12  # turns
@@ -54,7 +55,6 @@ _COARSE_EXCESS: Final = 40.0  # of three degrees of freedom; right axes reach 15
 # [rad] within which it may be one that maps axes to axes, at least, and in standard deviations
 _COARSE_SNAP: Final = 0.05
 _COARSE_SNAP_SDS: Final = 2.5
-_STRAY: Final = 0.5  # [rad^2/s] of an axis that is not turned about: it explains nothing
 
 
 class GyroError(ValueError):

@@ -29,12 +29,14 @@ _WINDOW_NS: Final = 2_000_000_000
 _WINDOW_LEAST_S: Final = 1.5  # of it, with samples
 _WINDOW_GAP_S: Final = 0.1  # between them, at most
 _WINDOW_MOST: Final = 10_000  # samples
-_TUMBLED: Final = 0.7  # share of gravity that is left. To be right it takes a fall to 6 m/s
+_TUMBLED: Final = (
+    0.7  # share of gravity that is left; in rad/s only a fall to 6 m/s leaves so little
+)
 _STEADY: Final = 0.8  # share that is left of it in degrees
 # [rad/s] median of a window, in which a carrier would turn five times: no scan could be followed.
 # For carriers that turn about the vertical alone, which leaves gravity where it is
 _FASTEST_TURN: Final = 15.0
-_IN_DEGREES: Final = 2  # windows that show it
+_DEGREE_WINDOWS: Final = 2  # windows that show it
 _KEPT_NS: Final = 2_000_000_000
 _MOST_KEPT: Final = 10_000  # samples
 # The sign is decided by comparing the changes of the velocity: 20 of them are 4 to 5 s, and
@@ -73,7 +75,7 @@ class ImuConvention:
         self._window: list[Samples] = []
         self._window_count = 0  # samples in it, up to _WINDOW_MOST
         self._window_number = 0  # its stamps, divided by its length
-        self._in_degrees = 0  # windows that show degrees
+        self._degree_windows = 0  # that show degrees
         self.forget_motion()
 
     @property
@@ -150,8 +152,8 @@ class ImuConvention:
         for number in several.tolist():
             if number != self._window_number:
                 whole = records.joined(self._window) if self._window else samples[:0]
-                self._in_degrees += _are_in_degrees(whole)
-                self.in_degrees |= self._in_degrees >= _IN_DEGREES
+                self._degree_windows += _are_in_degrees(whole)
+                self.in_degrees |= self._degree_windows >= _DEGREE_WINDOWS
                 self._window, self._window_count, self._window_number = [], 0, number
             some = samples[numbers == number] if len(several) > 1 else samples
             some = some[: _WINDOW_MOST - self._window_count]

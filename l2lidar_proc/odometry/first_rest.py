@@ -3,7 +3,7 @@
 A carrier that glides while its motors shake the IMU passes for a sensor at rest, and so does one
 that creeps. So the sweeps of the first rest are kept for some seconds, as the unit reports them.
 If sweeps or IMU end it, the map may begin again with them, as in motion. It also begins again with
-them when the beam angles are known better than in the map.
+them when the unit is known better than in the map, also in the first seconds after the rest.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class FirstRest:
         """Forget all of it."""
         self.sweeps, self._ended = [], None
 
-    def end_with(self, state: InertialState, covariance: F64, *, but: int = 0) -> None:
+    def end_with(self, state: InertialState, covariance: F64, *, moving: int = 0) -> None:
         """Take that motion has ended the rest; its sweeps are kept for a moment.
 
         Parameters
@@ -95,10 +95,10 @@ class FirstRest:
         state : InertialState
             At rest, at any stamp.
         covariance : ndarray, shape (18, 18)
-        but : int
-            So many of the latest sweeps were no longer at rest.
+        moving : int
+            So many of the latest sweeps show the motion.
         """
-        rested = self.sweeps[: len(self.sweeps) - but]
+        rested = self.sweeps[: len(self.sweeps) - moving]
         self.end()
         self._ended = (rested, state, covariance) if rested else None
 
@@ -106,7 +106,8 @@ class FirstRest:
         """Return the rest that has just ended with what is known of the unit now, if that is more.
 
         Where the sensor sees to one side only, corrected angles and ranges shift it against a map
-        without them, and nothing would undo that: half a hall and 38 mm made 40 mm.
+        without them, and nothing would undo that: in a hall, 38 mm of range shifted it by 40 mm.
+        With the same knowledge the rest is returned only once.
 
         Parameters
         ----------
@@ -124,6 +125,7 @@ class FirstRest:
         *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
         turn = tuning.BEAM_DRIFT_TURN * max(angles)
         shift = tuning.BEAM_DRIFT_SHIFT * max(angles) + ranges
+        self._mapped_with = self._corrections  # tried once with what is known now
         return EndedRest(
             [self._intrinsics.applied_to(one) for one in sweeps],
             state,

@@ -43,7 +43,7 @@ class LateGravity:
         """Forget the velocities so far, as where the map's axes change."""
         self._passed.clear()
 
-    def added(self, motion: SweepMotion) -> SweepMotion:
+    def estimated(self, motion: SweepMotion) -> SweepMotion:
         """Return the motion of an aligned sweep, with gravity where the samples show it.
 
         It is the same where gravity is trusted already, where samples are missing, and where what

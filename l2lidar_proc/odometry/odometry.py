@@ -292,7 +292,7 @@ class Odometry:
             status.append(Status.SUSPECT)
         motion, is_mapped = self._with_start_velocity(sweep, motion, found, status)
         if found is not None:
-            motion = self._late_gravity.added(motion)
+            motion = self._late_gravity.estimated(motion)
         self._keep(motion)
         quality = self.matcher.quality(len(source.points), found)
         quality = self._consistency(quality, found, motion.state.stamp)
@@ -665,7 +665,7 @@ class Odometry:
             status.append(Status.RETURNED)
             self._keep(still)
         else:
-            still = self._late_gravity.added(still)
+            still = self._late_gravity.estimated(still)
             self._keep_at_rest(still)
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
@@ -701,7 +701,7 @@ class Odometry:
         state, covariance = self._posterior
         self._posterior = state, self._zero_velocity.widened(covariance)
         sweeps = self._first_rest.sweeps
-        self._first_rest.end_with(state, covariance, but=1)
+        self._first_rest.end_with(state, covariance, moving=1)
         if sweeps and self._zero_velocity.drifted:
             begun = self._first_rest.retried(sweeps)
             if begun is not None:

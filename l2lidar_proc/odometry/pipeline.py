@@ -130,7 +130,7 @@ class OdometryPipeline:
         mount = odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
         self.check = ExtrinsicCheck(mount[:3, :3])
         self.last: OdometryEstimate | None = None
-        self._start: HostNs | None = None  # of the sweep that was registered last
+        self._latest_start: HostNs | None = None  # of the sweep that was registered last
 
     def motion_of(self, sweep: Sweep) -> KnownMotion | None:
         """Return the motion that was estimated for a sweep, None if there is none."""
@@ -212,8 +212,8 @@ class OdometryPipeline:
             registered = self._registered(release.sweep)
             self._remember(release.sweep, registered)
             if not registered:
-                self._note_held(release.sweep)
-            self._start = release.sweep.start
+                self._note_unanswered(release.sweep)
+            self._latest_start = release.sweep.start
             for estimate in registered:
                 self.counts.update(estimate.status)
                 if Status.REFUSED in estimate.status:
@@ -224,9 +224,10 @@ class OdometryPipeline:
                 self._watch(estimate)
         return estimates
 
-    def _note_held(self, sweep: Sweep) -> None:
+    def _note_unanswered(self, sweep: Sweep) -> None:
         """Count a sweep without an estimate if it will never have one: its clock stands still."""
-        if self._start is not None and -tuning.LONG_GAP_NS < sweep.start - self._start <= 0:
+        before = self._latest_start
+        if before is not None and -tuning.LONG_GAP_NS < sweep.start - before <= 0:
             self.counts[Status.REFUSED] += 1
 
     def _registered(self, sweep: Sweep) -> list[OdometryEstimate]:
@@ -286,7 +287,7 @@ def judge(
     values |= {f"clouds refused: {reason}": str(count) for reason, count in refused.items()}
     if last is None:
         text = "waiting until the first sweeps match" if since else "no clouds"
-        if since and counts[Status.REFUSED] >= since:
+        if since and 2 * counts[Status.REFUSED] > sweeps:
             text = "the stamps of the clouds do not advance"
         return Check("odometry", Level.WARN, text, values)
     quality = last.quality

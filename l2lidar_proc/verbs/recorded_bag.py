@@ -146,7 +146,7 @@ def _axes_of_imu(
     return coarse_rotation(
         np.array([stamp for stamp, _ in poses], np.int64),
         np.array([rotations.from_matrix(pose[:3, :3]) for _, pose in poses]),
-        failed.runner.pipeline.convention.applied(ordered),
+        failed.runner.pipeline.corrected(ordered),
     )
 
 

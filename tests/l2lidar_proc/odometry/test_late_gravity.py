@@ -104,13 +104,13 @@ def test_what_accelerates_the_sensor_is_not_gravity() -> None:
         motion = predictor.over(
             state, 1e-4 * np.eye(ERRORS), (stamp, HostNs(stamp + 100_000_000)), stamp
         )
-        found = late.added(motion)
+        found = late.estimated(motion)
         assert predictor.trusts_gravity == (seconds > 2.1)
         if predictor.trusts_gravity:
             break
         assert found is motion
     np.testing.assert_allclose(found.state.gravity, [0.0, 0.0, -STANDARD_GRAVITY], atol=1e-3)
-    assert late.added(found) is found
+    assert late.estimated(found) is found
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:

@@ -248,11 +248,18 @@ def test_sweeps_at_rest_show_both_angles_together(unit: Any) -> None:
     np.testing.assert_allclose(np.degrees(rested(unit, 12, None).angles), unit, atol=0.06)
 
 
-def test_sweeps_that_deviate_are_compared_at_once() -> None:
+def at_rest() -> tuple[Odometry, list[Sweep]]:
+    """Return an odometry after four sweeps at rest, and these."""
     odometry = Odometry(OdometryConfig(), np.eye(4))
     odometry.imu(resting())
-    for k in range(4):
-        odometry.register(turn(UNIT, k)[0])
+    some = [turn(UNIT, k)[0] for k in range(4)]
+    for sweep in some:
+        odometry.register(sweep)
+    return odometry, some
+
+
+def test_sweeps_that_deviate_are_compared_at_once() -> None:
+    odometry, _ = at_rest()
     assert odometry._intrinsics._rested_ns == 0
     assert odometry.motion is not None
     odometry._first_rest.map_with_known_beams(odometry.motion, doubted=False)
@@ -262,11 +269,7 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
 
 
 def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better() -> None:
-    odometry = Odometry(OdometryConfig(), np.eye(4))
-    odometry.imu(resting())
-    some = [turn(UNIT, k)[0] for k in range(4)]
-    for sweep in some:
-        odometry.register(sweep)
+    odometry, some = at_rest()
     rest, intrinsics = odometry._first_rest, odometry._intrinsics
     assert odometry._posterior is not None
     state, covariance = odometry._posterior
@@ -276,6 +279,7 @@ def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better(
     intrinsics.ranges.correction += 0.03
     found = rest.recalibrated(state)
     assert found is not None
+    assert rest.recalibrated(state) is None  # once is enough
     assert len(found.sweeps) == len(some)
     shift = float(np.sqrt(found.moved[0, 0]))
     assert shift == pytest.approx(0.03, abs=0.005)
@@ -295,14 +299,10 @@ def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better(
 
 
 def test_what_showed_that_a_rest_had_ended_is_not_part_of_it() -> None:
-    odometry = Odometry(OdometryConfig(), np.eye(4))
-    odometry.imu(resting())
-    some = [turn(UNIT, k)[0] for k in range(4)]
-    for sweep in some:
-        odometry.register(sweep)
+    odometry, some = at_rest()
     rest = odometry._first_rest
     assert odometry._posterior is not None
-    rest.end_with(*odometry._posterior, but=1)
+    rest.end_with(*odometry._posterior, moving=1)
     odometry._intrinsics.ranges.correction += 0.03
     found = rest.recalibrated(odometry._posterior[0])
     assert found is not None
