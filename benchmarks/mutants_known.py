@@ -71,8 +71,8 @@ FAULTS: Final = (
     ),
     Fault(
         "l2lidar_proc/odometry/map_initialization.py",
-        "place = initial.state.rotation @ self._matcher.lever",
-        "place = 0.0 * self._matcher.lever",
+        "place = initial.state.rotation @ self.matcher.lever",
+        "place = 0.0 * self.matcher.lever",
         (f"{_PROC}/odometry/test_odometry.py",),
     ),
     Fault(

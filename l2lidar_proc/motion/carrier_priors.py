@@ -11,6 +11,56 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GRAVITY, VELOCITY, InertialState, update
 
 
+class Carrier:
+    """What carries the sensor, as far as its speed tells.
+
+    Attributes
+    ----------
+    peak_speed : float
+        Highest of late, as :func:`peak_speed_after` returns it [m/s]; 0 while nothing is known.
+    """
+
+    def __init__(self) -> None:
+        self.peak_speed = 0.0
+
+    @property
+    def drives(self) -> bool:
+        """Whether it drives, and is not moved by hand."""
+        return is_driving_speed(self.peak_speed)
+
+    def note_speed(self, state: InertialState, covariance: F64, seconds: float) -> None:
+        """Take a velocity, given as to :func:`peak_speed_after`."""
+        self.peak_speed = peak_speed_after(self.peak_speed, state, covariance, seconds)
+
+    def with_priors(
+        self,
+        state: InertialState,
+        covariance: F64,
+        seconds: float,
+        *,
+        least_speed: float,
+        height_observed: bool,
+    ) -> tuple[InertialState, F64]:
+        """Return state and covariance with what is known of such carriers and of gravity.
+
+        Parameters
+        ----------
+        state : InertialState
+        covariance : ndarray, shape (18, 18)
+        seconds : float
+            Time since this was done last.
+        least_speed : float
+            The carrier may be so fast, whatever it has shown [m/s].
+        height_observed : bool
+            As for :func:`apply_zero_velocity_prior`.
+        """
+        peak = max(self.peak_speed, least_speed)
+        state, covariance = apply_zero_velocity_prior(
+            state, covariance, seconds, peak, height_observed=height_observed
+        )
+        return with_gravity_of_known_size(state, covariance)
+
+
 def apply_zero_velocity_prior(
     state: InertialState,
     covariance: F64,

@@ -8,17 +8,19 @@ them when the unit is known better than in the map, also in the first seconds af
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.motion.filter import InertialState, with_loose_pose
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer
+from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
 
 
@@ -40,6 +42,24 @@ class EndedRest(NamedTuple):
     state: InertialState
     covariance: F64
     moved: F64
+
+
+class RemappedRest(NamedTuple):
+    """A map that has begun again with a rest that motion has ended.
+
+    Attributes
+    ----------
+    matcher : SweepMatcher
+        With the map; the latest sweep is in it.
+    motion : SweepMotion
+        Of the latest sweep, in the map.
+    fresh : float
+        Share of its points that fell where there was no map before.
+    """
+
+    matcher: SweepMatcher
+    motion: SweepMotion
+    fresh: float
 
 
 class FirstRest:
@@ -132,6 +152,34 @@ class FirstRest:
             covariance,
             np.diag(np.square([shift] * 3 + [turn] * 3)),
         )
+
+    def mapped_again(self, reported: Sweep, motion: SweepMotion) -> RemappedRest | None:
+        """Return the map begun again with a rest that has just ended, if the unit is known better.
+
+        None also where the latest sweep does not meet that map.
+
+        Parameters
+        ----------
+        reported : Sweep
+            The latest, as the unit reports it.
+        motion : SweepMotion
+            Of that sweep, in the map in use.
+        """
+        ended = self.recalibrated(motion.state)
+        if ended is None:
+            return None
+        initializer = self._initializer.for_another_map()
+        initializer.map_rest(ended.sweeps, ended.state, ended.covariance)
+        matcher, sweep = initializer.matcher, self._intrinsics.applied_to(reported)
+        covariance = with_loose_pose(motion.state, motion.covariance, ended.moved)
+        loose = dataclasses.replace(motion, covariance=covariance)
+        found = matcher.match(matcher.source(sweep, loose), loose).alignment
+        if found is None:
+            return None
+        matcher.meet(found, 0.0)
+        motion = motion.with_state(found.state, found.covariance)
+        fresh = matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
+        return RemappedRest(matcher, motion, fresh)
 
     def end_doubt(self) -> None:
         """Keep no sweeps of a rest that has lasted so long that it was one."""

@@ -19,33 +19,63 @@ import numpy as np
 
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import POSE, POSITION, VELOCITY, InertialState
+from l2lidar_proc.motion.filter import POSE, VELOCITY, InertialState
 
-_MOTION: Final = slice(POSE.start, VELOCITY.stop)  # turn, place and velocity
+MOTION: Final = slice(POSE.start, VELOCITY.stop)
+"""Errors of turn, place and velocity."""
+
 _VELOCITY: Final = slice(VELOCITY.start - POSE.start, VELOCITY.stop - POSE.start)
 
 
-class _Correction(NamedTuple):
+class Correction(NamedTuple):
+    """How an alignment has corrected a prediction.
+
+    Attributes
+    ----------
+    stamp : int
+        Of the posterior [ns].
+    squared : float
+        Normalized and squared, the sum over all degrees of freedom.
+    freedoms : int
+        Degrees of freedom that were measured.
+    velocity : ndarray, shape (3,)
+        Correction of the velocity, map axes [m/s].
+    allowed : ndarray, shape (3, 3)
+        Its covariance.
+    """
+
     stamp: int
-    squared: float  # normalized, of all degrees of freedom
+    squared: float
     freedoms: int
-    velocity: F64  # correction of the velocity, map axes [m/s], shape (3,)
-    allowed: F64  # its covariance, shape (3, 3)
+    velocity: F64
+    allowed: F64
 
 
-def _correction(
+def correction(
     prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
-) -> _Correction:
-    """Return how a prior was corrected, with its covariance (18, 18) before and after."""
-    before = covariance[_MOTION, _MOTION]
-    allowed = before - corrected[_MOTION, _MOTION]
-    change = posterior.boxminus(prior)[_MOTION]
+) -> Correction:
+    """Return how an alignment has corrected a prediction.
+
+    Parameters
+    ----------
+    prior : InertialState
+        As predicted.
+    covariance : ndarray, shape (18, 18)
+        Of the prior.
+    posterior : InertialState
+        As aligned.
+    corrected : ndarray, shape (18, 18)
+        Covariance of the posterior.
+    """
+    before = covariance[MOTION, MOTION]
+    allowed = before - corrected[MOTION, MOTION]
+    change = posterior.boxminus(prior)[MOTION]
     unit = np.sqrt(np.maximum(np.diag(before), 1e-18))
     # only directions that were measured: elsewhere nothing was corrected, nor could be
     share, axes = np.linalg.eigh(allowed / np.outer(unit, unit))
     seen = share > tuning.NIS_SEEN
     normalized = (axes[:, seen].T @ (change / unit)) ** 2 / share[seen]
-    return _Correction(
+    return Correction(
         posterior.stamp,
         float(normalized.sum()),
         int(seen.sum()),
@@ -82,48 +112,6 @@ def observed_scale(covariance: F64, factor: float, unobserved: F64) -> F64:
     return np.asarray(regression + np.sqrt(factor) * (np.eye(3) - regression))
 
 
-def inflated_prior(
-    prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
-) -> F64 | None:
-    """Return the covariance that a prior must have had, if a correction contradicts it.
-
-    A single correction far beyond what the covariances allow (an innovation gate) means that one
-    of the two is wrong. A prior that is too sure of itself would make a compromise of both, at
-    which neither fits.
-
-    Parameters
-    ----------
-    prior : InertialState
-        As predicted.
-    covariance : ndarray, shape (18, 18)
-        Of the prior.
-    posterior : InertialState
-        As aligned.
-    corrected : ndarray, shape (18, 18)
-        Covariance of the posterior.
-
-    Returns
-    -------
-    ndarray, shape (18, 18), or None
-        Pose and velocity are as uncertain as the correction shows. None within the gate.
-    """
-    item = _correction(prior, covariance, posterior, corrected)
-    nis = item.squared / max(item.freedoms, 1)
-    if nis < tuning.NIS_GATE:
-        return None
-    scale = np.ones(len(covariance))
-    scale[_MOTION] = np.sqrt(nis)
-    return np.asarray(covariance * np.outer(scale, scale))
-
-
-def with_loose_motion(covariance: F64) -> F64:
-    """Return the covariance (18, 18) of a prior whose position and velocity may be wrong."""
-    found = covariance.copy()
-    found[POSITION, POSITION] += tuning.DOUBT_SIGMA[0] ** 2 * np.eye(3)
-    found[VELOCITY, VELOCITY] += tuning.DOUBT_SIGMA[1] ** 2 * np.eye(3)
-    return found
-
-
 class InnovationTest:
     """Compares the innovations of the last seconds with their covariances."""
 
@@ -132,7 +120,7 @@ class InnovationTest:
 
     def clear(self) -> None:
         """Forget everything, as after a rest or a loss."""
-        self._recent: deque[_Correction] = deque()
+        self._recent: deque[Correction] = deque()
         self._unobserved: deque[tuple[int, F64]] = deque()  # stamps, and directions (3, K)
 
     def note_unobserved(self, stamp: int, directions: F64) -> None:
@@ -157,8 +145,8 @@ class InnovationTest:
         posterior: InertialState,
         corrected: F64,
     ) -> None:
-        """Take an alignment, given as to :func:`inflated_prior`."""
-        item = _correction(prior, covariance, posterior, corrected)
+        """Take an alignment, given as to :func:`correction`."""
+        item = correction(prior, covariance, posterior, corrected)
         if not item.freedoms:
             return
         recent = self._recent

@@ -150,6 +150,7 @@ class MapInitializer:
 
     Attributes
     ----------
+    matcher : SweepMatcher
     held : list of Sweep
         Sweeps without an estimate so far, oldest first.
     moving : MovingStart or None
@@ -165,7 +166,7 @@ class MapInitializer:
         min_points: int,
     ) -> None:
         self._predictor = predictor
-        self._matcher = matcher
+        self.matcher = matcher
         self._zero_velocity = zero_velocity
         self._min_points = min_points
         self.held: list[Sweep] = []
@@ -173,6 +174,11 @@ class MapInitializer:
         self._young = YoungSurfaces.TRUSTED  # of the map that begins in motion
         self._lead_s = 0.0  # from the first pose of all to that of the first sweep in the map
         self._lead_velocity: F64 = np.zeros(3)  # with which that pose was estimated [m/s]
+
+    def for_another_map(self) -> MapInitializer:
+        """Return one that fills other maps, and leaves this one's test of rest as it is."""
+        matcher = SweepMatcher(self.matcher.config, self.matcher.lever)
+        return MapInitializer(self._predictor, matcher, ZeroVelocityTest(), self._min_points)
 
     def add(self, sweep: Sweep) -> InitializedMap | None:
         """Hold a sweep; return the map if it can begin now."""
@@ -338,7 +344,7 @@ class MapInitializer:
 
     def _at_cloud_origin(self, initial: InitialState) -> InertialState:
         """Return the first state: the map begins at the cloud's origin, the state is the IMU's."""
-        place = initial.state.rotation @ self._matcher.lever
+        place = initial.state.rotation @ self.matcher.lever
         return dataclasses.replace(initial.state, position=place)
 
     def _at_rest(
@@ -351,7 +357,7 @@ class MapInitializer:
         is_known: bool = False,
     ) -> Trial:
         """Add sweeps to an empty map where they are at rest, as long as they agree, or all."""
-        matcher = self._matcher
+        matcher = self.matcher
         matcher.clear()
         motions: list[SweepMotion] = []
         met, last = False, None
@@ -417,7 +423,7 @@ class MapInitializer:
         if not fitted.is_other:
             before = self._lead_s * (fitted.state.velocity - self._lead_velocity)
             shift = fitted.shift + before
-            self._matcher.drift.shift_first_pose(shift)
+            self.matcher.drift.shift_first_pose(shift)
             return []
         known = covariance.copy()
         known[VELOCITY] = known[:, VELOCITY] = 0.0
@@ -537,14 +543,14 @@ class MapInitializer:
         if across.sum() > tuning.WALLS_ACROSS * upright.sum():
             return False
         spots = [
-            self._matcher.beside_walls(sweep, motion, axes)[0]
+            self.matcher.beside_walls(sweep, motion, axes)[0]
             for sweep, motion in zip(sweeps, trial.motions, strict=True)
         ]
         return are_walls(records.joined(spots), axes)
 
     def _normals(self) -> tuple[F64, F64]:
         """Return the normals (N, 3) of the surfaces of the map, and their areas (N,) [m^2]."""
-        levels = self._matcher.surfaces.flat_cells()
+        levels = self.matcher.surfaces.flat_cells()
         normals = np.concatenate([normals for *_, normals in levels])
         areas = [np.full(len(places), size**2) for size, places, *_ in levels]
         return normals, np.concatenate(areas)
@@ -605,7 +611,7 @@ class MapInitializer:
 
         Where one may, the IMU alone carries it.
         """
-        matcher = self._matcher
+        matcher = self.matcher
         matcher.clear()
         matcher.surfaces.young = self._young
         first = self._predictor.over_sweep(sweeps[0], start, initial.covariance, since)

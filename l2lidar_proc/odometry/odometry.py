@@ -19,7 +19,6 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
 from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Relocalization
 from l2lidar_proc.odometry.estimate import (
     AlignmentQuality,
@@ -29,7 +28,8 @@ from l2lidar_proc.odometry.estimate import (
     gaps_in,
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
-from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, with_loose_motion
+from l2lidar_proc.odometry.innovation_gate import InnovationGate
+from l2lidar_proc.odometry.innovations import InnovationTest
 from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer, cropped
@@ -105,10 +105,10 @@ class Odometry:
         self._intrinsics = LidarIntrinsics()
         self._use(SweepMatcher(self.config, self._lever))
         self._start = StartVelocity(self._lever)
-        self._peak_speed = 0.0  # of this carrier [m/s]
+        self._carrier = carrier_priors.Carrier()
         self._unmatched_ns = 0  # of sweeps with enough points since the latest match
         self._was_blind = False  # a sweep since then had few
-        self._next_check = 0  # stamp from which on a sweep that fits badly is aligned again
+        self._gate = InnovationGate()
         self._walls = WallVelocity()
         self._jump = FrameJump()
         self._earlier = EarlierMaps()
@@ -262,7 +262,10 @@ class Odometry:
             self._innovations.clear()
         if found is not None:
             blurred = blur is not None
-            predicted, found = self._checked(source, predicted, found, status, blurred=blurred)
+            gated = self._gate.passed(self.matcher, source, predicted, found, blurred=blurred)
+            predicted, found = gated.predicted, gated.alignment
+            if gated.is_suspect:
+                status.append(Status.SUSPECT)
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
@@ -308,32 +311,18 @@ class Odometry:
         return estimate
 
     def _map_ended_rest(self, motion: SweepMotion) -> bool:
-        """Map a rest that has just ended again, if the unit is known better by now.
+        """Go on in a map of the rest that has just ended, if the unit is known better by now.
 
-        Return whether that map is used from now on, and has the latest sweep: if this meets it.
+        Return whether that is so; the map has the latest sweep then.
         """
-        ended = self._first_rest.recalibrated(motion.state)
-        if ended is None:
+        remapped = self._first_rest.mapped_again(self._reported, motion)
+        if remapped is None:
             return False
-        matcher = SweepMatcher(self.config, self._lever)
-        initializer = MapInitializer(
-            self._predictor, matcher, ZeroVelocityTest(), self.config.min_points
-        )
-        initializer.map_rest(ended.sweeps, ended.state, ended.covariance)
-        sweep = self._intrinsics.applied_to(self._reported)
-        covariance = eskf.with_loose_pose(motion.state, motion.covariance, ended.moved)
-        loose = dataclasses.replace(motion, covariance=covariance)
-        found = matcher.match(matcher.source(sweep, loose), loose).alignment
-        if found is None:
-            return False
-        self._use(matcher)
-        matcher.meet(found, 0.0)
+        self._use(remapped.matcher)
         self._walls.clear()
         self._innovations.clear()
-        motion = motion.with_state(found.state, found.covariance)
-        self._keep(motion)
-        fresh = matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
-        self._anchor_anew(fresh)
+        self._keep(remapped.motion)
+        self._anchor_anew(remapped.fresh)
         return True
 
     def _with_start_velocity(
@@ -378,47 +367,6 @@ class Odometry:
         start.end_search(sweep.end)
         return motion, bool(motions)
 
-    def _checked(
-        self,
-        source: Source,
-        predicted: SweepMotion,
-        found: Alignment,
-        status: list[Status],
-        *,
-        blurred: bool,
-    ) -> tuple[SweepMotion, Alignment | None]:
-        """Return prediction and alignment, found anew if the two contradict each other.
-
-        A prediction that is too sure of itself makes a compromise of both, at which neither fits.
-        The sweep is then aligned as after a prediction that may be wrong by as much.
-        """
-        prior = predicted.state
-        wide = inflated_prior(prior, predicted.covariance, found.state, found.covariance)
-        fits_badly = self.matcher.fits_badly(found)
-        if (wide is not None or fits_badly) and blurred:
-            # what the alignment makes of the blur is not the motion of the sensor
-            status.append(Status.SUSPECT)
-            covariance = predicted.covariance if wide is None else wide
-            return dataclasses.replace(predicted, covariance=covariance), None
-        is_due = prior.stamp >= self._next_check and fits_badly
-        if wide is None and not is_due:
-            return predicted, found
-        self._next_check = prior.stamp + tuning.DOUBT_PAUSE_NS
-        covariance = with_loose_motion(predicted.covariance if wide is None else wide)
-        loose = dataclasses.replace(predicted, covariance=covariance)
-        other = self.matcher.match(source, loose).alignment
-        if other is not None and other.fits_better_than(found, len(source.points)):
-            status.append(Status.SUSPECT)
-            return loose, other
-        if wide is None:
-            return predicted, found
-        status.append(Status.SUSPECT)
-        loose = dataclasses.replace(predicted, covariance=wide)
-        other = self.matcher.match(source, loose).alignment
-        if other is not None and found.fits_better_than(other, len(source.points)):
-            return predicted, found
-        return loose, other
-
     def _with_wall_velocity(
         self, sweep: Sweep, predicted: SweepMotion, found: Alignment
     ) -> Alignment:
@@ -445,7 +393,8 @@ class Odometry:
         assert self._posterior is not None
         before = self._posterior[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
-        self._note_speed(after, covariance, lasted)
+        self._carrier.note_speed(after, covariance, lasted)
+        self.matcher.driving = self._carrier.drives
         posterior = self._with_priors(before.position, after, covariance, lasted)
         bounded = carrier_priors.bound_speed(*posterior, self.config.max_speed)
         is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)
@@ -459,25 +408,18 @@ class Odometry:
         )
         return predicted.with_state(*bounded)
 
-    def _note_speed(self, state: InertialState, covariance: F64, seconds: float) -> None:
-        """Take the velocity of a sweep [s] after the one before, which tells what carries it."""
-        self._peak_speed = carrier_priors.peak_speed_after(
-            self._peak_speed, state, covariance, seconds
-        )
-        self.matcher.driving = carrier_priors.is_driving_speed(self._peak_speed)
-
     def _with_priors(
         self, place: F64, state: InertialState, covariance: F64, seconds: float
     ) -> tuple[InertialState, F64]:
         """Return a state, [s] after that at a place (3,), with the priors of carriers."""
-        peak = self._peak_speed
-        if self._start.is_open:
-            # the prior of the start has said already how fast carriers are
-            peak = max(peak, tuning.START_VELOCITY_SIGMA[1])
-        state, covariance = carrier_priors.apply_zero_velocity_prior(
-            state, covariance, seconds, peak, height_observed=self.matcher.observes_height
+        state, covariance = self._carrier.with_priors(
+            state,
+            covariance,
+            seconds,
+            # the prior of an open start has said already how fast carriers are
+            least_speed=tuning.START_VELOCITY_SIGMA[1] if self._start.is_open else 0.0,
+            height_observed=self.matcher.observes_height,
         )
-        state, covariance = carrier_priors.with_gravity_of_known_size(state, covariance)
         lean = float(np.linalg.norm(state.position - place)) * tuning.MAP_BEND**2
         return state, eskf.with_leaning_gravity(state, covariance, lean)
 
@@ -560,6 +502,13 @@ class Odometry:
         """Begin to count anew: the pose is known relative to the map in use."""
         self._unmatched_ns, self._was_blind = 0, False
 
+    def _forget_sweeps(self) -> None:
+        """Forget what sweeps have shown together: those to come are apart from them."""
+        self._walls.clear()
+        self._start.clear()
+        self._late_gravity.clear()
+        self._innovations.clear()
+
     def _note_aligned(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> None:
         """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
         state, covariance = found.state, found.covariance
@@ -584,11 +533,8 @@ class Odometry:
         else:
             self._earlier.keep(self.matcher, before, motion.state.stamp)
             self._use(SweepMatcher(self.config, self._lever))
-        self._walls.clear()
-        self._start.clear()
-        self._late_gravity.clear()
+        self._forget_sweeps()
         self._forget_unmatched()
-        self._innovations.clear()
         self.phase = Phase.LOST
         return dataclasses.replace(motion, covariance=eskf.at_map_origin(motion.covariance))
 
@@ -611,10 +557,7 @@ class Odometry:
         self.matcher.config = self.config
         self.matcher.meet(found.alignment, 0.0)
         self._zero_velocity.clear()
-        self._walls.clear()
-        self._start.clear()
-        self._late_gravity.clear()
-        self._innovations.clear()
+        self._forget_sweeps()
         self._forget_unmatched()
         self._leave_rest()
         return motion.with_state(found.alignment.state, found.alignment.covariance)
@@ -741,11 +684,8 @@ class Odometry:
         self._jump = self._jump.unseen(self._posterior[0])
         self._posterior = eskf.after_time_jump(*self._posterior, HostNs(reference - 1))
         self._zero_velocity.clear()
-        self._walls.clear()
-        self._start.clear()
-        self._late_gravity.clear()
-        self._innovations.clear()
-        self._next_check = int(reference)
+        self._forget_sweeps()
+        self._gate.restart(reference)
         self._earlier.restart(reference)
         self._revisit.restart(reference)
         self._first_rest.end()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import given, strategies as st
 
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSE, POSITION, VELOCITY, InertialState
-from l2lidar_proc.odometry.innovations import InnovationTest, inflated_prior, observed_scale
+from l2lidar_proc.odometry.innovations import InnovationTest, observed_scale
 from tests.l2lidar_proc.motion.analytic import at
 
 BEFORE = np.diag(np.full(ERRORS, 0.02**2))
@@ -66,27 +65,6 @@ def test_too_large_ones_are_suspect_and_tell_by_how_much() -> None:
     assert found.variance_factor == pytest.approx(4.0, rel=0.3)
     assert run(100.0).variance_factor == tuning.NIS_MOST
     assert not run(2.0, seconds=0.7).contradicts  # too few to say so
-
-
-@pytest.mark.parametrize("axis", [POSITION.start, VELOCITY.start])
-def test_a_single_one_beyond_the_gate_tells_how_uncertain_the_prior_was(axis: int) -> None:
-    after = corrected(BEFORE, slice(axis, axis + 1))
-    allowed = float(np.sqrt(BEFORE[axis, axis] - after[axis, axis]))
-
-    def inflated(sigmas: float) -> Any:
-        error = np.zeros(ERRORS)
-        error[axis] = sigmas * allowed
-        return inflated_prior(STILL, BEFORE, STILL.boxplus(error), after)
-
-    gate = float(np.sqrt(tuning.NIS_GATE))
-    assert inflated(0.98 * gate) is None
-    assert inflated(-0.98 * gate) is None
-    for sigmas in (1.02 * gate, -30.0):
-        expected = BEFORE.copy()
-        expected[:9] *= abs(sigmas)
-        expected[:, :9] *= abs(sigmas)
-        np.testing.assert_allclose(inflated(sigmas), expected, rtol=1e-6)
-    assert inflated_prior(STILL, BEFORE, STILL, BEFORE) is None  # nothing was measured
 
 
 def test_small_ones_tell_that_variances_are_too_large() -> None:
