@@ -68,12 +68,13 @@ class FirstRest:
     Parameters
     ----------
     initializer : MapInitializer
-        Begins the map again.
     zero_velocity : ZeroVelocityTest
     intrinsics : LidarIntrinsics
 
     Attributes
     ----------
+    initializer : MapInitializer
+        Begins the map again; to be replaced by that of each map that goes on from there.
     sweeps : list of Sweep
         As the unit reports them, oldest first; none if the map did not begin at rest, or so long
         ago that the rest is beyond doubt.
@@ -85,7 +86,7 @@ class FirstRest:
         zero_velocity: ZeroVelocityTest,
         intrinsics: LidarIntrinsics,
     ) -> None:
-        self._initializer = initializer
+        self.initializer = initializer
         self._zero_velocity = zero_velocity
         self._intrinsics = intrinsics
         self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
@@ -168,7 +169,7 @@ class FirstRest:
         ended = self.recalibrated(motion.state)
         if ended is None:
             return None
-        initializer = self._initializer.for_another_map()
+        initializer = self.initializer.for_another_map()
         initializer.map_rest(ended.sweeps, ended.state, ended.covariance)
         matcher, sweep = initializer.matcher, self._intrinsics.applied_to(reported)
         covariance = with_loose_pose(motion.state, motion.covariance, ended.moved)
@@ -209,7 +210,7 @@ class FirstRest:
             return None
         self._mapped_with = self._corrections
         better = [self._intrinsics.applied_to(one) for one in self.sweeps]
-        return self._initializer.begin_again_at_rest(better, still.state, still.covariance)
+        return self.initializer.begin_again_at_rest(better, still.state, still.covariance)
 
     def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
         """Return whether unknown beams may be why sweeps deviate; the sensor rests as before then.
@@ -246,7 +247,7 @@ class FirstRest:
         """
         if not sweeps or sweeps[-1].end - sweeps[0].start > tuning.RETRY_SHORT_NS:
             return None
-        motions = self._initializer.begin_again_in_motion(sweeps, state, covariance)
+        motions = self.initializer.begin_again_in_motion(sweeps, state, covariance)
         if not motions:
             return None
         self._forget_intrinsics()
@@ -264,7 +265,7 @@ class FirstRest:
         """
         self._forget_intrinsics()
         for may_rest in (False, True):
-            motions = self._initializer.begin(sweeps, sweeps[0].start, may_rest)
+            motions = self.initializer.begin(sweeps, sweeps[0].start, may_rest)
             if motions:
                 way = float(np.linalg.norm(motions[-1].state.position))
                 if way < tuning.RETRY_FARTHEST_M:

@@ -103,7 +103,9 @@ class Odometry:
         self._zero_velocity = ZeroVelocityTest()
         self._innovations = InnovationTest()
         self._intrinsics = LidarIntrinsics()
-        self._use(SweepMatcher(self.config, self._lever))
+        self.matcher = SweepMatcher(self.config, self._lever)
+        self._initializer = self._map_initializer()
+        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._intrinsics)
         self._start = StartVelocity(self._lever)
         self._carrier = carrier_priors.Carrier()
         self._unmatched_ns = 0  # of sweeps with enough points since the latest match
@@ -118,10 +120,12 @@ class Odometry:
     def _use(self, matcher: SweepMatcher) -> None:
         """Go on with the maps of a matcher."""
         self.matcher = matcher
-        self._initializer = MapInitializer(
-            self._predictor, matcher, self._zero_velocity, self.config.min_points
+        self._initializer = self._first_rest.initializer = self._map_initializer()
+
+    def _map_initializer(self) -> MapInitializer:
+        return MapInitializer(
+            self._predictor, self.matcher, self._zero_velocity, self.config.min_points
         )
-        self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._intrinsics)
 
     def imu(self, samples: Samples) -> None:
         """Take IMU samples (N,), dtype IMU_SAMPLE, in any order and state."""
@@ -504,6 +508,7 @@ class Odometry:
 
     def _forget_sweeps(self) -> None:
         """Forget what sweeps have shown together: those to come are apart from them."""
+        self._first_rest.end()
         self._walls.clear()
         self._start.clear()
         self._late_gravity.clear()
@@ -688,7 +693,6 @@ class Odometry:
         self._gate.restart(reference)
         self._earlier.restart(reference)
         self._revisit.restart(reference)
-        self._first_rest.end()
         if self.phase is Phase.STATIONARY:
             self._leave_rest()
 

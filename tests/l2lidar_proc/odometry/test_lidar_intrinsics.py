@@ -578,3 +578,27 @@ def test_a_run_over_a_recording_says_what_was_corrected() -> None:
         run = run_events(iter([(0, resting()), *((int(one.end), one) for one in turns)]), CONFIG)
         notes = [note for note in run.report if "l2lidar calibrate still" in note]
         assert len(notes) == said
+
+
+def test_a_rest_is_mapped_again_with_each_thing_that_becomes_known() -> None:
+    odometry, _ = at_rest()
+    assert odometry._posterior is not None
+    assert odometry.motion is not None
+    odometry._first_rest.end_with(*odometry._posterior)
+    for _ in range(2):
+        before = odometry.matcher
+        assert not odometry._map_ended_rest(odometry.motion)  # nothing is known better
+        odometry._intrinsics.ranges.correction += 0.03
+        assert odometry._map_ended_rest(odometry.motion)
+        assert odometry.matcher is not before
+        assert odometry._first_rest.initializer.matcher is odometry.matcher
+
+
+def test_a_rest_before_a_gap_of_the_clock_is_not_mapped_again() -> None:
+    odometry, some = at_rest()
+    assert odometry._posterior is not None
+    assert odometry.motion is not None
+    odometry._first_rest.end_with(*odometry._posterior)
+    odometry._begin_time_line(HostNs(some[-1].end + 1))
+    odometry._intrinsics.ranges.correction += 0.03
+    assert not odometry._map_ended_rest(odometry.motion)
