@@ -293,7 +293,8 @@ def _samples(given: Scenario, setting: Setting) -> NDArray[np.void]:
             rate, force = rate @ turn, force @ turn
             times = times + fault.imu_late_s
         kept = np.ones(len(times), np.bool_)
-        for at in rng.uniform(3.0, given.seconds, round(fault.imu_gaps * given.seconds / 60.0)):
+        gaps = round(fault.imu_gaps * given.seconds / 60.0)
+        for at in rng.uniform(min(3.0, given.seconds), given.seconds, gaps):
             kept &= (times < at) | (times > at + rng.uniform(0.02, 0.06))
         samples, rate, force, times = samples[kept], rate[kept], force[kept], times[kept]
     samples["stamp"] = EPOCH + np.round(times * 1e9).astype(np.int64)

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("recordings")
     ],
 )
 def test_what_begins_in_motion_does_not_run_away(seed: int, most: float, turned: float) -> None:
-    given = recording(scenario(STARTS, seed, 12.0))
+    given = recording(scenario(STARTS, seed, 9.0))
     found = errors(given, tracked(given))
     assert np.linalg.norm(found.position[-1]) < most
     assert np.degrees(np.linalg.norm(found.turn[-10:, :2], axis=1).max()) < turned
