@@ -327,8 +327,13 @@ class MapInitializer:
         return []
 
     def _samples(self, sweeps: list[Sweep], since: HostNs) -> NDArray[np.void]:
-        until = min(sweeps[-1].end, since + tuning.INITIAL_IMU_NS)
-        return self._predictor.samples(since - tuning.INITIAL_NS, until)
+        """Return the samples that show the first attitude, none of them from before a long gap."""
+        first = since - tuning.INITIAL_NS
+        last = min(sweeps[-1].end, since + tuning.INITIAL_IMU_NS)
+        found = self._predictor.samples(first, last)
+        stamps = found["stamp"]
+        apart = np.maximum(first - stamps, stamps - last)
+        return found[apart < tuning.LONG_GAP_NS]
 
     def _begin_anew(self, sweeps: list[Sweep], since: HostNs, may_rest: bool) -> InitialState:
         """Forget what an attempt has found out of a motion; return the first state again."""

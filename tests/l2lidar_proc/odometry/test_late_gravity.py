@@ -63,6 +63,22 @@ def test_gravity_is_known_within_two_seconds_of_the_first_sample(
     assert sigma <= 0.16  # by the accelerometer's bias at rest, by less in motion
 
 
+@pytest.mark.parametrize(("before_s", "counts"), [(0.9, True), (1.1, False)])
+def test_how_the_sensor_lay_a_second_before_does_not_show_the_vertical(
+    before_s: float, counts: bool
+) -> None:
+    """A silent IMU whose latest samples are older than the held sweeps reach back."""
+    run = recording("room", "walk")
+    odometry, samples = Odometry(OdometryConfig(), T_CLOUD_IMU), run.imu[:40].copy()
+    some = list(sweeps(run, "turn"))[:5]
+    end = int(some[0].start) - tuning.INITIAL_NS - round(before_s * SECOND)
+    samples["stamp"] += end - samples["stamp"][-1]
+    odometry.imu(samples)
+    estimates = [item for sweep in some for item in odometry.register(sweep)]
+    assert odometry._predictor.trusts_gravity == counts
+    assert (Status.GRAVITY_UNTRUSTED in estimates[0].status) != counts
+
+
 def test_in_a_corridor_the_imu_then_carries_the_way_along_it() -> None:
     run = recording("corridor", "walk", 11.5)
     _, estimates = followed(run, without_first(run, 0.8))
