@@ -140,7 +140,12 @@ def check_place(folder: Path) -> None:
         return
     except OSError as error:
         raise _unsaved(folder, error) from None
-    if MANIFEST not in names and not all(map(_is_of_a_map, names)):
+    if MANIFEST in names:
+        try:
+            _body(folder / MANIFEST)
+        except AtlasError as error:
+            raise AtlasError(f"{error}; choose a new or empty folder") from None
+    elif not all(map(_is_of_a_map, names)):
         raise AtlasError(
             f"{folder} contains files that are not a map; choose a new or empty folder"
         )
@@ -210,22 +215,30 @@ def load(folder: Path) -> tuple[Map, list[str]]:
     return Map(built, nodes["T_map_node"].copy(), edges), warnings
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
+def _body(path: Path) -> tuple[dict[str, Any], Any]:
+    """Return what a manifest says of its map, and the checksum that it gives for it."""
     try:
         read = json.loads(path.read_bytes())
     except FileNotFoundError:
-        raise AtlasError(f"{folder} is not a saved map: there is no {MANIFEST} in it") from None
+        raise AtlasError(
+            f"{path.parent} is not a saved map: there is no {MANIFEST} in it"
+        ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise AtlasError(f"{path} cannot be read: {error}") from None
     body = read.get("map") if isinstance(read, dict) else None
     if not isinstance(body, dict) or body.get("format") != "l2lidar atlas":
         raise AtlasError(f"{path} is not the manifest of a saved map")
+    return body, read.get("sha256")
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    body, checksum = _body(path)
     if body.get("version") != VERSION:
         raise AtlasError(
             f"{path}: version {body.get('version')!r} is not known, expected {VERSION}"
         )
-    if read.get("sha256") != _sha256(_canonical(body)):
+    if checksum != _sha256(_canonical(body)):
         raise AtlasError(f"{path} is damaged: its checksum is wrong")
     names = [body.get("graph"), *(body.get("submaps") or ["missing"])]
     for name in names[:1] + [name for name in names[1:] if name is not None]:

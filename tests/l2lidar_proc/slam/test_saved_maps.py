@@ -145,6 +145,23 @@ def test_a_folder_with_other_files_is_not_written_to(mapped: Slam, tmp_path: Pat
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ('{"sprites": []}', "is not the manifest of a saved map"),
+        ('{"sha256": "0", "map": {', "cannot be read"),
+    ],
+)
+def test_an_atlas_of_another_program_is_not_written_over(
+    mapped: Slam, tmp_path: Path, content: str, said: str
+) -> None:
+    manifest = tmp_path / atlas.MANIFEST
+    manifest.write_text(content)
+    with pytest.raises(AtlasError, match=f"{said}.*choose a new or empty folder"):
+        AtlasWriter(tmp_path).save(mapped.map())
+    assert contents(tmp_path) == {atlas.MANIFEST: content.encode()}
+
+
 def test_gtsam_reads_the_g2o_file_back(mapped: Slam, tmp_path: Path) -> None:
     gtsam = pytest.importorskip("gtsam")
     built = mapped.map()
