@@ -347,8 +347,15 @@ class Recorder:
         self._is_open = True
         self._flushed = HostNs(0)
         device, host = endpoints(network)
-        self._writer = RecordingWriter(self._file, device, host)
-        self._file.flush()
+        try:
+            self._writer = RecordingWriter(self._file, device, host)
+            self._file.flush()
+        except OSError:
+            # nothing came into the file: an empty one would stand in the way of the next attempt
+            with contextlib.suppress(OSError):
+                self._file.close()
+            path.unlink(missing_ok=True)
+            raise
 
     def received(self, data: bytes, arrival: HostNs) -> None:
         """Write bytes that came from the device."""

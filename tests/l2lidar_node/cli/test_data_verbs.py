@@ -266,6 +266,22 @@ def test_a_full_disk_ends_the_recording_and_not_the_driver(unit: Unit, tmp_path:
     assert str(tmp_path / "a.pcap") in failure
 
 
+def test_a_recording_that_cannot_be_begun_leaves_no_file(tmp_path: Path) -> None:
+    """In a process of its own, whose files may not grow, as on a full disk."""
+    path = tmp_path / "a.pcap"
+    program = f"""
+import resource
+from pathlib import Path
+from l2lidar_node.config import NetworkConfig
+from l2lidar_node.recording.recording import Recorder
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+Recorder(Path({str(path)!r}), NetworkConfig(), print)
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "OSError: [Errno 27] File too large" in found.stderr
+    assert not path.exists()
+
+
 def test_a_name_that_is_taken_gets_a_number(tmp_path: Path) -> None:
     path = tmp_path / "a.pcap"
     assert free_name(path) == path
