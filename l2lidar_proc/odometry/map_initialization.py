@@ -333,7 +333,7 @@ class MapInitializer:
         found = self._predictor.samples(first, last)
         stamps = found["stamp"]
         apart = np.maximum(first - stamps, stamps - last)
-        return found[apart < tuning.LONG_GAP_NS]
+        return records.selected(found, np.flatnonzero(apart < tuning.LONG_GAP_NS))
 
     def _begin_anew(self, sweeps: list[Sweep], since: HostNs, may_rest: bool) -> InitialState:
         """Forget what an attempt has found out of a motion; return the first state again."""
