@@ -187,13 +187,6 @@ CONVERGED: Final = 5e-4  # [rad, m]
 # Without an IMU it is the velocity that has to settle. Tuned on: bushes, poles
 CONVERGED_TWIST: Final = 5e-3  # [m/s, rad/s]
 DEGENERATE_SHARE: Final = 0.01  # of the points; with fewer a direction is hardly observed
-# Weak directions. Tuned on: camera in the room, corridor with a view of 80 degrees, rosette lidar
-WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals may prevail
-WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off in the finest cells
-# Points on surfaces that face a direction of the place: with no more than so many, the whole sweep
-# tells nothing about it. Tuned on: narrow views, seeds 100 to 115; 8 do as well, 0 worse
-FREE_FACING: Final = 4
-FREE_LEFT: Final = 0.5  # length that is left of a weak direction beside the free ones
 # [s] from one sweep to the next of an L2: in a map that began with an open velocity, ages count in
 # such sweeps. Counted in its own, the rims of a spinning lidar had half the time, and two drives
 # ended 37 and 125 m off; counted so in all maps, cameras that began at rest were 1.5 times as far
@@ -202,6 +195,13 @@ SWEEP_S: Final = 0.23
 SWEEP_LEAST_S: Final = 0.01
 SWEEP_MOST_S: Final = 0.5
 SWEEP_BLEND: Final = 0.05
+# Weak directions. Tuned on: camera in the room, corridor with a view of 80 degrees, rosette lidar
+WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals may prevail
+WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off in the finest cells
+# Points on surfaces that face a direction of the place: with no more than so many, the whole sweep
+# tells nothing about it. Tuned on: narrow views, seeds 100 to 115; 8 do as well, 0 worse
+FREE_FACING: Final = 4
+FREE_LEFT: Final = 0.5  # length that is left of a weak direction beside the free ones
 WEAK_AGE: Final = 8  # sweeps since a surface was opened: until then it is a rim of the view
 WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above the noise
 WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller

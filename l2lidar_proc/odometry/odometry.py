@@ -507,7 +507,7 @@ class Odometry:
         self._unmatched_ns, self._was_blind = 0, False
 
     def _forget_sweeps(self) -> None:
-        """Forget what sweeps have shown together: those to come are apart from them."""
+        """Forget what the latest sweeps have shown together: the next are not tied to them."""
         self._first_rest.end()
         self._walls.clear()
         self._start.clear()
