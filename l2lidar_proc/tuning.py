@@ -723,6 +723,9 @@ STILL_FAR: Final = (0.035, 0.1)  # [rad, m] and one that always does
 STILL_TURN_NS: Final = 200_000_000  # [ns] shorter sweeps are averaged into a turn
 STILL_COMPARED: Final = 40  # turns whose deviations are compared,
 STILL_TESTED: Final = 12  # of these up to so many of the latest with all before
+# Turns that agreed before the latest one or two did not: it was a rest until then. Derived: with
+# fewer, one that accelerates evenly from the start looks like that
+STILL_OLDER: Final = 6
 STILL_DRIFT: Final = 160.0  # squared Mahalanobis distance of a drift (6) that is not chance
 # Share of the points that fixed the weakest direction at first, to tell that motion has blurred it
 # since. A creep of 0.05 m/s through a room: 0.1 at first, 0.01 after 2 s; at rest 0.06 to 0.12

@@ -650,7 +650,8 @@ class Odometry:
         self._posterior = state, self._zero_velocity.widened(covariance)
         sweeps = self._first_rest.sweeps
         self._first_rest.end_with(state, covariance, moving=1)
-        if sweeps and self._zero_velocity.drifted:
+        test = self._zero_velocity
+        if sweeps and test.drifted and not test.ended_suddenly:
             begun = self._first_rest.retried(sweeps)
             if begun is not None:
                 self._enter_map(begun)

@@ -38,10 +38,14 @@ class ZeroVelocityTest:
     ----------
     anchor : InertialState or None
         Where it stands; None while it moves.
+    ended_suddenly : bool
+        Whether the last one was given up for one or two turns of the head, which deviated from
+        many that had agreed: the sensor was at rest until then.
     """
 
     def __init__(self) -> None:
         self.anchor: InertialState | None = None
+        self.ended_suddenly = False
         self._turned = 0  # the instant of the last sweep of a turn
         # how well the first sweep at the anchor fixed the weakest direction, as a share of all
         self._fixed: float | None = None
@@ -146,6 +150,7 @@ class ZeroVelocityTest:
         """
         assert self.anchor is not None
         deviation = found.state.boxminus(self.anchor)[POSE]
+        self.ended_suddenly = False
         if self._is_blurred(found):
             self._drift = deviation
             self._doubt()
@@ -159,6 +164,7 @@ class ZeroVelocityTest:
             deviation[3:] -= free @ (free.T @ deviation[3:])
         if (np.abs(deviation) > _both(*tuning.STILL_FAR)).any():
             self._drift = deviation
+            self.ended_suddenly = len(self._deviations) >= tuning.STILL_OLDER
             self._doubt()
             return False
         # parts of a turn see, and err, each in their own way: only whole turns are compared
@@ -186,6 +192,8 @@ class ZeroVelocityTest:
         if surprise[worst] < tuning.STILL_DRIFT:
             return True
         self._drift = drifts[worst]
+        # what moved from the start, however it sped up, stands out most with three turns or more
+        self.ended_suddenly = bool(worst <= 1 and older[worst] >= tuning.STILL_OLDER)
         self._doubt()
         return False
 

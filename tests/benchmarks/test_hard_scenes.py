@@ -103,6 +103,12 @@ def test_beams_that_nobody_knows_yet_do_not_end_a_rest_between_trees(
         assert (np.abs(found - true) < 2.0 * np.degrees(odometry._intrinsics.sigmas)).all()
 
 
+def test_a_rest_that_ends_with_a_slow_turn_was_one() -> None:
+    """It passed for motion since the start, and the map began again turned by 20 mrad."""
+    given = recording(scenario("flat with glass and mirror", 232, 4.0))
+    assert np.linalg.norm(errors(given, tracked(given)).turn, axis=1).max() < 0.012
+
+
 def test_a_rest_outlasts_a_sweep_that_meets_nothing_of_so_young_a_map() -> None:
     """Between bare trunks it ended there, and the map turned by 20 mrad until the real start."""
     given = recording(scenario("bare trunks", 203, 3.0))
