@@ -29,9 +29,8 @@ _WINDOW_NS: Final = 2_000_000_000
 _WINDOW_LEAST_S: Final = 1.5  # of it, with samples
 _WINDOW_GAP_S: Final = 0.1  # between them, at most
 _WINDOW_MOST: Final = 10_000  # samples
-_TUMBLED: Final = (
-    0.7  # share of gravity that is left; in rad/s only a fall to 6 m/s leaves so little
-)
+# Share of gravity that is left. In rad/s only a fall to 6 m/s leaves so little
+_TUMBLED: Final = 0.7
 _STEADY: Final = 0.8  # share that is left of it in degrees
 # [rad/s] median of a window, in which a carrier would turn five times: no scan could be followed.
 # For carriers that turn about the vertical alone, which leaves gravity where it is

@@ -519,9 +519,8 @@ def test_a_clock_of_clouds_that_stands_still_is_said_to() -> None:
     assert pipeline.counts == {Status.REFUSED: 8}
     found = judge(pipeline.last, pipeline.sweeps, 4, pipeline.counts, Counter())
     assert (found.level, found.message) == (Level.WARN, "the stamps of the clouds do not advance")
-    waiting = judge(
-        None, 20, 4, pipeline.counts, Counter()
-    )  # a clock that stood still and goes on
+    # a clock that stood still and goes on
+    waiting = judge(None, 20, 4, pipeline.counts, Counter())
     assert waiting.message == "waiting until the first sweeps match"
 
 
