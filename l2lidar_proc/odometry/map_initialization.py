@@ -567,20 +567,23 @@ class MapInitializer:
 
         Where the first sweeps hardly fix a direction, as in a corridor, rounds that begin at rest
         may end at the wrong velocity along it: rounds from a walk either way are tried as well.
+        Where they fit badly, as where a yard shows ground and few walls, also along the others.
         """
         start = self._at_cloud_origin(initial)
         trial, begun = self._rounds(sweeps, since, start, initial)
         if initial.at_rest or trial.last is None:
             return trial, begun
-        strength, axis = weak_axis(trial.last.information)
-        if strength >= tuning.WEAK_SHARE:
-            return trial, begun
         best, best_begun, latest = trial, begun, trial
-        for speed in (tuning.INITIAL_SPEED, -tuning.INITIAL_SPEED):
-            walking = dataclasses.replace(start, velocity=speed * axis)
-            latest, begun = self._rounds(sweeps, since, walking, initial)
-            if latest.motions and latest.fits_better(best):
-                best, best_begun = latest, begun
+        strengths, axes = np.linalg.eigh(trial.last.information[POSITION, POSITION])
+        weak = strengths < tuning.WEAK_SHARE * strengths[-1]
+        for k, axis in enumerate(axes.T):
+            if not (best.is_doubtful or (k == 0 and weak[0])):
+                break
+            for speed in (tuning.INITIAL_SPEED, -tuning.INITIAL_SPEED):
+                walking = dataclasses.replace(start, velocity=speed * axis)
+                latest, begun = self._rounds(sweeps, since, walking, initial)
+                if latest.motions and latest.fits_better(best):
+                    best, best_begun = latest, begun
         if best is not latest:  # the maps are those of the latest one
             best = self._round(sweeps, since, best_begun, initial)
         return best, best_begun
