@@ -774,6 +774,13 @@ REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
 REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part
 REVISIT_INLIERS: Final = 0.85  # least share of those that are near its surfaces
 REVISIT_MET_NS: Final = 2_000_000_000  # [ns] within which a meeting must be confirmed
+# Places on a level at which sweeps fit within that time: they are one so far apart, and where
+# others fit elsewhere, so many, and so many times the others, have to agree. Observed: cameras
+# looking into rooms, where right places stayed within 1 to 5 cm, and wrong ones moved by 5 to 20
+# from sweep to sweep
+REVISIT_SAME_M: Final = 0.05  # [m]
+REVISIT_AGREEING: Final = 3
+REVISIT_MAJORITY: Final = 2
 # Relocalization on a level is tried with each sweep for so long after one that left a direction
 # free: the surface that fixes it again may be in sight for a second only.
 REVISIT_SIGHT_NS: Final = 2_000_000_000  # [ns]
@@ -799,11 +806,16 @@ RELOCALIZE_APART_M: Final = 0.25  # [m] so far apart
 # Tuned on: camera on stairs, where sweeps fit 0.16 m and more higher or lower as well, and flats
 # with a cone of 70 degrees and a rosette, where the height had drifted by 0.1 m besides
 RELOCALIZE_HEIGHT_M: Final = 0.15  # [m] by which the place may move up or down
+# Where the height is all that a sweep leaves free, sine of how far from the vertical. Observed in
+# such views: 0.06 at most
+RELOCALIZE_TILT: Final = 0.2
 RELOCALIZE_FLOOR_M: Final = 0.05  # [m] added to its uncertainty in each direction
 # Share of the points on surfaces, of all in their cells and of those in the finest. Coarse cells
 # near an old place hold what has not been seen before: 0.56 to 0.98 at right places, 0.38 at wrong
 # ones. Tuned on: as above
 RELOCALIZE_INLIERS: Final = (0.5, 0.85)
-RELOCALIZE_MATCHED: Final = 0.15  # of all points, on surfaces of the finest cells
+# Of all points, on surfaces of the finest cells, and where few of them show how far away the place
+# is. Such places were right with 0.45 and more, and wrong with 0.44 and less, cameras in rooms
+RELOCALIZE_MATCHED: Final = (0.15, 0.45)
 # Time in which the place may have moved by the jump. Observed: a view lacks for 3 to 10 s.
 REVISIT_DRIFT_S: Final = 5.0  # [s]

@@ -18,6 +18,7 @@ one that is likely counts by itself.
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -182,6 +183,59 @@ class OlderPart(NamedTuple):
     is_contradicted: bool
 
 
+class _Agreement(NamedTuple):
+    """How many of the latest sweeps fit the older part of the map at one place, and elsewhere.
+
+    Attributes
+    ----------
+    same : int
+        The present one among them.
+    others : int
+    facing : float
+        Points of those at one place that show how far away it is.
+    """
+
+    same: int
+    others: int
+    facing: float
+
+    @property
+    def is_one_place(self) -> bool:
+        """Whether enough points show one place, and two sweeps agree, or most of many."""
+        if self.facing < tuning.FAR_POINTS:
+            return False
+        if not self.others:
+            return self.same >= 2
+        return self.same >= max(tuning.REVISIT_AGREEING, tuning.REVISIT_MAJORITY * self.others)
+
+
+class _LevelFits:
+    """Where the latest sweeps fit the older part of the map, on their level.
+
+    A right place stays where it is from sweep to sweep, a wrong one wanders with what is in sight.
+    """
+
+    def __init__(self) -> None:
+        self._latest: deque[tuple[int, F64, float]] = deque()
+
+    def clear(self) -> None:
+        """Forget them, as where the pose has jumped."""
+        self._latest.clear()
+
+    def add(self, stamp: int, shift: F64, facing: float) -> _Agreement:
+        """Take the shift (3,) [m] of a sweep to where it fits; return how many agree with it."""
+        latest = self._latest
+        latest.append((stamp, shift, facing))
+        while latest[0][0] <= stamp - tuning.REVISIT_MET_NS:
+            latest.popleft()
+        same = [
+            points
+            for _, other, points in latest
+            if np.linalg.norm(other - shift) < tuning.REVISIT_SAME_M
+        ]
+        return _Agreement(len(same), len(latest) - len(same), sum(same))
+
+
 class MapRevisit:
     """Search of the older part of the map in use while the pose is less certain than that.
 
@@ -194,7 +248,7 @@ class MapRevisit:
 
     def __init__(self) -> None:
         self._is_uncertain = self.is_contradicted = False
-        self._meetings = _Meetings()
+        self._meetings, self._fits = _Meetings(), _LevelFits()
         self._met = _Recently(tuning.REVISIT_MET_NS)
         self._unobserved = _Recently(tuning.REVISIT_SIGHT_NS)
         self._returned = _Recently(tuning.REVISIT_MET_NS)
@@ -208,7 +262,11 @@ class MapRevisit:
         for event in (self._met, self._unobserved, self._returned, self._contradicted):
             event.clear()
         self._contradicting = 0  # sweeps before this were the first at the surfaces that did so
+        self._forget_meetings()
+
+    def _forget_meetings(self) -> None:
         self._meetings.clear()
+        self._fits.clear()
 
     def note_unobserved(self, stamp: HostNs) -> None:
         """Note that the sweep of a stamp left a direction of the place free."""
@@ -239,7 +297,7 @@ class MapRevisit:
         self._is_uncertain = not (older is None or matcher.is_young or matcher.driving)
         if older is None or not self._is_uncertain:
             self._certain_at, self._next_search = stamp, stamp + tuning.REVISIT_LOOK_NS
-            self._meetings.clear()
+            self._forget_meetings()
             return None
         self._note_seen_through(matcher.seen_through(source(), state), stamp)
         contradicted = self._contradicted.at(stamp)
@@ -288,20 +346,19 @@ class MapRevisit:
         jump : FrameJump
             Of the map in use.
         """
-        found, is_likely = _found_in(part, source, motion)
         stamp = int(motion.state.stamp)
+        found, counts = self._found_in(part, source, motion)
         if found is None:
             if self._met.at(stamp):
                 self._next_search = stamp + 1
             else:
                 self._meetings.clear()
             return None
-        is_confirmed = self._meetings.confirm(None, _moves(motion.state, found.state))
-        if not (is_confirmed or (is_likely and not self._returned.at(stamp))):
+        if not counts:
             self._met.note(stamp)
             self._next_search = stamp + 1
             return None
-        self._meetings.clear()
+        self._forget_meetings()
         self._returned.note(stamp)
         self._contradicted.clear()
         part.matcher.drift.is_doubted = False
@@ -311,33 +368,43 @@ class MapRevisit:
         found = dataclasses.replace(found, covariance=covariance)
         return Relocalization(EarlierMap(part.matcher, jump), found)
 
+    def _found_in(
+        self, part: OlderPart, source: Source, motion: SweepMotion
+    ) -> tuple[Alignment | None, bool]:
+        """Return how a sweep meets the older part of the map, and whether that counts already.
 
-def _found_in(
-    part: OlderPart, source: Source, motion: SweepMotion
-) -> tuple[Alignment | None, bool]:
-    """Return how a sweep meets the older part of the map, and whether it needs no confirmation.
-
-    It needs none where it relocalizes the pose by a likely drift. A pose that is known to be wrong
-    is searched with each sweep, so that one may fit by chance.
-    """
-    older, place = part.matcher, motion.state.position
-    uncertain = _kept_level(motion.state, older.drift.at(place))
-    expected = older.drift.reported_at(place)[:3, :3]
-    if part.is_due:
-        drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
-        found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
-        if found is not None and _is_elsewhere(found, motion, len(source.points), expected):
-            return found, False
-    if not _is_loose_on_level(motion.state, uncertain, contradicted=part.is_contradicted):
-        return None, False
-    loose = with_loose_pose(motion.state, motion.covariance, uncertain)
-    freed = dataclasses.replace(motion, covariance=loose)
-    found = older.relocalize(source, freed, uncertain[:3, :3], expected)
-    if found is None:
-        return None, False
-    move = found.state.position - place
-    is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
-    return found, is_likely and not part.is_contradicted
+        It does where the latest sweeps agree, and at once where it relocalizes the pose by a
+        likely drift, unless it has just returned, and no other sweep has fitted elsewhere. A pose
+        that is known to be wrong is searched with each sweep, so that one may fit by chance.
+        """
+        older, place = part.matcher, motion.state.position
+        uncertain = _kept_level(motion.state, older.drift.at(place))
+        expected = older.drift.reported_at(place)[:3, :3]
+        if part.is_due:
+            drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
+            found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
+            if found is not None and _is_elsewhere(found, motion, len(source.points), expected):
+                return found, self._meetings.confirm(None, _moves(motion.state, found.state))
+        if not _is_loose_on_level(motion.state, uncertain, contradicted=part.is_contradicted):
+            return None, False
+        loose = with_loose_pose(motion.state, motion.covariance, uncertain)
+        freed = dataclasses.replace(motion, covariance=loose)
+        fit = older.relocalize(source, freed, uncertain[:3, :3])
+        if fit is None:
+            return None, False
+        stamp = int(motion.state.stamp)
+        move = fit.alignment.state.position - place
+        agreement = self._fits.add(stamp, move, fit.facing)
+        if not is_explained_by_drift(move, expected):
+            return None, False
+        is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
+        by_itself = is_likely and not (
+            part.is_contradicted
+            or self._returned.at(stamp)
+            or agreement.others
+            or fit.facing < tuning.FAR_POINTS
+        )
+        return fit.alignment, by_itself or agreement.is_one_place
 
 
 def _kept_level(state: InertialState, uncertain: F64) -> F64:

@@ -44,6 +44,7 @@ from l2lidar_proc.odometry.free_space import SeenThrough, seen_through
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.pose_hypotheses import (
     is_explained_by_drift,
+    level_basis,
     level_hypotheses,
     pose_hypotheses,
     rotation_is_loose,
@@ -75,6 +76,21 @@ class Match(NamedTuple):
 
     alignment: Alignment | None
     status: MatchStatus
+
+
+class LevelFit(NamedTuple):
+    """How a sweep fits the map on the level of its predicted place.
+
+    Attributes
+    ----------
+    alignment : Alignment
+        Its height is the predicted one where the sweep leaves that free.
+    facing : float
+        Number of points that show how far away it is: those on surfaces that face the way there.
+    """
+
+    alignment: Alignment
+    facing: float
 
 
 class SweepMatcher:
@@ -231,44 +247,45 @@ class SweepMatcher:
             return Match(None, MatchStatus.UNMAPPED)
         return self._believed(best)
 
-    def relocalize(
-        self, source: Source, motion: SweepMotion, places: F64, expected: F64
-    ) -> Alignment | None:
-        """Return how a sweep fits the map at another place on its level, None if it does not.
+    def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> LevelFit | None:
+        """Return how a sweep fits the map at another place on its level, None if at none, or more.
 
         For a place that has drifted while no surface fixed it. Of the first surface that fixes it
         again few points are seen, and all others fit anywhere along their walls. So the places
         tried are close together, and only points in the finest cells count. There must be one
-        such place only, on the same level, as a step of a stair looks like the next, and no
-        farther away than drift explains: what lies beside it may be another door in the same wall.
+        such place only, on the same level, as a step of a stair looks like the next. What lies
+        farther away than drift explains may be another door in the same wall.
 
         Parameters
         ----------
         source : Source
         motion : SweepMotion
             The one that deskewed the source; its pose is loose.
-        places, expected : ndarray, shape (3, 3)
-            How uncertain the place in this map has to be allowed to be, and is expected to be, map
-            axes [m^2].
+        places : ndarray, shape (3, 3)
+            How uncertain the place in this map has to be allowed to be, map axes [m^2].
         """
         state = motion.state
         if not state.gravity.any() or len(source.points) < tuning.FAR_MATCHED:
             return None
         starts = level_hypotheses(state, places, source, self.surfaces)
         others = [self._align(source, motion, start) for start in starts]
-        good = [one for one in others if one and self._is_relocalized(one, source, motion, places)]
+        good = [one for one in others if one and self._fits_on_level(one, source, motion, places)]
         best = max(good, key=lambda one: one.fine_inliers, default=None)
         if best is None or any(_are_apart(one, best) for one in good):
             return None
         move = best.state.position - state.position
-        return best if is_explained_by_drift(move, expected) else None
+        free = unobserved_directions(best.information[POSITION, POSITION])
+        kept = dataclasses.replace(
+            best.state, position=best.state.position - free @ (free.T @ move)
+        )
+        return LevelFit(dataclasses.replace(best, state=kept), self._facing(best, motion))
 
-    def _is_relocalized(
+    def _fits_on_level(
         self, found: Alignment, source: Source, motion: SweepMotion, places: F64
     ) -> bool:
         """Return whether an alignment fixes another place on the level of the predicted one."""
         move, gravity = found.state.position - motion.state.position, motion.state.gravity
-        if not is_far(found, motion) or self._is_far_fetched(found, motion):
+        if not is_far(found, motion) or found.matched < tuning.FAR_MATCHED:
             return False
         if abs(float(move @ gravity)) > tuning.RELOCALIZE_HEIGHT_M * float(
             np.linalg.norm(gravity)
@@ -279,11 +296,13 @@ class SweepMatcher:
         inliers, fine_inliers = tuning.RELOCALIZE_INLIERS
         if found.inlier_ratio < inliers or found.fine_ratio < fine_inliers:
             return False
-        if found.fine_inliers < tuning.RELOCALIZE_MATCHED * len(source.points):
+        is_weak = self._facing(found, motion) < tuning.FAR_POINTS
+        if found.fine_inliers < tuning.RELOCALIZE_MATCHED[is_weak] * len(source.points):
             return False
         if self._sees_through(found, source):
             return False
-        return not unobserved_directions(found.information[POSITION, POSITION]).size
+        free = unobserved_directions(found.information[POSITION, POSITION])
+        return not free.size or is_vertical(free, gravity)
 
     @property
     def _wall_direction(self) -> F64 | None:
@@ -546,13 +565,17 @@ class SweepMatcher:
         """
         if not is_far(found, motion):
             return False
-        move = found.state.position - motion.state.position
-        far = float(np.linalg.norm(move))
-        points = self.config.surfaces.point_noise**2 * found.information[POSITION, POSITION]
-        facing = float(move @ points @ move)
+        far = float(np.linalg.norm(found.state.position - motion.state.position))
         return found.matched < tuning.FAR_MATCHED or (
-            far >= tuning.FAR_MOVE and facing < tuning.FAR_POINTS * far**2
+            far >= tuning.FAR_MOVE and self._facing(found, motion) < tuning.FAR_POINTS
         )
+
+    def _facing(self, found: Alignment, motion: SweepMotion) -> float:
+        """Return the number of points on surfaces that face the way from the predicted place."""
+        move = found.state.position - motion.state.position
+        squared = float(move @ move)
+        points = self.config.surfaces.point_noise**2 * found.information[POSITION, POSITION]
+        return float(move @ points @ move) / squared if squared else 0.0
 
     def _needed_inliers(self, strict: bool) -> float:
         """Return the inlier ratio that a result needs.
@@ -632,6 +655,12 @@ def is_far(found: Alignment, motion: SweepMotion) -> bool:
     free = unobserved_directions(found.information[POSITION, POSITION])
     way = way - free @ (free.T @ way)
     return bool(np.linalg.norm(way) >= tuning.FAR_MOVE or np.linalg.norm(turn) >= tuning.FAR_TURN)
+
+
+def is_vertical(directions: F64, gravity: F64) -> bool:
+    """Return whether directions (3, K), orthonormal, are but the vertical of a gravity (3,)."""
+    level = level_basis(gravity).T @ directions
+    return bool(np.linalg.norm(level) < tuning.RELOCALIZE_TILT)
 
 
 def is_ambiguous(best: Alignment, others: list[Alignment | None], motion: SweepMotion) -> bool:

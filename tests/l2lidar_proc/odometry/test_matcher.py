@@ -15,7 +15,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher, is_far
+from l2lidar_proc.odometry.matcher import LevelFit, Match, MatchStatus, SweepMatcher, is_far
 from l2lidar_proc.odometry.pose_hypotheses import level_basis, level_grid
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
@@ -518,27 +518,29 @@ DRIFTED = np.array([0.55, 0.0, 0.0])  # along the wall that fills the view
 DRIFT_SIGMA = np.array([0.5, 0.05, 0.2])
 
 
-def relocalized(
+def level_fit(
     matcher: SweepMatcher,
     points: F64,
     drift: F64 = DRIFTED,
     sigma: F64 = DRIFT_SIGMA,
     gravity: float = 1.0,
-    expected: F64 | None = None,
-) -> F64 | None:
-    """Return the drift that remains when points are relocalized, None where they are not.
-
-    ``sigma`` is what has to be allowed for, and unless it is given also what is expected [m].
-    """
+) -> LevelFit | None:
+    """Return how points fit on the level of a place that has drifted, allowing for a sigma [m]."""
     at = motion(TIGHT, PLACE + drift)
     places = np.diag(sigma**2)
     covariance = at.covariance.copy()
     covariance[eskf.POSITION, eskf.POSITION] = places
     state = dataclasses.replace(at.state, gravity=gravity * at.state.gravity)
     loose = dataclasses.replace(at, covariance=covariance, state=state)
-    expected = places if expected is None else np.diag(expected**2)
-    found = matcher.relocalize(source(points - PLACE), loose, places, expected)
-    return None if found is None else found.state.position - PLACE
+    return matcher.relocalize(source(points - PLACE), loose, places)
+
+
+def relocalized(
+    matcher: SweepMatcher, points: F64, drift: F64 = DRIFTED, sigma: F64 = DRIFT_SIGMA
+) -> F64 | None:
+    """Return the drift that remains when points are relocalized, None where they are not."""
+    found = level_fit(matcher, points, drift, sigma)
+    return None if found is None else found.alignment.state.position - PLACE
 
 
 @pytest.mark.parametrize("along", [0.55, -0.55, 0.2, 0.95])
@@ -577,14 +579,30 @@ def test_only_places_that_drift_explains_are_found(
     assert relocalized(grown, points, np.array(drift), np.array(sigma)) is None
 
 
-@pytest.mark.parametrize(("along", "found"), [(0.3, True), (0.22, False)])
-def test_a_place_that_is_allowed_for_but_not_expected_is_not_found(
-    grown: SweepMatcher, along: float, found: bool
+@pytest.mark.parametrize("strip", [8, 16, 25])
+def test_the_points_that_show_how_far_away_a_place_is_are_counted(
+    grown: SweepMatcher, strip: int
 ) -> None:
-    """What fits there may be another corner: 0.55 m are 2.4 or 1.8 sigma."""
-    expected = np.array([along, 0.05, 0.2])
-    points = corner(np.random.default_rng(39))
-    assert (relocalized(grown, points, expected=expected) is not None) == found
+    """They are those of the strip, and their weight falls with the noise of the map."""
+    found = level_fit(grown, corner(np.random.default_rng(40), strip=strip))
+    assert found is not None
+    assert 0.25 * strip < found.facing < strip
+
+
+def test_where_nothing_holds_the_height_it_stays_the_predicted_one(grown: SweepMatcher) -> None:
+    drift = DRIFTED + np.array([0.0, 0.0, 0.07])
+    found = level_fit(grown, corner(np.random.default_rng(34), floor=0), drift)
+    assert found is not None
+    left = found.alignment.state.position - PLACE
+    np.testing.assert_allclose(left[:2], 0.0, atol=0.02)
+    assert left[2] == pytest.approx(0.07, abs=0.01)
+    # and as uncertain as it was
+    sigma = np.sqrt(found.alignment.covariance[eskf.POSITION, eskf.POSITION][2, 2])
+    assert sigma > 0.9 * DRIFT_SIGMA[2]
+
+
+def test_what_leaves_the_way_free_as_well_fits_at_no_place(grown: SweepMatcher) -> None:
+    assert level_fit(grown, corner(np.random.default_rng(34), floor=0, strip=0)) is None
 
 
 def unknown(rng: np.random.Generator, count: int) -> F64:
@@ -600,9 +618,9 @@ def before(rng: np.random.Generator, count: int, gap: tuple[float, float]) -> F6
 @pytest.mark.parametrize(
     "points",
     [
-        lambda rng: corner(rng, strip=4),  # a few points fit in many places
+        # a few points show how far away it is, of those that fit at all
+        lambda rng: np.vstack((corner(rng, strip=4), unknown(rng, 600))),
         lambda rng: corner(rng, strip=0),
-        lambda rng: corner(rng, floor=0),  # nothing holds the height
         lambda rng: corner(rng, 25, 10, 8),  # fewer than fifty points
         lambda rng: np.vstack((corner(rng, 25, 30, 60), unknown(rng, 1200))),
         lambda rng: np.vstack((corner(rng), before(rng, 500, (0.15, 0.45)))),
@@ -619,7 +637,7 @@ def test_places_on_one_level_are_searched_where_gravity_tells_which_that_is(
     grown: SweepMatcher,
 ) -> None:
     points = corner(np.random.default_rng(35))
-    assert relocalized(grown, points, gravity=0.0) is None
+    assert level_fit(grown, points, gravity=0.0) is None
     few = np.vstack((points[:20], points[300:325], points[325:329]))  # of wall, strip and floor
     assert len(few) == tuning.FAR_MATCHED - 1
     assert relocalized(grown, few) is None
@@ -658,15 +676,14 @@ def test_the_place_found_is_the_only_one_that_fits(plates: tuple[float, ...], fo
 
 
 @pytest.mark.parametrize(("plates", "found"), [((2.32,), True), ((2.0, 2.32), False)])
-def test_two_places_that_fit_are_none_even_if_only_one_is_expected(
+def test_two_places_that_fit_are_none_even_if_one_is_far_less_likely(
     plates: tuple[float, ...], found: bool
 ) -> None:
-    """They are 0.28 and 0.6 m away, 1.4 and 2.9 sigma."""
+    """They are 0.28 and 0.6 m away, 0.6 and 1.2 sigma."""
     rng = np.random.default_rng(36)
     matcher = alley_with(rng, *((x, 1.5) for x in plates))
     cloud = np.vstack((alley(rng, 150, 4.0), plate(rng, 2.0, 1.5, 40)))
-    at, expected = np.array([0.6, 0.0, 0.0]), np.array([0.2, 0.05, 0.2])
-    left = relocalized(matcher, cloud + PLACE, at - PLACE, expected=expected)
+    left = relocalized(matcher, cloud + PLACE, np.array([0.6, 0.0, 0.0]) - PLACE)
     assert (left is not None) == found
 
 
