@@ -647,10 +647,15 @@ class MapInitializer:
     def _first_pose(self, second: SweepMotion) -> F64:
         """Return the covariance (6, 6) of the first pose of all against the map, map axes.
 
-        The velocity until the first sweep in the map is known as well as in the second one.
+        The velocity until the first sweep in the map is known as well as in the second one. A
+        wrong one has also deskewed the first sweeps, which turns them against those that follow.
         """
         covariance = np.diag(np.repeat(np.square(tuning.BEGUN_IN_MOTION), 3))
-        covariance[:3, :3] += self._lead_s**2 * second.covariance[VELOCITY, VELOCITY]
+        velocity = second.covariance[VELOCITY, VELOCITY]
+        covariance[:3, :3] += self._lead_s**2 * velocity
+        turn, most = tuning.BEGUN_TURN
+        worst = min(float(np.linalg.eigvalsh(velocity)[-1]), most**2)
+        covariance[3:, 3:] += turn**2 * worst * np.eye(3)
         return covariance
 
 
