@@ -158,7 +158,7 @@ class Odometry:
         head = self._intrinsics.head(sweep)
         # at rest the samples show it themselves
         moves = self.phase is Phase.TRACKING
-        self._predictor.has_head = not (moves and self._intrinsics.is_other)
+        self._predictor.may_have_head_lines = not (moves and self._intrinsics.is_other)
         if head is not None:
             self._predictor.note_head(head, sweep.end)
         if self.config.correct_beams:

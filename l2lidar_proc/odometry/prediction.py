@@ -53,7 +53,7 @@ class Predictor:
         Rate without bias where there is no gyro [rad/s], cloud axes.
     gyro_noise : float
         Of the samples that were used last [rad/s], each axis.
-    has_head : bool
+    may_have_head_lines : bool
         Whether the gyro may have lines of a head that its samples do not show.
     """
 
@@ -66,7 +66,7 @@ class Predictor:
     def reset(self) -> None:
         """Forget what was found out about the motion; the samples stay."""
         self.trusts_gravity = False
-        self.has_head = True
+        self.may_have_head_lines = True
         self.steady_rate: F64 = np.zeros(3)
         self.gyro_noise = self.config.inertial.gyro_noise
         self._rest: tuple[F64, int] = np.zeros(3), 0  # mean squares of the gyro at rest, samples
@@ -199,7 +199,11 @@ class Predictor:
         accel = noise_spectrum(samples["linear_acceleration"], period)
         least = self._least_gyro_noise
         if least is None:
-            least = settings.gyro_noise * stated if self.has_head else tuning.LEAST_GYRO_NOISE
+            least = (
+                settings.gyro_noise * stated
+                if self.may_have_head_lines
+                else tuning.LEAST_GYRO_NOISE
+            )
         self.gyro_noise = max(least, tuning.GYRO_NOISE_FACTOR * gyro.floor)
         scale = float(np.sqrt(period))
         return Noise(
