@@ -779,13 +779,12 @@ REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
 REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part
 REVISIT_INLIERS: Final = 0.85  # least share of those that are near its surfaces
 REVISIT_MET_NS: Final = 2_000_000_000  # [ns] within which a meeting must be confirmed
-# Places on a level at which sweeps fit within that time: they are one so far apart, and where
-# others fit elsewhere, so many, and so many times the others, have to agree. Observed: cameras
-# looking into rooms, where right places stayed within 1 to 5 cm, and wrong ones moved by 5 to 20
-# from sweep to sweep
-REVISIT_SAME_M: Final = 0.05  # [m]
+# Places on a level at which sweeps fit within that time: two are one so far apart, if one leaves
+# the height free, and otherwise; where others fit elsewhere, so many have to agree. Observed where
+# the height was free: right places stayed within 1 cm from sweep to sweep, wrong ones moved by 3
+# to 20. The other as EARLIER_SAME
+REVISIT_SAME_M: Final = (0.02, 0.25)  # [m]
 REVISIT_AGREEING: Final = 3
-REVISIT_MAJORITY: Final = 2
 # Relocalization on a level is tried with each sweep for so long after one that left a direction
 # free: the surface that fixes it again may be in sight for a second only.
 REVISIT_SIGHT_NS: Final = 2_000_000_000  # [ns]
@@ -819,8 +818,6 @@ RELOCALIZE_FLOOR_M: Final = 0.05  # [m] added to its uncertainty in each directi
 # near an old place hold what has not been seen before: 0.56 to 0.98 at right places, 0.38 at wrong
 # ones. Tuned on: as above
 RELOCALIZE_INLIERS: Final = (0.5, 0.85)
-# Of all points, on surfaces of the finest cells, and where few of them show how far away the place
-# is. Such places were right with 0.45 and more, and wrong with 0.44 and less, cameras in rooms
-RELOCALIZE_MATCHED: Final = (0.15, 0.45)
+RELOCALIZE_MATCHED: Final = 0.15  # of all points, on surfaces of the finest cells
 # Time in which the place may have moved by the jump. Observed: a view lacks for 3 to 10 s.
 REVISIT_DRIFT_S: Final = 5.0  # [s]

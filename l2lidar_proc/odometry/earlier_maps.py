@@ -18,6 +18,7 @@ one that is likely counts by itself.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -183,32 +184,6 @@ class OlderPart(NamedTuple):
     is_contradicted: bool
 
 
-class _Agreement(NamedTuple):
-    """How many of the latest sweeps fit the older part of the map at one place, and elsewhere.
-
-    Attributes
-    ----------
-    same : int
-        The present one among them.
-    others : int
-    facing : float
-        Points of those at one place that show how far away it is.
-    """
-
-    same: int
-    others: int
-    facing: float
-
-    @property
-    def is_one_place(self) -> bool:
-        """Whether enough points show one place, and two sweeps agree, or most of many."""
-        if self.facing < tuning.FAR_POINTS:
-            return False
-        if not self.others:
-            return self.same >= 2
-        return self.same >= max(tuning.REVISIT_AGREEING, tuning.REVISIT_MAJORITY * self.others)
-
-
 class _LevelFits:
     """Where the latest sweeps fit the older part of the map, on their level.
 
@@ -216,24 +191,38 @@ class _LevelFits:
     """
 
     def __init__(self) -> None:
-        self._latest: deque[tuple[int, F64, float]] = deque()
+        self._latest: deque[tuple[int, F64, bool]] = deque()
 
     def clear(self) -> None:
         """Forget them, as where the pose has jumped."""
         self._latest.clear()
 
-    def add(self, stamp: int, shift: F64, facing: float) -> _Agreement:
-        """Take the shift (3,) [m] of a sweep to where it fits; return how many agree with it."""
+    def add(self, stamp: int, shift: F64, *, fixes_height: bool) -> None:
+        """Take the shift (3,) [m] of the sweep of a stamp to where it fits."""
         latest = self._latest
-        latest.append((stamp, shift, facing))
+        latest.append((stamp, shift, fixes_height))
         while latest[0][0] <= stamp - tuning.REVISIT_MET_NS:
             latest.popleft()
-        same = [
-            points
-            for _, other, points in latest
-            if np.linalg.norm(other - shift) < tuning.REVISIT_SAME_M
-        ]
-        return _Agreement(len(same), len(latest) - len(same), sum(same))
+
+    @property
+    def disagree(self) -> bool:
+        """Whether they are at several places."""
+        return self._agreeing() < len(self._latest)
+
+    @property
+    def are_one_place(self) -> bool:
+        """Whether the last two agree; three, where others before them do not."""
+        return self._agreeing() >= (tuning.REVISIT_AGREEING if self.disagree else 2)
+
+    def _agreeing(self) -> int:
+        """Return how many of the last agree, each with the one before."""
+        agreeing = 1
+        for (_, one, fixes), (_, other, fixes_too) in itertools.pairwise(reversed(self._latest)):
+            same = tuning.REVISIT_SAME_M[fixes and fixes_too]
+            if np.linalg.norm(one - other) > same:
+                break
+            agreeing += 1
+        return agreeing
 
 
 class MapRevisit:
@@ -389,22 +378,18 @@ class MapRevisit:
             return None, False
         loose = with_loose_pose(motion.state, motion.covariance, uncertain)
         freed = dataclasses.replace(motion, covariance=loose)
-        fit = older.relocalize(source, freed, uncertain[:3, :3])
-        if fit is None:
+        found = older.relocalize(source, freed, uncertain[:3, :3])
+        if found is None:
             return None, False
-        stamp = int(motion.state.stamp)
-        move = fit.alignment.state.position - place
-        agreement = self._fits.add(stamp, move, fit.facing)
+        move = found.state.position - place
         if not is_explained_by_drift(move, expected):
             return None, False
+        stamp, fits = int(motion.state.stamp), self._fits
+        free = unobserved_directions(found.information[POSITION, POSITION])
+        fits.add(stamp, move, fixes_height=not free.size)
+        is_doubted = part.is_contradicted or self._returned.at(stamp) or fits.disagree
         is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
-        by_itself = is_likely and not (
-            part.is_contradicted
-            or self._returned.at(stamp)
-            or agreement.others
-            or fit.facing < tuning.FAR_POINTS
-        )
-        return fit.alignment, by_itself or agreement.is_one_place
+        return found, (is_likely and not is_doubted) or fits.are_one_place
 
 
 def _kept_level(state: InertialState, uncertain: F64) -> F64:

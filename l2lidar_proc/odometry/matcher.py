@@ -78,21 +78,6 @@ class Match(NamedTuple):
     status: MatchStatus
 
 
-class LevelFit(NamedTuple):
-    """How a sweep fits the map on the level of its predicted place.
-
-    Attributes
-    ----------
-    alignment : Alignment
-        Its height is the predicted one where the sweep leaves that free.
-    facing : float
-        Number of points that show how far away it is: those on surfaces that face the way there.
-    """
-
-    alignment: Alignment
-    facing: float
-
-
 class SweepMatcher:
     """Two maps of the same points, surfaces and KISS-ICP's, and the matching of sweeps with them.
 
@@ -247,14 +232,15 @@ class SweepMatcher:
             return Match(None, MatchStatus.UNMAPPED)
         return self._believed(best)
 
-    def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> LevelFit | None:
+    def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
         """Return how a sweep fits the map at another place on its level, None if at none, or more.
 
         For a place that has drifted while no surface fixed it. Of the first surface that fixes it
         again few points are seen, and all others fit anywhere along their walls. So the places
         tried are close together, and only points in the finest cells count. There must be one
         such place only, on the same level, as a step of a stair looks like the next. What lies
-        farther away than drift explains may be another door in the same wall.
+        farther away than drift explains may be another door in the same wall. The height is the
+        predicted one where the sweep leaves it free.
 
         Parameters
         ----------
@@ -275,17 +261,15 @@ class SweepMatcher:
             return None
         move = best.state.position - state.position
         free = unobserved_directions(best.information[POSITION, POSITION])
-        kept = dataclasses.replace(
-            best.state, position=best.state.position - free @ (free.T @ move)
-        )
-        return LevelFit(dataclasses.replace(best, state=kept), self._facing(best, motion))
+        position = best.state.position - free @ (free.T @ move)
+        return dataclasses.replace(best, state=dataclasses.replace(best.state, position=position))
 
     def _fits_on_level(
         self, found: Alignment, source: Source, motion: SweepMotion, places: F64
     ) -> bool:
         """Return whether an alignment fixes another place on the level of the predicted one."""
         move, gravity = found.state.position - motion.state.position, motion.state.gravity
-        if not is_far(found, motion) or found.matched < tuning.FAR_MATCHED:
+        if not is_far(found, motion) or self._is_far_fetched(found, motion):
             return False
         if abs(float(move @ gravity)) > tuning.RELOCALIZE_HEIGHT_M * float(
             np.linalg.norm(gravity)
@@ -296,8 +280,7 @@ class SweepMatcher:
         inliers, fine_inliers = tuning.RELOCALIZE_INLIERS
         if found.inlier_ratio < inliers or found.fine_ratio < fine_inliers:
             return False
-        is_weak = self._facing(found, motion) < tuning.FAR_POINTS
-        if found.fine_inliers < tuning.RELOCALIZE_MATCHED[is_weak] * len(source.points):
+        if found.fine_inliers < tuning.RELOCALIZE_MATCHED * len(source.points):
             return False
         if self._sees_through(found, source):
             return False
@@ -565,17 +548,13 @@ class SweepMatcher:
         """
         if not is_far(found, motion):
             return False
-        far = float(np.linalg.norm(found.state.position - motion.state.position))
-        return found.matched < tuning.FAR_MATCHED or (
-            far >= tuning.FAR_MOVE and self._facing(found, motion) < tuning.FAR_POINTS
-        )
-
-    def _facing(self, found: Alignment, motion: SweepMotion) -> float:
-        """Return the number of points on surfaces that face the way from the predicted place."""
         move = found.state.position - motion.state.position
-        squared = float(move @ move)
+        far = float(np.linalg.norm(move))
         points = self.config.surfaces.point_noise**2 * found.information[POSITION, POSITION]
-        return float(move @ points @ move) / squared if squared else 0.0
+        facing = float(move @ points @ move)
+        return found.matched < tuning.FAR_MATCHED or (
+            far >= tuning.FAR_MOVE and facing < tuning.FAR_POINTS * far**2
+        )
 
     def _needed_inliers(self, strict: bool) -> float:
         """Return the inlier ratio that a result needs.

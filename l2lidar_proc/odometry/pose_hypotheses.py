@@ -70,7 +70,7 @@ def level_hypotheses(
     errors = np.zeros((len(shifts), ERRORS))
     errors[:, POSITION] = shifts
     scores = _scores(state, errors, source, surfaces, tuning.SEARCH_POINTS)
-    least = tuning.RELOCALIZE_MATCHED[False] * len(_some(source.points, tuning.SEARCH_POINTS))
+    least = tuning.RELOCALIZE_MATCHED * len(_some(source.points, tuning.SEARCH_POINTS))
     better = scores > max(scores[0], least)
     count, apart = tuning.RELOCALIZE_STARTS, tuning.RELOCALIZE_APART_M
     best = _distinct(errors[better], scores[better], apart, count)

@@ -425,26 +425,19 @@ def test_one_sweep_relocalizes_a_pose_by_a_likely_drift_unless_it_has_just_retur
         assert (again is not None) == counts
 
 
-def strip_view(rng: np.random.Generator, strip: int) -> Source:
-    """Return a corner view with so many points that show the place along the wall."""
-    return source(corner(rng, strip=strip) - PLACE)
-
-
-@pytest.mark.parametrize(("strip", "sweeps"), [(8, 4), (18, 2), (60, 1)])
-def test_sweeps_that_agree_add_up_to_enough_points(strip: int, sweeps: int) -> None:
-    """Of 8 points in a strip, 3 count, and of 18 more than 5."""
-    revisit, matcher = MapRevisit(), drifted_matcher(0.6, drift=ALONG)
-    part = OlderPart(matcher.part_of(np.arange(28) < 14), False, False)
-    seen = strip_view(np.random.default_rng(53), strip)
-    for number in range(1, sweeps + 1):
-        back = revisit.search(seen, part, later(AWAY, 0.1 * number), FrameJump())
-        assert (back is not None) == (number == sweeps)
-    assert back is not None
-    np.testing.assert_allclose(back.alignment.state.position, PLACE, atol=0.02)
-
-
-@pytest.mark.parametrize(("others", "sweeps"), [(0, 2), (1, 3), (2, 4)])
-def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(others: int, sweeps: int) -> None:
+@pytest.mark.parametrize(
+    ("floor", "away", "others", "sweeps"),
+    [
+        (0, 0.05, 0, 2),  # nothing fixes the height: 5 cm away is elsewhere
+        (0, 0.05, 1, 3),
+        (0, 0.05, 2, 3),
+        (40, 0.05, 1, 1),
+        (40, 0.26, 1, 3),
+    ],
+)
+def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(
+    floor: int, away: float, others: int, sweeps: int
+) -> None:
     """A wrong place wanders with what is in sight. A sweep of two seconds ago does not count."""
     rng, revisit, matcher = (
         np.random.default_rng(54),
@@ -452,15 +445,18 @@ def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(others: int, swee
         drifted_matcher(0.6, drift=ALONG),
     )
     part = OlderPart(matcher.part_of(np.arange(28) < 14), False, True)
-    for number in range(others + 1):
-        away = 0.0 if number == 0 else 0.06 * number  # nearer to the place, so it fits nearer
-        seconds = -2.5 if number == 0 else 0.1 * number
-        other = later(motion(TIGHT, PLACE + ALONG - (away, 0.0, 0.0)), seconds)
-        assert revisit.search(strip_view(rng, 25), part, other, FrameJump()) is None
-    for number in range(1, sweeps + 1):
-        sweep = later(AWAY, 1.0 + 0.1 * number)
-        back = revisit.search(strip_view(rng, 25), part, sweep, FrameJump())
-        assert (back is not None) == (number == sweeps)
+
+    def is_back(nearer: float, seconds: float) -> bool:
+        """Search with a sweep that fits nearer by so much."""
+        sweep = later(motion(TIGHT, PLACE + ALONG - (nearer, 0.0, 0.0)), seconds)
+        seen = source(corner(rng, strip=60, floor=floor) - PLACE)
+        return revisit.search(seen, part, sweep, FrameJump()) is not None
+
+    assert not is_back(0.0, -2.5)
+    for number in range(1, others + 1):
+        assert not is_back(away * number, 0.1 * number)
+    found = [is_back(0.0, 1.0 + 0.1 * number) for number in range(sweeps)]
+    assert found == [False] * (sweeps - 1) + [True]
 
 
 @pytest.mark.parametrize("known", [0.4, 0.6])

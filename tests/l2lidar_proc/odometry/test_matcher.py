@@ -15,7 +15,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.matcher import LevelFit, Match, MatchStatus, SweepMatcher, is_far
+from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher, is_far
 from l2lidar_proc.odometry.pose_hypotheses import level_basis, level_grid
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
@@ -524,7 +524,7 @@ def level_fit(
     drift: F64 = DRIFTED,
     sigma: F64 = DRIFT_SIGMA,
     gravity: float = 1.0,
-) -> LevelFit | None:
+) -> Alignment | None:
     """Return how points fit on the level of a place that has drifted, allowing for a sigma [m]."""
     at = motion(TIGHT, PLACE + drift)
     places = np.diag(sigma**2)
@@ -540,7 +540,7 @@ def relocalized(
 ) -> F64 | None:
     """Return the drift that remains when points are relocalized, None where they are not."""
     found = level_fit(matcher, points, drift, sigma)
-    return None if found is None else found.alignment.state.position - PLACE
+    return None if found is None else found.state.position - PLACE
 
 
 @pytest.mark.parametrize("along", [0.55, -0.55, 0.2, 0.95])
@@ -579,25 +579,15 @@ def test_only_places_that_drift_explains_are_found(
     assert relocalized(grown, points, np.array(drift), np.array(sigma)) is None
 
 
-@pytest.mark.parametrize("strip", [8, 16, 25])
-def test_the_points_that_show_how_far_away_a_place_is_are_counted(
-    grown: SweepMatcher, strip: int
-) -> None:
-    """They are those of the strip, and their weight falls with the noise of the map."""
-    found = level_fit(grown, corner(np.random.default_rng(40), strip=strip))
-    assert found is not None
-    assert 0.25 * strip < found.facing < strip
-
-
 def test_where_nothing_holds_the_height_it_stays_the_predicted_one(grown: SweepMatcher) -> None:
     drift = DRIFTED + np.array([0.0, 0.0, 0.07])
     found = level_fit(grown, corner(np.random.default_rng(34), floor=0), drift)
     assert found is not None
-    left = found.alignment.state.position - PLACE
+    left = found.state.position - PLACE
     np.testing.assert_allclose(left[:2], 0.0, atol=0.02)
     assert left[2] == pytest.approx(0.07, abs=0.01)
     # and as uncertain as it was
-    sigma = np.sqrt(found.alignment.covariance[eskf.POSITION, eskf.POSITION][2, 2])
+    sigma = np.sqrt(found.covariance[eskf.POSITION, eskf.POSITION][2, 2])
     assert sigma > 0.9 * DRIFT_SIGMA[2]
 
 
@@ -618,8 +608,7 @@ def before(rng: np.random.Generator, count: int, gap: tuple[float, float]) -> F6
 @pytest.mark.parametrize(
     "points",
     [
-        # a few points show how far away it is, of those that fit at all
-        lambda rng: np.vstack((corner(rng, strip=4), unknown(rng, 600))),
+        lambda rng: corner(rng, strip=4),  # a few points fit in many places
         lambda rng: corner(rng, strip=0),
         lambda rng: corner(rng, 25, 10, 8),  # fewer than fifty points
         lambda rng: np.vstack((corner(rng, 25, 30, 60), unknown(rng, 1200))),
