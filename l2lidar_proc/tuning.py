@@ -779,10 +779,10 @@ REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
 REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part
 REVISIT_INLIERS: Final = 0.85  # least share of those that are near its surfaces
 REVISIT_MET_NS: Final = 2_000_000_000  # [ns] within which a meeting must be confirmed
-# Places on a level at which sweeps fit within that time: two are one so far apart, if one leaves
-# the height free, and otherwise; where others fit elsewhere, so many have to agree. Observed where
-# the height was free: right places stayed within 1 cm from sweep to sweep, wrong ones moved by 3
-# to 20. The other as EARLIER_SAME
+# By which places on a level may be apart at which two sweeps fit within that time: where one of
+# them leaves the height free, and where both fix it (as EARLIER_SAME). Where others fit elsewhere,
+# so many sweeps have to agree. Observed where the height was free: right places stayed within 1 cm
+# from sweep to sweep, wrong ones moved by 3 to 20
 REVISIT_SAME_M: Final = (0.02, 0.25)  # [m]
 REVISIT_AGREEING: Final = 3
 # Relocalization on a level is tried with each sweep for so long after one that left a direction

@@ -574,11 +574,12 @@ class MapInitializer:
         if initial.at_rest or trial.last is None:
             return trial, begun
         best, best_begun, latest = trial, begun, trial
-        strengths, axes = np.linalg.eigh(trial.last.information[POSITION, POSITION])
-        weak = strengths < tuning.WEAK_SHARE * strengths[-1]
-        for k, axis in enumerate(axes.T):
-            if not (best.is_doubtful or (k == 0 and weak[0])):
+        axes = np.linalg.eigh(trial.last.information[POSITION, POSITION])[1]
+        is_weak = trial.leaves_open(tuning.WEAK_SHARE)
+        for axis in axes.T:  # weakest first
+            if not (is_weak or best.is_doubtful):
                 break
+            is_weak = False  # the others, only while none fits well
             for speed in (tuning.INITIAL_SPEED, -tuning.INITIAL_SPEED):
                 walking = dataclasses.replace(start, velocity=speed * axis)
                 latest, begun = self._rounds(sweeps, since, walking, initial)
