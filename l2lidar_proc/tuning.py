@@ -404,10 +404,10 @@ OTHER_BEAM_SIGMAS: Final = (0.008, 0.0009)  # [rad]
 # [m, rad] of the first pose of a map begun in motion, beyond its covariance. Tuned on: walks,
 # seeds 0 to 7, which err by 17 mm and 4 mrad on each axis
 BEGUN_IN_MOTION: Final = (0.015, 0.004)
-# [s/m] by which it may be turned, for what the velocity of the first sweeps may be wrong by.
-# Derived: in a sweep of 0.23 s, that moves what is 2 m away. With velocities up to the second
-# [m/s]: beyond, a search tells more. Judged on: starts, seeds 1000 to 1039, of whose poses 87 %
-# were within their bound, and now 94 %
+# Turn of that pose for the uncertainty of the first velocity [rad s/m], and the largest of these
+# uncertainties that counts [m/s]: beyond, a search tells more. Derived: a sweep of 0.23 s that is
+# deskewed with a wrong velocity, and things 2 m away. Judged on: starts, seeds 1000 to 1039, of
+# whose poses 87 % were within their bound, and now 94 %
 BEGUN_TURN: Final = (0.115, 0.2)
 # The map bends where it grows, so the vertical where it began is not quite that of its other end.
 # Tuned on: narrow corridors, seeds 100 to 127, where 0.01 m/s^2 (0.06 degrees) makes 1 to 5 m.
@@ -779,12 +779,11 @@ REVISIT_LEAST_M: Final = 0.06  # [m] by which the pose has to jump
 REVISIT_MATCHED: Final = 0.35  # least share of the sweep's points that meet the older part
 REVISIT_INLIERS: Final = 0.85  # least share of those that are near its surfaces
 REVISIT_MET_NS: Final = 2_000_000_000  # [ns] within which a meeting must be confirmed
-# By which places on a level may be apart at which two sweeps fit within that time: where one of
-# them leaves the height free, and where both fix it (as EARLIER_SAME). Where others fit elsewhere,
-# so many sweeps have to agree. Observed where the height was free: right places stayed within 1 cm
-# from sweep to sweep, wrong ones moved by 3 to 20
-REVISIT_SAME_M: Final = (0.02, 0.25)  # [m]
-REVISIT_AGREEING: Final = 3
+# [m] within which two places on a level agree where one of the sweeps leaves the height free;
+# otherwise EARLIER_SAME. Observed: right places stayed within 1 cm from sweep to sweep, wrong ones
+# moved by 3 to 20
+REVISIT_SAME_M: Final = 0.02
+REVISIT_AGREEING: Final = 3  # sweeps in a row have to, where others of that time fit elsewhere
 # Relocalization on a level is tried with each sweep for so long after one that left a direction
 # free: the surface that fixes it again may be in sight for a second only.
 REVISIT_SIGHT_NS: Final = 2_000_000_000  # [ns]

@@ -12,7 +12,7 @@ it fits; the part of the map that it sees through is older than what holds it.
 When a sweep meets such a map, the odometry goes on in it and the pose jumps back. A wrong jump is
 worse than none, so a meeting counts only if it fixes the place in every direction and the next one
 says the same. What shows where the pose is on its level may be in sight for one sweep only: there,
-one that is likely counts by itself.
+one that is likely counts by itself. Such a sweep need not fix the height.
 """
 
 from __future__ import annotations
@@ -184,6 +184,29 @@ class OlderPart(NamedTuple):
     is_contradicted: bool
 
 
+class _LevelFit(NamedTuple):
+    """Where a sweep fits the older part of the map, on its level.
+
+    Attributes
+    ----------
+    stamp : int
+        [ns]
+    shift : ndarray, shape (3,)
+        From the predicted place [m], map axes.
+    fixes_height : bool
+    """
+
+    stamp: int
+    shift: F64
+    fixes_height: bool
+
+    def agrees_with(self, other: _LevelFit) -> bool:
+        """Return whether two sweeps fit at one place."""
+        fixed = self.fixes_height and other.fixes_height
+        most = tuning.EARLIER_SAME[1] if fixed else tuning.REVISIT_SAME_M
+        return float(np.linalg.norm(self.shift - other.shift)) < most
+
+
 class _LevelFits:
     """Where the latest sweeps fit the older part of the map, on their level.
 
@@ -191,17 +214,17 @@ class _LevelFits:
     """
 
     def __init__(self) -> None:
-        self._latest: deque[tuple[int, F64, bool]] = deque()
+        self._latest: deque[_LevelFit] = deque()
 
     def clear(self) -> None:
         """Forget them, as where the pose has jumped."""
         self._latest.clear()
 
-    def add(self, stamp: int, shift: F64, *, fixes_height: bool) -> None:
-        """Take the shift (3,) [m] of the sweep of a stamp to where it fits."""
+    def add(self, fit: _LevelFit) -> None:
+        """Take the fit of a sweep; forget those of long before it."""
         latest = self._latest
-        latest.append((stamp, shift, fixes_height))
-        while latest[0][0] <= stamp - tuning.REVISIT_MET_NS:
+        latest.append(fit)
+        while latest[0].stamp <= fit.stamp - tuning.REVISIT_MET_NS:
             latest.popleft()
 
     @property
@@ -216,13 +239,9 @@ class _LevelFits:
 
     def _agreeing(self) -> int:
         """Return how many of the last agree, each with the one before."""
-        agreeing = 1
-        for (_, one, fixes), (_, other, fixes_too) in itertools.pairwise(reversed(self._latest)):
-            same = tuning.REVISIT_SAME_M[fixes and fixes_too]
-            if np.linalg.norm(one - other) > same:
-                break
-            agreeing += 1
-        return agreeing
+        pairs = itertools.pairwise(reversed(self._latest))
+        agreeing = itertools.takewhile(lambda pair: pair[0].agrees_with(pair[1]), pairs)
+        return 1 + len(list(agreeing))
 
 
 class MapRevisit:
@@ -386,7 +405,7 @@ class MapRevisit:
             return None, False
         stamp, fits = int(motion.state.stamp), self._fits
         free = unobserved_directions(found.information[POSITION, POSITION])
-        fits.add(stamp, move, fixes_height=not free.size)
+        fits.add(_LevelFit(stamp, move, not free.size))
         is_doubted = part.is_contradicted or self._returned.at(stamp) or fits.disagree
         is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
         return found, (is_likely and not is_doubted) or fits.are_one_place

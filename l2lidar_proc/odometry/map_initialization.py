@@ -65,7 +65,7 @@ class Trial(NamedTuple):
 
     def leaves_open(self, share: float) -> bool:
         """Return whether the last sweep fixes a direction less than a share of the strongest."""
-        return self.last is not None and weak_axis(self.last.information)[0] < share
+        return self.last is not None and weakest_share(self.last.information) < share
 
     def fits_closer(self, other: Trial, margin: float = 0.0) -> bool:
         """Return whether the last sweep of this trial fits closer than that of another one.
@@ -92,7 +92,7 @@ class Trial(NamedTuple):
         if self.last is None or other.last is None or not self.last.matched:
             return False
         closer = self.last.inlier_ratio - other.last.inlier_ratio
-        fixed, others = (weak_axis(trial.information)[0] for trial in (self.last, other.last))
+        fixed, others = (weakest_share(last.information) for last in (self.last, other.last))
         return closer > tuning.INITIAL_FAR_CLOSER or (
             closer > 0.0
             and fixed > tuning.INITIAL_FIXED
@@ -576,10 +576,9 @@ class MapInitializer:
         best, best_begun, latest = trial, begun, trial
         axes = np.linalg.eigh(trial.last.information[POSITION, POSITION])[1]
         is_weak = trial.leaves_open(tuning.WEAK_SHARE)
-        for axis in axes.T:  # weakest first
-            if not (is_weak or best.is_doubtful):
+        for number, axis in enumerate(axes.T):  # weakest first
+            if not (best.is_doubtful or (is_weak and number == 0)):
                 break
-            is_weak = False  # the others, only while none fits well
             for speed in (tuning.INITIAL_SPEED, -tuning.INITIAL_SPEED):
                 walking = dataclasses.replace(start, velocity=speed * axis)
                 latest, begun = self._rounds(sweeps, since, walking, initial)
@@ -660,18 +659,15 @@ class MapInitializer:
         return covariance
 
 
-def weak_axis(information: F64) -> tuple[float, F64]:
-    """Return how well an alignment fixes the weakest direction of the place, and the direction.
+def weakest_share(information: F64) -> float:
+    """Return what an alignment says about the place along its weakest direction, by the strongest.
 
-    Returns
-    -------
-    float
-        Its information, relative to that of the strongest.
-    ndarray, shape (3,)
-        Unit, map axes.
+    Parameters
+    ----------
+    information : ndarray, shape (18, 18)
     """
-    strength, axes = np.linalg.eigh(information[POSITION, POSITION])
-    return float(strength[0] / max(strength[-1], 1e-9)), axes[:, 0]
+    strength = np.linalg.eigvalsh(information[POSITION, POSITION])
+    return float(strength[0] / max(strength[-1], 1e-9))
 
 
 def joined(sweeps: list[Sweep], least_ns: int) -> list[Sweep]:

@@ -233,7 +233,9 @@ class SweepMatcher:
         return self._believed(best)
 
     def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
-        """Return how a sweep fits the map at another place on its level, None if at none, or more.
+        """Return how a sweep fits the map at the only other place on its level where it does.
+
+        None if there is no such place, or more than one.
 
         For a place that has drifted while no surface fixed it. Of the first surface that fixes it
         again few points are seen, and all others fit anywhere along their walls. So the places
@@ -637,7 +639,7 @@ def is_far(found: Alignment, motion: SweepMotion) -> bool:
 
 
 def is_vertical(directions: F64, gravity: F64) -> bool:
-    """Return whether directions (3, K), orthonormal, are but the vertical of a gravity (3,)."""
+    """Return whether directions (3, K), orthonormal, are that of a gravity (3,) alone."""
     level = level_basis(gravity).T @ directions
     return bool(np.linalg.norm(level) < tuning.RELOCALIZE_TILT)
 

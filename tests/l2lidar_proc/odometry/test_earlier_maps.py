@@ -426,17 +426,19 @@ def test_one_sweep_relocalizes_a_pose_by_a_likely_drift_unless_it_has_just_retur
 
 
 @pytest.mark.parametrize(
-    ("floor", "away", "others", "sweeps"),
+    ("floors", "away", "others", "sweeps"),
     [
-        (0, 0.05, 0, 2),  # nothing fixes the height: 5 cm away is elsewhere
-        (0, 0.05, 1, 3),
-        (0, 0.05, 2, 3),
-        (40, 0.05, 1, 1),
-        (40, 0.26, 1, 3),
+        ((0, 0), 0.05, 0, 2),  # without a floor, nothing fixes the height: 5 cm away is elsewhere
+        ((0, 0), 0.05, 1, 3),
+        ((0, 0), 0.05, 2, 3),
+        ((0, 40), 0.05, 1, 3),
+        ((40, 0), 0.05, 1, 3),
+        ((40, 40), 0.05, 1, 1),
+        ((40, 40), 0.26, 1, 3),
     ],
 )
 def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(
-    floor: int, away: float, others: int, sweeps: int
+    floors: tuple[int, int], away: float, others: int, sweeps: int
 ) -> None:
     """A wrong place wanders with what is in sight. A sweep of two seconds ago does not count."""
     rng, revisit, matcher = (
@@ -446,16 +448,16 @@ def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(
     )
     part = OlderPart(matcher.part_of(np.arange(28) < 14), False, True)
 
-    def is_back(nearer: float, seconds: float) -> bool:
+    def is_back(nearer: float, seconds: float, floor: int) -> bool:
         """Search with a sweep that fits nearer by so much."""
         sweep = later(motion(TIGHT, PLACE + ALONG - (nearer, 0.0, 0.0)), seconds)
         seen = source(corner(rng, strip=60, floor=floor) - PLACE)
         return revisit.search(seen, part, sweep, FrameJump()) is not None
 
-    assert not is_back(0.0, -2.5)
+    assert not is_back(0.0, -2.5, floors[1])
     for number in range(1, others + 1):
-        assert not is_back(away * number, 0.1 * number)
-    found = [is_back(0.0, 1.0 + 0.1 * number) for number in range(sweeps)]
+        assert not is_back(away * number, 0.1 * number, floors[0])
+    found = [is_back(0.0, 1.0 + 0.1 * number, floors[1]) for number in range(sweeps)]
     assert found == [False] * (sweeps - 1) + [True]
 
 
