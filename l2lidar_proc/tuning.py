@@ -485,6 +485,17 @@ RANGE_BIAS_FLOOR: Final = 0.003
 RANGE_BIAS_KNOWN: Final = 0.01  # [m] less certain, it is not corrected
 RANGE_BIAS_SWEEPS: Final = 12  # of a rest that are looked at. Speed only
 RANGE_BIAS_CHANGE: Final = 0.005  # [m] after which a map at rest is begun again
+# Of the map, where planes do not show it. Tuned on: woods, 14 units drawn and imperfect
+RANGE_BIAS_MAP_POINTS: Final = 50  # of a sweep that meet surfaces, at least
+RANGE_BIAS_MAP_SIGMA: Final = 0.02  # [m] of a point beside a surface, ground and bark included
+RANGE_BIAS_MAP_PRIOR: Final = 0.1  # [m] wide: a single sweep shows little
+# Of its information: points of one surface err alike, sweep after sweep
+RANGE_BIAS_MAP_SHARE: Final = 0.1
+RANGE_BIAS_MAP_SWEEPS: Final = 40  # within which sweeps are forgotten
+RANGE_BIAS_MAP_FLOOR: Final = 0.004  # [m] however long
+# [rad] 0.15 degrees of the best known beam angles: with wrong ones the map showed 50 mm
+RANGE_BIAS_MAP_BEAMS: Final = 0.0026
+RANGE_BIAS_STEP: Final = 0.003  # [m] by which the correction changes from sweep to sweep
 # [rad/m] by which it lets the map lean, about each level axis; 0.02 to 0.2 in room, corridor,
 # hall and wood
 RANGE_BIAS_TURN: Final = 0.1

@@ -30,7 +30,7 @@ from l2lidar_proc.odometry.fan_halves import (
     halves,
 )
 from l2lidar_proc.odometry.map_initialization import joined
-from l2lidar_proc.odometry.range_bias import RangeBias
+from l2lidar_proc.odometry.range_bias import RangeBias, SeenAgain
 
 # A whole turn of a slow head shows the pattern in any view, shorter clouds seldom in narrow ones.
 _TURN_NS: Final = 250_000_000
@@ -185,6 +185,14 @@ class LidarIntrinsics:
         self._weighted = self._weighted + gradient
         self.angles = self._known()
 
+    def learn_from_map(self, seen: SeenAgain | None) -> None:
+        """Take how the points of a sweep lie beside the map, for the range bias.
+
+        Halves of the fan that are apart bend the map as well: the beam angles have to be known.
+        """
+        if self.sigmas is not None and self.sigmas[0] < tuning.RANGE_BIAS_MAP_BEAMS:
+            self.ranges.learn_from_map(seen)
+
     def is_due_at_rest(self, sweeps: list[Sweep]) -> bool:
         """Return whether a rest has lasted long enough to :meth:`learn_at_rest`, again perhaps."""
         lasted = sweeps[-1].end - sweeps[0].start
@@ -242,6 +250,12 @@ class LidarIntrinsics:
     def range_sigma(self) -> float:
         """What corrected ranges may be wrong by, 1 sigma [m]; 0 as ``sigmas`` None."""
         return 0.0 if self.is_other else self.ranges.sigma
+
+    @property
+    def range_correction_in_doubt(self) -> float | None:
+        """What is added to ranges [m] while the map may show more of it; else None."""
+        is_open = self._is_shown and self.ranges.needs_map
+        return self.ranges.correction if is_open else None
 
     @property
     def _errors(self) -> F64:

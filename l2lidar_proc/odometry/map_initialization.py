@@ -177,7 +177,7 @@ class MapInitializer:
 
     def for_another_map(self) -> MapInitializer:
         """Return one that fills other maps, and leaves this one's test of rest as it is."""
-        matcher = SweepMatcher(self.matcher.config, self.matcher.lever)
+        matcher = self.matcher.for_another_map()
         return MapInitializer(self._predictor, matcher, ZeroVelocityTest(), self._min_points)
 
     def add(self, sweep: Sweep) -> InitializedMap | None:

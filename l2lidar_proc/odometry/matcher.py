@@ -49,6 +49,7 @@ from l2lidar_proc.odometry.pose_hypotheses import (
     pose_hypotheses,
     rotation_is_loose,
 )
+from l2lidar_proc.odometry.range_bias import SeenAgain
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.uncertainty import MapDrift
 from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
@@ -98,6 +99,9 @@ class SweepMatcher:
         How wrong the map may be where the latest sweep is.
     driving : bool
         Whether the carrier is one that drives, not one moved by hand.
+    range_correction : float or None
+        What is added to the ranges of the sweeps to come [m]; None where nobody asks how the map
+        has seen what they meet (:meth:`seen_again`).
     """
 
     def __init__(self, config: OdometryConfig, lever: F64) -> None:
@@ -113,8 +117,15 @@ class SweepMatcher:
         self.kiss = KissMatcher(config)
         self.drift = MapDrift()
         self.driving = False
+        self.range_correction: float | None = 0.0
         self._pruned_at = np.zeros(3)
         self._begin_way()
+
+    def for_another_map(self) -> SweepMatcher:
+        """Return one without maps, for the same sweeps."""
+        another = SweepMatcher(self.config, self.lever)
+        another.range_correction = self.range_correction
+        return another
 
     def _begin_way(self) -> None:
         self._sweeps = 0
@@ -359,12 +370,45 @@ class SweepMatcher:
         # points from nearby, which the errors of that way have moved, must not take its place
         weighted = not self.driving
         self._note_period(state.stamp)
-        fresh = self.surfaces.add(placed, self._sweeps, apart, state.position, weighted=weighted)
+        fresh = self.surfaces.add(
+            placed,
+            self._sweeps,
+            apart,
+            state.position,
+            weighted=weighted,
+            range_correction=self.range_correction,
+        )
         measured = not motion.imu.missing.all()
         self.kiss.update(points, state.pose, guess.pose, keyframes=measured)
         self._walk(state.position)
         self._sweeps += 1
         return fresh
+
+    def seen_again(self, source: Source, state: InertialState) -> SeenAgain | None:
+        """Return the points of a sweep that meet surfaces, and how the map has seen these.
+
+        Parameters
+        ----------
+        source : Source
+        state : InertialState
+            Of the sweep.
+        """
+        if self.range_correction is None:
+            return None
+        apart = source.ranges > tuning.RANGE_BIAS_NEAREST
+        from_imu = source.points[apart] @ state.rotation.T
+        found = self.surfaces.match(from_imu + state.position, origins=state.position)
+        sights = self.surfaces.sights(found.cells)
+        noted = np.flatnonzero(sights["weight"] > 0.0)
+        weights = sights["weight"][noted, None].astype(np.float64)
+        return SeenAgain(
+            (from_imu + state.rotation @ self.lever)[found.index[noted]],
+            found.normals[noted],
+            found.distances[noted],
+            sights["lines"][noted] / weights,
+            sights["corrected"][noted] / weights,
+            self.range_correction,
+        )
 
     def _note_period(self, stamp: HostNs) -> None:
         """Take the instant of a sweep, for the time from one to the next."""

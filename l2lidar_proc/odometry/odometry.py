@@ -119,6 +119,7 @@ class Odometry:
 
     def _use(self, matcher: SweepMatcher) -> None:
         """Go on with the maps of a matcher."""
+        matcher.range_correction = self.matcher.range_correction
         self.matcher = matcher
         self._initializer = self._first_rest.initializer = self._map_initializer()
 
@@ -161,8 +162,10 @@ class Odometry:
         self._predictor.may_have_head_lines = not (moves and self._intrinsics.is_other)
         if head is not None:
             self._predictor.note_head(head, sweep.end)
+        self.matcher.range_correction = None
         if self.config.correct_beams:
             sweep = self._intrinsics.corrected(sweep)
+            self.matcher.range_correction = self._intrinsics.range_correction_in_doubt
         if self.phase is Phase.INITIALIZING:
             return self._initialize(sweep)
         if may_skip and not status:
@@ -306,6 +309,7 @@ class Odometry:
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._intrinsics.learn(sweep, estimate.points, at_rest=False)
+            self._intrinsics.learn_from_map(self.matcher.seen_again(source, found.state))
             is_mapped |= self._map_ended_rest(motion)
         is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
         if not is_mapped and (found is not None or is_new):
@@ -537,7 +541,7 @@ class Odometry:
             self.matcher.clear()
         else:
             self._earlier.keep(self.matcher, before, motion.state.stamp)
-            self._use(SweepMatcher(self.config, self._lever))
+            self._use(self.matcher.for_another_map())
         self._forget_sweeps()
         self._forget_unmatched()
         self.phase = Phase.LOST

@@ -3,8 +3,9 @@
 A constant added to all ranges moves a point along its ray. Where a wall is seen head-on it moves
 by all of it, where it is seen at a grazing angle by nothing: a plane is bent. Registration follows
 the bent planes, and 34 mm let the map of a room lean by 0.25 degrees. So the planes of single
-sweeps are fitted with the bias as one more unknown. ``l2lidar calibrate still`` measures it once
-and for all.
+sweeps are fitted with the bias as one more unknown. Where nothing is flat, as in a wood, the map
+shows it more slowly: ground that was first seen from afar, at a grazing angle, comes to lie higher
+or lower when the sensor passes above it. ``l2lidar calibrate still`` measures it once and for all.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ class RangeBias:
     def forget(self) -> None:
         """Forget what was learned."""
         self.correction = 0.0
-        self._information = 1.0 / tuning.RANGE_BIAS_SIGMA**2  # of the correction [1/m^2]
-        self._weighted = 0.0  # by the estimate
+        # of planes, then of the map: of the correction [1/m^2], and multiplied by the estimate
+        self._information, self._weighted = 1.0 / tuning.RANGE_BIAS_SIGMA**2, 0.0
+        self._map_information, self._map_weighted = 0.0, 0.0
 
     @property
     def sigma(self) -> float:
@@ -71,22 +73,87 @@ class RangeBias:
             information, gradient = bend_of_planes(points)
             self._information += information
             self._weighted += gradient + information * used
-        self.correction = self._known()
+        if not self.needs_map:
+            self.correction = self._known()
+
+    def learn_from_map(self, seen: SeenAgain | None) -> None:
+        """Take how the points of a sweep lie beside the map, if planes do not show the bias.
+
+        The correction changes slowly: sweeps with another one do not fit the map, and the pose
+        would jump. What is left of the bias has bent the map, which hides some of it, so only the
+        latest sweeps count.
+        """
+        if seen is None or not self.needs_map:
+            return
+        information, gradient = bend_of_map(seen)
+        kept, share = 1.0 - 1.0 / tuning.RANGE_BIAS_MAP_SWEEPS, tuning.RANGE_BIAS_MAP_SHARE
+        self._map_information = kept * self._map_information + share * information
+        self._map_weighted = kept * self._map_weighted + share * gradient
+        step = tuning.RANGE_BIAS_STEP
+        self.correction += float(np.clip(self._known() - self.correction, -step, step))
+
+    @property
+    def needs_map(self) -> bool:
+        """Whether planes alone do not show the bias."""
+        floor2 = tuning.RANGE_BIAS_FLOOR**2
+        return 1.0 / self._information + floor2 >= tuning.RANGE_BIAS_KNOWN**2
+
+    @property
+    def _evidence(self) -> tuple[float, float]:
+        """Of the correction [1/m^2], and multiplied by the estimate."""
+        if not self.needs_map:
+            return self._information, self._weighted
+        # however long a map is looked at, it is not better than that
+        share = 1.0 / (1.0 + self._map_information * tuning.RANGE_BIAS_MAP_FLOOR**2)
+        return (
+            self._information + share * self._map_information,
+            self._weighted + share * self._map_weighted,
+        )
 
     @property
     def _estimate(self) -> float:
-        return self._weighted / self._information
+        information, weighted = self._evidence
+        return weighted / information
 
     @property
     def _variance(self) -> float:
         """Of the estimate [m^2]: no wall is quite flat, however often it is seen."""
-        return 1.0 / self._information + tuning.RANGE_BIAS_FLOOR**2
+        return 1.0 / self._evidence[0] + tuning.RANGE_BIAS_FLOOR**2
 
     def _known(self) -> float:
-        """Return the estimate if it is known, and differs from zero."""
+        """Return the estimate if it is known, and differs from zero or has done so."""
         variance, bias = self._variance, self._estimate
-        known = variance < tuning.RANGE_BIAS_KNOWN**2
-        return bias if known and bias**2 > tuning.BEAM_SIGMAS**2 * variance else 0.0
+        known = self.needs_map or variance < tuning.RANGE_BIAS_KNOWN**2
+        is_in_use = self.needs_map and self.correction != 0.0
+        differs = is_in_use or bias**2 > tuning.BEAM_SIGMAS**2 * variance
+        return bias if known and differs else 0.0
+
+
+class SeenAgain(NamedTuple):
+    """Points of a sweep, and how the surfaces of the map that they meet were seen before.
+
+    Attributes
+    ----------
+    places : ndarray, shape (M, 3)
+        From the sensor [m], map axes.
+    normals : ndarray, shape (M, 3)
+        Of the surfaces, unit, map axes.
+    distances : ndarray, shape (M,)
+        Of the points from the surfaces along the normals [m].
+    lines : ndarray, shape (M, 3)
+        Mean lines of sight by which the map has seen the surfaces, unit vectors before the mean.
+    corrected : ndarray, shape (M, 3)
+        The same, each by the correction of its range [m].
+    correction : float
+        Of the ranges of the points [m].
+    """
+
+    places: F64
+    normals: F64
+    distances: F64
+    lines: F64
+    corrected: F64
+    correction: float
 
 
 class _Flat(NamedTuple):
@@ -128,21 +195,69 @@ def bend_of_planes(points: NDArray[np.void]) -> tuple[float, float]:
         design = np.column_stack(
             (np.ones(len(places)), (places - middle) @ along.T, -(sights @ normal))
         )
-        prior = np.diag((0.0, 0.0, 0.0, 1.0 / tuning.RANGE_BIAS_SIGMA**2))
-        fit = np.zeros(4)
-        for number in range(tuning.RANGE_BIAS_STEPS):
-            residual = heights - design @ fit if number else np.zeros(len(heights))
-            weights = 1.0 / (1.0 + (residual / tuning.RANGE_BIAS_SCALE) ** 2) ** 2
-            weighted = (design * (weights / tuning.RANGE_BIAS_CELL_SIGMA**2)[:, None]).T
-            normal_matrix, right = weighted @ design, weighted @ heights
-            fit = np.linalg.solve(normal_matrix + prior, right)
-        # place and attitude of the plane are of no interest
-        shared = np.linalg.solve(
-            normal_matrix[:3, :3], np.column_stack((normal_matrix[:3, 3], right[:3]))
+        more = _correction_from(
+            design, heights, tuning.RANGE_BIAS_CELL_SIGMA, tuning.RANGE_BIAS_SIGMA
         )
-        information += float(normal_matrix[3, 3] - normal_matrix[3, :3] @ shared[:, 0])
-        gradient += float(right[3] - normal_matrix[3, :3] @ shared[:, 1])
+        information, gradient = information + more[0], gradient + more[1]
     return information, gradient
+
+
+def bend_of_map(seen: SeenAgain) -> tuple[float, float]:
+    """Return what a map tells about a correction of ranges: information and gradient.
+
+    As of :func:`bend_of_planes`. What a surface is off by depends on how its points were seen, and
+    so does what the map has it off by. The pose of the sweep is of no interest.
+    """
+    if len(seen.distances) < tuning.RANGE_BIAS_MAP_POINTS:
+        return 0.0, 0.0
+    sights = seen.places / np.linalg.norm(seen.places, axis=1)[:, None]
+    now = np.einsum("ni,ni->n", sights, seen.normals)
+    before = np.einsum("ni,ni->n", seen.lines, seen.normals)
+    corrected = np.einsum("ni,ni->n", seen.corrected, seen.normals)
+    # distance = (correction of now - right one) * now - (those of the map - right one) * before
+    measured = seen.distances - seen.correction * now + corrected
+    pose = np.concatenate((seen.normals, np.cross(seen.places, seen.normals)), axis=1)
+    design = np.column_stack((pose, before - now))
+    return _correction_from(
+        design, measured, tuning.RANGE_BIAS_MAP_SIGMA, tuning.RANGE_BIAS_MAP_PRIOR
+    )
+
+
+def _correction_from(
+    design: F64, measured: F64, sigma: float, prior_sigma: float
+) -> tuple[float, float]:
+    """Return information and gradient of the last unknown; the others are of no interest.
+
+    Parameters
+    ----------
+    design : ndarray, shape (N, K)
+        What one unit of each unknown does to each measurement.
+    measured : ndarray, shape (N,)
+        [m]
+    sigma : float
+        Of each [m]; what is far off loses weight.
+    prior_sigma : float
+        Of the correction [m], for what is far off; information and gradient are without it.
+    """
+    last = design.shape[1] - 1
+    prior = 1e-6 * np.eye(last + 1)  # a single wall does not fix a pose
+    prior[last, last] = 1.0 / prior_sigma**2
+    fit = np.zeros(last + 1)
+    for number in range(tuning.RANGE_BIAS_STEPS):
+        residual = measured - design @ fit if number else np.zeros(len(measured))
+        weights = 1.0 / (1.0 + (residual / tuning.RANGE_BIAS_SCALE) ** 2) ** 2
+        weighted = (design * (weights / sigma**2)[:, None]).T
+        normal_matrix, right = weighted @ design, weighted @ measured
+        fit = np.linalg.solve(normal_matrix + prior, right)
+    shared = np.linalg.solve(
+        normal_matrix[:last, :last] + prior[:last, :last],
+        np.column_stack((normal_matrix[:last, last], right[:last])),
+    )
+    across = normal_matrix[last, :last]
+    return (
+        float(normal_matrix[last, last] - across @ shared[:, 0]),
+        float(right[last] - across @ shared[:, 1]),
+    )
 
 
 def _planes(flat: _Flat) -> Iterator[tuple[F64, F64, F64]]:

@@ -34,6 +34,7 @@ from l2lidar_proc.odometry.surfels import (
     CELL,
     FLAT,
     PLANE,
+    SIGHT,
     Candidates,
     Matches,
     YoungSurfaces,
@@ -93,6 +94,7 @@ class SurfelMap:
         # row 0 is that of all places without a cell
         self._cells: NDArray[np.void] = np.zeros(1, CELL)
         self._planes: NDArray[np.void] = np.zeros(1, PLANE)
+        self._sights: NDArray[np.void] = np.zeros(1, SIGHT)
         self._kind: NDArray[np.int8] = np.zeros(1, np.int8)  # by row, apart: quickly looked up
 
     def __len__(self) -> int:
@@ -106,8 +108,8 @@ class SurfelMap:
         self.young = YoungSurfaces.TRUSTED
         self._index.clear()
         # the arrays stay for the next map: memory freed and asked for again comes back in pieces
-        self._cells[:used] = np.zeros(1, CELL)
-        self._planes[:used] = np.zeros(1, PLANE)
+        for table in (self._cells, self._planes, self._sights):
+            table[:used] = np.zeros(1, table.dtype)
         self._kind[:used] = 0
 
     def add(
@@ -118,6 +120,7 @@ class SurfelMap:
         origin: F64 | None = None,
         *,
         weighted: bool = False,
+        range_correction: float | None = None,
     ) -> float:
         """Add points, and return the share of them in places where there were none before.
 
@@ -133,6 +136,9 @@ class SurfelMap:
             Where they were seen from [m], map frame.
         weighted : bool
             Whether points near the origin, which then has to be given, count for more.
+        range_correction : float, optional
+            What was added to their ranges [m], if their lines of sight from the origin, which then
+            has to be given, are to be noted for :meth:`sights`.
         """
         if not len(points):
             return 0.0
@@ -146,7 +152,11 @@ class SurfelMap:
         weights = np.ones(len(rows))
         if weighted and origin is not None:
             weights = weights_from(np.ascontiguousarray(cells.middles.T) - origin)
+        before = self._cells["weight"][rows]
         grown = self._extend(points, groups, cells, rows, weights)
+        if range_correction is not None and origin is not None:
+            added = self._cells["weight"][rows] - before
+            self._note_sights(rows, added, cells.middles - origin[:, None], range_correction)
         self._fit(rows[grown], cells.middles[:, grown], origin)
         return fresh
 
@@ -251,6 +261,30 @@ class SurfelMap:
         records.assign(self._cells, rows, cells)
         is_due = cells["weight"] >= tuning.REFIT_GROWTH * cells["fitted"]
         return np.asarray(is_due & (cells["count"] >= self._least))
+
+    def _note_sights(self, rows: I64, added: F64, ways: F64, range_correction: float) -> None:
+        """Note how points were seen that have been added to cells.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (C,)
+        added : ndarray, shape (C,)
+            Sums of their weights.
+        ways : ndarray, shape (3, C)
+            From the sensor to the cells [m].
+        range_correction : float
+            [m]
+        """
+        grown = np.flatnonzero(added > 0.0)
+        sights = records.selected(self._sights, rows[grown])
+        sights["weight"] += added[grown]
+        shares = added[grown] / np.maximum(np.linalg.norm(ways[:, grown], axis=0), 1e-9)
+        for line, corrected, way in zip(
+            sights["lines"].T, sights["corrected"].T, ways[:, grown], strict=True
+        ):
+            line += shares * way
+            corrected += range_correction * shares * way
+        records.assign(self._sights, rows[grown], sights)
 
     def _fit(self, rows: I64, middles: F64, origin: F64 | None) -> None:
         """Fit the planes of some cells anew.
@@ -403,6 +437,10 @@ class SurfelMap:
         """Return the surfaces in the cells (M,) of some :class:`Matches`, dtype PLANE."""
         return records.selected(self._planes, rows)
 
+    def sights(self, rows: I64) -> NDArray[np.void]:
+        """Return how the cells (M,) of some :class:`Matches` were seen, dtype SIGHT."""
+        return records.selected(self._sights, rows)
+
     def forget(self, origin: F64, distance: float, since: int = 0) -> None:
         """Drop cells farther than a distance [m] from a place (3,), or not seen since a sweep."""
         cells = self._cells[1 : len(self) + 1]
@@ -428,7 +466,7 @@ class SurfelMap:
         last = np.setdiff1d(np.arange(left, end), rows, assume_unique=True)
         self._index.remove(self._cells["key"][rows])
         self._index.move(self._cells["key"][last], holes)
-        for table in (self._cells, self._planes):
+        for table in (self._cells, self._planes, self._sights):
             records.assign(table, holes, records.selected(table, last))
             table[left:end] = np.zeros(1, table.dtype)
         self._kind[holes] = self._kind[last]
@@ -453,6 +491,7 @@ class SurfelMap:
         rows = np.concatenate(([0], 1 + np.flatnonzero(kept)))
         self._cells = records.selected(other._cells, rows)
         self._planes = records.selected(other._planes, rows)
+        self._sights = records.selected(other._sights, rows)
         self._kind = other._kind[rows]
         self._index.insert(self._cells["key"][1:].copy(), np.arange(1, len(rows)))
 
@@ -480,6 +519,7 @@ class SurfelMap:
         if first + len(keys) > len(self._cells):
             size = max(first + len(keys), 2 * len(self._cells))
             self._cells, self._planes = _grown(self._cells, size), _grown(self._planes, size)
+            self._sights = _grown(self._sights, size)
             self._kind = _grown(self._kind, size)
         self._cells["key"][first : first + len(keys)] = keys
         return rows

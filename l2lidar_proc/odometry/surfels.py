@@ -40,6 +40,15 @@ PLANE: Final = np.dtype(
 )
 """The surface in a cell: what points are matched with, and what seldom changes."""
 
+SIGHT: Final = np.dtype(
+    [
+        ("weight", "<f4"),  # sum of the weights of the points whose lines of sight were noted
+        ("lines", "<f4", (3,)),  # weighted sum of their lines of sight, unit, away from the sensor
+        ("corrected", "<f4", (3,)),  # [m] the same, each by the correction of its range
+    ],
+)
+"""How the points of a cell were seen: what an error of their ranges has moved them by."""
+
 # Sides from which the points of a cell were seen: nobody said; the one that the normal points to;
 # both. A flat cell with points from both is a board. A wall is thicker, and has two surfaces.
 _NO_SIDE, _ONE_SIDE, _BOTH_SIDES = 0, 1, 2

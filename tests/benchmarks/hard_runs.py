@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from benchmarks import bench_odometry_hard
 from benchmarks.hard_recordings import Recording
 from benchmarks.hard_scores import Track, score
+from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.estimate import OdometryEstimate
+from l2lidar_proc.odometry.odometry import Odometry
 
 
 def tracked(some: Recording) -> Track:
@@ -12,6 +17,19 @@ def tracked(some: Recording) -> Track:
     track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, some)
     assert track is not None
     return track
+
+
+def estimates_of(some: Recording) -> list[OdometryEstimate]:
+    """Return all estimates of a recording."""
+    odometry = Odometry(OdometryConfig(), some.T_cloud_imu)
+    estimates: list[OdometryEstimate] = []
+    first = 0
+    for sweep in some.sweeps():
+        last = int(np.searchsorted(some.imu["stamp"], sweep.end)) + 1
+        odometry.imu(some.imu[first:last])
+        first = last
+        estimates += odometry.register(sweep)
+    return estimates
 
 
 def end_of(some: Recording) -> float:

@@ -13,12 +13,13 @@ from benchmarks import hard_recordings
 from benchmarks.hard_recordings import recording
 from benchmarks.hard_scenarios import Imperfections, scenario
 from benchmarks.hard_scores import QUANTILE, errors, normalized, score
-from l2lidar_node.emulator.unit.units import UNITS, UnitErrors
+from l2lidar_node.emulator.unit.units import UNITS, UnitErrors, unit as named_unit
+from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry, Phase
 from l2lidar_proc.odometry.wall_velocity import WallVelocity
-from tests.benchmarks.hard_runs import end_of, tracked
+from tests.benchmarks.hard_runs import end_of, estimates_of, tracked
 
 pytest.importorskip("open3d")
 pytestmark = pytest.mark.usefixtures("recordings")
@@ -112,9 +113,7 @@ def test_a_rest_that_ends_with_a_slow_turn_was_one() -> None:
 def test_a_rest_outlasts_a_sweep_that_meets_nothing_of_so_young_a_map() -> None:
     """Between bare trunks it ended there, and the map turned by 20 mrad until the real start."""
     given = recording(scenario("bare trunks", 203, 3.0))
-    odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
-    odometry.imu(given.imu)
-    estimates = [item for sweep in given.sweeps() for item in odometry.register(sweep)]
+    estimates = estimates_of(given)
     rest = [item for item in estimates if item.stamp < given.imu["stamp"][0] + 2_000_000_000]
     unmatched = [item for item in rest if Status.UNMATCHED in item.status]
     assert len(rest) > 6
@@ -152,3 +151,20 @@ def test_the_map_of_a_unit_with_a_range_bias_does_not_lean(
     assert score(given, track)["nees_pose"] > 0.8
     turned = np.linalg.norm(errors(given, track).turn, axis=1)
     assert turned[-20:].mean() < np.radians(0.1)
+
+
+def test_a_wood_shows_the_range_bias_as_the_sensor_walks() -> None:
+    """No plane does there: 34 mm turned the map by 6 mrad within a minute."""
+    estimates = estimates_of(recording(scenario("wood, drawn unit", 0, 18.0)))
+    bias = named_unit("0").errors.range_bias
+    used = np.array([one.quality.range_correction for one in estimates])
+    assert bias > 0.03
+    assert used[-1] == pytest.approx(bias, rel=0.5)
+    assert used.min() == 0.0
+    assert used.max() < bias
+    assert np.abs(np.diff(used)).max() <= tuning.RANGE_BIAS_STEP + 1e-12
+
+
+def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
+    estimates = estimates_of(recording(scenario("wood, imperfect", 0, 18.0)))
+    assert not any(one.quality.range_correction for one in estimates)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
-from l2lidar_proc.odometry.range_bias import RangeBias, bend_of_planes
+from l2lidar_proc.odometry.range_bias import RangeBias, SeenAgain, bend_of_map, bend_of_planes
 from tests.l2lidar_proc.odometry.test_lidar_intrinsics import CLOUD, turn
 
 BOX = np.array([4.2, 3.3, 2.7])  # [m] half the edges
@@ -147,3 +147,130 @@ def test_a_rest_shows_the_bias_and_ends_with_what_it_taught() -> None:
     assert abs(gradient / information) < 0.004
     intrinsics.forget()
     assert intrinsics.ranges.correction == 0.0
+
+
+NOISE = 0.01  # [m] of a point beside a surface, in these maps
+
+
+def seen_again(
+    bias: float, seed: int, *, used: float = 0.0, mapped_with: float = 0.0, pose: F64 | None = None
+) -> SeenAgain:
+    """Return rough ground seen from 1.2 m above it, by a sensor that has come 2 m nearer to it.
+
+    Parameters
+    ----------
+    bias : float
+        By which ranges are too long [m].
+    used, mapped_with : float
+        Corrections of the sweep's ranges and of the map's [m].
+    pose : ndarray, shape (6,), optional
+        A shift [m] and a turn [rad] that the sweep is off by.
+    """
+    rng = np.random.default_rng(seed)
+    places = np.column_stack((rng.uniform(-8.0, 8.0, (1500, 2)), np.full(1500, -1.2)))
+    places = places[np.linalg.norm(places, axis=1) > tuning.RANGE_BIAS_NEAREST]
+    normals = np.array([0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=places.shape)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    mapped = places + np.array([2.0, 0.0, 0.0])
+    lines = mapped / np.linalg.norm(mapped, axis=1)[:, None]
+    sights = places / np.linalg.norm(places, axis=1)[:, None]
+    moved = (bias + used) * sights - (bias + mapped_with) * lines
+    if pose is not None:
+        moved += pose[:3] + np.cross(pose[3:], places)
+    distances = (moved * normals).sum(axis=1) + NOISE * rng.normal(size=len(places))
+    return SeenAgain(places, normals, distances, lines, mapped_with * lines, used)
+
+
+@pytest.mark.parametrize(("used", "mapped_with"), [(0.0, 0.0), (-0.02, 0.0), (-0.02, -0.01)])
+@pytest.mark.parametrize("bias", [0.03, 0.0, -0.02])
+def test_the_bias_shows_in_a_map_that_was_seen_from_elsewhere(
+    bias: float, used: float, mapped_with: float
+) -> None:
+    pose = np.array([0.02, -0.01, 0.03, 0.002, -0.003, 0.001])
+    found = [
+        bend_of_map(seen_again(bias, seed, used=used, mapped_with=mapped_with, pose=pose))
+        for seed in SEEDS
+    ]
+    information, gradient = np.sum(found, axis=0)
+    assert information > 1.0 / 0.005**2
+    assert gradient / information == pytest.approx(-bias, abs=0.003)
+
+
+def test_a_map_is_known_as_well_as_it_says() -> None:
+    """NEES over biases, each shown by some sweeps whose points err alike in part."""
+    rng = np.random.default_rng(8)
+    nees: list[float] = []
+    for bias in tuning.RANGE_BIAS_SIGMA * rng.normal(size=24):
+        ranges = RangeBias()
+        for number in range(40):
+            seed = 1000 * len(nees) + number // 3  # each three sweeps have the same errors
+            ranges.learn_from_map(seen_again(bias, seed, used=ranges.correction))
+        nees.append((ranges._estimate + bias) ** 2 / ranges._variance)
+    assert np.mean(nees) < 1.5
+    assert max(nees) < 10.8  # 99.9 % of one degree of freedom
+
+
+def test_a_map_that_was_seen_from_the_same_places_tells_nothing() -> None:
+    seen = seen_again(0.03, 0)
+    same = seen.places / np.linalg.norm(seen.places, axis=1)[:, None]
+    assert bend_of_map(seen._replace(lines=same))[0] == pytest.approx(0.0, abs=1e-6)
+    few = seen._replace(places=seen.places[:40], normals=seen.normals[:40])
+    few = few._replace(distances=seen.distances[:40], lines=seen.lines[:40])
+    few = few._replace(corrected=seen.corrected[:40])
+    assert bend_of_map(few) == (0.0, 0.0)
+    wall = seen._replace(normals=np.tile([1.0, 0.0, 0.0], (len(same), 1)))
+    assert np.isfinite(bend_of_map(wall)).all()
+
+
+def test_the_map_corrects_slowly_what_planes_do_not_show() -> None:
+    ranges = RangeBias()
+    corrections = [0.0]
+    for seed in range(60):
+        ranges.learn_from_map(seen_again(0.03, seed, used=ranges.correction))
+        corrections.append(ranges.correction)
+    steps = np.abs(np.diff(corrections))
+    assert steps.max() == pytest.approx(tuning.RANGE_BIAS_STEP)
+    assert ranges.correction == pytest.approx(-0.03, abs=0.004)
+    assert tuning.RANGE_BIAS_MAP_FLOOR <= ranges.sigma < 0.01
+    ranges.forget()
+    assert ranges.correction == 0.0
+    assert ranges.sigma > 0.02
+
+
+def test_a_correction_by_the_map_does_not_come_and_go() -> None:
+    """Once in use, it follows the estimate, however near to zero that is."""
+    ranges = RangeBias()
+    for seed in range(60):
+        ranges.learn_from_map(seen_again(0.03, seed, used=ranges.correction))
+    for seed in range(400):
+        ranges.learn_from_map(seen_again(-0.002, seed, used=ranges.correction))
+    assert ranges.correction == pytest.approx(0.002, abs=0.002)
+    assert ranges.correction != 0.0
+    unbiased = RangeBias()
+    for seed in range(60):
+        unbiased.learn_from_map(seen_again(0.002, seed))
+    assert unbiased.correction == 0.0
+
+
+def test_planes_count_alone_where_they_show_the_bias() -> None:
+    ranges = RangeBias()
+    ranges.learn(box(0.03, 1))
+    assert not ranges.needs_map
+    known = ranges.correction, ranges.sigma
+    for seed in range(20):
+        ranges.learn_from_map(seen_again(-0.05, seed, used=ranges.correction))
+    ranges.learn_from_map(None)
+    assert (ranges.correction, ranges.sigma) == known
+
+
+def test_the_map_says_nothing_while_the_beams_are_unknown() -> None:
+    """Halves of the fan that are apart bend it too: a wood seemed to show 50 mm."""
+    unknown, known = LidarIntrinsics(), LidarIntrinsics()
+    known.learn_at_rest([turn((0.0, 0.0, 0.0), number)[0] for number in range(12)])
+    known.ranges.forget()  # what the planes of that room have shown
+    for intrinsics in (unknown, known):
+        for seed in range(40):
+            intrinsics.learn_from_map(seen_again(0.03, seed))
+    assert unknown.ranges.correction == 0.0
+    assert unknown.range_sigma > tuning.RANGE_BIAS_SIGMA
+    assert known.ranges.correction == pytest.approx(-0.03, abs=0.006)

@@ -507,3 +507,43 @@ def test_weighted_points_give_the_weighted_mean_and_count_for_less() -> None:
     count = weights.sum() ** 2 / (weights**2).sum()
     assert coarse["count"][0] == pytest.approx(count)
     assert count < 5000
+
+
+def test_cells_remember_how_their_points_were_seen() -> None:
+    """From two places, the first ranges uncorrected, the second ones shortened by 2 cm."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform((2.0, 0.0, 0.02), (2.2, 0.2, 0.04), (300, 3))
+    eyes = np.array([[0.0, 0.0, 1.0], [2.1, 0.1, 3.0]])
+    surfaces = SurfelMap([0.4])
+    surfaces.add(points[:100], 0, origin=eyes[0], range_correction=0.0)
+    surfaces.add(points[100:], 1, origin=eyes[1], range_correction=-0.02)
+    ways = np.array([2.2, 0.2, 0.2]) - eyes  # to the cell's middle
+    lines = ways / np.linalg.norm(ways, axis=1)[:, None]
+    (sight,) = surfaces.sights(surfaces.match(points[:1]).cells)
+    assert sight["weight"] == pytest.approx(300.0)
+    np.testing.assert_allclose(sight["lines"], 100 * lines[0] + 200 * lines[1], rtol=1e-5)
+    np.testing.assert_allclose(sight["corrected"], -0.02 * 200 * lines[1], rtol=1e-5)
+
+
+def test_lines_of_sight_stay_with_their_cells() -> None:
+    """Cells go, others take their rows, and a part of the map has the same."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform((-8.0, -8.0, 0.02), (8.0, 8.0, 0.04), (40000, 3))
+    eye = np.array([0.0, 0.0, 2.0])
+    surfaces = SurfelMap([0.5, 1.0])
+    surfaces.add(points[::2], 0, origin=eye, range_correction=0.01)
+    surfaces.add(points[1::2], 1)  # nobody asked
+    probes = np.column_stack((rng.uniform(-3.0, 3.0, (500, 2)), np.full(500, 0.03)))
+
+    def seen(some: SurfelMap) -> Any:
+        return some.sights(some.match(probes).cells)
+
+    before = seen(surfaces)
+    assert np.all(before["weight"] > 0.0)
+    np.testing.assert_allclose(before["corrected"], 0.01 * before["lines"], rtol=1e-4)
+    surfaces.forget(np.zeros(3), 6.0)
+    np.testing.assert_array_equal(seen(surfaces), before)
+    np.testing.assert_array_equal(seen(surfaces.part_of(np.ones(2, np.bool_))), before)
+    surfaces.clear()
+    surfaces.add(points, 0)
+    assert not seen(surfaces)["weight"].any()
