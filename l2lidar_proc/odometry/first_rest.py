@@ -170,6 +170,7 @@ class FirstRest:
         if ended is None:
             return None
         initializer = self.initializer.for_another_map()
+        initializer.matcher.drift.corrections = self._intrinsics.corrections
         initializer.map_rest(ended.sweeps, ended.state, ended.covariance)
         matcher, sweep = initializer.matcher, self._intrinsics.applied_to(reported)
         covariance = with_loose_pose(motion.state, motion.covariance, ended.moved)
@@ -210,6 +211,7 @@ class FirstRest:
             return None
         self._mapped_with = self._corrections
         better = [self._intrinsics.applied_to(one) for one in self.sweeps]
+        self.initializer.matcher.drift.corrections = self._intrinsics.corrections
         return self.initializer.begin_again_at_rest(better, still.state, still.covariance)
 
     def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
@@ -222,10 +224,10 @@ class FirstRest:
         seen : Source
             Its points.
         """
-        sigmas = self._intrinsics.sigmas if self.sweeps else None
-        if sigmas is None:
+        if not self.sweeps or self._intrinsics.is_other:
             return False
-        turn, shift = tuning.BEAM_DRIFT_TURN * sigmas[1], tuning.BEAM_DRIFT_SHIFT * sigmas[1]
+        worse = self._intrinsics.errors.beams[1]
+        turn, shift = tuning.BEAM_DRIFT_TURN * worse, tuning.BEAM_DRIFT_SHIFT * worse
         rotation, middle = still.state.rotation, seen.points.mean(axis=0)
         if not self._zero_velocity.has_drifted_within(turn, shift, rotation, middle):
             return False
@@ -286,4 +288,4 @@ class FirstRest:
     @property
     def _corrections(self) -> F64:
         """Of the beam angles [rad] and of the ranges [m], shape (4,)."""
-        return np.append(self._intrinsics.angles, self._intrinsics.ranges.correction)
+        return np.append(*self._intrinsics.corrections)

@@ -31,6 +31,7 @@ from l2lidar_proc.odometry.fan_halves import (
 )
 from l2lidar_proc.odometry.map_initialization import joined
 from l2lidar_proc.odometry.range_bias import RangeBias, SeenAgain
+from l2lidar_proc.odometry.uncertainty import Corrections, IntrinsicErrors
 
 # A whole turn of a slow head shows the pattern in any view, shorter clouds seldom in narrow ones.
 _TURN_NS: Final = 250_000_000
@@ -185,12 +186,12 @@ class LidarIntrinsics:
         self._weighted = self._weighted + gradient
         self.angles = self._known()
 
-    def learn_from_map(self, seen: SeenAgain | None) -> None:
+    def learn_from_map(self, seen: SeenAgain) -> None:
         """Take how the points of a sweep lie beside the map, for the range bias.
 
         Halves of the fan that are apart bend the map as well: the beam angles have to be known.
         """
-        if self.sigmas is not None and self.sigmas[0] < tuning.RANGE_BIAS_MAP_BEAMS:
+        if not self.is_other and self.errors.beams[0] < tuning.RANGE_BIAS_MAP_BEAMS:
             self.ranges.learn_from_map(seen)
 
     def is_due_at_rest(self, sweeps: list[Sweep]) -> bool:
@@ -230,38 +231,34 @@ class LidarIntrinsics:
         self._information, self._weighted = _PRIOR, np.zeros(3)
 
     @property
-    def sigmas(self) -> tuple[float, float] | None:
-        """What xi and beta of corrected clouds may be wrong by, 1 sigma [rad].
+    def corrections(self) -> Corrections:
+        """What is added to what the unit reports."""
+        return Corrections(self.angles, self.ranges.correction)
 
-        Along the direction that is known best, and the other. What the estimate says but is not
-        sure enough of to correct it counts as well. None for clouds without the pattern of an L2.
+    @property
+    def errors(self) -> IntrinsicErrors:
+        """What corrected clouds may be wrong by."""
+        return self.errors_with(self.corrections)
+
+    def errors_with(self, used: Corrections) -> IntrinsicErrors:
+        """Return what clouds with some corrections may be wrong by, as is known now.
+
+        What the estimate says but is not sure enough of to correct it counts as well. Clouds
+        without the pattern of an L2 are as good as their makers say.
         """
         if self.is_other:
-            return None
-        best, worst = np.sqrt(np.linalg.eigvalsh(self._errors[:2, :2])).tolist()
-        return best, worst
+            return IntrinsicErrors(tuning.OTHER_BEAM_SIGMAS, 0.0, 0.0)
+        left = self._estimate - used.angles
+        covariance = np.linalg.inv(self._information)
+        variances, axes = np.linalg.eigh(covariance[:2, :2])
+        best, worst = np.sqrt(variances + (axes.T @ left[:2]) ** 2).tolist()
+        alpha = float(np.hypot(np.sqrt(covariance[2, 2]), left[2]))
+        return IntrinsicErrors((best, worst), alpha, self.ranges.sigma_with(used.ranges))
 
     @property
-    def alpha_sigma(self) -> float:
-        """What alpha of corrected clouds may be wrong by, 1 sigma [rad]; 0 as ``sigmas`` None."""
-        return 0.0 if self.is_other else float(np.sqrt(self._errors[2, 2]))
-
-    @property
-    def range_sigma(self) -> float:
-        """What corrected ranges may be wrong by, 1 sigma [m]; 0 as ``sigmas`` None."""
-        return 0.0 if self.is_other else self.ranges.sigma
-
-    @property
-    def range_correction_in_doubt(self) -> float | None:
-        """What is added to ranges [m] while the map may show more of it; else None."""
-        is_open = self._is_shown and self.ranges.needs_map
-        return self.ranges.correction if is_open else None
-
-    @property
-    def _errors(self) -> F64:
-        """Return the squared errors (3, 3) of the angles of corrected clouds [rad^2]."""
-        left = self._estimate - self.angles
-        return np.asarray(np.linalg.inv(self._information) + np.outer(left, left))
+    def learns_from_map(self) -> bool:
+        """Whether :meth:`learn_from_map` is of use."""
+        return self._is_shown and self.ranges.needs_map
 
     def _teaches(self) -> bool:
         """Return whether the present sweep is worth the time that its gaps take."""

@@ -99,9 +99,8 @@ class SweepMatcher:
         How wrong the map may be where the latest sweep is.
     driving : bool
         Whether the carrier is one that drives, not one moved by hand.
-    range_correction : float or None
-        What is added to the ranges of the sweeps to come [m]; None where nobody asks how the map
-        has seen what they meet (:meth:`seen_again`).
+    notes_sights : bool
+        Whether to note how surfaces are seen, for :meth:`seen_again`.
     """
 
     def __init__(self, config: OdometryConfig, lever: F64) -> None:
@@ -117,14 +116,15 @@ class SweepMatcher:
         self.kiss = KissMatcher(config)
         self.drift = MapDrift()
         self.driving = False
-        self.range_correction: float | None = 0.0
+        self.notes_sights = True
         self._pruned_at = np.zeros(3)
         self._begin_way()
 
     def for_another_map(self) -> SweepMatcher:
         """Return one without maps, for the same sweeps."""
         another = SweepMatcher(self.config, self.lever)
-        another.range_correction = self.range_correction
+        another.drift.corrections = another.drift.began = self.drift.corrections
+        another.notes_sights = self.notes_sights
         return another
 
     def _begin_way(self) -> None:
@@ -376,7 +376,7 @@ class SweepMatcher:
             apart,
             state.position,
             weighted=weighted,
-            range_correction=self.range_correction,
+            range_correction=self.drift.corrections.ranges if self.notes_sights else None,
         )
         measured = not motion.imu.missing.all()
         self.kiss.update(points, state.pose, guess.pose, keyframes=measured)
@@ -384,7 +384,7 @@ class SweepMatcher:
         self._sweeps += 1
         return fresh
 
-    def seen_again(self, source: Source, state: InertialState) -> SeenAgain | None:
+    def seen_again(self, source: Source, state: InertialState) -> SeenAgain:
         """Return the points of a sweep that meet surfaces, and how the map has seen these.
 
         Parameters
@@ -393,8 +393,6 @@ class SweepMatcher:
         state : InertialState
             Of the sweep.
         """
-        if self.range_correction is None:
-            return None
         apart = source.ranges > tuning.RANGE_BIAS_NEAREST
         from_imu = source.points[apart] @ state.rotation.T
         found = self.surfaces.match(from_imu + state.position, origins=state.position)
@@ -407,7 +405,7 @@ class SweepMatcher:
             found.distances[noted],
             sights["lines"][noted] / weights,
             sights["corrected"][noted] / weights,
-            self.range_correction,
+            self.drift.corrections.ranges,
         )
 
     def _note_period(self, stamp: HostNs) -> None:

@@ -119,7 +119,8 @@ class Odometry:
 
     def _use(self, matcher: SweepMatcher) -> None:
         """Go on with the maps of a matcher."""
-        matcher.range_correction = self.matcher.range_correction
+        matcher.drift.corrections = self.matcher.drift.corrections
+        matcher.notes_sights = self.matcher.notes_sights
         self.matcher = matcher
         self._initializer = self._first_rest.initializer = self._map_initializer()
 
@@ -162,10 +163,10 @@ class Odometry:
         self._predictor.may_have_head_lines = not (moves and self._intrinsics.is_other)
         if head is not None:
             self._predictor.note_head(head, sweep.end)
-        self.matcher.range_correction = None
+        self.matcher.notes_sights = self.config.correct_beams and self._intrinsics.learns_from_map
         if self.config.correct_beams:
             sweep = self._intrinsics.corrected(sweep)
-            self.matcher.range_correction = self._intrinsics.range_correction_in_doubt
+            self.matcher.drift.corrections = self._intrinsics.corrections
         if self.phase is Phase.INITIALIZING:
             return self._initialize(sweep)
         if may_skip and not status:
@@ -309,7 +310,8 @@ class Odometry:
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._intrinsics.learn(sweep, estimate.points, at_rest=False)
-            self._intrinsics.learn_from_map(self.matcher.seen_again(source, found.state))
+            if self.matcher.notes_sights:
+                self._intrinsics.learn_from_map(self.matcher.seen_again(source, found.state))
             is_mapped |= self._map_ended_rest(motion)
         is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
         if not is_mapped and (found is not None or is_new):
@@ -711,11 +713,10 @@ class Odometry:
         """Deskew a sweep with its motion and report it."""
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
-        xi, beta, alpha = self._intrinsics.angles.tolist()
-        ranges = self._intrinsics.ranges.correction
-        self.matcher.drift.beam_sigmas = self._intrinsics.sigmas or tuning.OTHER_BEAM_SIGMAS
-        self.matcher.drift.alpha_sigma = self._intrinsics.alpha_sigma
-        self.matcher.drift.range_sigma = self._intrinsics.range_sigma
+        drift, (angles, ranges) = self.matcher.drift, self._intrinsics.corrections
+        xi, beta, alpha = angles.tolist()
+        drift.errors = self._intrinsics.errors
+        drift.errors_began = self._intrinsics.errors_with(drift.began)
         self._last = estimate_of(
             motion,
             self._lever,
@@ -727,6 +728,6 @@ class Odometry:
             self._predictor.gyro_noise,
             self._predictor.gyro_line,
             self._jump,
-            self.matcher.drift,
+            drift,
         )
         return self._last

@@ -41,13 +41,12 @@ class RangeBias:
         self._information, self._weighted = 1.0 / tuning.RANGE_BIAS_SIGMA**2, 0.0
         self._map_information, self._map_weighted = 0.0, 0.0
 
-    @property
-    def sigma(self) -> float:
-        """What the ranges of corrected clouds may be wrong by, 1 sigma [m].
+    def sigma_with(self, correction: float) -> float:
+        """Return what ranges may be wrong by that have a correction [m], 1 sigma [m].
 
         What the estimate says but is not sure enough of to correct it counts as well.
         """
-        left = self._estimate - self.correction
+        left = self._estimate - correction
         return float(np.sqrt(self._variance + left**2))
 
     def applied_to(self, points: NDArray[np.void]) -> None:
@@ -76,14 +75,14 @@ class RangeBias:
         if not self.needs_map:
             self.correction = self._known()
 
-    def learn_from_map(self, seen: SeenAgain | None) -> None:
+    def learn_from_map(self, seen: SeenAgain) -> None:
         """Take how the points of a sweep lie beside the map, if planes do not show the bias.
 
         The correction changes slowly: sweeps with another one do not fit the map, and the pose
         would jump. What is left of the bias has bent the map, which hides some of it, so only the
         latest sweeps count.
         """
-        if seen is None or not self.needs_map:
+        if not self.needs_map:
             return
         information, gradient = bend_of_map(seen)
         kept, share = 1.0 - 1.0 / tuning.RANGE_BIAS_MAP_SWEEPS, tuning.RANGE_BIAS_MAP_SHARE

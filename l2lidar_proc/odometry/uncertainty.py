@@ -11,6 +11,7 @@ sweeps have mapped only tells the pose relative to these sweeps.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,39 @@ from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import InertialState, pose_covariance, skew
 from l2lidar_proc.odometry.correspondences import Support
+
+
+class Corrections(NamedTuple):
+    """What is added to what a unit reports, as far as its errors are known.
+
+    Attributes
+    ----------
+    angles : ndarray, shape (3,)
+        To ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad].
+    ranges : float
+        [m]
+    """
+
+    angles: F64
+    ranges: float
+
+
+class IntrinsicErrors(NamedTuple):
+    """What corrected clouds may be wrong by, 1 sigma.
+
+    Attributes
+    ----------
+    beams : tuple of float
+        Of xi and beta, along their best known direction and the other [rad].
+    alpha : float
+        [rad]
+    ranges : float
+        [m]
+    """
+
+    beams: tuple[float, float]
+    alpha: float
+    ranges: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,14 +67,10 @@ class MapError:
         as it has to be allowed for, and as it is expected to be.
     behind : float
         Way on which the surfaces were opened that hold the latest sweep [m].
-    beam_sigmas : tuple of float
+    errors, errors_began : IntrinsicErrors
         As of :class:`MapDrift`.
-    beam_began : float
-        The better of them when the surroundings of the origin were mapped [rad].
     swung : float
-        The worse of them, added up along ``behind`` [rad m].
-    alpha_sigma, range_sigma : float
-        As of :class:`MapDrift`; not less than when the surroundings of the origin were mapped.
+        The worse known of the beam angles' errors, added up along ``behind`` [rad m].
     lean : ndarray, shape (3,)
         By which the map has bent since it was begun, as gravity shows [rad].
     up : ndarray, shape (3,), optional
@@ -52,11 +82,9 @@ class MapError:
     drift: F64
     expected_drift: F64
     behind: float
-    beam_sigmas: tuple[float, float]
-    beam_began: float
+    errors: IntrinsicErrors
+    errors_began: IntrinsicErrors
     swung: float
-    alpha_sigma: float
-    range_sigma: float
     lean: F64
     up: F64 | None
     first_pose: F64
@@ -88,12 +116,13 @@ class MapError:
         ranges is wrong by moves places along the line from the origin, and nothing else. What only
         the IMU holds is part of the drift.
         """
-        better, worse = self.beam_sigmas
+        now, began = self.errors, self.errors_began
+        better, worse = now.beams
         away = float(np.linalg.norm(place))
         way = max(away, self.behind)
         left = 1.0 - np.exp(-way / tuning.UNIT_FROM_M)
         turn = (tuning.MAP_TURN * left) ** 2 + tuning.MAP_TURN_BEND**2 * way
-        first = tuning.BEAM_TURN * max(better, self.beam_began) * left
+        first = tuning.BEAM_TURN * max(better, began.beams[0]) * left
         shift = (tuning.MAP_SHIFT * left) ** 2 + (tuning.MAP_SHARE * way) ** 2
         swing = (tuning.BEAM_SWING * max(self.swung, worse * away)) ** 2
         up = np.eye(3) if self.up is None else np.outer(self.up, self.up)
@@ -103,7 +132,8 @@ class MapError:
         unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
         unit[3:, 3:] += swing * up
         leans = np.hypot(
-            tuning.ALPHA_TURN * self.alpha_sigma, tuning.RANGE_BIAS_TURN * self.range_sigma
+            tuning.ALPHA_TURN * max(now.alpha, began.alpha),
+            tuning.RANGE_BIAS_TURN * max(now.ranges, began.ranges),
         )
         leaning = (leans * left) ** 2 * level
         return self._with(place, unit, self.expected_drift, first**2 * np.eye(3) + leaning)
@@ -138,11 +168,12 @@ class MapDrift:
     first_pose : ndarray, shape (6, 6)
         Covariance of the first pose against the map that followed it [m, rad], map axes. Zero at
         rest. In motion, velocity and gyro bias of the first sweeps were hardly known.
-    beam_sigmas : tuple of float
-        What the beam angles of the sweeps to come may be wrong by, 1 sigma [rad], along their
-        best known direction and the other.
-    alpha_sigma, range_sigma : float
-        What alpha and the ranges may be wrong by, 1 sigma [rad, m].
+    corrections : Corrections
+        Of the sweeps to come.
+    began : Corrections
+        Of the sweeps that mapped the surroundings of the origin.
+    errors, errors_began : IntrinsicErrors
+        What clouds with these corrections may be wrong by, as is known now.
     is_doubted : bool
         Whether the drift is known to be larger than expected: then as much as has to be allowed
         for is expected.
@@ -152,8 +183,9 @@ class MapDrift:
         self._history = np.zeros((64, 2, 6, 6), np.float32)
         self._ways = np.zeros(64)  # on which they were [m]
         self._swings = np.zeros(64)  # the worse of the beam angles, added up along it [rad m]
-        self.beam_sigmas = tuning.BEAM_SIGMA, tuning.BEAM_SIGMA
-        self.alpha_sigma = self.range_sigma = 0.0
+        self.corrections = Corrections(np.zeros(3), 0.0)
+        unknown = IntrinsicErrors((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA), 0.0, 0.0)
+        self.errors = self.errors_began = unknown
         self.clear()
 
     def clear(self) -> None:
@@ -170,8 +202,7 @@ class MapDrift:
         self._swing = 0.0
         self._behind = 0.0  # way on which the surfaces were opened that hold the latest sweep [m]
         self._swung = 0.0  # the worse of the beam angles, added up until then [rad m]
-        self._began = 0.0  # the better of them, when the surroundings of the origin were mapped
-        self._alpha_began = self._range_began = 0.0  # likewise of alpha and the ranges
+        self.began = self.corrections
         self._vertical: F64 | None = None  # gravity when it was first known [m/s^2]
         self._lean: F64 = np.zeros(3)  # by which the map has bent since, as gravity shows [rad]
         self._up: F64 | None = None  # as gravity shows it now, unit; None while it does not
@@ -335,14 +366,13 @@ class MapDrift:
             self._ways = np.concatenate((self._ways, more))
             self._swings = np.concatenate((self._swings, more))
             self._history = grown
-        better, worse = self.beam_sigmas
+        worse = self.errors.beams[1]
         if self._known:
             step = float(np.linalg.norm(place - self._before))
             self._way += step
             self._swing += step * worse
         if self._way < tuning.UNIT_FROM_M:
-            self._began, self._alpha_began = better, self.alpha_sigma
-            self._range_began = self.range_sigma
+            self.began = self.corrections
         self._before = place
         self._ways[self._known : row + 1] = self._way
         self._swings[self._known : row + 1] = self._swing
@@ -441,11 +471,9 @@ class MapDrift:
             drift=self._reported[_ALLOWED],
             expected_drift=self._reported[_ALLOWED if self.is_doubted else _EXPECTED],
             behind=self._behind,
-            beam_sigmas=self.beam_sigmas,
-            beam_began=self._began,
+            errors=self.errors,
+            errors_began=self.errors_began,
             swung=self._swung,
-            alpha_sigma=max(self.alpha_sigma, self._alpha_began),
-            range_sigma=max(self.range_sigma, self._range_began),
             lean=self._lean,
             up=self._up,
             first_pose=self.first_pose,

@@ -100,8 +100,7 @@ def test_beams_that_nobody_knows_yet_do_not_end_a_rest_between_trees(
     if shown:
         np.testing.assert_allclose(found, true, atol=0.15)
     elif found.any():
-        assert odometry._intrinsics.sigmas is not None
-        assert (np.abs(found - true) < 2.0 * np.degrees(odometry._intrinsics.sigmas)).all()
+        assert (np.abs(found - true) < 2.0 * np.degrees(odometry._intrinsics.errors.beams)).all()
 
 
 def test_a_rest_that_ends_with_a_slow_turn_was_one() -> None:

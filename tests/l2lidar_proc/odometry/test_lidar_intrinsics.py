@@ -130,7 +130,6 @@ def test_a_rate_of_the_head_that_does_not_fit_is_searched_anew() -> None:
     for _ in range(50):  # covered, it stays an L2
         assert intrinsics.head(nothing) is None
     assert intrinsics.head(turn(UNIT, 9, 34.9)[0]) is not None
-    assert intrinsics.sigmas is not None
 
 
 @pytest.mark.parametrize("rate", [27.1, 34.9])
@@ -189,7 +188,7 @@ def test_where_the_turn_of_the_mirror_begins_is_found(
     assert found[2] == pytest.approx(alpha, abs=0.05)
     size = float(np.linalg.norm(found[:2]))
     assert size == pytest.approx(np.dot(others, found[:2] / max(size, 1e-9)), abs=0.05)
-    assert np.degrees(intrinsics.alpha_sigma) < 0.05
+    assert np.degrees(intrinsics.errors.alpha) < 0.05
     sweep, _ = turn((*others, alpha), 30)
 
     def off(cloud: Any) -> float:
@@ -209,10 +208,10 @@ def test_a_unit_that_is_right_is_left_alone() -> None:
 
 def test_how_wrong_the_angles_may_still_be_is_told() -> None:
     """What is found but not sure enough to be corrected is an error that stays."""
-    assert LidarIntrinsics().sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
-    assert LidarIntrinsics().alpha_sigma == pytest.approx(tuning.ALPHA_SIGMA)
+    assert LidarIntrinsics().errors.beams == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
+    assert LidarIntrinsics().errors.alpha == pytest.approx(tuning.ALPHA_SIGMA)
     units = ((0.0, 0.0, 0.0), (0.5, -0.2, 0.0), (0.4, 0.8, 0.0))
-    right, across, along = (learned(unit).sigmas for unit in units)
+    right, across, along = (learned(unit).errors.beams for unit in units)
     assert right is not None
     assert across is not None
     assert along is not None
@@ -317,8 +316,7 @@ def test_sweeps_at_rest_show_what_moves_the_halves_apart_even_among_trunks(
 ) -> None:
     """No cell there is flat: trunks are 12 to 30 cm thick."""
     intrinsics = rested(unit, 12, _some_trunks(seed))
-    assert intrinsics.sigmas is not None
-    assert np.degrees(intrinsics.sigmas[0]) < 0.08
+    assert np.degrees(intrinsics.errors.beams[0]) < 0.08
     apart = np.degrees(intrinsics.angles) - unit
     assert apart @ (0.82, -0.57, 0.0) == pytest.approx(0.0, abs=0.17)
 
@@ -341,9 +339,7 @@ def test_a_head_in_step_with_its_packets_tells_no_more_than_one_turn_does() -> N
     """Its lines repeat: they would pass for the edges of what they happen to hit."""
     trunks = _some_trunks(0)
     repeated, spread = (rested(UNIT, 12, trunks, step) for step in (IN_STEP, OUT_OF_STEP))
-    assert repeated.sigmas is not None
-    assert spread.sigmas is not None
-    assert repeated.sigmas[0] > 3.0 * spread.sigmas[0]
+    assert repeated.errors.beams[0] > 3.0 * spread.errors.beams[0]
     error = repeated._estimate - np.radians(UNIT)
     assert error @ repeated._information @ error < 16.3
 
@@ -364,7 +360,7 @@ def test_sweeps_at_rest_are_compared_again_when_there_are_many_more() -> None:
         assert after < before * tuning.BEAM_REST_AGAIN + 230_000_000
     intrinsics.forget()
     np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
-    assert intrinsics.sigmas == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
+    assert intrinsics.errors.beams == pytest.approx((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA))
 
 
 def test_of_other_sensors_nothing_is_learned_at_rest() -> None:
@@ -452,7 +448,7 @@ def test_clouds_of_other_sensors_are_left_as_they_are(measure: Any) -> None:
         intrinsics.learn(sweep, sweep.points, at_rest=True)
         assert intrinsics.is_other == (number >= 8), "known after three turns of a head"
     np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
-    assert intrinsics.sigmas is None
+    assert intrinsics.is_other
     # it has given up: an L2 later is not looked at
     sweep, _ = turn(UNIT, 0)
     intrinsics.corrected(sweep)
@@ -471,7 +467,7 @@ def test_other_sweeps_may_be_corrected_without_being_learned() -> None:
         corrected = other.corrected(sweep)
         other.learn(corrected, corrected.points, at_rest=True)
     np.testing.assert_array_equal(intrinsics.angles, other.angles)
-    assert intrinsics.sigmas == other.sigmas
+    assert intrinsics.errors.beams == other.errors.beams
     assert intrinsics.angles.any()
     shown, again = intrinsics.applied_to(sweep), intrinsics.corrected(sweep)
     np.testing.assert_array_equal(shown.points, again.points)

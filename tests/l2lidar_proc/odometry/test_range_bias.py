@@ -88,7 +88,7 @@ def test_what_was_corrected_is_not_corrected_again() -> None:
         ranges.applied_to(points)
         ranges.learn(points, used=used)
     assert ranges.correction == pytest.approx(-0.03, abs=0.002)
-    assert tuning.RANGE_BIAS_FLOOR <= ranges.sigma < 0.005
+    assert tuning.RANGE_BIAS_FLOOR <= ranges.sigma_with(ranges.correction) < 0.005
 
 
 def test_without_planes_nothing_is_known() -> None:
@@ -102,7 +102,7 @@ def test_without_planes_nothing_is_known() -> None:
     ranges = RangeBias()
     ranges.learn(cloud[:0])
     assert ranges.correction == 0.0
-    assert ranges.sigma == pytest.approx(tuning.RANGE_BIAS_SIGMA, rel=0.02)
+    assert ranges.sigma_with(ranges.correction) == pytest.approx(tuning.RANGE_BIAS_SIGMA, rel=0.02)
 
 
 def test_what_is_very_near_tells_nothing() -> None:
@@ -115,7 +115,7 @@ def test_a_bias_that_may_as_well_be_zero_is_left() -> None:
     ranges = RangeBias()
     ranges.learn(box(0.002, 3))
     assert ranges.correction == 0.0
-    assert ranges.sigma < tuning.RANGE_BIAS_KNOWN
+    assert ranges.sigma_with(ranges.correction) < tuning.RANGE_BIAS_KNOWN
 
 
 def test_clouds_of_another_sensor_are_left_as_they_are() -> None:
@@ -125,7 +125,7 @@ def test_clouds_of_another_sensor_are_left_as_they_are() -> None:
         other = dataclasses.replace(sweep, points=box(0.03, seed))
         assert intrinsics.corrected(other) is other
         intrinsics.learn(other, other.points, at_rest=False)
-    assert intrinsics.range_sigma == 0.0
+    assert intrinsics.errors.ranges == 0.0
     assert intrinsics.ranges.correction == 0.0
 
 
@@ -231,10 +231,10 @@ def test_the_map_corrects_slowly_what_planes_do_not_show() -> None:
     steps = np.abs(np.diff(corrections))
     assert steps.max() == pytest.approx(tuning.RANGE_BIAS_STEP)
     assert ranges.correction == pytest.approx(-0.03, abs=0.004)
-    assert tuning.RANGE_BIAS_MAP_FLOOR <= ranges.sigma < 0.01
+    assert tuning.RANGE_BIAS_MAP_FLOOR <= ranges.sigma_with(ranges.correction) < 0.01
     ranges.forget()
     assert ranges.correction == 0.0
-    assert ranges.sigma > 0.02
+    assert ranges.sigma_with(ranges.correction) > 0.02
 
 
 def test_a_correction_by_the_map_does_not_come_and_go() -> None:
@@ -256,11 +256,10 @@ def test_planes_count_alone_where_they_show_the_bias() -> None:
     ranges = RangeBias()
     ranges.learn(box(0.03, 1))
     assert not ranges.needs_map
-    known = ranges.correction, ranges.sigma
+    known = ranges.correction, ranges.sigma_with(0.0)
     for seed in range(20):
         ranges.learn_from_map(seen_again(-0.05, seed, used=ranges.correction))
-    ranges.learn_from_map(None)
-    assert (ranges.correction, ranges.sigma) == known
+    assert (ranges.correction, ranges.sigma_with(0.0)) == known
 
 
 def test_the_map_says_nothing_while_the_beams_are_unknown() -> None:
@@ -272,5 +271,5 @@ def test_the_map_says_nothing_while_the_beams_are_unknown() -> None:
         for seed in range(40):
             intrinsics.learn_from_map(seen_again(0.03, seed))
     assert unknown.ranges.correction == 0.0
-    assert unknown.range_sigma > tuning.RANGE_BIAS_SIGMA
+    assert unknown.errors.ranges > tuning.RANGE_BIAS_SIGMA
     assert known.ranges.correction == pytest.approx(-0.03, abs=0.006)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.uncertainty import MapDrift
+from l2lidar_proc.odometry.uncertainty import Corrections, IntrinsicErrors, MapDrift
 
 ZERO = np.zeros(3)
 SURE = np.diag([1e-6] * 6)
@@ -108,10 +108,16 @@ def test_what_gravity_has_turned_in_the_map_the_attitude_may_be_wrong_by() -> No
     np.testing.assert_array_equal(drift.at(ZERO), np.zeros((6, 6)))
 
 
+def known_so_well(
+    better: float = 0.0, worse: float = 0.0, *, alpha: float = 0.0, ranges: float = 0.0
+) -> IntrinsicErrors:
+    return IntrinsicErrors((better, worse), alpha, ranges)
+
+
 def upright(better: float = 0.0, worse: float = 0.0) -> MapDrift:
     """Return a map that knows its vertical, of a unit with beam angles known so well."""
     drift = MapDrift()
-    drift.beam_sigmas = better, worse
+    drift.errors = drift.errors_began = known_so_well(better, worse)
     for _ in range(2):
         drift.lean(np.array([0.0, 0.0, -9.8]), 0.01 * np.eye(3))
     return drift
@@ -151,7 +157,7 @@ def test_what_was_mapped_with_wrong_beam_angles_stays_turned() -> None:
     drift, way, nothing = upright(0.0, 0.005), np.array([1.0, 0.0, 0.0]), np.zeros((6, 6))
     drift.record(0, ZERO, nothing)
     drift.record(10 * tuning.DRIFT_GROUP, 10.0 * way, nothing)
-    drift.beam_sigmas = 0.0, 0.0
+    drift.errors = known_so_well()
     drift.record(150 * tuning.DRIFT_GROUP, 20.0 * way, nothing)  # in a longer history
     swing = (tuning.BEAM_SWING * 0.005 * 10.0) ** 2
     others = upright().reported_at(20.0 * way)[5, 5]
@@ -165,23 +171,36 @@ def test_what_was_mapped_with_wrong_beam_angles_stays_turned() -> None:
     assert drift.reported_at(20.0 * way)[5, 5] == pytest.approx(others, rel=1e-3)
 
 
-def test_a_map_leans_by_what_alpha_may_be_wrong_by() -> None:
-    """It may be known later: what was mapped until then has leant."""
-    drift, way = upright(), np.array([1.0, 0.0, 0.0])
-    drift.alpha_sigma = 0.004
-    drift.record(0, ZERO, np.zeros((6, 6)))
-    drift.alpha_sigma = 0.001
-    drift.record(1, 5.0 * way, np.zeros((6, 6)))
-    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
-    turn = (tuning.ALPHA_TURN * 0.004) ** 2
-    expected = np.diag([0.0, 0.0, 25.0 * turn, turn, turn, 0.0])
-    expected[2, 4] = expected[4, 2] = -5.0 * turn
-    np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-15)
+@pytest.mark.parametrize(
+    ("errors", "turn"),
+    [
+        (known_so_well(alpha=0.004), tuning.ALPHA_TURN * 0.004),
+        (known_so_well(ranges=0.02), tuning.RANGE_BIAS_TURN * 0.02),
+    ],
+)
+def test_a_map_leans_by_what_alpha_and_ranges_may_be_wrong_by(
+    errors: IntrinsicErrors, turn: float
+) -> None:
+    """Now, or when the surroundings of the origin were mapped: what was mapped then has leant."""
+    place = np.array([5.0, 0.0, 0.0])
+    expected = turn**2 * np.diag([0.0, 0.0, 25.0, 1.0, 1.0, 0.0])
+    expected[2, 4] = expected[4, 2] = -5.0 * turn**2
+    for name in ("errors", "errors_began"):
+        drift = upright()
+        setattr(drift, name, errors)
+        added = drift.reported_at(place) - upright().reported_at(place)
+        np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-15)
+
+
+def test_a_map_knows_with_which_corrections_it_began() -> None:
+    drift, way = MapDrift(), np.array([1.0, 0.0, 0.0])
+    first, later = (Corrections(np.zeros(3), ranges) for ranges in (0.01, 0.02))
+    for sweep, (corrections, place) in enumerate([(first, 0.1), (later, 0.2), (first, 5.0)]):
+        drift.corrections = corrections
+        drift.record(sweep, place * way, np.zeros((6, 6)))
+    assert drift.began is later  # the last ones before the way began
     drift.clear()
-    drift.alpha_sigma = 0.0
-    drift.record(0, ZERO, np.zeros((6, 6)))
-    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
-    np.testing.assert_allclose(added, np.zeros((6, 6)), atol=1e-15)
+    assert drift.began is first
 
 
 @pytest.mark.parametrize("first", [0.001, 0.005])
@@ -191,7 +210,7 @@ def test_a_map_is_turned_by_beam_angles_that_its_first_pose_did_not_know(
 ) -> None:
     drift, way = upright(first), np.array([1.0, 0.0, 0.0])
     drift.record(0, ZERO, np.zeros((6, 6)))
-    drift.beam_sigmas = now, 0.0
+    drift.errors = known_so_well(now)
     drift.record(1, 5.0 * way, np.zeros((6, 6)))
     added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
     turn = (tuning.BEAM_TURN * max(first, now)) ** 2
@@ -199,10 +218,6 @@ def test_a_map_is_turned_by_beam_angles_that_its_first_pose_did_not_know(
     expected[1, 5] = expected[5, 1] = 5.0 * turn  # what is turned about the origin moves
     expected[2, 4] = expected[4, 2] = -5.0 * turn
     np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-15)
-    drift.clear()
-    drift.record(0, ZERO, np.zeros((6, 6)))
-    added = drift.reported_at(5.0 * way) - upright().reported_at(5.0 * way)
-    assert added[3, 3] == pytest.approx((tuning.BEAM_TURN * now) ** 2)
 
 
 def test_no_more_is_reported_than_any_unit_is_allowed() -> None:
