@@ -115,15 +115,18 @@ class Gaps(NamedTuple):
     motion: F64
 
 
-def angle_derivatives(points: NDArray[np.void], sign: F64) -> F64:
+def angle_derivatives(points: NDArray[np.void], head: Halves) -> F64:
     """Return how points move with errors of xi, beta and alpha.
+
+    The direction of the fan is that of the head, not that of the point: near the head's axis, what
+    is 0.8 degrees beside the fan is seen elsewhere, by up to a right angle.
 
     Parameters
     ----------
     points : ndarray, shape (N,)
-        With x, y, z [m] in the cloud frame.
-    sign : ndarray, shape (N,)
-        As :class:`Halves` has it.
+        Some of the cloud's, with x, y, z [m] in the cloud frame, not deskewed, and time [s].
+    head : Halves
+        Of the cloud.
 
     Returns
     -------
@@ -131,42 +134,41 @@ def angle_derivatives(points: NDArray[np.void], sign: F64) -> F64:
         Along x, y and z; by xi, beta and alpha [m/rad].
     """
     x, y, z = (points[name].astype(np.float64) for name in "xyz")
-    flat = x * x + y * y
-    radius = np.maximum(np.sqrt(flat), 1e-6)
-    across, above = sign / radius, z - OPTICAL_CENTRE_M
-    xi, beta, alpha = -np.sqrt(flat + z * z) * across, z * across, -above * across
+    fan = head.angle + head.rate * points["time"].astype(np.float64)
+    cos, sin = np.cos(fan), np.sin(fan)
+    xi, above = -np.sqrt(x * x + y * y + z * z), z - OPTICAL_CENTRE_M
     level = np.zeros_like(z)
     return np.stack(
         (
-            np.stack((xi * y, beta * y, alpha * x)),
-            np.stack((xi * -x, beta * -x, alpha * y)),
-            np.stack((level, level, sign * radius)),
+            np.stack((xi * sin, z * sin, -above * cos)),
+            np.stack((-xi * cos, -z * cos, -above * sin)),
+            np.stack((level, level, x * cos + y * sin)),
         )
     )
 
 
-def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64) -> Gaps | None:
+def between_halves(points: NDArray[np.void], moved: NDArray[np.void], head: Halves) -> Gaps | None:
     """Return the gaps between the halves of a cloud, None where no flat cell has both.
 
     Parameters
     ----------
     points, moved : ndarray, shape (N,)
         As measured, and deskewed.
-    sign : ndarray, shape (N,)
-        As :class:`Halves` has it.
+    head : Halves
+        Of the cloud.
     """
     at = np.stack([moved[name].astype(np.float64) for name in "xyz"])
     cell = cell_numbers(at)
     count = int(cell.max()) + 1 if len(cell) else 0
-    rising = sign > 0.0
+    rising = head.sign > 0.0
     numbers = np.stack([np.bincount(cell[some], minlength=count) for some in (rising, ~rising)])
-    both = numbers.min(axis=0, initial=len(sign)) >= tuning.BEAM_CELL_POINTS
+    both = numbers.min(axis=0, initial=len(rising)) >= tuning.BEAM_CELL_POINTS
     inside = both[cell]
     if not inside.any():
         return None
     kept = np.cumsum(both) - 1
     at, cell, rising = at[:, inside], kept[cell[inside]], rising[inside]
-    derivatives = angle_derivatives(points[inside], sign[inside]).reshape(9, -1)
+    derivatives = angle_derivatives(records.selected(points, inside), head).reshape(9, -1)
     time = points["time"][inside].astype(np.float64)
     time -= 0.5 * (time.min() + time.max())
     values = np.concatenate((at, derivatives, time[None], time * at))
@@ -186,7 +188,9 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], sign: F64)
     return Gaps(gap[flat], across.T[flat], motion[flat])
 
 
-def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64, F64] | None:
+def angles_at_rest(
+    sweeps: list[tuple[NDArray[np.void], Halves]], prior: F64
+) -> tuple[F64, F64] | None:
     """Return the beam angles with which both halves see a place at rest alike, and information.
 
     In each cell, the mean of the points of one half is compared with that of the other, along the
@@ -200,10 +204,8 @@ def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64
 
     Parameters
     ----------
-    points : ndarray, shape (N,)
-        Of several sweeps from one place, cloud frame, as the unit reports them.
-    sign : ndarray, shape (N,)
-        As :class:`Halves` has it.
+    sweeps : list of tuple of ndarray and Halves
+        From one place: the points (N,) of each, cloud frame, as the unit reports them.
     prior : ndarray, shape (3, 3)
         Information of the angles' being zero [1/rad^2].
 
@@ -216,8 +218,10 @@ def angles_at_rest(points: NDArray[np.void], sign: F64, prior: F64) -> tuple[F64
 
     None instead where no cell can be compared.
     """
+    points = records.joined([some for some, _ in sweeps])
     at = np.stack([points[name].astype(np.float64) for name in "xyz"])
-    along = angle_derivatives(points, sign)
+    along = np.concatenate([angle_derivatives(*some) for some in sweeps], axis=2)
+    sign = np.concatenate([head.sign for _, head in sweeps])
     line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)
     line -= line.min(initial=0)
     angles, information = np.zeros(3), prior

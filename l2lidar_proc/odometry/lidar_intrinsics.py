@@ -18,7 +18,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from l2lidar_node import records
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.head_line import HeadAngle
@@ -71,7 +70,7 @@ class LidarIntrinsics:
         self._rested_ns = 0  # of the sweeps at rest that were compared last
         self._seen: tuple[Sweep, Halves | None] | None = None  # the latest sweep
         # the one to learn from: its halves, and what corrected angles and ranges
-        self._latest: tuple[Sweep, F64, F64, float] | None = None
+        self._latest: tuple[Sweep, Halves, F64, float] | None = None
 
     @property
     def is_other(self) -> bool:
@@ -124,7 +123,7 @@ class LidarIntrinsics:
         corrected = self.applied_to(sweep)
         found = self._halves_of(sweep) if self._teaches() else None
         if found is not None:
-            self._latest = corrected, found.sign, self.angles, self.ranges.correction
+            self._latest = corrected, found, self.angles, self.ranges.correction
         return corrected
 
     def applied_to(self, sweep: Sweep) -> Sweep:
@@ -140,7 +139,7 @@ class LidarIntrinsics:
         if found is None:
             return sweep
         points = sweep.points.copy()
-        for name, line in zip("xyz", angle_derivatives(points, found.sign), strict=True):
+        for name, line in zip("xyz", angle_derivatives(points, found), strict=True):
             points[name] += self.angles @ line
         self.ranges.applied_to(points)
         return dataclasses.replace(sweep, points=points)
@@ -162,10 +161,10 @@ class LidarIntrinsics:
         """
         if self._latest is None or self._latest[0] is not sweep or len(moved) != len(sweep.points):
             return
-        _, sign, used, used_range = self._latest
+        _, head, used, used_range = self._latest
         if not at_rest:  # a rest shows the same walls again and again
             self.ranges.learn(moved, used=used_range)
-        gaps = between_halves(sweep.points, moved, sign)
+        gaps = between_halves(sweep.points, moved, head)
         if gaps is None:
             return
         measured = gaps.derivatives @ used - gaps.gap
@@ -211,11 +210,10 @@ class LidarIntrinsics:
         if self.is_other:
             return
         shown = [(one.points, halves(one.points, self._rate)) for one in sweeps]
-        whole = [(points, found.sign) for points, found in shown if found is not None]
+        whole = [(points, found) for points, found in shown if found is not None]
         if not whole:
             return
-        points = records.joined([points for points, _ in whole])
-        found = angles_at_rest(points, np.concatenate([sign for _, sign in whole]), _PRIOR)
+        found = angles_at_rest(whole, _PRIOR)
         if found is not None:
             angles, self._information = found
             self._weighted = self._information @ angles
