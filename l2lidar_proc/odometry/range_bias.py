@@ -100,8 +100,6 @@ class RangeBias:
     @property
     def _evidence(self) -> tuple[float, float]:
         """Of the correction [1/m^2], and multiplied by the estimate."""
-        if not self.needs_map:
-            return self._information, self._weighted
         # however long a map is looked at, it is not better than that
         share = 1.0 / (1.0 + self._map_information * tuning.RANGE_BIAS_MAP_FLOOR**2)
         return (
@@ -123,7 +121,7 @@ class RangeBias:
         """Return the estimate if it is known, and differs from zero or has done so."""
         variance, bias = self._variance, self._estimate
         known = self.needs_map or variance < tuning.RANGE_BIAS_KNOWN**2
-        is_in_use = self.needs_map and self.correction != 0.0
+        is_in_use = self._map_information > 0.0 and self.correction != 0.0
         differs = is_in_use or bias**2 > tuning.BEAM_SIGMAS**2 * variance
         return bias if known and differs else 0.0
 

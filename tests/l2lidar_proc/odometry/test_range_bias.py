@@ -252,6 +252,18 @@ def test_a_correction_by_the_map_does_not_come_and_go() -> None:
     assert unbiased.correction == 0.0
 
 
+def test_planes_that_come_into_sight_do_not_undo_what_the_map_has_shown() -> None:
+    """They are as wrong as furniture bends them: together they know it best."""
+    ranges = RangeBias()
+    for seed in range(60):
+        ranges.learn_from_map(seen_again(0.03, seed, used=ranges.correction))
+    before, sigma = ranges.correction, ranges.sigma_with(ranges.correction)
+    ranges.learn(box(0.012, 1), used=0.0)
+    assert not ranges.needs_map
+    assert before < ranges.correction < -0.012
+    assert ranges.sigma_with(ranges.correction) < sigma
+
+
 def test_planes_count_alone_where_they_show_the_bias() -> None:
     ranges = RangeBias()
     ranges.learn(box(0.03, 1))
