@@ -499,6 +499,8 @@ RANGE_BIAS_STEP: Final = 0.003  # [m] by which the correction changes from sweep
 # [rad/m] by which it lets the map lean, about each level axis; 0.02 to 0.2 in room, corridor,
 # hall and wood
 RANGE_BIAS_TURN: Final = 0.1
+# Correlation of the place with the turn; 0.5 does as well. Tuned on: woods, four drawn units
+BENT_TOGETHER: Final = 0.8
 
 # ---- odometry: innovation consistency
 

@@ -131,11 +131,10 @@ class MapError:
         unit[:3, :3] += swing * way**2 * level  # as if all of it had come about at the beginning
         unit[:3, :3] += tuning.RANGE_SCALE**2 * np.outer(place, place)
         unit[3:, 3:] += swing * up
-        leans = np.hypot(
-            tuning.ALPHA_TURN * max(now.alpha, began.alpha),
-            tuning.RANGE_BIAS_TURN * max(now.ranges, began.ranges),
+        unit += _bent(
+            place, (tuning.RANGE_BIAS_TURN * max(now.ranges, began.ranges) * left) ** 2 * level
         )
-        leaning = (leans * left) ** 2 * level
+        leaning = (tuning.ALPHA_TURN * max(now.alpha, began.alpha) * left) ** 2 * level
         return self._with(place, unit, self.expected_drift, first**2 * np.eye(3) + leaning)
 
     def _with(self, place: F64, unit: F64, drift: F64, first: F64 | float = 0.0) -> F64:
@@ -486,6 +485,19 @@ class MapDrift:
     def reported_at(self, place: F64) -> F64:
         """Return :meth:`MapError.reported_at` a place (3,) [m] as of now."""
         return self.error.reported_at(place)
+
+
+def _bent(place: F64, turn: F64) -> F64:
+    """Return what a covariance (3, 3) of the turn at a place makes of a pose there: (6, 6).
+
+    The map was not turned at once but has bent on the way, and a unit that became known on the way
+    has bent it in part of it only. So the place is less tied to the turn than by :func:`_carried`.
+    """
+    moved = _carried(place)[:, 3:]
+    whole = moved @ turn @ moved.T
+    whole[:3, 3:] *= tuning.BENT_TOGETHER
+    whole[3:, :3] *= tuning.BENT_TOGETHER
+    return np.asarray(whole)
 
 
 def _carried(place: F64) -> F64:

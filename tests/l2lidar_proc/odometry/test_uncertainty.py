@@ -172,19 +172,19 @@ def test_what_was_mapped_with_wrong_beam_angles_stays_turned() -> None:
 
 
 @pytest.mark.parametrize(
-    ("errors", "turn"),
+    ("errors", "turn", "together"),
     [
-        (known_so_well(alpha=0.004), tuning.ALPHA_TURN * 0.004),
-        (known_so_well(ranges=0.02), tuning.RANGE_BIAS_TURN * 0.02),
+        (known_so_well(alpha=0.004), tuning.ALPHA_TURN * 0.004, 1.0),
+        (known_so_well(ranges=0.02), tuning.RANGE_BIAS_TURN * 0.02, tuning.BENT_TOGETHER),
     ],
 )
 def test_a_map_leans_by_what_alpha_and_ranges_may_be_wrong_by(
-    errors: IntrinsicErrors, turn: float
+    errors: IntrinsicErrors, turn: float, together: float
 ) -> None:
     """Now, or when the surroundings of the origin were mapped: what was mapped then has leant."""
     place = np.array([5.0, 0.0, 0.0])
     expected = turn**2 * np.diag([0.0, 0.0, 25.0, 1.0, 1.0, 0.0])
-    expected[2, 4] = expected[4, 2] = -5.0 * turn**2
+    expected[2, 4] = expected[4, 2] = -5.0 * together * turn**2
     for name in ("errors", "errors_began"):
         drift = upright()
         setattr(drift, name, errors)
