@@ -19,9 +19,9 @@ def tracked(some: Recording) -> Track:
     return track
 
 
-def estimates_of(some: Recording) -> list[OdometryEstimate]:
-    """Return all estimates of a recording."""
-    odometry = Odometry(OdometryConfig(), some.T_cloud_imu)
+def estimates_of(some: Recording, odometry: Odometry | None = None) -> list[OdometryEstimate]:
+    """Return all estimates of a recording, by a given odometry or a new one."""
+    odometry = odometry or Odometry(OdometryConfig(), some.T_cloud_imu)
     estimates: list[OdometryEstimate] = []
     first = 0
     for sweep in some.sweeps():

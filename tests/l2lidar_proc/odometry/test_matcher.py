@@ -17,6 +17,7 @@ from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher, is_far
 from l2lidar_proc.odometry.pose_hypotheses import level_basis, level_grid
+from l2lidar_proc.odometry.uncertainty import Corrections
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,
@@ -698,3 +699,14 @@ def test_however_uncertain_a_place_is_no_more_others_are_tried() -> None:
         assert np.linalg.norm(shifts, axis=1).max() <= tuning.SEARCH_RADIUS_M[1] + 1e-9
         apart = np.linalg.norm(shifts[:, None] - shifts[None, :], axis=2)
         assert len(shifts) == 1 or apart[apart > 0.0].min() >= tuning.RELOCALIZE_STEP_M - 1e-9
+
+
+def test_another_map_of_the_same_sweeps_is_begun_with_the_same_corrections() -> None:
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    matcher.drift.corrections = Corrections(np.array([0.001, 0.002, 0.003]), 0.02)
+    matcher.notes_sights = False
+    other = matcher.for_another_map()
+    assert len(other.surfaces) == 0
+    assert other.drift.corrections is matcher.drift.corrections
+    assert other.drift.began is matcher.drift.corrections
+    assert not other.notes_sights
