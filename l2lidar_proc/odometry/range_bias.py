@@ -118,12 +118,12 @@ class RangeBias:
         return 1.0 / self._evidence[0] + tuning.RANGE_BIAS_FLOOR**2
 
     def _known(self) -> float:
-        """Return the estimate if it is known, and differs from zero or has done so."""
+        """Return the estimate if it is known, and differs from zero; or was in use before."""
         variance, bias = self._variance, self._estimate
-        known = self.needs_map or variance < tuning.RANGE_BIAS_KNOWN**2
         is_in_use = self._map_information > 0.0 and self.correction != 0.0
-        differs = is_in_use or bias**2 > tuning.BEAM_SIGMAS**2 * variance
-        return bias if known and differs else 0.0
+        is_known = variance < tuning.RANGE_BIAS_KNOWN**2
+        differs = bias**2 > tuning.BEAM_SIGMAS**2 * variance
+        return bias if is_in_use or (is_known and differs) else 0.0
 
 
 class SeenAgain(NamedTuple):

@@ -252,6 +252,17 @@ def test_a_correction_by_the_map_does_not_come_and_go() -> None:
     assert unbiased.correction == 0.0
 
 
+def test_few_planes_correct_nothing_before_the_map_does() -> None:
+    """A cone of 70 degrees saw one plane, at rest, that seemed to show 28 mm; 12 mm of sigma."""
+    ranges = RangeBias()
+    ranges._information += 1.0 / 0.014**2
+    ranges._weighted -= 0.04 / 0.014**2
+    assert ranges.needs_map
+    assert abs(ranges._estimate) > 2.0 * ranges._variance**0.5
+    ranges.learn_from_map(seen_again(0.03, 0)._replace(distances=np.zeros(0)))
+    assert ranges.correction == 0.0
+
+
 def test_planes_that_come_into_sight_do_not_undo_what_the_map_has_shown() -> None:
     """They are as wrong as furniture bends them: together they know it best."""
     ranges = RangeBias()
