@@ -500,7 +500,7 @@ RANGE_BIAS_STEP: Final = 0.003  # [m] by which the correction changes from sweep
 # hall and wood
 RANGE_BIAS_TURN: Final = 0.1
 # Correlation of the place with the turn; 0.5 does as well. Tuned on: woods, four drawn units
-BENT_TOGETHER: Final = 0.8
+BEND_CORRELATION: Final = 0.8
 
 # ---- odometry: innovation consistency
 

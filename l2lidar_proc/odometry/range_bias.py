@@ -138,11 +138,11 @@ class SeenAgain(NamedTuple):
     distances : ndarray, shape (M,)
         Of the points from the surfaces along the normals [m].
     lines : ndarray, shape (M, 3)
-        Mean lines of sight by which the map has seen the surfaces, unit vectors before the mean.
+        Mean of the unit vectors from the sensor to a surface when the map saw it, map axes.
     corrected : ndarray, shape (M, 3)
-        The same, each by the correction of its range [m].
+        Mean of the same vectors, each multiplied by the correction of its range [m].
     correction : float
-        Of the ranges of the points [m].
+        Of the ranges of the sweep [m].
     """
 
     places: F64
@@ -202,8 +202,17 @@ def bend_of_planes(points: NDArray[np.void]) -> tuple[float, float]:
 def bend_of_map(seen: SeenAgain) -> tuple[float, float]:
     """Return what a map tells about a correction of ranges: information and gradient.
 
-    As of :func:`bend_of_planes`. What a surface is off by depends on how its points were seen, and
-    so does what the map has it off by. The pose of the sweep is of no interest.
+    What a point is off by along the normal depends on the angle at which it is seen, and so does
+    what its surface in the map is off by. The pose of the sweep is of no interest.
+
+    Parameters
+    ----------
+    seen : SeenAgain
+
+    Returns
+    -------
+    information, gradient : float
+        As of :func:`bend_of_planes`; both 0 where few points meet surfaces.
     """
     if len(seen.distances) < tuning.RANGE_BIAS_MAP_POINTS:
         return 0.0, 0.0

@@ -495,8 +495,8 @@ def _bent(place: F64, turn: F64) -> F64:
     """
     moved = _carried(place)[:, 3:]
     whole = moved @ turn @ moved.T
-    whole[:3, 3:] *= tuning.BENT_TOGETHER
-    whole[3:, :3] *= tuning.BENT_TOGETHER
+    whole[:3, 3:] *= tuning.BEND_CORRELATION
+    whole[3:, :3] *= tuning.BEND_CORRELATION
     return np.asarray(whole)
 
 

@@ -175,7 +175,7 @@ def test_what_was_mapped_with_wrong_beam_angles_stays_turned() -> None:
     ("errors", "turn", "together"),
     [
         (known_so_well(alpha=0.004), tuning.ALPHA_TURN * 0.004, 1.0),
-        (known_so_well(ranges=0.02), tuning.RANGE_BIAS_TURN * 0.02, tuning.BENT_TOGETHER),
+        (known_so_well(ranges=0.02), tuning.RANGE_BIAS_TURN * 0.02, tuning.BEND_CORRELATION),
     ],
 )
 def test_a_map_leans_by_what_alpha_and_ranges_may_be_wrong_by(
