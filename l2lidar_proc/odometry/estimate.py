@@ -96,6 +96,8 @@ class AlignmentQuality:
         What was added to the unit's ``xi_angle``, ``beta_angle`` and ``alpha_angle_bias`` [rad].
     range_correction : float
         What was added to its ranges [m].
+    attitude_variance : float
+        About each axis, by what the gyro's noise bends the sweep that was aligned [rad^2].
     """
 
     points: int = 0
@@ -113,6 +115,7 @@ class AlignmentQuality:
     unobserved: tuple[tuple[float, float, float], ...] = ()
     beam_correction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     range_correction: float = 0.0
+    attitude_variance: float = 0.0
 
     @property
     def observes_all(self) -> bool:
@@ -290,8 +293,9 @@ def estimate_of(
         late=late,
         gyro_line=gyro_line,
     )
-    of_map = found.map_covariance(state.position)
-    return dataclasses.replace(found, covariance=found.covariance + of_map)
+    added = found.map_covariance(state.position)
+    added[3:, 3:] += quality.attitude_variance * np.eye(3)
+    return dataclasses.replace(found, covariance=found.covariance + added)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -199,6 +199,7 @@ class Odometry:
             variance_factor=last.variance_factor,
             velocity_factor=last.velocity_factor,
             unobserved=last.unobserved,
+            attitude_variance=last.attitude_variance,
         )
         return estimate_of(
             motion,
@@ -305,6 +306,9 @@ class Odometry:
         if found is not None:
             motion = self._late_gravity.estimated(motion)
         self._keep(motion)
+        if found is not None and not motion.imu.missing.all():
+            variance = self._predictor.attitude_variance(sweep)
+            quality = dataclasses.replace(quality, attitude_variance=variance)
         quality = self.matcher.quality(len(source.points), found)
         quality = self._consistency(quality, found, motion.state.stamp)
         estimate = self._estimate(sweep, motion, status, quality)

@@ -53,6 +53,8 @@ class Predictor:
         Rate without bias where there is no gyro [rad/s], cloud axes.
     gyro_noise : float
         Of the samples that were used last [rad/s], each axis.
+    gyro_density : float
+        The same as a density [rad/s/sqrt(Hz)].
     may_have_head_lines : bool
         Whether the gyro may have lines of a head that its samples do not show.
     """
@@ -69,6 +71,7 @@ class Predictor:
         self.may_have_head_lines = True
         self.steady_rate: F64 = np.zeros(3)
         self.gyro_noise = self.config.inertial.gyro_noise
+        self.gyro_density = self.gyro_noise * float(np.sqrt(tuning.IMU_PERIOD_S))
         self._rest: tuple[F64, int] = np.zeros(3), 0  # mean squares of the gyro at rest, samples
         self._line = HeadLine()
 
@@ -106,6 +109,20 @@ class Predictor:
         if self.config.reference == "end":
             return sweep.end
         return HostNs((sweep.start + sweep.end) // 2)
+
+    def attitude_variance(self, sweep: Sweep) -> float:
+        """Return the variance of the attitude at the reference of an aligned sweep [rad^2].
+
+        Alignment tells the mean attitude over a sweep. Between that and the attitude at one
+        instant lies what the gyro's white noise adds up to, a random walk: its mean over a time T
+        differs from its value after a share a of it by ``density^2 T (1/3 - a (1 - a))``.
+        """
+        lasted = sweep.end - sweep.start
+        if lasted <= 0:
+            return 0.0
+        before = (self.reference(sweep) - sweep.start) / lasted
+        share = 1.0 / 3.0 - before * (1.0 - before)
+        return self.gyro_density**2 * lasted * 1e-9 * share
 
     def over_sweep(
         self, sweep: Sweep, state: InertialState, covariance: F64, since: HostNs | None = None
@@ -207,7 +224,7 @@ class Predictor:
         self.gyro_noise = max(least, tuning.GYRO_NOISE_FACTOR * gyro.floor)
         scale = float(np.sqrt(period))
         return Noise(
-            self.gyro_noise * scale,
+            self.gyro_density,
             max(settings.accel_noise * stated, accel.floor) * scale,
             settings.gyro_bias_walk,
             settings.accel_bias_walk,
@@ -221,6 +238,7 @@ class Predictor:
 def blur_of(predicted: SweepMotion, before: F64) -> F64 | None:
     """Return the covariance that the IMU leaves open within a sweep, if it is large.
 
+        self.gyro_density = self.gyro_noise * scale
     After a hit, or in a gap of its samples, attitude and velocity become uncertain all at once,
     and the parts of the sweep before and after do not fit together. The sweep then tells the
     motion of one part, or a mean of both.

@@ -317,6 +317,25 @@ def at_rate(hz: float, seconds: float, noise: float = 0.0) -> Any:
     return made
 
 
+@pytest.mark.parametrize("reference", ["start", "middle", "end"])
+def test_noise_within_a_sweep_moves_its_attitude_as_a_random_walk(reference: Any) -> None:
+    """Of many, the mean over the sweep differs from the value at the reference by as much."""
+    predictor = Predictor(OdometryConfig(reference=reference), np.eye(4))
+    predictor.imu(at_rate(250.0, 2.0, 0.03))
+    predictor._noise(predictor.samples(EPOCH, EPOCH + 2_000_000_000))
+    sweep = next(iter(sweeps(recording("room", "walk"), "turn")))
+    lasted = (sweep.end - sweep.start) * 1e-9
+    steps = 200
+    rng = np.random.default_rng(4)
+    walks = rng.normal(0.0, predictor.gyro_density * np.sqrt(lasted / steps), (4000, steps))
+    walks = np.cumsum(walks, axis=1)
+    at = {"start": 0, "middle": steps // 2, "end": steps - 1}[reference]
+    spread = np.var(walks.mean(axis=1) - walks[:, at])
+    assert predictor.attitude_variance(sweep) == pytest.approx(spread, rel=0.08)
+    empty = dataclasses.replace(sweep, end=sweep.start)
+    assert predictor.attitude_variance(empty) == 0.0
+
+
 @pytest.mark.parametrize("hz", [100.0, 200.0, 400.0, 1000.0])
 def test_an_imu_may_have_another_rate(hz: float) -> None:
     """The parameters are densities, told for 250 Hz; measured noise is that of its samples."""
