@@ -94,8 +94,12 @@ class RangeBias:
     @property
     def needs_map(self) -> bool:
         """Whether planes alone do not show the bias."""
-        floor2 = tuning.RANGE_BIAS_FLOOR**2
-        return 1.0 / self._information + floor2 >= tuning.RANGE_BIAS_KNOWN**2
+        return self._of_planes >= tuning.RANGE_BIAS_KNOWN**2
+
+    @property
+    def _of_planes(self) -> float:
+        """Variance of the estimate that planes alone amount to [m^2]."""
+        return 1.0 / self._information + tuning.RANGE_BIAS_FLOOR**2
 
     @property
     def _evidence(self) -> tuple[float, float]:
@@ -118,12 +122,16 @@ class RangeBias:
         return 1.0 / self._evidence[0] + tuning.RANGE_BIAS_FLOOR**2
 
     def _known(self) -> float:
-        """Return the estimate if it is known, and differs from zero; or was in use before."""
+        """Return the estimate if it is known, and differs from zero; or was in use before.
+
+        Where planes show it well, it counts in any case: hardly a unit has none at all.
+        """
         variance, bias = self._variance, self._estimate
         is_in_use = self._map_information > 0.0 and self.correction != 0.0
         is_known = variance < tuning.RANGE_BIAS_KNOWN**2
         differs = bias**2 > tuning.BEAM_SIGMAS**2 * variance
-        return bias if is_in_use or (is_known and differs) else 0.0
+        is_sure = self._of_planes < tuning.RANGE_BIAS_SURE**2
+        return bias if is_in_use or is_sure or (is_known and differs) else 0.0
 
 
 class SeenAgain(NamedTuple):

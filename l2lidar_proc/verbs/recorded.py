@@ -16,6 +16,7 @@ from l2lidar_node.recording.packet_bag import open_packets
 from l2lidar_node.recording.recording import Recording, measurements
 from l2lidar_node.settings import build
 from l2lidar_node.types import IMU_SAMPLE, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.odometry.estimate import BaseFrame, OdometryEstimate, Status
@@ -173,7 +174,7 @@ class OdometryRunner:
                 f"(beta) and {alpha:+.2f} degrees (alpha), estimated from the clouds: l2lidar "
                 "calibrate still measures them"
             )
-        if self._ranges:
+        if abs(self._ranges) > tuning.RANGE_BIAS_FLOOR:  # less is no news of a unit
             found.append(
                 f"the unit's ranges were corrected by {1e3 * self._ranges:+.0f} mm, estimated "
                 "from walls in the clouds: l2lidar calibrate still measures that as well"

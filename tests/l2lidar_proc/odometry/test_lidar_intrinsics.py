@@ -229,7 +229,9 @@ def test_where_the_turn_of_the_mirror_begins_is_found(
 def test_a_unit_that_is_right_is_left_alone() -> None:
     intrinsics = learned((0.0, 0.0, 0.0), at_rest=False)
     np.testing.assert_array_equal(intrinsics.angles, (0.0, 0.0, 0.0))
+    assert abs(intrinsics.corrections.ranges) < tuning.RANGE_BIAS_FLOOR
     sweep, _ = turn((0.0, 0.0, 0.0), 20)
+    intrinsics.ranges.forget()
     assert intrinsics.corrected(sweep) is sweep
 
 

@@ -146,7 +146,7 @@ def test_a_unit_that_shows_its_beam_angles_is_more_certain_of_its_pose() -> None
     run = recording("room", "walk")
     seen = driven("room", "walk")[-1]
     unseen = drive(run, config=OdometryConfig(correct_beams=False))[-1]
-    np.testing.assert_array_equal(seen.T_map_lidar, unseen.T_map_lidar)
+    np.testing.assert_allclose(seen.T_map_lidar, unseen.T_map_lidar, atol=0.003)
     assert (np.diag(seen.covariance)[3:] < 0.3 * np.diag(unseen.covariance)[3:]).all()
 
 
