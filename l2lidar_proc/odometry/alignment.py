@@ -98,12 +98,34 @@ class Alignment:
         More points fit here, and they are most of the sweep and fix the place, or they are many
         and nearly all.
         """
-        some, nearly_all = tuning.DOUBT_MATCHED
         if self.inlier_ratio < other.inlier_ratio + tuning.DOUBT_BETTER:
             return False
-        if unobserved_directions(self.information[POSITION, POSITION]).size:
-            return self.matched >= max(nearly_all * points, tuning.DOUBT_MANY)
-        return self.matched >= some * points
+        if self.fixes_place:
+            return self.is_rich(points)
+        nearly_all = tuning.DOUBT_MATCHED[1] * points
+        return self.matched >= max(nearly_all, tuning.DOUBT_MANY)
+
+    def fits_closer_than(self, other: Alignment, config: SurfaceConfig) -> bool:
+        """Return whether this fixes the place, and as many points lie much closer to surfaces."""
+        if not self.fixes_place or self.matched < tuning.DOUBT_AS_MANY * other.matched:
+            return False
+        share = tuning.DOUBT_CLOSER[not other.fixes_place]
+        return bool(self.misfit(config) < share * other.misfit(config))
+
+    def is_rich(self, points: int) -> bool:
+        """Return whether it fixes the place by a good part of some points."""
+        return self.fixes_place and self.matched >= tuning.DOUBT_MATCHED[0] * points
+
+    @property
+    def fixes_place(self) -> bool:
+        """Whether every direction of the place is observed."""
+        return not unobserved_directions(self.information[POSITION, POSITION]).size
+
+    def misfit(self, config: SurfaceConfig) -> float:
+        """Mean square of the points' distances to surfaces; outliers are at their limit [m^2]."""
+        outliers = 1.0 - self.inlier_ratio
+        limit = tuning.INLIER_SCALES * config.outlier_scale
+        return self.inlier_ratio * self.residual**2 + outliers * limit**2
 
 
 def align(

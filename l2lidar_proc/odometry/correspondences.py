@@ -166,7 +166,7 @@ class Correspondences:
 
     @property
     def _is_inlier(self) -> NDArray[np.bool_]:
-        return np.asarray(np.abs(self.distances) < 2.0 * self.scales)
+        return np.asarray(np.abs(self.distances) < tuning.INLIER_SCALES * self.scales)
 
     @property
     def residual(self) -> float:

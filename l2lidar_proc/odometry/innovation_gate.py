@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
-from l2lidar_proc.motion.filter import POSITION, VELOCITY, InertialState
+from l2lidar_proc.motion.filter import POSITION, VELOCITY
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.innovations import MOTION, correction
+from l2lidar_proc.odometry.innovations import MOTION, Correction, correction
 from l2lidar_proc.odometry.matcher import SweepMatcher
+
+
+class Hypothesis(NamedTuple):
+    """A predicted motion, and the points that it deskewed."""
+
+    motion: SweepMotion
+    source: Source
 
 
 class GatedAlignment(NamedTuple):
@@ -24,6 +32,8 @@ class GatedAlignment(NamedTuple):
     ----------
     predicted : SweepMotion
         Its covariance is larger where the prediction was too sure of itself.
+    source : Source
+        Deskewed by it.
     alignment : Alignment or None
         None where the sweep tells nothing that can be believed.
     is_suspect : bool
@@ -31,6 +41,7 @@ class GatedAlignment(NamedTuple):
     """
 
     predicted: SweepMotion
+    source: Source
     alignment: Alignment | None
     is_suspect: bool
 
@@ -48,56 +59,107 @@ class InnovationGate:
     def passed(
         self,
         matcher: SweepMatcher,
-        source: Source,
-        predicted: SweepMotion,
-        found: Alignment,
+        given: Hypothesis,
+        found: Alignment | None,
+        held: Callable[[], Hypothesis] | None,
         *,
         blurred: bool,
     ) -> GatedAlignment:
         """Return prediction and alignment, found anew if the two contradict each other.
 
         A prediction that is too sure of itself makes a compromise of both, at which neither fits.
-        The sweep is then aligned as after a prediction that may be wrong by as much.
+        The sweep is then aligned as after a prediction that may be wrong by as much. A lesser
+        contradiction may be the first sign of the same. If that does not help either, what the
+        accelerometer felt may not have moved the sensor: a blow on its housing, or a fault.
 
         Parameters
         ----------
         matcher : SweepMatcher
             That of the alignment.
-        source : Source
-        predicted : SweepMotion
-        found : Alignment
+        given : Hypothesis
+            The prediction.
+        found : Alignment or None
+            Of its points; None where they did not match.
+        held : callable, optional
+            Returns what follows from the velocity before without the accelerometer, if that was
+            used.
         blurred : bool
             The sweep is blurred: what an alignment makes of that is not the motion of the sensor.
         """
-        prior, many = predicted.state, len(source.points)
-        wide = inflated_prior(prior, predicted.covariance, found.state, found.covariance)
+        predicted, source = given
+        unchanged = GatedAlignment(predicted, source, found, False)
+        stamp = int(predicted.state.stamp)
+        if found is None:
+            if blurred or matcher.is_young or stamp < self._next_check:
+                return unchanged
+            if len(source.points) < matcher.config.min_points:
+                return unchanged
+            return self._again(matcher, given, None, held) or unchanged
+        before = predicted.covariance
+        item = correction(predicted.state, before, found.state, found.covariance)
+        wide = inflated_prior(before, item)
         fits_badly = matcher.fits_badly(found)
         if (wide is not None or fits_badly) and blurred:
-            covariance = predicted.covariance if wide is None else wide
+            covariance = before if wide is None else wide
             return GatedAlignment(
-                dataclasses.replace(predicted, covariance=covariance), None, True
+                dataclasses.replace(predicted, covariance=covariance), source, None, True
             )
-        is_due = prior.stamp >= self._next_check and fits_badly
+        is_doubted = item.nis >= tuning.NIS_DOUBT and not matcher.is_young
+        is_checked = stamp >= self._next_check
+        is_due = is_doubted or (is_checked and (fits_badly or matcher.lost_sight(found)))
         if wide is None and not is_due:
-            return GatedAlignment(predicted, found, False)
-        self._next_check = prior.stamp + tuning.DOUBT_PAUSE_NS
-        covariance = with_loose_motion(predicted.covariance if wide is None else wide)
-        loose = dataclasses.replace(predicted, covariance=covariance)
-        other = matcher.match(source, loose).alignment
-        if other is not None and other.fits_better_than(found, many):
-            return GatedAlignment(loose, other, True)
+            return unchanged
         if wide is None:
-            return GatedAlignment(predicted, found, False)
-        loose = dataclasses.replace(predicted, covariance=wide)
-        other = matcher.match(source, loose).alignment
-        if other is not None and found.fits_better_than(other, many):
-            return GatedAlignment(predicted, found, True)
-        return GatedAlignment(loose, other, True)
+            return self._again(matcher, given, found, held) or unchanged
+        inflated = given._replace(motion=dataclasses.replace(predicted, covariance=wide))
+        other = matcher.match(source, inflated.motion).alignment
+        if other is not None and found.fits_better_than(other, len(source.points)):
+            return unchanged._replace(is_suspect=True)
+        better = self._again(matcher, inflated, other, held)
+        return better or GatedAlignment(inflated.motion, source, other, True)
+
+    def _again(
+        self,
+        matcher: SweepMatcher,
+        given: Hypothesis,
+        found: Alignment | None,
+        held: Callable[[], Hypothesis] | None,
+    ) -> GatedAlignment | None:
+        """Return an alignment that is better, from a prediction that is looser or another one."""
+        motion, source = given
+        stamp = int(motion.state.stamp)
+        covariance = with_loose_motion(motion.covariance)
+        tried = [Hypothesis(dataclasses.replace(motion, covariance=covariance), source)]
+        if held is not None:
+            tried.append(held())
+        surfaces = matcher.config.surfaces
+        best: GatedAlignment | None = None
+        least = np.inf
+        for predicted, deskewed in tried:
+            other = matcher.match(deskewed, predicted).alignment
+            if other is None or not self._is_better(matcher, other, found, len(source.points)):
+                continue
+            if other.misfit(surfaces) < least:
+                least = other.misfit(surfaces)
+                best = GatedAlignment(predicted, deskewed, other, True)
+        # the next prediction may be as wrong; but one that is right need not be doubted for long
+        self._next_check = stamp if best is not None else stamp + tuning.DOUBT_PAUSE_NS
+        return best
+
+    def _is_better(
+        self, matcher: SweepMatcher, other: Alignment, found: Alignment | None, points: int
+    ) -> bool:
+        """Return whether another alignment of so many points is right, and the first one wrong."""
+        if found is None:
+            return other.is_rich(points) and not matcher.fits_badly(other)
+        if other.fits_better_than(found, points):
+            return True
+        # what seems to fix the place along bare walls is another niche
+        is_fixed_anew = matcher.driving and not found.fixes_place
+        return not is_fixed_anew and other.fits_closer_than(found, matcher.config.surfaces)
 
 
-def inflated_prior(
-    prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64
-) -> F64 | None:
+def inflated_prior(covariance: F64, item: Correction) -> F64 | None:
     """Return the covariance that a prior must have had, if a correction contradicts it.
 
     A single correction far beyond what the covariances allow (an innovation gate) means that one
@@ -106,20 +168,19 @@ def inflated_prior(
 
     Parameters
     ----------
-    prior, covariance, posterior, corrected
-        As for :func:`~l2lidar_proc.odometry.innovations.correction`.
+    covariance : ndarray, shape (18, 18)
+        Of the prior.
+    item : Correction
 
     Returns
     -------
     ndarray, shape (18, 18), or None
         Pose and velocity are as uncertain as the correction shows. None within the gate.
     """
-    item = correction(prior, covariance, posterior, corrected)
-    nis = item.squared / max(item.freedoms, 1)
-    if nis < tuning.NIS_GATE:
+    if item.nis < tuning.NIS_GATE:
         return None
     scale = np.ones(len(covariance))
-    scale[MOTION] = np.sqrt(nis)
+    scale[MOTION] = np.sqrt(item.nis)
     return np.asarray(covariance * np.outer(scale, scale))
 
 

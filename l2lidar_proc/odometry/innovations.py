@@ -50,6 +50,11 @@ class Correction(NamedTuple):
     velocity: F64
     allowed: F64
 
+    @property
+    def nis(self) -> float:
+        """Normalized innovation squared, for each degree of freedom."""
+        return self.squared / max(self.freedoms, 1)
+
 
 def correction(
     prior: InertialState, covariance: F64, posterior: InertialState, corrected: F64

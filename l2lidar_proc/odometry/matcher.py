@@ -570,6 +570,18 @@ class SweepMatcher:
         """Return whether an alignment fits the map as wrong ones do, or as new places."""
         return not self.is_young and found.inlier_ratio < self._needed_inliers(True)
 
+    def lost_sight(self, found: Alignment) -> bool:
+        """Return whether an alignment leaves a direction free, and has many more outliers.
+
+        More than of late: surfaces that fixed the direction may be there, but beyond reach. Not
+        along the walls of a carrier that drives, as one niche looks like the next.
+        """
+        usual, sweeps = self._inliers
+        if self.driving or self.is_young or not sweeps or found.fixes_place:
+            return False
+        most = tuning.DOUBT_OUTLIERS[0] * (1.0 - usual) + tuning.DOUBT_OUTLIERS[1]
+        return bool(1.0 - found.inlier_ratio > most)
+
     def _is_confirmed(self, found: Alignment | None, source: Source, motion: SweepMotion) -> bool:
         """Return whether the finest cells confirm a loose prediction.
 

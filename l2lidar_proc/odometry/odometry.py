@@ -28,7 +28,7 @@ from l2lidar_proc.odometry.estimate import (
     gaps_in,
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
-from l2lidar_proc.odometry.innovation_gate import InnovationGate
+from l2lidar_proc.odometry.innovation_gate import GatedAlignment, Hypothesis, InnovationGate
 from l2lidar_proc.odometry.innovations import InnovationTest
 from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
@@ -269,12 +269,10 @@ class Odometry:
         blur = blur_of(predicted, covariance)
         if blur is not None:
             self._innovations.clear()
-        if found is not None:
-            blurred = blur is not None
-            gated = self._gate.passed(self.matcher, source, predicted, found, blurred=blurred)
-            predicted, found = gated.predicted, gated.alignment
-            if gated.is_suspect:
-                status.append(Status.SUSPECT)
+        gated = self._gated(sweep, Hypothesis(predicted, source), found, blurred=blur is not None)
+        predicted, source, found = gated.predicted, gated.source, gated.alignment
+        if gated.is_suspect:
+            status.append(Status.SUSPECT)
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
@@ -306,11 +304,11 @@ class Odometry:
         if found is not None:
             motion = self._late_gravity.estimated(motion)
         self._keep(motion)
+        quality = self.matcher.quality(len(source.points), found)
+        quality = self._consistency(quality, found, motion.state.stamp)
         if found is not None and not motion.imu.missing.all():
             variance = self._predictor.attitude_variance(sweep)
             quality = dataclasses.replace(quality, attitude_variance=variance)
-        quality = self.matcher.quality(len(source.points), found)
-        quality = self._consistency(quality, found, motion.state.stamp)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
             self._intrinsics.learn(sweep, estimate.points, at_rest=False)
@@ -323,6 +321,20 @@ class Odometry:
             fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
             self._anchor_anew(fresh)
         return estimate
+
+    def _gated(
+        self, sweep: Sweep, given: Hypothesis, found: Alignment | None, *, blurred: bool
+    ) -> GatedAlignment:
+        """Return what passes the innovation gate of a prediction and its alignment."""
+        assert self._posterior is not None
+        before = self._posterior
+
+        def held() -> Hypothesis:
+            motion = self._predictor.over_sweep(sweep, *before, use_forces=False)
+            return Hypothesis(motion, self.matcher.source(sweep, motion))
+
+        tried = held if given.motion.use_forces else None
+        return self._gate.passed(self.matcher, given, found, tried, blurred=blurred)
 
     def _map_ended_rest(self, motion: SweepMotion) -> bool:
         """Go on in a map of the rest that has just ended, if the unit is known better by now.

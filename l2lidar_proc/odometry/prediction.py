@@ -125,14 +125,27 @@ class Predictor:
         return self.gyro_density**2 * lasted * 1e-9 * share
 
     def over_sweep(
-        self, sweep: Sweep, state: InertialState, covariance: F64, since: HostNs | None = None
+        self,
+        sweep: Sweep,
+        state: InertialState,
+        covariance: F64,
+        since: HostNs | None = None,
+        *,
+        use_forces: bool = True,
     ) -> SweepMotion:
         """Return the motion of a sweep that follows from an earlier state, as :meth:`over`."""
         span = (sweep.start if since is None else since, sweep.end)
-        return self.over(state, covariance, span, self.reference(sweep))
+        reference = self.reference(sweep)
+        return self.over(state, covariance, span, reference, use_forces=use_forces)
 
     def over(
-        self, state: InertialState, covariance: F64, span: tuple[HostNs, HostNs], reference: HostNs
+        self,
+        state: InertialState,
+        covariance: F64,
+        span: tuple[HostNs, HostNs],
+        reference: HostNs,
+        *,
+        use_forces: bool = True,
     ) -> SweepMotion:
         """Return the motion that follows from a state.
 
@@ -144,6 +157,8 @@ class Predictor:
         span : tuple of HostNs
             Start and end of what the motion has to cover.
         reference : HostNs
+        use_forces : bool
+            Whether the accelerometer is used where it can be; else the velocity is held.
         """
         until = max(span[1], reference)
         samples = self.samples(min(span[0], state.stamp), until)
@@ -166,7 +181,7 @@ class Predictor:
             noise=self._noise(samples),
             gap_ns=round(self.config.inertial.imu_gap_ms * 1e6),
             steady_rate=self.steady_rate + state.gyro_bias,
-            use_forces=self._use_forces,
+            use_forces=use_forces and self._use_forces,
         )
 
     def static_update(
@@ -223,6 +238,7 @@ class Predictor:
             )
         self.gyro_noise = max(least, tuning.GYRO_NOISE_FACTOR * gyro.floor)
         scale = float(np.sqrt(period))
+        self.gyro_density = self.gyro_noise * scale
         return Noise(
             self.gyro_density,
             max(settings.accel_noise * stated, accel.floor) * scale,
@@ -238,7 +254,6 @@ class Predictor:
 def blur_of(predicted: SweepMotion, before: F64) -> F64 | None:
     """Return the covariance that the IMU leaves open within a sweep, if it is large.
 
-        self.gyro_density = self.gyro_noise * scale
     After a hit, or in a gap of its samples, attitude and velocity become uncertain all at once,
     and the parts of the sweep before and after do not fit together. The sweep then tells the
     motion of one part, or a mean of both.
