@@ -353,7 +353,8 @@ def _setting(rows: list[Row]) -> str:
 
 
 def _accuracy(rows: list[Row]) -> str:
-    names = list(dict.fromkeys(row["method"] for row in rows))
+    there = {row["method"] for row in rows}
+    names = [name for name in (OURS, methods.PLAIN, *REFEREES) if name in there]
     lines = [
         "## Accuracy",
         "",

@@ -107,10 +107,9 @@ class InnovationGate:
         is_doubted = item.nis >= tuning.NIS_DOUBT and not matcher.is_young
         is_checked = stamp >= self._next_check
         is_due = is_doubted or (is_checked and (fits_badly or matcher.lost_sight(found)))
-        if wide is None and not is_due:
-            return unchanged
         if wide is None:
-            return self._again(matcher, given, found, held) or unchanged
+            better = self._again(matcher, given, found, held) if is_due else None
+            return better or unchanged
         inflated = given._replace(motion=dataclasses.replace(predicted, covariance=wide))
         other = matcher.match(source, inflated.motion).alignment
         if other is not None and found.fits_better_than(other, len(source.points)):
@@ -142,7 +141,7 @@ class InnovationGate:
             if other.misfit(surfaces) < least:
                 least = other.misfit(surfaces)
                 best = GatedAlignment(predicted, deskewed, other, True)
-        # the next prediction may be as wrong; but one that is right need not be doubted for long
+        # the next prediction may be as wrong; what is no better elsewhere is right, or a new place
         self._next_check = stamp if best is not None else stamp + tuning.DOUBT_PAUSE_NS
         return best
 
