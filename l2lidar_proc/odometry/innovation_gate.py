@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,14 @@ class GatedAlignment(NamedTuple):
     is_suspect: bool
 
 
+class _Better(NamedTuple):
+    """A prediction, the points that it deskewed, and their alignment."""
+
+    predicted: SweepMotion
+    source: Source
+    alignment: Alignment
+
+
 class InnovationGate:
     """Finds an alignment anew that contradicts its prediction, or fits badly."""
 
@@ -61,7 +69,7 @@ class InnovationGate:
         matcher: SweepMatcher,
         given: Hypothesis,
         found: Alignment | None,
-        held: Callable[[], Hypothesis] | None,
+        others: Sequence[Callable[[], Hypothesis]],
         *,
         blurred: bool,
     ) -> GatedAlignment:
@@ -69,8 +77,8 @@ class InnovationGate:
 
         A prediction that is too sure of itself makes a compromise of both, at which neither fits.
         The sweep is then aligned as after a prediction that may be wrong by as much. A lesser
-        contradiction may be the first sign of the same. If that does not help either, what the
-        accelerometer felt may not have moved the sensor: a blow on its housing, or a fault.
+        contradiction may be the first sign of the same. Or what the IMU felt did not move the
+        sensor: a blow on its housing, or a fault.
 
         Parameters
         ----------
@@ -80,9 +88,8 @@ class InnovationGate:
             The prediction.
         found : Alignment or None
             Of its points; None where they did not match.
-        held : callable, optional
-            Returns what follows from the velocity before without the accelerometer, if that was
-            used.
+        others : sequence of callable
+            Return other predictions, from less of the IMU each.
         blurred : bool
             The sweep is blurred: what an alignment makes of that is not the motion of the sensor.
         """
@@ -94,7 +101,7 @@ class InnovationGate:
                 return unchanged
             if len(source.points) < matcher.config.min_points:
                 return unchanged
-            return self._again(matcher, given, None, held) or unchanged
+            return self._again(matcher, given, None, others) or unchanged
         before = predicted.covariance
         item = correction(predicted.state, before, found.state, found.covariance)
         wide = inflated_prior(before, item)
@@ -108,13 +115,13 @@ class InnovationGate:
         is_checked = stamp >= self._next_check
         is_due = is_doubted or (is_checked and (fits_badly or matcher.lost_sight(found)))
         if wide is None:
-            better = self._again(matcher, given, found, held) if is_due else None
+            better = self._again(matcher, given, found, others) if is_due else None
             return better or unchanged
         inflated = given._replace(motion=dataclasses.replace(predicted, covariance=wide))
         other = matcher.match(source, inflated.motion).alignment
         if other is not None and found.fits_better_than(other, len(source.points)):
             return unchanged._replace(is_suspect=True)
-        better = self._again(matcher, inflated, other, held)
+        better = self._again(matcher, inflated, other, others)
         return better or GatedAlignment(inflated.motion, source, other, True)
 
     def _again(
@@ -122,28 +129,33 @@ class InnovationGate:
         matcher: SweepMatcher,
         given: Hypothesis,
         found: Alignment | None,
-        held: Callable[[], Hypothesis] | None,
+        others: Sequence[Callable[[], Hypothesis]],
     ) -> GatedAlignment | None:
-        """Return an alignment that is better, from a prediction that is looser or another one."""
+        """Return an alignment that is better, from a prediction that is looser or another one.
+
+        The closest of those that are better; one that fits as badly is kept only for want of
+        another.
+        """
         motion, source = given
         stamp = int(motion.state.stamp)
         covariance = with_loose_motion(motion.covariance)
-        tried = [Hypothesis(dataclasses.replace(motion, covariance=covariance), source)]
-        if held is not None:
-            tried.append(held())
+        loose = Hypothesis(dataclasses.replace(motion, covariance=covariance), source)
         surfaces = matcher.config.surfaces
-        best: GatedAlignment | None = None
+        best: _Better | None = None
         least = np.inf
-        for predicted, deskewed in tried:
+        for number, hypothesis in enumerate((lambda: loose, *others)):
+            if number > 1 and best is not None and not matcher.fits_badly(best.alignment):
+                break
+            predicted, deskewed = hypothesis()
             other = matcher.match(deskewed, predicted).alignment
             if other is None or not self._is_better(matcher, other, found, len(source.points)):
                 continue
             if other.misfit(surfaces) < least:
                 least = other.misfit(surfaces)
-                best = GatedAlignment(predicted, deskewed, other, True)
+                best = _Better(predicted, deskewed, other)
         # the next prediction may be as wrong; what is no better elsewhere is right, or a new place
         self._next_check = stamp if best is not None else stamp + tuning.DOUBT_PAUSE_NS
-        return best
+        return None if best is None else GatedAlignment(*best, True)
 
     def _is_better(
         self, matcher: SweepMatcher, other: Alignment, found: Alignment | None, points: int

@@ -34,7 +34,7 @@ from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer, cropped
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
-from l2lidar_proc.odometry.prediction import Predictor, blur_of
+from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
 from l2lidar_proc.odometry.start_velocity import StartVelocity
 from l2lidar_proc.odometry.uncertainty import FrameJump
 from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
@@ -325,16 +325,24 @@ class Odometry:
     def _gated(
         self, sweep: Sweep, given: Hypothesis, found: Alignment | None, *, blurred: bool
     ) -> GatedAlignment:
-        """Return what passes the innovation gate of a prediction and its alignment."""
+        """Return what passes the innovation gate of a prediction and its alignment.
+
+        The other predictions hold the velocity instead of using the accelerometer, and the rate as
+        well instead of using the gyro.
+        """
         assert self._posterior is not None
         before = self._posterior
 
-        def held() -> Hypothesis:
-            motion = self._predictor.over_sweep(sweep, *before, use_forces=False)
+        def held(use: ImuUse) -> Hypothesis:
+            motion = self._predictor.over_sweep(sweep, *before, use=use)
             return Hypothesis(motion, self.matcher.source(sweep, motion))
 
-        tried = held if given.motion.use_forces else None
-        return self._gate.passed(self.matcher, given, found, tried, blurred=blurred)
+        others = []
+        if given.motion.use_forces:
+            others.append(functools.partial(held, ImuUse.GYRO))
+        if not given.motion.imu.missing.all():
+            others.append(functools.partial(held, ImuUse.NOTHING))
+        return self._gate.passed(self.matcher, given, found, others, blurred=blurred)
 
     def _map_ended_rest(self, motion: SweepMotion) -> bool:
         """Go on in a map of the rest that has just ended, if the unit is known better by now.

@@ -12,6 +12,7 @@ of a second to the next sweep the two differ by less than a millimeter.
 from __future__ import annotations
 
 import dataclasses
+from enum import Enum
 from itertools import pairwise
 from typing import Final
 
@@ -32,6 +33,13 @@ from l2lidar_proc.odometry.estimate import OdometryEstimate
 
 LONGEST_NS: Final = 1_000_000_000
 """Without a sweep for this long the pose is not carried on: the speed drifts by 0.1 m/s."""
+
+
+class ImuUse(Enum):
+    """What less than all of an IMU predicts a motion."""
+
+    GYRO = "gyro"  # the velocity is held
+    NOTHING = "nothing"  # the rate is held as well
 
 
 class Predictor:
@@ -131,12 +139,12 @@ class Predictor:
         covariance: F64,
         since: HostNs | None = None,
         *,
-        use_forces: bool = True,
+        use: ImuUse | None = None,
     ) -> SweepMotion:
         """Return the motion of a sweep that follows from an earlier state, as :meth:`over`."""
         span = (sweep.start if since is None else since, sweep.end)
         reference = self.reference(sweep)
-        return self.over(state, covariance, span, reference, use_forces=use_forces)
+        return self.over(state, covariance, span, reference, use=use)
 
     def over(
         self,
@@ -145,7 +153,7 @@ class Predictor:
         span: tuple[HostNs, HostNs],
         reference: HostNs,
         *,
-        use_forces: bool = True,
+        use: ImuUse | None = None,
     ) -> SweepMotion:
         """Return the motion that follows from a state.
 
@@ -157,11 +165,13 @@ class Predictor:
         span : tuple of HostNs
             Start and end of what the motion has to cover.
         reference : HostNs
-        use_forces : bool
-            Whether the accelerometer is used where it can be; else the velocity is held.
+        use : ImuUse, optional
+            By default all of the IMU that can be trusted.
         """
         until = max(span[1], reference)
         samples = self.samples(min(span[0], state.stamp), until)
+        if use is ImuUse.NOTHING:
+            samples = samples[:0]
         inside = (samples["stamp"] >= state.stamp) & (samples["stamp"] <= until)
         if not inside.any():
             # the bias stands for the change of the rate: the sweep itself will show it
@@ -181,7 +191,7 @@ class Predictor:
             noise=self._noise(samples),
             gap_ns=round(self.config.inertial.imu_gap_ms * 1e6),
             steady_rate=self.steady_rate + state.gyro_bias,
-            use_forces=use_forces and self._use_forces,
+            use_forces=use is None and self._use_forces,
         )
 
     def static_update(

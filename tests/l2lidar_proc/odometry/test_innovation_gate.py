@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -67,14 +68,13 @@ def gated(
     seen: Source,
     predicted: SweepMotion,
     found: Alignment | None,
-    held: SweepMotion | None = None,
-    *,
+    *held: SweepMotion,
     blurred: bool = False,
 ) -> GatedAlignment:
-    """Return what passes a new gate, perhaps with another prediction to fall back on."""
-    other = None if held is None else lambda: Hypothesis(held, seen)
+    """Return what passes a new gate, perhaps with other predictions to fall back on."""
+    others = [partial(Hypothesis, motion, seen) for motion in held]
     given = Hypothesis(predicted, seen)
-    return InnovationGate().passed(matcher, given, found, other, blurred=blurred)
+    return InnovationGate().passed(matcher, given, found, others, blurred=blurred)
 
 
 def aligned(matcher: SweepMatcher, seen: Source, predicted: SweepMotion) -> Alignment:
@@ -182,7 +182,7 @@ def test_one_that_fits_badly_everywhere_is_aligned_again_once_a_second(
     def is_found(seconds: float, points: Source, found: Alignment) -> bool:
         state = dataclasses.replace(predicted.state, stamp=at(seconds))
         later = Hypothesis(dataclasses.replace(predicted, state=state), points)
-        return gate.passed(matcher, later, found, None, blurred=False).is_suspect
+        return gate.passed(matcher, later, found, (), blurred=False).is_suspect
 
     pause = 1e-9 * tuning.DOUBT_PAUSE_NS
     assert is_found(0.0, seen, poor)
@@ -227,6 +227,18 @@ def test_of_two_predictions_that_fit_better_the_closer_one_is_believed(
     by_held = aligned(matcher, seen, held)
     least = min(loose.misfit(surfaces), by_held.misfit(surfaces))
     assert passed.alignment.misfit(surfaces) == pytest.approx(least)
+
+
+def test_a_third_prediction_is_tried_if_the_second_does_not_fit(
+    matcher: SweepMatcher, seen: Source
+) -> None:
+    """It does without the gyro as well, and is worth its time only then."""
+    far, near = motion(TIGHT, PLACE + 3.0), motion(TIGHT, PLACE + 0.01)
+    passed = gated(matcher, seen, far, None, far, near)
+    assert passed.predicted is near
+    assert passed.is_suspect
+    again = gated(matcher, seen, far, None, near, dataclasses.replace(near))
+    assert again.predicted is near
 
 
 def test_a_doubted_prediction_gives_way_to_what_lies_closer_to_surfaces(

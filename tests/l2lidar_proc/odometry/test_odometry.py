@@ -179,6 +179,40 @@ def test_no_variance_is_lowered_after_a_sweep_that_missed_a_direction(
     assert (turns[seconds > -2.0] < 0.3).all()
 
 
+@pytest.mark.parametrize("scene", ["room", "yard"])
+@pytest.mark.parametrize(
+    ("samples", "seconds", "fault"),
+    [
+        ("linear_acceleration", np.inf, "frozen"),
+        ("linear_acceleration", np.inf, "zero"),
+        ("angular_velocity", np.inf, "frozen"),
+        ("angular_velocity", np.inf, "zero"),
+        ("angular_velocity", 0.1, (3.0, 0.0, 0.0)),
+        ("angular_velocity", 0.1, (0.0, 10.0, 0.0)),
+    ],
+)
+def test_an_imu_that_fails_while_it_moves_does_not_lead_away(
+    samples: str, seconds: float, fault: Any, scene: str
+) -> None:
+    """The sweeps show it; a gyro that stood still, or felt a turn, led 19 m away."""
+    run = recording(scene, "walk")
+    some = list(sweeps(run, "turn"))
+    begin = int(some[len(some) // 2].start) + 70_000_000
+    imu = run.imu.copy()
+    since = (imu["stamp"] - begin) * 1e-9
+    during = (since >= 0.0) & (since < seconds)
+    if fault == "frozen":
+        imu[samples][during] = imu[samples][np.argmax(during)]
+    elif fault == "zero":
+        imu[samples][during] = 0.0
+    else:
+        imu[samples][during] += fault
+    estimates = drive(run, imu=imu)
+    after = np.array([item.stamp for item in estimates]) > begin
+    assert any(Status.SUSPECT in item.status for item in estimates)
+    assert errors(run, estimates)[after].max() < 0.05
+
+
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("scene", ["room", "yard"])
 def test_a_blow_of_any_kind_that_only_the_accelerometer_felt_moves_nothing(
