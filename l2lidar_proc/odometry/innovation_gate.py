@@ -118,10 +118,12 @@ class InnovationGate:
             better = self._again(matcher, given, found, others) if is_due else None
             return better or unchanged
         inflated = given._replace(motion=dataclasses.replace(predicted, covariance=wide))
-        other = matcher.match(source, inflated.motion).alignment
+        other = matcher.match(source, inflated.motion, on_trial=True).alignment
         if other is not None and found.fits_better_than(other, len(source.points)):
             return unchanged._replace(is_suspect=True)
         better = self._again(matcher, inflated, other, others)
+        if better is None and other is not None:
+            matcher.note_usual(other)
         return better or GatedAlignment(inflated.motion, source, other, True)
 
     def _again(
@@ -147,7 +149,7 @@ class InnovationGate:
             if number > 1 and best is not None and not matcher.fits_badly(best.alignment):
                 break
             predicted, deskewed = hypothesis()
-            other = matcher.match(deskewed, predicted).alignment
+            other = matcher.match(deskewed, predicted, on_trial=True).alignment
             if other is None or not self._is_better(matcher, other, found, len(source.points)):
                 continue
             if other.misfit(surfaces) < least:
@@ -155,7 +157,10 @@ class InnovationGate:
                 best = _Better(predicted, deskewed, other)
         # the next prediction may be as wrong; what is no better elsewhere is right, or a new place
         self._next_check = stamp if best is not None else stamp + tuning.DOUBT_PAUSE_NS
-        return None if best is None else GatedAlignment(*best, True)
+        if best is None:
+            return None
+        matcher.note_usual(best.alignment)
+        return GatedAlignment(*best, True)
 
     def _is_better(
         self, matcher: SweepMatcher, other: Alignment, found: Alignment | None, points: int

@@ -188,7 +188,14 @@ class SweepMatcher:
             np.linalg.norm(points, axis=1),
         )
 
-    def match(self, source: Source, motion: SweepMotion, *, initial: bool = False) -> Match:
+    def match(
+        self,
+        source: Source,
+        motion: SweepMotion,
+        *,
+        initial: bool = False,
+        on_trial: bool = False,
+    ) -> Match:
         """Return the alignment that can be believed, if there is one.
 
         A prediction that may be a surface off is not the only one to begin from: KISS-ICP's
@@ -203,7 +210,16 @@ class SweepMatcher:
         initial : bool
             The map has only just begun: it cannot be searched, and wrong results are sorted out
             later.
+        on_trial : bool
+            Nothing is learned from it of what is usual here, unless :meth:`note_usual` is called.
         """
+        found = self._matched(source, motion, initial=initial)
+        if found.alignment is not None and not on_trial:
+            self.note_usual(found.alignment)
+        return found
+
+    def _matched(self, source: Source, motion: SweepMotion, *, initial: bool) -> Match:
+        """Return the alignment that can be believed, as :meth:`match`."""
         if len(source.points) < self.config.min_points or not len(self.surfaces):
             return Match(None, MatchStatus.REJECTED)
         motion = self._with_turned_way(motion)
@@ -214,7 +230,7 @@ class SweepMatcher:
         is_good = self._is_believable(found, source, motion, strict)
         near = found is not None and not is_far(found, motion)
         if is_good and (not loose or (strict and near)):
-            return self._believed(found)
+            return Match(found, MatchStatus.ALIGNED)
         if not loose:
             is_new = young and found is None
             return Match(None, MatchStatus.NEW_MAP if is_new else MatchStatus.REJECTED)
@@ -241,7 +257,7 @@ class SweepMatcher:
             best = self._placed(source, motion, tuning.KISS_SIGMA[1])
         if best is None and strict and self._is_unmapped(source, motion.state):
             return Match(None, MatchStatus.UNMAPPED)
-        return self._believed(best)
+        return Match(best, MatchStatus.REJECTED if best is None else MatchStatus.ALIGNED)
 
     def relocalize(self, source: Source, motion: SweepMotion, places: F64) -> Alignment | None:
         """Return how a sweep fits the map at the only other place on its level where it does.
@@ -633,13 +649,13 @@ class SweepMatcher:
         known = self.surfaces.are_known(points @ state.rotation.T + state.position)
         return bool(np.mean(known) < tuning.UNMAPPED_KNOWN)
 
-    def _believed(self, found: Alignment | None) -> Match:
-        """Return a match, and learn from it what share of inliers is usual here."""
-        if found is not None and found.matched:
-            usual, sweeps = self._inliers
-            blend = max(tuning.USUAL_BLEND, 1.0 / (sweeps + 1))
-            self._inliers = usual + blend * (found.inlier_ratio - usual), sweeps + 1
-        return Match(found, MatchStatus.REJECTED if found is None else MatchStatus.ALIGNED)
+    def note_usual(self, found: Alignment) -> None:
+        """Learn from an alignment that is believed what share of inliers is usual here."""
+        if not found.matched:
+            return
+        usual, sweeps = self._inliers
+        blend = max(tuning.USUAL_BLEND, 1.0 / (sweeps + 1))
+        self._inliers = usual + blend * (found.inlier_ratio - usual), sweeps + 1
 
     def _align(
         self, source: Source, motion: SweepMotion, start: InertialState

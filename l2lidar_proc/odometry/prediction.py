@@ -36,9 +36,9 @@ LONGEST_NS: Final = 1_000_000_000
 
 
 class ImuUse(Enum):
-    """What less than all of an IMU predicts a motion."""
+    """Part of the IMU that a motion is predicted from, where not all of it is believed."""
 
-    GYRO = "gyro"  # the velocity is held
+    GYRO = "gyro"  # the velocity is held instead of using the accelerometer
     NOTHING = "nothing"  # the rate is held as well
 
 
@@ -170,6 +170,7 @@ class Predictor:
         """
         until = max(span[1], reference)
         samples = self.samples(min(span[0], state.stamp), until)
+        noise = self._noise(samples)
         if use is ImuUse.NOTHING:
             samples = samples[:0]
         inside = (samples["stamp"] >= state.stamp) & (samples["stamp"] <= until)
@@ -188,7 +189,7 @@ class Predictor:
             samples,
             span,
             reference,
-            noise=self._noise(samples),
+            noise=noise,
             gap_ns=round(self.config.inertial.imu_gap_ms * 1e6),
             steady_rate=self.steady_rate + state.gyro_bias,
             use_forces=use is None and self._use_forces,

@@ -214,6 +214,22 @@ def test_a_sweep_that_meets_nothing_is_aligned_from_a_velocity_that_was_held(
     assert gated(matcher, strange, predicted, None, held) == (predicted, strange, None, False)
 
 
+def test_only_what_is_believed_teaches_what_is_usual(
+    matcher: SweepMatcher, seen: Source, strange: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials that failed had taught it, and a spinning lidar ended 0.3 m off for it."""
+    monkeypatch.setattr(matcher, "_inliers", (0.99, 20))
+    predicted = motion(LOOSE, PLACE)
+    bad = matcher._align(strange, predicted, predicted.state)
+    assert bad is not None
+    assert not gated(matcher, strange, predicted, bad, motion(TIGHT, PLACE)).is_suspect
+    assert matcher._inliers == (0.99, 20)
+    poor = dataclasses.replace(aligned(matcher, seen, predicted), inlier_ratio=0.3)
+    before = matcher._inliers[1]
+    assert gated(matcher, seen, predicted, poor).is_suspect
+    assert matcher._inliers[1] == before + 1
+
+
 def test_of_two_predictions_that_fit_better_the_closer_one_is_believed(
     matcher: SweepMatcher, seen: Source
 ) -> None:
