@@ -387,8 +387,9 @@ UNIT_SHIFT: Final = 0.005  # [m] each axis
 UNIT_FROM_M: Final = 0.3  # [m] from the start at which these hold
 # What is reported for a unit whose beam angles are estimated. Source of the scale: captures, as
 # above. Tuned on: poses of the hard runs, seeds 0 to 6 and 253 to 256, so that 85 % of those of
-# each scene at least are within their 95 % bound; and a yard seen in half turns by a typical unit,
-# which shows little of itself: with half as much, 69 % of its poses are within theirs
+# each scene at least are within their 95 % bound; and on a yard that a typical unit sees in half
+# turns, which show little of it: with 0.12, 0.3, 0.015 and 0.03 for BEAM_TURN, ALPHA_TURN,
+# BEAM_SWING and RANGE_BIAS_TURN, 69 % of its poses are within theirs
 RANGE_SCALE: Final = 0.002  # error of ranges that nothing shows, 1 sigma
 BEAM_TURN: Final = 0.15  # about each axis at once, by error of the better known beam angle
 # about each level axis at once, by error of alpha. In one office, 0.3 degrees turned poses by
@@ -400,7 +401,8 @@ MAP_TURN_BEND: Final = 0.00005  # [rad/sqrt(m)] of the way
 MAP_SHIFT: Final = 0.0012  # [m] each axis
 MAP_SHARE: Final = 0.0003  # of the way, each axis
 # Of other sensors, whose makers have calibrated them, as if these were their beam angles. Tuned
-# on: a spinning lidar, seeds 0 to 7, whose first pose is turned against the map by 2 mrad
+# on: a spinning lidar, seeds 0 to 7, whose first pose is turned against the map by 2 mrad, which
+# is BEAM_TURN times the first
 OTHER_BEAM_SIGMAS: Final = (0.0133, 0.0018)  # [rad]
 # [m, rad] of the first pose of a map begun in motion, beyond its covariance. Tuned on: walks,
 # seeds 0 to 7, which err by 17 mm and 4 mrad on each axis
@@ -488,7 +490,8 @@ RANGE_BIAS_KNOWN: Final = 0.01  # [m] less certain, it is not corrected
 # of which three are off by 4 mm, which bent the map by 3 mrad in 70 m
 RANGE_BIAS_SURE: Final = 0.006
 RANGE_BIAS_SWEEPS: Final = 12  # of a rest that are looked at. Speed only
-RANGE_BIAS_CHANGE: Final = 0.003  # [m] after which a map at rest is begun again
+# [m] after which a map at rest is begun again; a smaller one is not known, see RANGE_BIAS_FLOOR
+RANGE_BIAS_CHANGE: Final = 0.003
 # Of the map, where planes do not show it. Tuned on: woods, 14 units drawn and imperfect
 RANGE_BIAS_MAP_POINTS: Final = 50  # of a sweep that meet surfaces, at least
 RANGE_BIAS_MAP_SIGMA: Final = 0.02  # [m] of a point beside a surface, ground and bark included
@@ -527,9 +530,8 @@ NIS_DOUBT: Final = 2.0
 # of 3 to 12 m/s^2 for 0.2 s that only the accelerometer felt; maps that drifted by 0.1 to 0.5 m
 DOUBT_SIGMA: Final = (0.3, 1.0)
 DOUBT_BETTER: Final = 0.05  # share of the points
-# or, where the innovation says so as well, if almost as many points fit so much closer: of their
-# mean square distance; less where they fix a place that was free. Observed in these blows: 0.2 to
-# 0.63; what chance does is 0.99
+# or if almost as many points fit, with so much of the mean square distance, and less of it where
+# they fix a place that was free. Observed in these blows: 0.2 to 0.63; chance alone: 0.99
 DOUBT_AS_MANY: Final = 0.97
 DOUBT_CLOSER: Final = (0.75, 0.5)
 # Outliers, by the usual ones and by a share, from which on a place that is free is doubted.

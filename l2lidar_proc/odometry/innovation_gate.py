@@ -18,8 +18,15 @@ from l2lidar_proc.odometry.innovations import MOTION, Correction, correction
 from l2lidar_proc.odometry.matcher import SweepMatcher
 
 
-class Hypothesis(NamedTuple):
-    """A predicted motion, and the points that it deskewed."""
+class Prediction(NamedTuple):
+    """A predicted motion, and what it makes of the sweep.
+
+    Attributes
+    ----------
+    motion : SweepMotion
+    source : Source
+        The points, deskewed by the motion.
+    """
 
     motion: SweepMotion
     source: Source
@@ -46,14 +53,6 @@ class GatedAlignment(NamedTuple):
     is_suspect: bool
 
 
-class _Better(NamedTuple):
-    """A prediction, the points that it deskewed, and their alignment."""
-
-    predicted: SweepMotion
-    source: Source
-    alignment: Alignment
-
-
 class InnovationGate:
     """Finds an alignment anew that contradicts its prediction, or fits badly."""
 
@@ -67,9 +66,9 @@ class InnovationGate:
     def passed(
         self,
         matcher: SweepMatcher,
-        given: Hypothesis,
+        given: Prediction,
         found: Alignment | None,
-        others: Sequence[Callable[[], Hypothesis]],
+        others: Sequence[Callable[[], Prediction]],
         *,
         blurred: bool,
     ) -> GatedAlignment:
@@ -84,12 +83,11 @@ class InnovationGate:
         ----------
         matcher : SweepMatcher
             That of the alignment.
-        given : Hypothesis
-            The prediction.
+        given : Prediction
         found : Alignment or None
             Of its points; None where they did not match.
         others : sequence of callable
-            Return other predictions, from less of the IMU each.
+            Return other predictions, each from less of the IMU than the one before.
         blurred : bool
             The sweep is blurred: what an alignment makes of that is not the motion of the sensor.
         """
@@ -129,38 +127,36 @@ class InnovationGate:
     def _again(
         self,
         matcher: SweepMatcher,
-        given: Hypothesis,
+        given: Prediction,
         found: Alignment | None,
-        others: Sequence[Callable[[], Hypothesis]],
+        others: Sequence[Callable[[], Prediction]],
     ) -> GatedAlignment | None:
-        """Return an alignment that is better, from a prediction that is looser or another one.
+        """Return the closest alignment that is better than the one found, if any is.
 
-        The closest of those that are better; one that fits as badly is kept only for want of
-        another.
+        It begins from the same prediction, loosely, and from the first of the others. The rest are
+        tried only if neither fits well.
         """
         motion, source = given
         stamp = int(motion.state.stamp)
         covariance = with_loose_motion(motion.covariance)
-        loose = Hypothesis(dataclasses.replace(motion, covariance=covariance), source)
+        loose = Prediction(dataclasses.replace(motion, covariance=covariance), source)
         surfaces = matcher.config.surfaces
-        best: _Better | None = None
-        least = np.inf
-        for number, hypothesis in enumerate((lambda: loose, *others)):
-            if number > 1 and best is not None and not matcher.fits_badly(best.alignment):
+        best: tuple[Prediction, Alignment] | None = None
+        for number, predict in enumerate((lambda: loose, *others)):
+            if number > 1 and best is not None and not matcher.fits_badly(best[1]):
                 break
-            predicted, deskewed = hypothesis()
-            other = matcher.match(deskewed, predicted, on_trial=True).alignment
+            tried = predict()
+            other = matcher.match(tried.source, tried.motion, on_trial=True).alignment
             if other is None or not self._is_better(matcher, other, found, len(source.points)):
                 continue
-            if other.misfit(surfaces) < least:
-                least = other.misfit(surfaces)
-                best = _Better(predicted, deskewed, other)
-        # the next prediction may be as wrong; what is no better elsewhere is right, or a new place
-        self._next_check = stamp if best is not None else stamp + tuning.DOUBT_PAUSE_NS
-        if best is None:
+            if best is None or other.misfit(surfaces) < best[1].misfit(surfaces):
+                best = tried, other
+        if best is None:  # what fits no better elsewhere is right, or a new place
+            self._next_check = stamp + tuning.DOUBT_PAUSE_NS
             return None
-        matcher.note_usual(best.alignment)
-        return GatedAlignment(*best, True)
+        self._next_check = stamp  # the next prediction may be as wrong
+        matcher.note_usual(best[1])
+        return GatedAlignment(*best[0], best[1], True)
 
     def _is_better(
         self, matcher: SweepMatcher, other: Alignment, found: Alignment | None, points: int

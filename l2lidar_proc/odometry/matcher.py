@@ -582,6 +582,14 @@ class SweepMatcher:
         """Return whether the sweep would see through known surfaces where an alignment puts it."""
         return self.seen_through(source, found.state).share > tuning.RAYS_THROUGH
 
+    def note_usual(self, found: Alignment) -> None:
+        """Learn from an alignment that is believed what share of inliers is usual here."""
+        if not found.matched:
+            return
+        usual, sweeps = self._inliers
+        blend = max(tuning.USUAL_BLEND, 1.0 / (sweeps + 1))
+        self._inliers = usual + blend * (found.inlier_ratio - usual), sweeps + 1
+
     def fits_badly(self, found: Alignment) -> bool:
         """Return whether an alignment fits the map as wrong ones do, or as new places."""
         return not self.is_young and found.inlier_ratio < self._needed_inliers(True)
@@ -648,14 +656,6 @@ class SweepMatcher:
             return False
         known = self.surfaces.are_known(points @ state.rotation.T + state.position)
         return bool(np.mean(known) < tuning.UNMAPPED_KNOWN)
-
-    def note_usual(self, found: Alignment) -> None:
-        """Learn from an alignment that is believed what share of inliers is usual here."""
-        if not found.matched:
-            return
-        usual, sweeps = self._inliers
-        blend = max(tuning.USUAL_BLEND, 1.0 / (sweeps + 1))
-        self._inliers = usual + blend * (found.inlier_ratio - usual), sweeps + 1
 
     def _align(
         self, source: Source, motion: SweepMotion, start: InertialState

@@ -28,7 +28,7 @@ from l2lidar_proc.odometry.estimate import (
     gaps_in,
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
-from l2lidar_proc.odometry.innovation_gate import GatedAlignment, Hypothesis, InnovationGate
+from l2lidar_proc.odometry.innovation_gate import GatedAlignment, InnovationGate, Prediction
 from l2lidar_proc.odometry.innovations import InnovationTest
 from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
@@ -269,7 +269,7 @@ class Odometry:
         blur = blur_of(predicted, covariance)
         if blur is not None:
             self._innovations.clear()
-        gated = self._gated(sweep, Hypothesis(predicted, source), found, blurred=blur is not None)
+        gated = self._gated(sweep, Prediction(predicted, source), found, blurred=blur is not None)
         predicted, source, found = gated.predicted, gated.source, gated.alignment
         if gated.is_suspect:
             status.append(Status.SUSPECT)
@@ -323,7 +323,7 @@ class Odometry:
         return estimate
 
     def _gated(
-        self, sweep: Sweep, given: Hypothesis, found: Alignment | None, *, blurred: bool
+        self, sweep: Sweep, given: Prediction, found: Alignment | None, *, blurred: bool
     ) -> GatedAlignment:
         """Return what passes the innovation gate of a prediction and its alignment.
 
@@ -333,9 +333,9 @@ class Odometry:
         assert self._posterior is not None
         before = self._posterior
 
-        def held(use: ImuUse) -> Hypothesis:
+        def held(use: ImuUse) -> Prediction:
             motion = self._predictor.over_sweep(sweep, *before, use=use)
-            return Hypothesis(motion, self.matcher.source(sweep, motion))
+            return Prediction(motion, self.matcher.source(sweep, motion))
 
         others = []
         if given.motion.use_forces:

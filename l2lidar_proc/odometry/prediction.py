@@ -36,8 +36,9 @@ LONGEST_NS: Final = 1_000_000_000
 
 
 class ImuUse(Enum):
-    """Part of the IMU that a motion is predicted from, where not all of it is believed."""
+    """Part of the IMU that a motion is predicted from."""
 
+    ALL = "all"  # as far as it can be trusted
     GYRO = "gyro"  # the velocity is held instead of using the accelerometer
     NOTHING = "nothing"  # the rate is held as well
 
@@ -139,7 +140,7 @@ class Predictor:
         covariance: F64,
         since: HostNs | None = None,
         *,
-        use: ImuUse | None = None,
+        use: ImuUse = ImuUse.ALL,
     ) -> SweepMotion:
         """Return the motion of a sweep that follows from an earlier state, as :meth:`over`."""
         span = (sweep.start if since is None else since, sweep.end)
@@ -153,7 +154,7 @@ class Predictor:
         span: tuple[HostNs, HostNs],
         reference: HostNs,
         *,
-        use: ImuUse | None = None,
+        use: ImuUse = ImuUse.ALL,
     ) -> SweepMotion:
         """Return the motion that follows from a state.
 
@@ -165,8 +166,7 @@ class Predictor:
         span : tuple of HostNs
             Start and end of what the motion has to cover.
         reference : HostNs
-        use : ImuUse, optional
-            By default all of the IMU that can be trusted.
+        use : ImuUse
         """
         until = max(span[1], reference)
         samples = self.samples(min(span[0], state.stamp), until)
@@ -192,7 +192,7 @@ class Predictor:
             noise=noise,
             gap_ns=round(self.config.inertial.imu_gap_ms * 1e6),
             steady_rate=self.steady_rate + state.gyro_bias,
-            use_forces=use is None and self._use_forces,
+            use_forces=use is ImuUse.ALL and self._use_forces,
         )
 
     def static_update(

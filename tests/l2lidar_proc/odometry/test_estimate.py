@@ -91,11 +91,11 @@ def test_the_covariance_of_the_pose_follows_its_derivatives() -> None:
 LEVER = np.array([0.3, -0.2, 0.5])
 
 
-def estimated(motion: SweepMotion) -> OdometryEstimate:
+def estimated(motion: SweepMotion, quality: AlignmentQuality | None = None) -> OdometryEstimate:
     """Return the estimate of a motion, without points, on a map without error."""
     return estimate_of(
-        motion, LEVER, np.zeros(0, POINT), (), AlignmentQuality(), 0.0, None, FrameJump(),
-        MapDrift(),
+        motion, LEVER, np.zeros(0, POINT), (), quality or AlignmentQuality(), 0.0, None,
+        FrameJump(), MapDrift(),
     )  # fmt: skip
 
 
@@ -135,6 +135,10 @@ def test_the_covariances_of_an_estimate_follow_its_derivatives_by_the_state() ->
     bias = both[:6, :6] * 0.0
     bias[:, :3] = (jacobian @ motion.covariance)[:6, eskf.GYRO_BIAS]
     np.testing.assert_allclose(here.gyro_bias_covariance[:6], bias[:, :3], atol=1e-8)
+    bent = estimated(motion, AlignmentQuality(attitude_variance=0.04)).covariance
+    np.testing.assert_allclose(
+        bent - here.covariance, 0.04 * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]), atol=1e-12
+    )
 
 
 def test_the_first_pose_is_the_origin_with_yaw_zero() -> None:

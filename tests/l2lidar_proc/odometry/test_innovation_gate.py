@@ -18,8 +18,8 @@ from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.innovation_gate import (
     GatedAlignment,
-    Hypothesis,
     InnovationGate,
+    Prediction,
     inflated_prior,
 )
 from l2lidar_proc.odometry.innovations import correction
@@ -72,8 +72,8 @@ def gated(
     blurred: bool = False,
 ) -> GatedAlignment:
     """Return what passes a new gate, perhaps with other predictions to fall back on."""
-    others = [partial(Hypothesis, motion, seen) for motion in held]
-    given = Hypothesis(predicted, seen)
+    others = [partial(Prediction, motion, seen) for motion in held]
+    given = Prediction(predicted, seen)
     return InnovationGate().passed(matcher, given, found, others, blurred=blurred)
 
 
@@ -181,7 +181,7 @@ def test_one_that_fits_badly_everywhere_is_aligned_again_once_a_second(
 
     def is_found(seconds: float, points: Source, found: Alignment) -> bool:
         state = dataclasses.replace(predicted.state, stamp=at(seconds))
-        later = Hypothesis(dataclasses.replace(predicted, state=state), points)
+        later = Prediction(dataclasses.replace(predicted, state=state), points)
         return gate.passed(matcher, later, found, (), blurred=False).is_suspect
 
     pause = 1e-9 * tuning.DOUBT_PAUSE_NS

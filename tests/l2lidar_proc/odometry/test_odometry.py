@@ -146,7 +146,9 @@ def test_a_unit_that_shows_its_beam_angles_is_more_certain_of_its_pose() -> None
     run = recording("room", "walk")
     seen = driven("room", "walk")[-1]
     unseen = drive(run, config=OdometryConfig(correct_beams=False))[-1]
-    np.testing.assert_allclose(seen.T_map_lidar, unseen.T_map_lidar, atol=0.003)
+    # its ranges are corrected by the millimeter that planes are wrong by
+    np.testing.assert_allclose(seen.T_map_lidar, unseen.T_map_lidar, atol=0.001)
+    assert 0.0 < seen.quality.attitude_variance < np.diag(seen.covariance)[3:].min()
     assert (np.diag(seen.covariance)[3:] < 0.3 * np.diag(unseen.covariance)[3:]).all()
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2lidar_node import rotations
 from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
@@ -16,7 +17,7 @@ from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.head_line import HeadAngle, LineRates
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, Predictor
+from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, ImuUse, Predictor
 from l2lidar_proc.odometry.uncertainty import MapDrift
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, recording
@@ -315,6 +316,34 @@ def at_rate(hz: float, seconds: float, noise: float = 0.0) -> Any:
     made["linear_acceleration"] = [0.0, 0.0, 9.80665]
     made["angular_velocity"] = np.random.default_rng(8).normal(0.0, noise, (len(made), 3))
     return made
+
+
+def test_less_of_the_imu_holds_the_velocity_or_the_rate_as_well() -> None:
+    """What is tried without the IMU does not change how noisy its gyro is taken to be."""
+    predictor = Predictor(OdometryConfig(), np.eye(4))
+    samples = at_rate(250.0, 3.0, 0.05)
+    samples["angular_velocity"] += (0.0, 0.0, 0.5)
+    samples["linear_acceleration"] += (1.0, 0.0, 0.0)
+    predictor.imu(samples)
+    predictor.trusts_gravity = True
+    predictor.steady_rate = np.array([0.0, 0.0, -0.2])
+    begin, end = HostNs(EPOCH + 2_000_000_000), HostNs(EPOCH + 2_200_000_000)
+    velocity = np.array([0.3, -0.1, 0.0])
+    state = InertialState(
+        begin, np.eye(3), np.zeros(3), velocity, np.zeros(3), np.zeros(3),
+        np.array([0.0, 0.0, -9.80665]),
+    )  # fmt: skip
+    covariance = 1e-4 * np.eye(eskf.ERRORS)
+    speeds, turns, noises = [], [], []
+    for use in ImuUse:
+        motion = predictor.over(state, covariance, (begin, end), end, use=use)
+        speeds.append(motion.state.velocity[0])
+        turns.append(rotations.log(rotations.from_matrix(motion.state.rotation))[2])
+        noises.append((predictor.gyro_noise, predictor.gyro_density))
+    assert list(ImuUse) == [ImuUse.ALL, ImuUse.GYRO, ImuUse.NOTHING]
+    np.testing.assert_allclose(speeds, [0.5, 0.3, 0.3], atol=0.02)
+    np.testing.assert_allclose(turns, [0.1, 0.1, -0.04], atol=0.01)
+    assert noises[0] == noises[1] == noises[2]
 
 
 @pytest.mark.parametrize("reference", ["start", "middle", "end"])
