@@ -1,6 +1,6 @@
 """Recordings of the hard runs: made once, kept below ``out/``, judged again and again.
 
-A recording is an ``.npz`` of some 1 MB per second: the sweeps as an odometry gets them, the IMU
+A recording is an ``.npz`` of 1 to 4 MB per second: the sweeps as an odometry gets them, the IMU
 samples, and the truth. It is also what :mod:`benchmarks.odometry_referee` reads.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +30,7 @@ from tests.support.other_sensors import CLOUD_POINT, SENSORS
 FOLDER: Final = Path("out") / "recordings"
 EPOCH: Final = 1_700_000_000_000_000_000
 _VERSION: Final = 2  # of what a scenario's name stands for; a new one makes all recordings anew
+_BYTES_PER_S: Final = 1_200_000  # mean of all families
 _BATCH: Final = 50
 _TRUTH_HZ: Final = 500
 
@@ -119,6 +120,11 @@ def path_of(given: Scenario) -> Path:
     return FOLDER / f"{words}-{given.seed}-{given.seconds:g}s-{digest[:8]}.npz"
 
 
+def missing_bytes(wanted: Iterable[Scenario]) -> float:
+    """Return about how much the recordings of scenarios need that are not there yet."""
+    return sum(_BYTES_PER_S * one.seconds for one in wanted if not path_of(one).exists())
+
+
 def recording(given: Scenario, *, fresh: bool = False) -> Recording:
     """Return the recording of a scenario, from its file where there is one.
 
@@ -131,9 +137,13 @@ def recording(given: Scenario, *, fresh: bool = False) -> Recording:
     path = path_of(given)
     if fresh or not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
+        measured = _measured(given)
         part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-        np.savez(part, **_measured(given))
-        part.replace(path)
+        try:
+            np.savez(part, **measured)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
     with np.load(path) as file:
         points = np.zeros(len(file["times"]), CLOUD_POINT)
         points["x"], points["y"], points["z"] = file["points"].T

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -195,6 +198,33 @@ def test_a_mixed_run_is_measured_from_the_command_line(
     with pytest.raises(SystemExit):
         bench_odometry_hard.main(["--families", "nothing"])
     assert MIXED in capsys.readouterr().err
+
+
+def test_a_campaign_without_room_for_its_recordings_does_not_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000_000))
+    with pytest.raises(SystemExit) as ended:
+        bench_odometry_hard.main(["--families", MIXED, "--runs", "200", "--methods", "ours"])
+    assert ended.value.code == 2
+    assert "200 runs of 30 s need 7.2 GB more below out/recordings" in capsys.readouterr().err
+    assert not list(Path("out").rglob("*.jsonl"))
+
+
+def test_a_recording_that_cannot_be_written_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def full(path: Path, **arrays: object) -> None:
+        path.write_bytes(b"half of it")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="No space"):
+        recording(scenario(MIXED, 3, 4.0))
+    assert not [path for path in Path("out").rglob("*") if path.is_file()]
 
 
 def test_too_few_poses_count_as_a_failure(given: Recording) -> None:
