@@ -62,8 +62,6 @@ class Predictor:
         Rate without bias where there is no gyro [rad/s], cloud axes.
     gyro_noise : float
         Of the samples that were used last [rad/s], each axis.
-    gyro_density : float
-        The same as a density [rad/s/sqrt(Hz)].
     may_have_head_lines : bool
         Whether the gyro may have lines of a head that its samples do not show.
     """
@@ -80,7 +78,7 @@ class Predictor:
         self.may_have_head_lines = True
         self.steady_rate: F64 = np.zeros(3)
         self.gyro_noise = self.config.inertial.gyro_noise
-        self.gyro_density = self.gyro_noise * float(np.sqrt(tuning.IMU_PERIOD_S))
+        self._period_s = tuning.IMU_PERIOD_S  # of the samples that were used last
         self._rest: tuple[F64, int] = np.zeros(3), 0  # mean squares of the gyro at rest, samples
         self._line = HeadLine()
 
@@ -223,6 +221,11 @@ class Predictor:
         self._rest = known, count
 
     @property
+    def gyro_density(self) -> float:
+        """The gyro's noise as a density [rad/s/sqrt(Hz)]."""
+        return self.gyro_noise * float(np.sqrt(self._period_s))
+
+    @property
     def _least_gyro_noise(self) -> float | None:
         """The gyro's noise as measured at rest [rad/s], None before that."""
         known, count = self._rest
@@ -248,11 +251,10 @@ class Predictor:
                 else tuning.LEAST_GYRO_NOISE
             )
         self.gyro_noise = max(least, tuning.GYRO_NOISE_FACTOR * gyro.floor)
-        scale = float(np.sqrt(period))
-        self.gyro_density = self.gyro_noise * scale
+        self._period_s = period
         return Noise(
             self.gyro_density,
-            max(settings.accel_noise * stated, accel.floor) * scale,
+            max(settings.accel_noise * stated, accel.floor) * float(np.sqrt(period)),
             settings.gyro_bias_walk,
             settings.accel_bias_walk,
             tuning.GYRO_SHARE,
