@@ -106,6 +106,8 @@ def score(recording: Recording, track: Track | None) -> Row:
         "sigmas": np.nan,
         "nees_pose": np.nan,
         "nees_velocity": np.nan,
+        "mean_nees_pose": np.nan,
+        "mean_nees_velocity": np.nan,
         "real_time_factor": 0.0,
         "status": "",
     }
@@ -147,6 +149,8 @@ def _consistency(found: Errors, far: F64, track: Track) -> Row:
         "sigmas": float((far / sigma)[quiet].max()) if quiet.any() else 0.0,
         "nees_pose": float((nees[judged] <= QUANTILE[6]).mean()),
         "nees_velocity": float((speed[judged] <= QUANTILE[3]).mean()),
+        "mean_nees_pose": float(nees[judged].mean() / 6.0),
+        "mean_nees_velocity": float(speed[judged].mean() / 3.0),
         "status": sequence(track.status),
     }
 

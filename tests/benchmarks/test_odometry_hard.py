@@ -131,9 +131,12 @@ def test_errors_drawn_from_the_covariance_are_consistent(given: Recording) -> No
     row = score(given, noisy)
     assert abs(row["nees_pose"] - 0.95) < 0.015
     assert abs(row["nees_velocity"] - 0.95) < 0.015
+    assert row["mean_nees_pose"] == pytest.approx(1.0, abs=0.03)
+    assert row["mean_nees_velocity"] == pytest.approx(1.0, abs=0.04)
     assert row["silent"] == 0
     sure = replace(noisy, covariances=1e-2 * np.asarray(track.covariances))
     assert score(given, sure)["nees_pose"] < 0.01
+    assert score(given, sure)["mean_nees_pose"] == pytest.approx(100.0, rel=0.03)
 
 
 def test_a_drift_is_silent_unless_a_status_says_so(given: Recording) -> None:
@@ -275,6 +278,7 @@ def test_the_page_tells_of_every_scene_and_failure(
     assert not all(target.met for target in reached)
     text = bench_odometry_hard.write(rows, reached).read_text()
     assert "| calm |" in text
+    assert "| 100 %, 0.00 | 100 %, 0.00 |" in text
     assert "| hard, 0 |" in text
     assert "gave up, 1 of 1" in text
     assert "**not met**" in text
