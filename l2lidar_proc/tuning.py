@@ -474,6 +474,7 @@ BEAM_CHANGE: Final = 0.0009  # [rad] after which a map at rest is begun again: 5
 
 # [m] of units; source: the population of the virtual L2, and 15 mm of a published recording
 RANGE_BIAS_SIGMA: Final = 0.02
+RANGE_BIAS_MOST: Final = 0.08  # [m] of any unit: four sigma
 RANGE_BIAS_NEAREST: Final = 1.5  # [m] nearer, ranges are not linear
 RANGE_BIAS_CELLS: Final = 8  # of a plane, at least
 RANGE_BIAS_SEEDS: Final = 12  # cells of a sweep from which planes grow, at most. Speed only
@@ -481,6 +482,15 @@ RANGE_BIAS_FACING: Final = 0.985  # cosine of the angle between a cell and its p
 RANGE_BIAS_BEND_MOST: Final = 0.12  # [m] from the plane: six sigma of the bias
 # [m] of a cell's mean; 12 mm of range noise hardly count. What hangs on a wall does
 RANGE_BIAS_CELL_SIGMA: Final = 0.012
+# Of the ground, which faces up within 45 degrees: [m] by what half of the cells lie beside it at
+# most. Of floors it is up to 3 mm; of lawns and forest ground 14 to 20, which seem 0.1 m of bias.
+# Tuned on: drones above woods
+RANGE_BIAS_GROUND: Final = 0.7
+RANGE_BIAS_ROUGH: Final = 0.005
+# [1/m] of the ground, at most. Floors show 0.1 to 0.3 mm/m^2; a road that falls by 2 mm/m^2 to its
+# sides seems a bias of 30 mm
+RANGE_BIAS_CURVATURE: Final = 7e-4
+RANGE_BIAS_CURVED_F: Final = 5.0  # F of these three unknowns; 1 of 300 flat floors has more
 RANGE_BIAS_SCALE: Final = 0.02  # [m] off, a cell keeps a quarter of its weight
 RANGE_BIAS_STEPS: Final = 4  # of either fit
 # [m] however long a place is looked at: skirting boards and furniture bend walls in the same way

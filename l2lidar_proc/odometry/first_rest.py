@@ -206,7 +206,7 @@ class FirstRest:
         if not self.sweeps:
             return None
         if doubted or self._intrinsics.is_due_at_rest(self.sweeps):
-            self._intrinsics.learn_at_rest(self.sweeps)
+            self._intrinsics.learn_at_rest(self.sweeps, still.state.rest_force)
         if not self._is_known_better:
             return None
         self._mapped_with = self._corrections

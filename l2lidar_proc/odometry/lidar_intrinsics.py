@@ -144,7 +144,14 @@ class LidarIntrinsics:
         self.ranges.applied_to(points)
         return dataclasses.replace(sweep, points=points)
 
-    def learn(self, sweep: Sweep, moved: NDArray[np.void], *, at_rest: bool) -> None:
+    def learn(
+        self,
+        sweep: Sweep,
+        moved: NDArray[np.void],
+        *,
+        at_rest: bool,
+        rest_force: F64 | None = None,
+    ) -> None:
         """Take the gaps between the halves of a sweep.
 
         Velocity and rate that deskewed it may be a little off, which moves halves apart as well;
@@ -158,12 +165,14 @@ class LidarIntrinsics:
             Its points, deskewed.
         at_rest : bool
             The sensor did not move for certain.
+        rest_force : ndarray, shape (3,), optional
+            As for :func:`~l2lidar_proc.odometry.range_bias.bend_of_planes`.
         """
         if self._latest is None or self._latest[0] is not sweep or len(moved) != len(sweep.points):
             return
         _, head, used, used_range = self._latest
         if not at_rest:  # a rest shows the same walls again and again
-            self.ranges.learn(moved, used=used_range)
+            self.ranges.learn(moved, used=used_range, rest_force=rest_force)
         gaps = between_halves(sweep.points, moved, head)
         if gaps is None:
             return
@@ -198,13 +207,15 @@ class LidarIntrinsics:
         lasted = sweeps[-1].end - sweeps[0].start
         return lasted >= max(tuning.BEAM_REST_NS, tuning.BEAM_REST_AGAIN * self._rested_ns)
 
-    def learn_at_rest(self, sweeps: list[Sweep]) -> None:
+    def learn_at_rest(self, sweeps: list[Sweep], rest_force: F64 | None = None) -> None:
         """Estimate the angles anew from the sweeps of a sensor at rest, all of them together.
 
         Parameters
         ----------
         sweeps : list of Sweep
             As the unit reports them, from one place, oldest first.
+        rest_force : ndarray, shape (3,), optional
+            As for :func:`~l2lidar_proc.odometry.range_bias.bend_of_planes`.
         """
         self._rested_ns = sweeps[-1].end - sweeps[0].start
         if self.is_other:
@@ -220,7 +231,8 @@ class LidarIntrinsics:
             self.angles = self._known()
         self.ranges.forget()
         step = -(-len(sweeps) // tuning.RANGE_BIAS_SWEEPS)
-        self.ranges.learn(*(self.applied_to(one).points for one in sweeps[::step]))
+        seen = (self.applied_to(one).points for one in sweeps[::step])
+        self.ranges.learn(*seen, rest_force=rest_force)
 
     def forget(self) -> None:
         """Forget what was learned, as after a rest that was none."""

@@ -311,7 +311,9 @@ class Odometry:
             quality = dataclasses.replace(quality, attitude_variance=variance)
         estimate = self._estimate(sweep, motion, status, quality)
         if found is not None:
-            self._intrinsics.learn(sweep, estimate.points, at_rest=False)
+            self._intrinsics.learn(
+                sweep, estimate.points, at_rest=False, rest_force=motion.state.rest_force
+            )
             if self.matcher.notes_sights:
                 self._intrinsics.learn_from_map(self.matcher.seen_again(source, found.state))
             is_mapped |= self._map_ended_rest(motion)

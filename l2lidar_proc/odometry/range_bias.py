@@ -3,9 +3,11 @@
 A constant added to all ranges moves a point along its ray. Where a wall is seen head-on it moves
 by all of it, where it is seen at a grazing angle by nothing: a plane is bent. Registration follows
 the bent planes, and 34 mm let the map of a room lean by 0.25 degrees. So the planes of single
-sweeps are fitted with the bias as one more unknown. Where nothing is flat, as in a wood, the map
-shows it more slowly: ground that was first seen from afar, at a grazing angle, comes to lie higher
-or lower when the sensor passes above it. ``l2lidar calibrate still`` measures it once and for all.
+sweeps are fitted with the bias as one more unknown. Ground that is as uneven as a lawn or curved
+as a road bends by itself, by what seems up to 0.1 m of bias, and is left out. Where nothing is
+flat, as in a wood, the map shows the bias more slowly: ground that was first seen from afar, at a
+grazing angle, comes to lie higher or lower when the sensor passes above it. ``l2lidar calibrate
+still`` measures it once and for all.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class RangeBias:
         for name, line in zip("xyz", at, strict=True):
             points[name] = line + share * line
 
-    def learn(self, *sweeps: NDArray[np.void], used: float = 0.0) -> None:
+    def learn(
+        self, *sweeps: NDArray[np.void], used: float = 0.0, rest_force: F64 | None = None
+    ) -> None:
         """Take the planes of sweeps.
 
         Parameters
@@ -67,9 +71,11 @@ class RangeBias:
             Points of each, deskewed, with the right beam angles [m].
         used : float
             Correction of their ranges [m].
+        rest_force : ndarray, shape (3,), optional
+            As for :func:`bend_of_planes`.
         """
         for points in sweeps:
-            information, gradient = bend_of_planes(points)
+            information, gradient = bend_of_planes(points, rest_force)
             self._information += information
             self._weighted += gradient + information * used
         if not self.needs_map:
@@ -127,6 +133,8 @@ class RangeBias:
         Where planes show it well, it counts in any case: hardly a unit has none at all.
         """
         variance, bias = self._variance, self._estimate
+        if abs(bias) > tuning.RANGE_BIAS_MOST:
+            return 0.0  # what seems so has another cause
         is_in_use = self._map_information > 0.0 and self.correction != 0.0
         is_known = variance < tuning.RANGE_BIAS_KNOWN**2
         differs = bias**2 > tuning.BEAM_SIGMAS**2 * variance
@@ -176,13 +184,19 @@ class _Flat(NamedTuple):
     counts: F64
 
 
-def bend_of_planes(points: NDArray[np.void]) -> tuple[float, float]:
+def bend_of_planes(points: NDArray[np.void], rest_force: F64 | None = None) -> tuple[float, float]:
     """Return what planes tell about a correction of ranges.
+
+    Walls and ceilings are straight. The ground is only believed to be where nothing of its shape
+    says otherwise.
 
     Parameters
     ----------
     points : ndarray, shape (N,)
         In the frame of the sensor [m].
+    rest_force : ndarray, shape (3,), optional
+        Specific force of a sensor at rest in this attitude [m/s^2]: it points away from the
+        ground. Without it, or where it is zero, any plane may be the ground.
 
     Returns
     -------
@@ -191,19 +205,21 @@ def bend_of_planes(points: NDArray[np.void]) -> tuple[float, float]:
     gradient : float
         The information, multiplied by the correction [1/m].
     """
+    force = np.zeros(3) if rest_force is None else rest_force
+    least = tuning.RANGE_BIAS_GROUND * float(np.linalg.norm(force))
     information = gradient = 0.0
     for places, along, normal in _planes(_flat_cells(_places(points))):
         # measured = plane - correction * cosine of the incidence
         sights = places / np.linalg.norm(places, axis=1)[:, None]
         middle = places.mean(axis=0)
+        across = (places - middle) @ along.T
         heights = (places - middle) @ normal
-        design = np.column_stack(
-            (np.ones(len(places)), (places - middle) @ along.T, -(sights @ normal))
-        )
-        more = _correction_from(
-            design, heights, tuning.RANGE_BIAS_CELL_SIGMA, tuning.RANGE_BIAS_SIGMA
-        )
-        information, gradient = information + more[0], gradient + more[1]
+        design = np.column_stack((np.ones(len(places)), across, -(sights @ normal)))
+        bend = _bend_of(design, heights, tuning.RANGE_BIAS_CELL_SIGMA, tuning.RANGE_BIAS_SIGMA)
+        may_be_ground = float(normal @ force) <= -least
+        if may_be_ground and _bends_by_itself(bend, across, design, heights):
+            continue
+        information, gradient = information + bend.information, gradient + bend.gradient
     return information, gradient
 
 
@@ -232,15 +248,64 @@ def bend_of_map(seen: SeenAgain) -> tuple[float, float]:
     measured = seen.distances - seen.correction * now + corrected
     pose = np.concatenate((seen.normals, np.cross(seen.places, seen.normals)), axis=1)
     design = np.column_stack((pose, before - now))
-    return _correction_from(
-        design, measured, tuning.RANGE_BIAS_MAP_SIGMA, tuning.RANGE_BIAS_MAP_PRIOR
+    bend = _bend_of(design, measured, tuning.RANGE_BIAS_MAP_SIGMA, tuning.RANGE_BIAS_MAP_PRIOR)
+    return bend.information, bend.gradient
+
+
+class _Bend(NamedTuple):
+    """What surfaces tell about a correction of ranges.
+
+    Attributes
+    ----------
+    information, gradient : float
+        As of :func:`bend_of_planes`.
+    residuals : ndarray, shape (N,)
+        What the fit with that correction leaves [m].
+    weights : ndarray, shape (N,)
+        0 to 1: what is far off has lost weight.
+    """
+
+    information: float
+    gradient: float
+    residuals: F64
+    weights: F64
+
+
+def _bends_by_itself(bend: _Bend, across: F64, design: F64, heights: F64) -> bool:
+    """Return whether the shape of a plane is not that which a correction of ranges explains.
+
+    The ground is rough where it is natural, and curved where water has to run off.
+
+    Parameters
+    ----------
+    bend : _Bend
+        Of its cells.
+    across : ndarray, shape (C, 2)
+        Where they are in the plane [m].
+    design, heights : ndarray, shape (C, 4) and (C,)
+        From which the bend follows.
+    """
+    if float(np.median(np.abs(bend.residuals))) > tuning.RANGE_BIAS_ROUGH:
+        return True
+    curved = np.column_stack((design, 0.5 * across**2, across.prod(axis=1)))
+    free = len(heights) - curved.shape[1]
+    if free <= 0:
+        return False
+    weighted = (curved * bend.weights[:, None]).T
+    covariance = np.linalg.inv(weighted @ curved + 1e-6 * np.eye(len(weighted)))
+    fit = covariance @ weighted @ heights
+    x, y, twist = own = fit[-3:]
+    variance = float(bend.weights @ (heights - curved @ fit) ** 2) / free
+    is_sure = (
+        own @ np.linalg.solve(covariance[-3:, -3:], own)
+        > 3.0 * tuning.RANGE_BIAS_CURVED_F * variance
     )
+    most = float(np.abs(np.linalg.eigvalsh(np.array(((x, twist), (twist, y))))).max())
+    return bool(is_sure and most > tuning.RANGE_BIAS_CURVATURE)
 
 
-def _correction_from(
-    design: F64, measured: F64, sigma: float, prior_sigma: float
-) -> tuple[float, float]:
-    """Return information and gradient of the last unknown; the others are of no interest.
+def _bend_of(design: F64, measured: F64, sigma: float, prior_sigma: float) -> _Bend:
+    """Return what measurements tell about the last unknown; the others are of no interest.
 
     Parameters
     ----------
@@ -268,9 +333,11 @@ def _correction_from(
         np.column_stack((normal_matrix[:last, last], right[:last])),
     )
     across = normal_matrix[last, :last]
-    return (
+    return _Bend(
         float(normal_matrix[last, last] - across @ shared[:, 0]),
         float(right[last] - across @ shared[:, 1]),
+        measured - design @ fit,
+        weights,
     )
 
 

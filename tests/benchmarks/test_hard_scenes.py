@@ -175,6 +175,17 @@ def test_a_wood_shows_the_range_bias_as_the_sensor_walks() -> None:
     assert np.abs(np.diff(used)).max() <= tuning.RANGE_BIAS_STEP + 1e-12
 
 
+def test_forest_ground_ahead_of_a_drone_shows_no_range_bias() -> None:
+    """It is uneven: 0.15 m were corrected that are not there, and the pose turned by 9 mrad."""
+    above = replace(scenario("bare trunks, imperfect", 734, 10.0), scene="wood", mount="forward")
+    given = recording(replace(above, imperfect=False))
+    estimates = estimates_of(given)
+    assert not any(one.quality.range_correction for one in estimates)
+    found = errors(given, tracked(given))
+    assert np.abs(found.position[:, 2]).max() < 0.02
+    assert np.abs(found.turn).max() < 0.003
+
+
 def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
     estimates = estimates_of(recording(scenario("wood, imperfect", 0, 18.0)))
     assert not any(one.quality.range_correction for one in estimates)

@@ -125,6 +125,91 @@ def test_a_small_bias_is_left_until_planes_show_it_surely() -> None:
     assert ranges.sigma_with(ranges.correction) < tuning.RANGE_BIAS_SURE
 
 
+UP = np.array([0.0, 0.0, 9.8])  # [m/s^2] specific force of a sensor at rest, upright
+
+
+def ground(
+    curvature: tuple[float, float],
+    *,
+    bias: float = 0.0,
+    rough: float = 0.0,
+    height: float = -1.8,
+) -> NDArray[np.void]:
+    """Return points of a surface below or above a sensor that looks ahead, out to 6 m.
+
+    Parameters
+    ----------
+    curvature : tuple of float
+        Along x and y [1/m].
+    bias : float
+        By which ranges are too long [m].
+    rough : float
+        Amplitude of waves of 2 m [m].
+    height : float
+        [m]
+    """
+    rng = np.random.default_rng(2)
+    sights = rng.normal(size=(30000, 3))
+    sights /= np.linalg.norm(sights, axis=1)[:, None]
+    sights = sights[(sights[:, 2] * np.sign(height) > 0.25) & (sights[:, 0] > -0.1)]
+    ranges = height / sights[:, 2]
+    for _ in range(20):
+        at = ranges[:, None] * sights[:, :2]
+        waves = rough * (np.sin(np.pi * at[:, 0]) + np.cos(np.pi * at[:, 1]))
+        ranges = (height + at**2 @ (0.5 * np.array(curvature)) + waves) / sights[:, 2]
+    near = np.linalg.norm(ranges[:, None] * sights[:, :2], axis=1) < 6.0
+    ranges = ranges[near] + bias + 0.012 * rng.normal(size=np.count_nonzero(near))
+    cloud = np.zeros(len(ranges), CLOUD)
+    for name, line in zip("xyz", (ranges[:, None] * sights[near]).T, strict=True):
+        cloud[name] = line
+    return cloud
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.03])
+def test_a_level_floor_shows_the_bias(bias: float) -> None:
+    information, gradient = bend_of_planes(ground((0.0, 0.0), bias=bias), UP)
+    assert information > 1.0 / 0.012**2
+    assert gradient / information == pytest.approx(-bias, abs=0.004)
+
+
+@pytest.mark.parametrize(
+    "curvature", [(0.0, -0.001), (0.0, -0.004), (0.004, 0.004), (-0.002, 0.002)]
+)
+def test_ground_that_is_curved_shows_no_bias(curvature: tuple[float, float]) -> None:
+    """A road that falls to its sides; what rises passes for ranges too short, up to 0.1 m."""
+    curved = ground(curvature)
+    for force in (UP, None, np.zeros(3)):
+        assert bend_of_planes(curved, force) == (0.0, 0.0)
+    information, gradient = bend_of_planes(curved, -UP)  # a ceiling
+    assert information > 0.0
+    assert abs(gradient / information) > 0.01
+
+
+def test_ground_as_uneven_as_a_lawn_shows_no_bias() -> None:
+    assert bend_of_planes(ground((0.0, 0.0), rough=0.02), UP) == (0.0, 0.0)
+    flat = bend_of_planes(ground((0.0, 0.0), rough=0.0005), UP)
+    assert flat[0] > 0.0
+
+
+def test_walls_count_beside_uneven_ground() -> None:
+    walls = box(0.03, 4, edges=np.array([4.2, 3.3, 2.5]))
+    walls = walls[walls["z"] > -1.4]
+    both = np.concatenate((walls, ground((0.0, 0.0), rough=0.02, bias=0.03)))
+    information, gradient = bend_of_planes(both, UP)
+    assert information > 1.0 / 0.01**2
+    assert gradient / information == pytest.approx(-0.03, abs=0.006)
+
+
+def test_a_bias_larger_than_that_of_any_unit_has_another_cause() -> None:
+    ranges = RangeBias()
+    for _ in range(20):
+        ranges.learn(ground((0.0, -0.008)), rest_force=-UP)
+    assert not ranges.needs_map
+    assert ranges._estimate > tuning.RANGE_BIAS_MOST
+    assert ranges.correction == 0.0
+    assert ranges.sigma_with(0.0) > tuning.RANGE_BIAS_MOST
+
+
 def test_clouds_of_another_sensor_are_left_as_they_are() -> None:
     intrinsics = LidarIntrinsics()
     for seed in range(25):
