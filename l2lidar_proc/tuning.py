@@ -779,6 +779,9 @@ STILL_BLURRED: Final = 0.4  # of that share is left
 STILL_DRIFT_S: Final = 0.5  # [s] how quickly a drift may have come about
 STILL_IMU_NS: Final = 250_000_000  # [ns] in which the IMU shows that rest has ended
 STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have begun to end
+# [rad, m, m/s] by what a motion that nothing shows yet moves poses at rest: what all those of the
+# hard runs are off by, whose rests last for two seconds
+STILL_UNNOTICED: Final = (4e-4, 2e-4, 2.5e-3)
 RETRY_NS: Final = 4_000_000_000  # [ns] until then a rest that was none is begun again, as motion,
 RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] or, if the IMU ends it by then, if that fits closer
 RETRY_FARTHEST_M: Final = 0.5  # [m] if that went no farther

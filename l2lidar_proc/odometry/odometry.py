@@ -38,7 +38,11 @@ from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
 from l2lidar_proc.odometry.start_velocity import StartVelocity
 from l2lidar_proc.odometry.uncertainty import FrameJump
 from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
-from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
+from l2lidar_proc.odometry.zero_velocity import (
+    ZeroVelocityTest,
+    free_pose,
+    with_unnoticed_motion,
+)
 
 LIBRARIES: Final = (*kiss.LIBRARIES, eskf.LIBRARY, "scipy.spatial.transform")
 """Imported with the first sweeps, unless something has done so before."""
@@ -739,6 +743,9 @@ class Odometry:
         """Deskew a sweep with its motion and report it."""
         if not self._predictor.trusts_gravity:
             status.append(Status.GRAVITY_UNTRUSTED)
+        if self.phase is Phase.STATIONARY:
+            covariance = with_unnoticed_motion(motion.covariance)
+            motion = dataclasses.replace(motion, covariance=covariance)
         drift, (angles, ranges) = self.matcher.drift, self._intrinsics.corrections
         xi, beta, alpha = angles.tolist()
         drift.errors = self._intrinsics.errors

@@ -23,12 +23,26 @@ from l2lidar_proc.motion.filter import (
     ERRORS,
     GYRO_BIAS,
     POSE,
+    POSITION,
+    ROTATION,
     VELOCITY,
     InertialState,
 )
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.static import StaticReference, static_reference
 from l2lidar_proc.odometry.alignment import Alignment, degeneracy_ratio, unobserved_directions
+
+
+def with_unnoticed_motion(covariance: F64) -> F64:
+    """Return a covariance (18, 18) of a state at rest, with a motion that may just have begun.
+
+    It is noticed a few hundredths of a second later.
+    """
+    turn, way, speed = tuning.STILL_UNNOTICED
+    out = covariance.copy()
+    for block, sigma in ((ROTATION, turn), (POSITION, way), (VELOCITY, speed)):
+        out[block, block] += sigma**2 * np.eye(3)
+    return out
 
 
 class ZeroVelocityTest:

@@ -149,6 +149,19 @@ def test_a_rest_ends_where_neither_imu_nor_map_prove_it() -> None:
     assert odometry.phase is not Phase.STATIONARY
 
 
+@pytest.mark.parametrize("family", ["wood, imperfect", "yard on a quadruped"])
+def test_a_motion_that_nothing_shows_yet_is_in_the_covariance(family: str) -> None:
+    """The last pose of a rest: it had a NEES of 37, and the velocity of zero one of 207."""
+    given = recording(scenario(family, 0, 4.0))
+    track = tracked(given)
+    found = errors(given, track)
+    assert track.covariances is not None
+    assert track.velocity_covariances is not None
+    pose = normalized(np.hstack([found.position, found.turn]), track.covariances)
+    assert pose.max() < 20.0
+    assert normalized(found.velocity, track.velocity_covariances).max() < 50.0
+
+
 def test_the_map_of_a_unit_with_a_range_bias_does_not_lean(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
