@@ -288,18 +288,15 @@ def _bends_by_itself(bend: _Bend, across: F64, design: F64, heights: F64) -> boo
     if float(np.median(np.abs(bend.residuals))) > tuning.RANGE_BIAS_ROUGH:
         return True
     curved = np.column_stack((design, 0.5 * across**2, across.prod(axis=1)))
-    free = len(heights) - curved.shape[1]
-    if free <= 0:
-        return False
     weighted = (curved * bend.weights[:, None]).T
     covariance = np.linalg.inv(weighted @ curved + 1e-6 * np.eye(len(weighted)))
     fit = covariance @ weighted @ heights
     x, y, twist = own = fit[-3:]
+    free = len(heights) - len(fit)  # a plane has more cells than there are unknowns
     variance = float(bend.weights @ (heights - curved @ fit) ** 2) / free
-    is_sure = (
-        own @ np.linalg.solve(covariance[-3:, -3:], own)
-        > 3.0 * tuning.RANGE_BIAS_CURVED_F * variance
-    )
+    # F test of no curvature at all
+    explained = own @ np.linalg.solve(covariance[-3:, -3:], own) / 3.0
+    is_sure = explained > tuning.RANGE_BIAS_CURVED_F * variance
     most = float(np.abs(np.linalg.eigvalsh(np.array(((x, twist), (twist, y))))).max())
     return bool(is_sure and most > tuning.RANGE_BIAS_CURVATURE)
 
