@@ -177,6 +177,13 @@ FAMILIES: Final[dict[str, Scenario]] = {
         scene="wood", motion="walk", speed=1.2, imperfect=True, drawn_unit=True
     ),
     "flat, drawn unit": Scenario(scene="flat", motion="look", imperfect=True, drawn_unit=True),
+    # and what such a unit sees of natural ground, where it is not upright
+    "wood ahead of a drone, drawn unit": Scenario(
+        scene="wood", motion="drone", mount="forward", imperfect=True, drawn_unit=True
+    ),
+    "yard below a drone, drawn unit": Scenario(
+        scene="yard", motion="drone", mount="upside_down", imperfect=True, drawn_unit=True
+    ),
     # other sensors
     "spinning lidar, corridor": Scenario(
         scene="office_corridor", motion="drive", sensor="spinning_16"
