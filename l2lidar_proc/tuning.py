@@ -512,6 +512,7 @@ RANGE_BIAS_MAP_SWEEPS: Final = 40  # within which sweeps are forgotten
 RANGE_BIAS_MAP_FLOOR: Final = 0.004  # [m] however long
 # [rad] 0.15 degrees of the best known beam angles: with wrong ones the map showed 50 mm
 RANGE_BIAS_MAP_BEAMS: Final = 0.0026
+RANGE_BIAS_MOVED: Final = 5e-4  # [m] by which it differs from the map's, for that to follow. Speed
 RANGE_BIAS_STEP: Final = 0.003  # [m] by which the correction changes from sweep to sweep
 # [rad/m] by which it lets the map lean, about each level axis; 0.02 to 0.2 in room, corridor,
 # hall and wood. Tuned on: the hard runs, as BEAM_TURN

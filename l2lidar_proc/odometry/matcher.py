@@ -51,7 +51,7 @@ from l2lidar_proc.odometry.pose_hypotheses import (
 )
 from l2lidar_proc.odometry.range_bias import SeenAgain
 from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry.uncertainty import MapDrift
+from l2lidar_proc.odometry.uncertainty import Corrections, MapDrift
 from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
 from l2lidar_proc.odometry.wall_profile import Spots, extract_spots
 
@@ -137,7 +137,19 @@ class SweepMatcher:
         self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
         self._scatter: F64 = np.zeros((3, 3))  # of the walls along which the carrier drives
         self._is_weak = False  # along them, in the latest sweep
+        self._range_correction = 0.0  # of what is in the map [m]
         self._height_fixed_s = 0.0, 0.0  # of late, and the time that counts in all
+
+    def correct(self, corrections: Corrections) -> None:
+        """Take the corrections of the sweeps to come, and let the map have that of their ranges.
+
+        Sweeps that look ahead would else push the pose forward by what walls come closer.
+        """
+        self.drift.corrections = corrections
+        change = corrections.ranges - self._range_correction
+        if self._sweeps and abs(change) >= tuning.RANGE_BIAS_MOVED:
+            self.surfaces.correct_ranges(change)
+            self._range_correction = corrections.ranges
 
     @property
     def is_young(self) -> bool:
@@ -386,6 +398,8 @@ class SweepMatcher:
         # points from nearby, which the errors of that way have moved, must not take its place
         weighted = not self.driving
         self._note_period(state.stamp)
+        if not self._sweeps:
+            self._range_correction = self.drift.corrections.ranges
         fresh = self.surfaces.add(
             placed,
             self._sweeps,

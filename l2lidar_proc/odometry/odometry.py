@@ -123,7 +123,7 @@ class Odometry:
 
     def _use(self, matcher: SweepMatcher) -> None:
         """Go on with the maps of a matcher."""
-        matcher.drift.corrections = self.matcher.drift.corrections
+        matcher.correct(self.matcher.drift.corrections)
         matcher.notes_sights = self.matcher.notes_sights
         self.matcher = matcher
         self._initializer = self._first_rest.initializer = self._map_initializer()
@@ -170,7 +170,7 @@ class Odometry:
         self.matcher.notes_sights = self.config.correct_beams and self._intrinsics.learns_from_map
         if self.config.correct_beams:
             sweep = self._intrinsics.corrected(sweep)
-            self.matcher.drift.corrections = self._intrinsics.corrections
+            self.matcher.correct(self._intrinsics.corrections)
         if self.phase is Phase.INITIALIZING:
             return self._initialize(sweep)
         if may_skip and not status:

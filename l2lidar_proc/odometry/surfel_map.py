@@ -441,6 +441,29 @@ class SurfelMap:
         """Return how the cells (M,) of some :class:`Matches` were seen, dtype SIGHT."""
         return records.selected(self._sights, rows)
 
+    def correct_ranges(self, change: float) -> None:
+        """Move what was seen along its lines of sight, as another correction would have put it.
+
+        What was seen without noting these stays.
+
+        Parameters
+        ----------
+        change : float
+            By which the correction of the ranges has grown [m].
+        """
+        rows = np.flatnonzero(self._sights["weight"] > 0.0)
+        cells, sights, planes = self.cells(rows), self.sights(rows), self.planes(rows)
+        moved = change * sights["lines"].astype(np.float64)
+        shift = moved / cells["weight"][:, None]
+        lines = np.column_stack((cells["weight"], cells["sum"], cells["products"])).T
+        _, *sums = shifted(lines, shift.T)
+        cells["sum"], cells["products"] = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
+        planes["mean"] += shift
+        sights["corrected"] += moved
+        records.assign(self._cells, rows, cells)
+        records.assign(self._sights, rows, sights)
+        records.assign(self._planes, rows, planes)
+
     def forget(self, origin: F64, distance: float, since: int = 0) -> None:
         """Drop cells farther than a distance [m] from a place (3,), or not seen since a sweep."""
         cells = self._cells[1 : len(self) + 1]

@@ -199,6 +199,13 @@ def test_forest_ground_ahead_of_a_drone_shows_no_range_bias() -> None:
     assert np.abs(found.turn).max() < 0.003
 
 
+def test_a_range_bias_that_becomes_known_on_the_way_does_not_move_a_view_ahead() -> None:
+    """Walls ahead come closer by 34 mm: the pose went 33 mm ahead, and stayed there."""
+    given = recording(scenario("wood ahead of a drone, drawn unit", 0, 16.0))
+    found = errors(given, tracked(given))
+    assert np.linalg.norm(found.position, axis=1).max() < 0.025
+
+
 def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
     estimates = estimates_of(recording(scenario("wood, imperfect", 0, 18.0)))
     assert not any(one.quality.range_correction for one in estimates)

@@ -710,3 +710,35 @@ def test_another_map_of_the_same_sweeps_is_begun_with_the_same_corrections() -> 
     assert other.drift.corrections is matcher.drift.corrections
     assert other.drift.began is matcher.drift.corrections
     assert not other.notes_sights
+
+
+def test_the_map_follows_a_correction_of_the_ranges() -> None:
+    def seen(ranges: float) -> Corrections:
+        return Corrections(np.zeros(3), ranges)
+
+    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
+    matcher.correct(seen(0.02))  # before there is a map, nothing has to follow
+    points = room(np.random.default_rng(5), 6000)
+    extended(matcher, points)
+    probes = points[::10]
+    before = matcher.surfaces.match(probes)
+    assert np.abs(before.distances).mean() < 0.02
+
+    def moved() -> float:
+        """Return by how much the map has moved away from the sensor, in the mean [m]."""
+        found = matcher.surfaces.match(probes)
+        outward = np.sign(np.einsum("ni,ni->n", found.normals, probes[found.index]))
+        return -float(np.median(outward * found.distances))
+
+    still = moved()
+    matcher.correct(seen(0.02 + 0.9 * tuning.RANGE_BIAS_MOVED))
+    assert moved() == still
+    matcher.correct(seen(0.045))
+    assert matcher.drift.corrections.ranges == 0.045
+    assert 0.01 < moved() - still < 0.026
+    matcher.correct(seen(0.02))
+    assert moved() == pytest.approx(still, abs=1e-3)
+    matcher.clear()
+    matcher.correct(seen(0.05))
+    extended(matcher, points)
+    assert moved() == pytest.approx(still, abs=1e-3)

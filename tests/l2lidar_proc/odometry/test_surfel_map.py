@@ -547,3 +547,35 @@ def test_lines_of_sight_stay_with_their_cells() -> None:
     surfaces.clear()
     surfaces.add(points, 0)
     assert not seen(surfaces)["weight"].any()
+
+
+def test_a_map_follows_a_correction_of_the_ranges() -> None:
+    """It is as if the ranges had had it before; what was seen without noting how stays."""
+    rng = np.random.default_rng(12)
+    eye, change = np.array([0.3, -0.2, 0.1]), 0.03
+    points = np.column_stack((np.full(4000, 5.02), *rng.uniform(-2.0, 2.0, (2, 4000))))
+    points[:, 0] += rng.normal(0.0, 0.005, 4000)
+    sights = points - eye
+    farther = eye + sights * (1.0 + change / np.linalg.norm(sights, axis=1))[:, None]
+    moved, expected, unseen = (SurfelMap((0.4, 0.8)) for _ in range(3))
+    moved.add(points, origin=eye, range_correction=0.0)
+    expected.add(farther, origin=eye, range_correction=change)
+    unseen.add(points, origin=eye)
+    for surfaces in (moved, unseen):
+        surfaces.correct_ranges(change)
+    probes = eye + sights[::20] * (1.0 + 0.5 * change / 5.0)
+    found, right, left = (one.match(probes) for one in (moved, expected, unseen))
+    assert len(found.index) > 150
+    np.testing.assert_array_equal(found.index, right.index)
+    np.testing.assert_allclose(found.distances, right.distances, atol=3e-3)
+    assert np.abs(left.distances - right.distances).mean() > 0.02
+    # what is added later meets moved sums, not only moved planes
+    for surfaces in (moved, expected):
+        surfaces.add(farther[::2], 1, origin=eye, range_correction=change)
+    again, best = moved.match(probes), expected.match(probes)
+    np.testing.assert_allclose(again.distances, best.distances, atol=3e-3)
+    ours, theirs = moved.sights(again.cells), expected.sights(best.cells)
+    scale = ours["weight"][:, None]
+    np.testing.assert_allclose(ours["corrected"] / scale, theirs["corrected"] / scale, atol=3e-3)
+    thickness = np.sqrt(moved.planes(again.cells)["spread"][:, 0])
+    assert np.median(thickness) < 0.008
