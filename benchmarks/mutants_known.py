@@ -77,7 +77,7 @@ FAULTS: Final = (
     ),
     Fault(
         "l2lidar_proc/odometry/prediction.py",
-        "max(settings.accel_noise * stated, accel.floor) * scale",
+        "max(settings.accel_noise * stated, accel.floor) * float(np.sqrt(period))",
         "max(settings.accel_noise * stated, accel.floor)",
         (f"{_PROC}/odometry/test_prediction.py",),
     ),
