@@ -5,7 +5,7 @@ from a seed (:mod:`benchmarks.hard_scenarios`). Without options it is the short 
 of 30 s of each of 17 families; ``--full`` is the campaign of 200 runs of a minute. The tuning
 constants were chosen on seeds 0 to 65, 100 to 175 and 222 to 256 (on 0 to 631 of the family
 ``starts``), so ``--first-seed 261`` tells what to expect elsewhere; its page is one of its own.
-Recordings stay in ``out/recordings`` (14 GB of a campaign), so a change of the estimator is judged
+Recordings stay in ``out/recordings`` (14 GB a campaign), so a change of the estimator is judged
 again without casting a ray; ``--fresh`` makes them anew. Every row is kept in
 ``out/bench/odometry_hard.jsonl`` as soon as it is there: ``--resume`` goes on where a campaign was
 cut.

@@ -512,7 +512,7 @@ RANGE_BIAS_MAP_SWEEPS: Final = 40  # within which sweeps are forgotten
 RANGE_BIAS_MAP_FLOOR: Final = 0.004  # [m] however long
 # [rad] 0.15 degrees of the best known beam angles: with wrong ones the map showed 50 mm
 RANGE_BIAS_MAP_BEAMS: Final = 0.0026
-RANGE_BIAS_MOVED: Final = 5e-4  # [m] by which it differs from the map's, for that to follow. Speed
+RANGE_BIAS_MOVED: Final = 5e-4  # [m] smaller changes leave the map as it is. Speed only
 RANGE_BIAS_STEP: Final = 0.003  # [m] by which the correction changes from sweep to sweep
 # [rad/m] by which it lets the map lean, about each level axis; 0.02 to 0.2 in room, corridor,
 # hall and wood. Tuned on: the hard runs, as BEAM_TURN
@@ -780,8 +780,8 @@ STILL_BLURRED: Final = 0.4  # of that share is left
 STILL_DRIFT_S: Final = 0.5  # [s] how quickly a drift may have come about
 STILL_IMU_NS: Final = 250_000_000  # [ns] in which the IMU shows that rest has ended
 STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have begun to end
-# [rad, m, m/s] by what a motion that nothing shows yet moves poses at rest: what all those of the
-# hard runs are off by, whose rests last for two seconds
+# [rad, m, m/s] 1 sigma of a motion that has begun and is not noticed yet. Source: errors of the
+# poses at rest in the hard runs, which rest for two seconds
 STILL_UNNOTICED: Final = (4e-4, 2e-4, 2.5e-3)
 RETRY_NS: Final = 4_000_000_000  # [ns] until then a rest that was none is begun again, as motion,
 RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] or, if the IMU ends it by then, if that fits closer

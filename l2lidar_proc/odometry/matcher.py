@@ -141,9 +141,13 @@ class SweepMatcher:
         self._height_fixed_s = 0.0, 0.0  # of late, and the time that counts in all
 
     def correct(self, corrections: Corrections) -> None:
-        """Take the corrections of the sweeps to come, and let the map have that of their ranges.
+        """Take the corrections of the sweeps to come, and correct the ranges in the map likewise.
 
-        Sweeps that look ahead would else push the pose forward by what walls come closer.
+        Otherwise the pose of a sensor that looks ahead would move by the change.
+
+        Parameters
+        ----------
+        corrections : Corrections
         """
         self.drift.corrections = corrections
         change = corrections.ranges - self._range_correction

@@ -187,8 +187,8 @@ class _Flat(NamedTuple):
 def bend_of_planes(points: NDArray[np.void], rest_force: F64 | None = None) -> tuple[float, float]:
     """Return what planes tell about a correction of ranges.
 
-    Walls and ceilings are straight. The ground is only believed to be where nothing of its shape
-    says otherwise.
+    Walls and ceilings are taken for straight. The ground counts only if it is smooth and shows no
+    curvature of its own.
 
     Parameters
     ----------
@@ -212,12 +212,12 @@ def bend_of_planes(points: NDArray[np.void], rest_force: F64 | None = None) -> t
         # measured = plane - correction * cosine of the incidence
         sights = places / np.linalg.norm(places, axis=1)[:, None]
         middle = places.mean(axis=0)
-        across = (places - middle) @ along.T
+        in_plane = (places - middle) @ along.T
         heights = (places - middle) @ normal
-        design = np.column_stack((np.ones(len(places)), across, -(sights @ normal)))
+        design = np.column_stack((np.ones(len(places)), in_plane, -(sights @ normal)))
         bend = _bend_of(design, heights, tuning.RANGE_BIAS_CELL_SIGMA, tuning.RANGE_BIAS_SIGMA)
         may_be_ground = float(normal @ force) <= -least
-        if may_be_ground and _bends_by_itself(bend, across, design, heights):
+        if may_be_ground and _bends_by_itself(bend, in_plane, design, heights):
             continue
         information, gradient = information + bend.information, gradient + bend.gradient
     return information, gradient
@@ -271,7 +271,7 @@ class _Bend(NamedTuple):
     weights: F64
 
 
-def _bends_by_itself(bend: _Bend, across: F64, design: F64, heights: F64) -> bool:
+def _bends_by_itself(bend: _Bend, in_plane: F64, design: F64, heights: F64) -> bool:
     """Return whether the shape of a plane is not that which a correction of ranges explains.
 
     The ground is rough where it is natural, and curved where water has to run off.
@@ -280,14 +280,14 @@ def _bends_by_itself(bend: _Bend, across: F64, design: F64, heights: F64) -> boo
     ----------
     bend : _Bend
         Of its cells.
-    across : ndarray, shape (C, 2)
-        Where they are in the plane [m].
+    in_plane : ndarray, shape (C, 2)
+        Their coordinates in the plane, from its middle [m].
     design, heights : ndarray, shape (C, 4) and (C,)
         From which the bend follows.
     """
     if float(np.median(np.abs(bend.residuals))) > tuning.RANGE_BIAS_ROUGH:
         return True
-    curved = np.column_stack((design, 0.5 * across**2, across.prod(axis=1)))
+    curved = np.column_stack((design, 0.5 * in_plane**2, in_plane.prod(axis=1)))
     weighted = (curved * bend.weights[:, None]).T
     covariance = np.linalg.inv(weighted @ curved + 1e-6 * np.eye(len(weighted)))
     fit = covariance @ weighted @ heights
