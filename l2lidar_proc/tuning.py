@@ -715,6 +715,19 @@ START_POSTS: Final = 300  # and fewer tell nothing
 START_CELLS: Final = (0.4, 0.2, 0.1)  # [m] along the way,
 START_ACROSS: Final = 0.15  # [m] across at least, as the way is known to that,
 START_ROW: Final = 0.5  # [m] and up
+# Walls: columns of points of one sweep that lie in a row
+START_WALL_COLUMN: Final = 0.2  # [m] in which points are one column
+# Of the range, in which columns are compared: scan lines are 0.12 of it apart. [m] at least, most
+START_WALL_REACH: Final = (0.3, 0.6, 5.0)
+START_WALL_COLUMNS: Final = 3  # columns there, at least,
+START_WALL_LENGTH: Final = 0.15  # 1 sigma of them along the wall, of the reach, at least
+START_WALL_FLAT: Final = 0.15  # and across it, of that along it, at most
+START_WALL_ANGLE: Final = 0.14  # [rad] walls that differ by less have one direction
+START_WALL_POINTS: Final = 40  # of walls of one direction, at least,
+START_WALLS: Final = 4  # and so many directions
+START_WALL_CELL: Final = 4.0  # [m] along a wall, longer than the gaps between its columns,
+START_WALL_ROW: Final = 2.0  # [m] and up
+START_FEW_POSTS: Final = 100  # points of posts, below which the scale below stays
 # Cells more for one unit of the logarithm, by the square root of the points. With it, a gap of
 # 5 units to the next best velocity was right to 0.3 m/s in 85 of 90 searches
 START_SCALE: Final = 0.3
@@ -728,7 +741,10 @@ START_YAW_STEP: Final = 0.0175  # [rad/s] in steps that are 0.4 m at 10 m in the
 START_YAW_FINER: Final = 0.0045  # [rad/s] and then about the best one
 START_YAW_VELOCITY_STEP: Final = 0.3  # [m/s] between velocities compared at each
 START_YAW_MOST: Final = 3000  # points of the first search, with the two coarser cells. Bounds time
-START_YAW_BETTER: Final = 4.0  # by the logarithm, than no change
+START_YAW_BETTER: Final = 4.0  # by the logarithm, than near no change
+# Sigmas of a change, at least. Observed in 21 searches: what was found near no change was right to
+# 0.4 degrees per second where the present rate was wrong by up to 1.1
+START_YAW_SIGNIFICANT: Final = 1.5
 START_YAW_NOISE: Final = 0.004  # [rad/s] error besides, 1 sigma: half of the finer steps
 
 # ---- odometry: initialization of the map. Tuned on: starts at rest and in motion, all scenes

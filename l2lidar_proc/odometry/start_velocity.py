@@ -31,8 +31,6 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.map_sharpness import (
-    SEEN,
-    Seen,
     candidates,
     velocity_log_likelihoods,
     wall_spots,
@@ -40,6 +38,7 @@ from l2lidar_proc.odometry.map_sharpness import (
 )
 from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.pose_hypotheses import level_basis
+from l2lidar_proc.odometry.posts_and_walls import SEEN, Seen
 from l2lidar_proc.odometry.vertical_direction import Vertical
 from l2lidar_proc.odometry.wall_profile import velocity_jacobian
 

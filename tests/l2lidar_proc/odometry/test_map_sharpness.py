@@ -9,22 +9,18 @@ from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.odometry.map_sharpness import (
-    SEEN,
-    Seen,
-    upright,
     velocity_log_likelihoods,
     wall_spots,
     yaw_rate_error,
 )
+from l2lidar_proc.odometry.posts_and_walls import upright
 from l2lidar_proc.odometry.start_velocity import placed
 from tests.support.passing_sweeps import (
-    EPOCH,
     GRAVITY,
     SPEED,
     X,
     Y,
     bare_walls,
-    ground,
     motion_at,
     passed_at,
     seen_from,
@@ -112,36 +108,3 @@ def test_walls_and_few_points_show_no_yaw_rate(passing: list[Sweep]) -> None:
     walls = seen_from(np.random.default_rng(2), bare_walls, speed)
     beside = placed(passed_at(walls, speed), motion_at(speed, np.eye(eskf.ERRORS)), np.zeros(3), X)
     assert yaw_rate_error(beside, now, X, GRAVITY, SPEED) is None
-
-
-def seen_at(places: F64, seconds: F64 | float = 0.0, sweep: int = 0) -> Seen:
-    found = np.zeros(len(places), SEEN)
-    found["place"] = found["sight"] = places
-    found["stamp"] = EPOCH + np.round(np.full(len(places), 1e9) * seconds).astype(np.int64)
-    found["sweep"] = sweep
-    return found
-
-
-def column(x: float, count: int = 8) -> F64:
-    return np.column_stack((np.full(count, x), np.zeros(count), 0.25 * np.arange(count)))
-
-
-def test_only_upright_things_count() -> None:
-    found = upright(np.concatenate((seen_at(ground()), seen_at(column(5.0)))), GRAVITY)
-    assert found["place"][:, 0] == pytest.approx(np.full(8, 5.0))
-
-
-def test_what_was_not_seen_at_once_is_not_upright() -> None:
-    """Floor and ceiling, or what a wrong velocity puts on top of each other."""
-    slow = seen_at(column(5.0), 0.06 * np.arange(8.0))
-    assert not len(upright(slow, GRAVITY))
-    assert len(upright(seen_at(column(5.0), 0.001 * np.arange(8.0)), GRAVITY)) == 8
-
-
-def test_a_spot_counts_once_in_each_sweep_and_far_ones_do_not() -> None:
-    twice = np.concatenate((seen_at(column(5.0)), seen_at(column(5.0) + 0.001)))
-    assert len(upright(twice, GRAVITY)) == 8
-    again = np.concatenate((seen_at(column(5.0)), seen_at(column(5.0), 0.2, sweep=1)))
-    assert len(upright(again, GRAVITY)) == 16
-    assert not len(upright(seen_at(column(tuning.START_RANGE + 1.0)), GRAVITY))
-    assert not len(upright(seen_at(np.zeros((0, 3))), GRAVITY))
