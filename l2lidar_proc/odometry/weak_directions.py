@@ -7,7 +7,8 @@ wall, so the pose stays where it was predicted, and velocity, biases and gravity
 that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
 * only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
-  them for some sweeps: the rim of what has just been seen moves along with the view;
+  them for some sweeps: the rim of what has just been seen moves along with the view. Nor do points
+  count that lie as well on what points beside them show to be a surface along the direction;
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
@@ -123,9 +124,10 @@ class WeakAxes:
         is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
         settled = found.settled(age, strict=is_ignored)
         faces = (np.abs(derivatives) > tuning.WEAK_FACING) & settled
-        if self.scatter is None:
-            return faces
         some = np.flatnonzero(faces)
+        if self.scatter is None:
+            faces[some] = ~lie_on_others(state, found, some)
+            return faces
         if number == 0:  # the way that the carrier drives
             widths = self.surfaces.widths(found.cells[some], found.axis[some])
             faces[some] = widths > tuning.FACING_WIDTH
@@ -136,6 +138,34 @@ class WeakAxes:
         sigma = np.linalg.norm(np.einsum("nij,nj->ni", tilts, moves), axis=1)
         faces[some] = np.abs(derivatives[some]) > tuning.FACING_SIGMAS * sigma
         return faces
+
+
+def lie_on_others(
+    state: InertialState, found: Correspondences, some: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return which of some points lie on the surfaces of points nearby that face elsewhere, (K,).
+
+    The front of a wall has points beside its jamb wherever along it the sensor is. Of many points,
+    most are real: none is said to be such a one.
+
+    Parameters
+    ----------
+    state : InertialState
+        From which the correspondences were found.
+    found : Correspondences
+    some : ndarray, shape (K,)
+        Indices of correspondences.
+    """
+    out = np.zeros(len(some), np.bool_)
+    if not 0 < len(some) <= tuning.OTHERS_MOST:
+        return out
+    points, normals = found.points @ state.rotation.T, found.normals
+    apart = points[some, None] - points
+    is_near = np.einsum("ijk,ijk->ij", apart, apart) < tuning.OTHERS_NEAR**2
+    is_on = np.abs(np.einsum("ijk,jk->ij", apart, normals)) < tuning.OTHERS_THICKNESS
+    faces_elsewhere = np.abs(normals[some] @ normals.T) < tuning.OTHERS_FACING
+    others = np.count_nonzero(is_near & is_on & faces_elsewhere, axis=1)
+    return np.asarray(others >= tuning.OTHERS_LEAST)
 
 
 def weak_axes(
@@ -165,7 +195,7 @@ def weak_axes(
         return None
     axes = axes[:, weak]
     if scatter is None or not _is_way(axes[:, 0], state.gravity):
-        axes, free = _free_first(axes, found)
+        axes, free = _free_first(axes, state, found)
         return WeakAxes(scale, axes, surfaces, free=free)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
@@ -174,13 +204,15 @@ def weak_axes(
     return WeakAxes(scale, axes, surfaces, scatter)
 
 
-def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
+def _free_first(axes: F64, state: InertialState, found: Correspondences) -> tuple[F64, int]:
     """Return weak directions (6, K) with those of the place first that no surface faces.
 
     Parameters
     ----------
     axes : ndarray, shape (6, K)
         Orthonormal, weakest first.
+    state : InertialState
+        From which the correspondences were found.
     found : Correspondences
 
     Returns
@@ -196,6 +228,9 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
     faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
+    for column in faces.T:
+        some = np.flatnonzero(column)
+        column[some] = ~lie_on_others(state, found, some)
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
         return axes, 0
