@@ -12,7 +12,7 @@ import pytest
 from benchmarks import hard_recordings
 from benchmarks.hard_recordings import recording
 from benchmarks.hard_scenarios import Imperfections, scenario
-from benchmarks.hard_scores import QUANTILE, errors, normalized, score
+from benchmarks.hard_scores import QUANTILE, Row, errors, normalized, score
 from l2lidar_node.emulator.unit.units import UNITS, UnitErrors, unit as named_unit
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -209,3 +209,24 @@ def test_a_range_bias_that_becomes_known_on_the_way_does_not_move_a_view_ahead()
 def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
     estimates = estimates_of(recording(scenario("wood, imperfect", 0, 18.0)))
     assert not any(one.quality.range_correction for one in estimates)
+
+
+def test_a_narrow_view_of_a_wall_does_not_run_away_along_it() -> None:
+    """It sped up to 0.4 m/s, by how the wall leans, and a jamb confirmed that: 1.1 m, silently."""
+    row = row_of("flat, cone of 70 degrees", 263, 38.0)
+    assert row["end_m"] < 0.3
+    assert row["silent"] == 0
+    assert row["nees_pose"] > 0.9
+
+
+def test_the_pattern_on_a_far_wall_does_not_show_the_velocity_of_a_start() -> None:
+    """It ran away at 2.5 m/s: 5.6 m after 6 s."""
+    row = row_of("starts", 2064, 6.0)
+    assert row["end_m"] < 0.3
+    assert row["nees_pose"] > 0.9
+
+
+def row_of(family: str, seed: int, seconds: float) -> Row:
+    """Return the figures of a run."""
+    given = recording(scenario(family, seed, seconds))
+    return score(given, tracked(given))
