@@ -37,7 +37,7 @@ lower, the less is known of the place.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -168,6 +168,28 @@ def lie_on_others(
     return np.asarray(others >= tuning.OTHERS_LEAST)
 
 
+def without_others(state: InertialState, found: Correspondences) -> Correspondences:
+    """Return correspondences in which points that lie on other surfaces as well have no weight.
+
+    The same ones where there are no such points.
+
+    Parameters
+    ----------
+    state : InertialState
+        From which they were found.
+    found : Correspondences
+    """
+    normals = found.normals
+    directions = np.linalg.eigh((normals * found.weights[:, None]).T @ normals)[1]
+    is_false = np.zeros(len(normals), np.bool_)
+    for facing in (np.abs(normals @ directions) > tuning.WEAK_FACING).T:
+        some = np.flatnonzero(facing)
+        is_false[some[lie_on_others(state, found, some)]] = True
+    if not is_false.any():
+        return found
+    return replace(found, weights=np.where(is_false, 0.0, found.weights))
+
+
 def weak_axes(
     state: InertialState,
     found: Correspondences,
@@ -195,7 +217,7 @@ def weak_axes(
         return None
     axes = axes[:, weak]
     if scatter is None or not _is_way(axes[:, 0], state.gravity):
-        axes, free = _free_first(axes, state, found)
+        axes, free = _free_first(axes, found)
         return WeakAxes(scale, axes, surfaces, free=free)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
@@ -204,15 +226,13 @@ def weak_axes(
     return WeakAxes(scale, axes, surfaces, scatter)
 
 
-def _free_first(axes: F64, state: InertialState, found: Correspondences) -> tuple[F64, int]:
+def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     """Return weak directions (6, K) with those of the place first that no surface faces.
 
     Parameters
     ----------
     axes : ndarray, shape (6, K)
         Orthonormal, weakest first.
-    state : InertialState
-        From which the correspondences were found.
     found : Correspondences
 
     Returns
@@ -228,9 +248,7 @@ def _free_first(axes: F64, state: InertialState, found: Correspondences) -> tupl
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
     faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
-    for column in faces.T:
-        some = np.flatnonzero(column)
-        column[some] = ~lie_on_others(state, found, some)
+    faces &= (found.weights > 0.0)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
         return axes, 0

@@ -16,7 +16,12 @@ from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import Source, correspondences
 from l2lidar_proc.odometry.surfel_map import SurfelMap
 from l2lidar_proc.odometry.surfels import YoungSurfaces
-from l2lidar_proc.odometry.weak_directions import WeakAxes, lie_on_others, weak_axes
+from l2lidar_proc.odometry.weak_directions import (
+    WeakAxes,
+    lie_on_others,
+    weak_axes,
+    without_others,
+)
 
 SIZES = (0.15, 0.3, 0.6, 1.5)
 REACH = 0.15
@@ -451,9 +456,34 @@ def test_a_front_beside_a_jamb_does_not_tell_the_way_along_the_wall() -> None:
     """A few of its points lie in the jamb's cells wherever the sensor is."""
     rng = np.random.default_rng(11)
     surfaces, points = front_and_jamb(rng, np.zeros((0, 3)), 20)
-    weak = weak_in(surfaces, points, None)
+    state = at()
+    seen = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    weak = weak_axes(state, without_others(state, seen), surfaces)
+    assert weak is not None
     assert np.abs(weak.axes[3, : weak.free]).max() > 0.99
     prior = 0.1**2 * np.eye(eskf.ERRORS)
     found = align(at(), prior, source(points), surfaces, SurfaceConfig(), 30)
     assert found is not None
     assert found.covariance[3, 3] > 0.099**2
+
+
+def test_where_most_of_what_is_seen_is_the_front_a_jamb_beside_it_does_not_fix_it() -> None:
+    """So many of its points are in the jamb's cells that by the eigenvalues, no way is weak."""
+    rng = np.random.default_rng(12)
+    surfaces, points = front_and_jamb(rng, np.zeros((0, 3)), 90)
+    points = np.vstack((points[:120], points[600:]))
+    state = at()
+    seen = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    left = without_others(state, seen)
+    facing = np.abs(seen.normals[:, 0]) > 0.9
+    assert (seen.weights * seen.normals[:, 0] ** 2).sum() > 0.12 * seen.weights.sum()
+    assert (left.weights[facing] == 0.0).mean() > 0.95
+    assert (left.weights[~facing] > 0.0).mean() > 0.8
+    found = align(
+        state, 0.1**2 * np.eye(eskf.ERRORS), source(points), surfaces, SurfaceConfig(), 9
+    )
+    assert found is not None
+    assert found.covariance[3, 3] > 0.095**2
+    wall = points[:120]
+    alone = correspondences(state, state, source(wall), surfaces, SurfaceConfig(), REACH)
+    assert without_others(state, alone) is alone
