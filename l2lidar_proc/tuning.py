@@ -208,6 +208,8 @@ WEAK_AGE: Final = 8  # sweeps since a surface was opened: until then it is a rim
 # it is less than twice the range noise away from that. Tuned on: cameras looking into rooms, cones
 # and corridors, seeds 0 to 6
 OTHERS_LEAST: Final = 2
+# [s] since such a surface was opened. Without, starts in motion ran away (two of 20)
+OTHERS_AGE_S: Final = 3.0
 OTHERS_MOST: Final = 100  # points compared; with more, the few false ones do not matter
 OTHERS_NEAR: Final = 0.5  # [m]
 OTHERS_THICKNESS: Final = 0.03  # [m]
@@ -424,10 +426,6 @@ BEGUN_TURN: Final = (0.115, 0.2)
 # Tuned on: narrow corridors, seeds 100 to 127, where 0.01 m/s^2 (0.06 degrees) makes 1 to 5 m.
 # With 0.0008, the acceleration along them erred by 0.3 to 0.5 sigma where nothing was false
 MAP_BEND: Final = 0.0005  # [rad/sqrt(m)] of the way
-# Share of the variance of the drift's turn by which what holds a sweep may lean against what held
-# the one before. Observed in narrow views, seeds 0 to 6: what leans errs by 0.05 to 0.2 of that
-# variance. Tuned on them: with 1, corridors lose sight of gravity; with 0, a flat ended 1.4 m off
-DRIFT_LEANS: Final = 0.3
 # Gravity is known, as a direction, when it is known as well as at rest, where it cannot be told
 # from a bias (ACCEL_BIAS_SIGMA, 0.9 degrees); as much of what it turns later may be that bias.
 LEAN_KNOWN: Final = 0.02  # [rad]

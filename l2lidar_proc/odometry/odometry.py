@@ -285,11 +285,9 @@ class Odometry:
             found = self._with_wall_velocity(sweep, predicted, found)
             self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
-            leaning = self.matcher.drift.leaning
-            covariance = eskf.with_leaning_gravity(found.state, found.covariance, leaning)
-            posterior = found.state, covariance
+            posterior = found.state, found.covariance
             if blur is not None:
-                posterior = found.state, covariance + blur
+                posterior = found.state, found.covariance + blur
         motion = self._constrained(predicted, *posterior, status)
         self._walls.correct(posterior[0], motion.state)
         # after a blind stretch, a view that the map does not hold will not match later either, and

@@ -173,9 +173,6 @@ class MapDrift:
         Of the sweeps that mapped the surroundings of the origin.
     errors, errors_began : IntrinsicErrors
         What clouds with these corrections may be wrong by, as is known now.
-    leaning : float
-        Variance of the turn about a level axis between the surfaces that hold the latest sweep and
-        those that held the one before [rad^2]. By so much gravity may have turned in the map.
     is_doubted : bool
         Whether the drift is known to be larger than expected: then as much as has to be allowed
         for is expected.
@@ -193,7 +190,6 @@ class MapDrift:
     def clear(self) -> None:
         """Forget everything: a new map begins, without error by definition."""
         self.first_pose: F64 = np.zeros((6, 6))
-        self.leaning = 0.0
         self.is_doubted = False
         self._group = tuning.DRIFT_GROUP  # sweeps that share an entry of the history
         self._known = 0
@@ -237,7 +233,6 @@ class MapDrift:
         strongly : tuple of tuple of ndarray and Support
             Likewise other directions, orthogonal to it.
         """
-        self.leaning = 0.0
         self._with_velocity = np.zeros((3, 3))  # errs like the surfaces, whatever the velocity
         sweeps, shares = support
         if not len(sweeps) or not self._known:
@@ -262,17 +257,7 @@ class MapDrift:
         """
         strength, axes = np.linalg.eigh(self._reported - self._current)
         left = tuning.DRIFT_FALL * np.maximum(strength, 0.0)[:, None]
-        before = self._lean_variance
         self._reported = self._current + (axes * left) @ np.swapaxes(axes, 1, 2)
-        self.leaning = tuning.DRIFT_LEANS * abs(self._lean_variance - before)
-
-    @property
-    def _lean_variance(self) -> float:
-        """Expected variance of the turn about a level axis of what holds a sweep [rad^2]."""
-        if self._up is None:
-            return 0.0
-        turn = self._reported[_EXPECTED, 3:, 3:]
-        return float(np.trace(turn) - self._up @ turn @ self._up) / 2.0
 
     def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.clip(sweeps // self._group, 0, self._known - 1)

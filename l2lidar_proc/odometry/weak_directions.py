@@ -143,10 +143,11 @@ class WeakAxes:
 def lie_on_others(
     state: InertialState, found: Correspondences, some: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Return which of some points lie on the surfaces of points nearby that face elsewhere, (K,).
+    """Return which of some points (K,) lie on surfaces of points nearby that face elsewhere.
 
     The front of a wall has points beside its jamb wherever along it the sensor is. Of many points,
-    most are real: none is said to be such a one.
+    most are real: none is said to be such a one. Nor are points on surfaces that have only just
+    been seen first: no pose has drifted against them.
 
     Parameters
     ----------
@@ -165,7 +166,8 @@ def lie_on_others(
     is_on = np.abs(np.einsum("ijk,jk->ij", apart, normals)) < tuning.OTHERS_THICKNESS
     faces_elsewhere = np.abs(normals[some] @ normals.T) < tuning.OTHERS_FACING
     others = np.count_nonzero(is_near & is_on & faces_elsewhere, axis=1)
-    return np.asarray(others >= tuning.OTHERS_LEAST)
+    is_old = (found.latest - found.opened[some]) * found.sweep_s >= tuning.OTHERS_AGE_S
+    return np.asarray(is_old & (others >= tuning.OTHERS_LEAST))
 
 
 def without_others(state: InertialState, found: Correspondences) -> Correspondences:

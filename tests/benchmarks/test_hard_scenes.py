@@ -212,7 +212,7 @@ def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
 
 
 def test_a_narrow_view_of_a_wall_does_not_run_away_along_it() -> None:
-    """It sped up to 0.4 m/s, by how the wall leans, and a jamb confirmed that: 1.1 m, silently."""
+    """It sped up to 0.4 m/s, and points at a jamb confirmed that: 1.1 m off, silently."""
     row = row_of("flat, cone of 70 degrees", 263, 38.0)
     assert row["end_m"] < 0.3
     assert row["silent"] == 0

@@ -510,36 +510,3 @@ def test_each_direction_is_as_uncertain_as_what_holds_it() -> None:
     added = np.diag(drift.at(place) - unit_alone(place))
     assert added[0] == pytest.approx(0.04, rel=0.05)
     assert added[1:3].max() < 1e-3
-
-
-def test_gravity_is_as_uncertain_as_what_holds_a_sweep_leans_against_what_did_before() -> None:
-    """Only turns about level axes count, in either direction, and each change once."""
-    drift = upright()
-    drift.record(0, ZERO, SURE)
-    drift.meet(held_by(0))
-    assert drift.leaning == pytest.approx(tuning.DRIFT_LEANS * SURE[3, 3], rel=1e-3)
-    later, yawed = 10 * tuning.DRIFT_GROUP, 20 * tuning.DRIFT_GROUP
-    tilt = np.diag([0.0, 0.0, 0.0, 4e-6, 2e-6, 0.0])
-    drift.record(later, ZERO, tilt)
-    drift.meet(held_by(later))
-    assert drift.leaning == pytest.approx(tuning.DRIFT_LEANS * 3e-6, rel=1e-3)
-    drift.meet(held_by(later))
-    assert drift.leaning == pytest.approx(0.0, abs=1e-12)
-    drift.record(yawed, ZERO, np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 1e-4]))
-    drift.meet(held_by(yawed))
-    assert drift.leaning == pytest.approx(0.0, abs=1e-12)
-    back = 0.0
-    for _ in range(60):  # what is reported falls over some sweeps
-        drift.meet(held_by(0))
-        back += drift.leaning
-    assert back == pytest.approx(tuning.DRIFT_LEANS * 3e-6, rel=1e-3)
-    drift.meet((np.array([], np.int64), np.array([])))
-    assert drift.leaning == 0.0
-
-
-def test_what_holds_a_sweep_may_lean_only_where_gravity_shows_the_vertical() -> None:
-    drift = MapDrift()
-    drift.record(0, ZERO, SURE)
-    drift.record(10 * tuning.DRIFT_GROUP, ZERO, np.diag([0.0, 0.0, 0.0, 4e-6, 4e-6, 0.0]))
-    drift.meet(held_by(10 * tuning.DRIFT_GROUP))
-    assert drift.leaning == 0.0

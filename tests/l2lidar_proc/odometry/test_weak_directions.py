@@ -404,13 +404,15 @@ def test_rims_of_a_map_that_has_only_just_begun_may_be_ignored(young: YoungSurfa
     assert fast.facing(state, found)[:, 0].any() == (young is not YoungSurfaces.IGNORED)
 
 
-def front_and_jamb(rng: np.random.Generator, jamb: F64, beside: int) -> tuple[SurfelMap, F64]:
+def front_and_jamb(
+    rng: np.random.Generator, jamb: F64, beside: int, sweeps: int = 20
+) -> tuple[SurfelMap, F64]:
     """Return a map of a wall's front and of a jamb 0.4 m deep in it, and points to match.
 
     Points of the front come first, then so many beside the jamb, then those of the jamb given.
     """
     surfaces = SurfelMap(SIZES)
-    for number in range(12):
+    for number in range(sweeps):
         front = rng.uniform((-2.0, 2.0, -0.8), (0.0, 2.0, 0.8), (3000, 3))
         side = rng.uniform((0.0, 2.0, -0.8), (0.0, 2.4, 0.8), (1500, 3))
         surfaces.add(np.vstack((front, side)) + rng.normal(0.0, 0.005, (4500, 3)), number)
@@ -449,6 +451,9 @@ def test_of_many_points_that_face_a_direction_all_count() -> None:
     assert not lie_on_others(state, found, facing).any()
     few = facing[: tuning.OTHERS_MOST]
     assert lie_on_others(state, found, few).all()
+    surfaces.sweep_s = 0.9 * tuning.OTHERS_AGE_S / 19  # the map is too young to have drifted
+    young = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    assert not lie_on_others(state, young, few).any()
     assert lie_on_others(state, found, few[:0]).shape == (0,)
 
 
