@@ -425,7 +425,7 @@ def front_and_jamb(
 def test_points_on_the_front_of_a_wall_do_not_face_as_the_jamb_beside_them(degrees: float) -> None:
     rng = np.random.default_rng(9)
     deep = rng.uniform((0.0, 2.1, -0.6), (0.0, 2.3, 0.6), (30, 3))
-    surfaces, points = front_and_jamb(rng, deep, 20)
+    surfaces, points = front_and_jamb(rng, deep, 60)
     turn = eskf.InertialState(HostNs(0), np.eye(3), *([np.zeros(3)] * 5)).boxplus(
         np.r_[0.0, 0.0, np.deg2rad(degrees), np.zeros(eskf.ERRORS - 3)]
     )
@@ -433,7 +433,7 @@ def test_points_on_the_front_of_a_wall_do_not_face_as_the_jamb_beside_them(degre
     seen = source(points @ state.rotation)
     found = correspondences(state, state, seen, surfaces, SurfaceConfig(), REACH)
     facing = np.flatnonzero(np.abs(found.normals[:, 0]) > 0.9)
-    is_deep = found.index[facing] >= 620
+    is_deep = found.index[facing] >= 660
     assert np.count_nonzero(is_deep) > 20
     assert np.count_nonzero(~is_deep) > 5
     on_others = lie_on_others(state, found, facing)
