@@ -40,7 +40,6 @@ from l2lidar_proc.odometry.weak_directions import (
     WeakDirections,
     weak_axes,
     weak_directions,
-    without_others,
 )
 
 
@@ -175,16 +174,11 @@ def align(
         )
         if len(found.index) < least:
             break
-        if weak is not None and reject_ambiguous:
-            found = without_others(at, found)
         step = _step(prior, root, at, found, weak)
         done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
-            if reject_ambiguous:
-                found = without_others(at, found)
             axes = weak_axes(at, found, surfaces, scatter)
             if axes is None:
-                step = step if found is step.found else _step(prior, root, at, found, None)
                 break
             views = _Views(prior, surfaces, config, reach, reject_ambiguous)
             if axes.scatter is not None:

@@ -7,8 +7,7 @@ wall, so the pose stays where it was predicted, and velocity, biases and gravity
 that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
 * only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
-  them for some sweeps: the rim of what has just been seen moves along with the view. Nor do points
-  count that lie as well on what points beside them show to be a surface along the direction;
+  them for some sweeps: the rim of what has just been seen moves along with the view;
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
@@ -37,7 +36,7 @@ lower, the less is known of the place.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -124,10 +123,9 @@ class WeakAxes:
         is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
         settled = found.settled(age, strict=is_ignored)
         faces = (np.abs(derivatives) > tuning.WEAK_FACING) & settled
-        some = np.flatnonzero(faces)
         if self.scatter is None:
-            faces[some] = ~lie_on_others(state, found, some)
             return faces
+        some = np.flatnonzero(faces)
         if number == 0:  # the way that the carrier drives
             widths = self.surfaces.widths(found.cells[some], found.axis[some])
             faces[some] = widths > tuning.FACING_WIDTH
@@ -138,58 +136,6 @@ class WeakAxes:
         sigma = np.linalg.norm(np.einsum("nij,nj->ni", tilts, moves), axis=1)
         faces[some] = np.abs(derivatives[some]) > tuning.FACING_SIGMAS * sigma
         return faces
-
-
-def lie_on_others(
-    state: InertialState, found: Correspondences, some: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Return which of some points (K,) lie on surfaces of points nearby that face elsewhere.
-
-    The front of a wall has points beside its jamb wherever along it the sensor is. Of many points,
-    most are real: none is said to be such a one. Nor are points on surfaces that have only just
-    been seen first: no pose has drifted against them.
-
-    Parameters
-    ----------
-    state : InertialState
-        From which the correspondences were found.
-    found : Correspondences
-    some : ndarray, shape (K,)
-        Indices of correspondences.
-    """
-    out = np.zeros(len(some), np.bool_)
-    if not 0 < len(some) <= tuning.OTHERS_MOST:
-        return out
-    points, normals = found.points @ state.rotation.T, found.normals
-    apart = points[some, None] - points
-    is_near = np.einsum("ijk,ijk->ij", apart, apart) < tuning.OTHERS_NEAR**2
-    is_on = np.abs(np.einsum("ijk,jk->ij", apart, normals)) < tuning.OTHERS_THICKNESS
-    faces_elsewhere = np.abs(normals[some] @ normals.T) < tuning.OTHERS_FACING
-    others = np.count_nonzero(is_near & is_on & faces_elsewhere, axis=1)
-    is_old = (found.latest - found.opened[some]) * found.sweep_s >= tuning.OTHERS_AGE_S
-    return np.asarray(is_old & (others >= tuning.OTHERS_LEAST))
-
-
-def without_others(state: InertialState, found: Correspondences) -> Correspondences:
-    """Return correspondences in which points that lie on other surfaces as well have no weight.
-
-    The same ones where there are no such points.
-
-    Parameters
-    ----------
-    state : InertialState
-        From which they were found.
-    found : Correspondences
-    """
-    normals = found.normals
-    directions = np.linalg.eigh((normals * found.weights[:, None]).T @ normals)[1]
-    is_false = np.zeros(len(normals), np.bool_)
-    for facing in (np.abs(normals @ directions) > tuning.WEAK_FACING).T:
-        some = np.flatnonzero(facing)
-        is_false[some[lie_on_others(state, found, some)]] = True
-    if not is_false.any():
-        return found
-    return replace(found, weights=np.where(is_false, 0.0, found.weights))
 
 
 def weak_axes(
@@ -250,7 +196,6 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
     faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
-    faces &= (found.weights > 0.0)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
         return axes, 0
