@@ -212,8 +212,8 @@ def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
 
 
 def test_the_pattern_on_a_far_wall_does_not_show_the_velocity_of_a_start() -> None:
-    """It ran away at 2.5 m/s: 5.6 m after 6 s."""
-    row = row_of("starts", 2064, 6.0)
+    """It ran away at 2.5 m/s, and ended 4.8 m off."""
+    row = row_of("starts", 2064, 12.0)
     assert row["end_m"] < 0.3
     assert row["nees_pose"] > 0.9
 
