@@ -97,6 +97,8 @@ class Upright(NamedTuple):
 def posts_and_walls(seen: Seen, along: F64) -> list[Upright]:
     """Return the upright things among points: posts, and then walls of up to four directions.
 
+    Points of walls that face elsewhere, or of too few points in one direction, are left out.
+
     Parameters
     ----------
     seen : ndarray, shape (N,), dtype SEEN
@@ -112,8 +114,9 @@ def posts_and_walls(seen: Seen, along: F64) -> list[Upright]:
     points = upright(seen, -along[2])
     angles = _wall_angles(points, along)
     is_post = np.isnan(angles)
-    least = 0.0, tuning.START_ACROSS, tuning.START_ROW
-    found = [Upright(points[is_post], along, least, is_wall=False)]
+    of_posts = 0.0, tuning.START_ACROSS, tuning.START_ROW
+    of_walls = tuning.START_WALL_CELL, 0.0, tuning.START_WALL_ROW
+    found = [Upright(points[is_post], along, of_posts, is_wall=False)]
     left = ~is_post
     for _ in range(tuning.START_WALLS):
         if np.count_nonzero(left) < tuning.START_WALL_POINTS:
@@ -122,8 +125,7 @@ def posts_and_walls(seen: Seen, along: F64) -> list[Upright]:
         off = np.abs(_folded(angles - angle))
         mine = left & (off < tuning.START_WALL_ANGLE)
         axes = _yawed(along.T, -angle).T
-        least = tuning.START_WALL_CELL, 0.0, tuning.START_WALL_ROW
-        found.append(Upright(points[mine], axes, least, is_wall=True))
+        found.append(Upright(points[mine], axes, of_walls, is_wall=True))
         left &= off >= tuning.START_WALL_ANGLE
     return [one for one in found if len(one.points)]
 

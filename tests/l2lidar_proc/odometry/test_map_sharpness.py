@@ -77,7 +77,7 @@ def test_beside_bare_walls_nobody_can_tell() -> None:
 
 
 @pytest.mark.parametrize("axes", [X, np.vstack((X, Y))], ids=["along", "both ways"])
-@pytest.mark.parametrize("yaw_rate", [0.07, -0.03, 0.0])
+@pytest.mark.parametrize("yaw_rate", [0.07, -0.03, 0.014, 0.0])
 def test_posts_are_sharpest_at_the_true_yaw_rate(
     passing: list[Sweep], yaw_rate: float, axes: F64
 ) -> None:
@@ -93,6 +93,7 @@ def test_posts_are_sharpest_at_the_true_yaw_rate(
         assert found is not None
         error, sigma = found
         assert error == pytest.approx(-yaw_rate, abs=0.01)
+        assert error == pytest.approx(-yaw_rate, rel=0.5)
         assert abs(error + yaw_rate) < 3.0 * sigma
         assert sigma < 0.01
 
