@@ -4,11 +4,11 @@
 from a seed (:mod:`benchmarks.hard_scenarios`). Without options it is the short version: one run
 of 30 s of each of 17 families; ``--full`` is the campaign of 200 runs of a minute. The tuning
 constants were chosen on seeds 0 to 65, 100 to 175, 222 to 256 and 261 to 263 (on 0 to 631 and
-2000 to 2139 of the family ``starts``), so ``--first-seed 264`` tells what to expect elsewhere; its page is one of its own.
-Recordings stay in ``out/recordings`` (14 GB a campaign), so a change of the estimator is judged
-again without casting a ray; ``--fresh`` makes them anew. Every row is kept in
-``out/bench/odometry_hard.jsonl`` as soon as it is there: ``--resume`` goes on where a campaign was
-cut.
+2000 to 2139 of the family ``starts``), so ``--first-seed 264`` tells what to expect elsewhere; its
+page is one of its own. Recordings stay in ``out/recordings`` (14 GB a campaign), so a change of
+the estimator is judged again without casting a ray; ``--fresh`` makes them anew. Every row is kept
+in ``out/bench/odometry_hard.jsonl`` as soon as it is there: ``--resume`` goes on where a campaign
+was cut.
 """
 
 from __future__ import annotations
