@@ -5,7 +5,8 @@ Each has its unit in brackets, its meaning and where it comes from:
 * *derived*: follows from the sensor's data sheet or from another number,
 * *source*: taken from the publication named,
 * *tuned on*: chosen on the recordings named; the built-in scenes are room, yard, corridor and box
-  with walk, trot and drone, and "captures" are the two of a real unit at rest (docs/odometry.md).
+  with walk, trot and drone, and "captures" are the two of a real unit at rest
+  (docs/odometry_design.md).
 """
 
 from __future__ import annotations
