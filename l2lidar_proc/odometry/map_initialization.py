@@ -49,11 +49,14 @@ class Trial(NamedTuple):
         Whether any sweep saw what those before it saw.
     last : Alignment or None
         Of the last sweep, where it was aligned.
+    missed : bool
+        Whether a sweep at rest fits nowhere.
     """
 
     motions: list[SweepMotion]
     met: bool
     last: Alignment | None = None
+    missed: bool = False
 
     @property
     def is_doubtful(self) -> bool:
@@ -83,6 +86,14 @@ class Trial(NamedTuple):
         if self.last is None or other.last is None:
             return False
         return self.last.inlier_ratio > other.last.inlier_ratio + margin
+
+    def disproves(self, rest: Trial) -> bool:
+        """Return whether this trial, in motion, shows that a rest which the IMU shows is none."""
+        if not (self.motions and self.met):
+            return False
+        speed = float(np.linalg.norm(self.motions[0].state.velocity))
+        is_closer = not rest.met or self.fits_closer(rest, tuning.INITIAL_CLOSER)
+        return is_closer and speed > tuning.INITIAL_REST_SPEED
 
     def fits_better(self, other: Trial) -> bool:
         """Return whether a trial fits better than another one: far closer, or far more firmly.
@@ -239,10 +250,13 @@ class MapInitializer:
         is_static = initial.at_rest and self._zero_velocity.anchored(
             start, self._samples(sweeps, since)
         )
+        rest = Trial([], met=False)
         if is_static:
-            trial = self._at_rest(sweeps, since, start, initial.covariance)
-            if trial.motions:
-                return trial.motions if trial.met or late else None
+            rest = self._at_rest(sweeps, since, start, initial.covariance)
+            if rest.motions and not rest.missed:
+                return rest.motions if rest.met or late else None
+            if rest.missed and not rest.met and len(sweeps) < tuning.INITIAL_MISSED[0]:
+                return None
             self._zero_velocity.clear()
         trial = self._in_motion(sweeps, since, initial)
         # a rest that neither the IMU nor the sweeps prove
@@ -258,6 +272,12 @@ class MapInitializer:
             else:  # the maps are those of the latest one
                 initial = self._begin_anew(sweeps, since, may_rest)
                 trial = self._in_motion(sweeps, since, initial)
+        if rest.motions and not trial.disproves(rest):
+            if not rest.met:
+                return None if len(sweeps) < tuning.INITIAL_MISSED[1] else []
+            self._begin_anew(sweeps, since, may_rest)
+            self._zero_velocity.anchored(start, self._samples(sweeps, since))
+            return self._at_rest(sweeps, since, start, initial.covariance).motions
         return trial.motions if trial.met or late or not trial.motions else None
 
     def begin_again_at_rest(
@@ -275,7 +295,8 @@ class MapInitializer:
         """
         start = dataclasses.replace(state, stamp=self._predictor.reference(sweeps[0]))
         self._zero_velocity.resume(start)
-        agree = bool(self._at_rest(sweeps, sweeps[0].start, start, covariance).motions)
+        rest = self._at_rest(sweeps, sweeps[0].start, start, covariance)
+        agree = bool(rest.motions) and (rest.met or not rest.missed)
         if not agree and not self._zero_velocity.drifted:
             self._zero_velocity.clear()  # a sweep met nothing of those before it
         return agree
@@ -361,11 +382,14 @@ class MapInitializer:
         *,
         is_known: bool = False,
     ) -> Trial:
-        """Add sweeps to an empty map where they are at rest, as long as they agree, or all."""
+        """Add sweeps to an empty map where they are at rest, as long as they agree, or all.
+
+        What fits nowhere does not contradict the rest: little of a wood is in two sweeps alike.
+        """
         matcher = self.matcher
         matcher.clear()
         motions: list[SweepMotion] = []
-        met, last = False, None
+        met, missed, last = False, False, None
         for sweep in sweeps:
             before = motions[-1].state if motions else state
             reach = None if motions else since
@@ -375,14 +399,15 @@ class MapInitializer:
                 source = matcher.source(sweep, motion)
                 trial = motion.at_rest(state, free_pose())
                 found, status = matcher.match(source, trial, initial=True)
-                if found is not None:
+                if found is None:
+                    missed |= status is not MatchStatus.NEW_MAP
+                elif self._zero_velocity.stays(found):
                     met, last = True, found
-                is_new = status is MatchStatus.NEW_MAP
-                if not (is_new if found is None else self._zero_velocity.stays(found)):
+                else:
                     return Trial([], False)
             motions.append(motion)
             matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
-        return Trial(motions, met, last)
+        return Trial(motions, met, last, missed)
 
     def begin_with(
         self, sweeps: list[Sweep], since: HostNs, start: InertialState, covariance: F64

@@ -72,6 +72,17 @@ def test_starts_that_ran_away_are_right_within_seconds(seed: int, most: float) -
     assert np.linalg.norm(found.velocity[-1]) < 0.5
 
 
+@pytest.mark.parametrize("seed", [26, 264])
+def test_a_rest_in_a_wood_is_one_though_two_sweeps_do_not_fit(seed: int) -> None:
+    """The map began when the carrier walked off, turned by 0.1 rad: 2.9 m off after a minute."""
+    given = recording(scenario("wood, imperfect", seed, 4.5))
+    track = tracked(given)
+    found = errors(given, track)
+    assert np.linalg.norm(found.turn, axis=1).max() < 5e-3
+    assert np.linalg.norm(found.position, axis=1).max() < 0.03
+    assert len(track.stamps) > 15  # the rest of 2 s is in it
+
+
 def test_a_walk_away_from_a_bad_fit_is_tried_along_every_axis() -> None:
     """The first sweeps of a yard fitted -0.8 m/s at 76 % and 1.2 m/s at 92 %: 1.4 m off."""
     given = recording(scenario("in motion from the first sweep", 232, 4.0))

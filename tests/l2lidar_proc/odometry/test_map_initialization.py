@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,27 @@ def test_a_trial_is_better_if_it_fixes_what_another_one_leaves_open() -> None:
     assert not trial(0.96, 0.015).fits_better(weak)
     assert not trial(0.94, 0.5).fits_better(weak)
     assert not trial(None).fits_better(weak)
+
+
+@pytest.mark.parametrize(
+    ("moving", "rest", "disproves"),
+    [
+        (trial(0.9), trial(0.8), True),
+        (trial(0.9), trial(0.895), False),
+        (trial(0.8), trial(None), True),  # no sweep at rest has met another one
+        (trial(None), trial(0.8), False),
+        (FAILED, trial(None), False),
+    ],
+)
+def test_a_motion_disproves_a_rest_that_fits_less(
+    moving: Trial, rest: Trial, disproves: bool
+) -> None:
+    assert moving.disproves(rest) == disproves
+
+
+def test_a_motion_that_is_slower_than_its_error_disproves_nothing() -> None:
+    slow = dataclasses.replace(
+        MOTION.state, velocity=np.array([0.9 * tuning.INITIAL_REST_SPEED, 0.0, 0.0])
+    )
+    motion = MOTION.with_state(slow, MOTION.covariance)
+    assert not trial(0.9)._replace(motions=[motion]).disproves(trial(0.8))
