@@ -205,6 +205,16 @@ WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off i
 FREE_FACING: Final = 4
 FREE_LEFT: Final = 0.5  # length that is left of a weak direction beside the free ones
 WEAK_AGE: Final = 8  # sweeps since a surface was opened: until then it is a rim of the view
+# A point also lies on another surface if so many points near it have one that faces elsewhere, and
+# it is less than twice the range noise away from that. Tuned on: cameras looking into rooms, cones
+# and corridors, seeds 0 to 6
+AMBIGUOUS_LEAST: Final = 2
+# [s] since its surface was opened. Without, 2 of 20 starts in motion ran away
+AMBIGUOUS_AGE_S: Final = 3.0
+AMBIGUOUS_MOST: Final = 100  # points compared; with more, the few false ones do not matter
+AMBIGUOUS_NEAR: Final = 0.5  # [m]
+AMBIGUOUS_THICKNESS: Final = 0.03  # [m]
+AMBIGUOUS_FACING: Final = 0.5  # cosine
 WEAK_STEP: Final = 0.04  # [m] the sweep is moved; below outlier_scale, above the noise
 WEAK_SIGMAS: Final = 1.0  # by which the share that is real is taken smaller
 WEAK_STEPS: Final = 2  # iterations with the weak directions known

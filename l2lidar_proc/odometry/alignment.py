@@ -174,11 +174,16 @@ def align(
         )
         if len(found.index) < least:
             break
+        if weak is not None and reject_ambiguous:
+            found = found.without_points_on_two_surfaces(at.rotation)
         step = _step(prior, root, at, found, weak)
         done = _is_small(step.state.boxminus(at)) or number >= last
         if done and weak is None:
+            if reject_ambiguous:
+                found = found.without_points_on_two_surfaces(at.rotation)
             axes = weak_axes(at, found, surfaces, scatter)
             if axes is None:
+                step = step if found is step.found else _step(prior, root, at, found, None)
                 break
             views = _Views(prior, surfaces, config, reach, reject_ambiguous)
             if axes.scatter is not None:

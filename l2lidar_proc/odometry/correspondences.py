@@ -8,7 +8,7 @@ linearly in dt: so a sweep corrects the motion within itself as well as its plac
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,6 +191,60 @@ class Correspondences:
         if not strict:
             age = min(age, self.latest // 2)
         return np.asarray(self.latest - self.opened >= age)
+
+    def on_two_surfaces(self, some: I64, rotation: F64) -> NDArray[np.bool_]:
+        """Return which of some correspondences are of points on another surface as well.
+
+        The front of a wall has points beside a jamb wherever along it the sensor is. Of many
+        points most are real: none is said to be such a one. Nor are those on surfaces that have
+        only just been seen first, as no pose has drifted against these.
+
+        Parameters
+        ----------
+        some : ndarray, shape (K,)
+            Indices of correspondences.
+        rotation : ndarray, shape (3, 3)
+            Of the state from which they were found.
+
+        Returns
+        -------
+        ndarray, shape (K,), dtype bool
+            Whether points nearby show a surface that faces elsewhere, and the point lies on it.
+        """
+        out = np.zeros(len(some), np.bool_)
+        if not 0 < len(some) <= tuning.AMBIGUOUS_MOST:
+            return out
+        is_old = (self.latest - self.opened[some]) * self.sweep_s >= tuning.AMBIGUOUS_AGE_S
+        old = some[is_old]
+        points = self.points @ rotation.T
+        apart = points[old, None] - points
+        is_near = np.einsum("ijk,ijk->ij", apart, apart) < tuning.AMBIGUOUS_NEAR**2
+        distances = np.abs(np.einsum("ijk,jk->ij", apart, self.normals))
+        is_on = distances < tuning.AMBIGUOUS_THICKNESS
+        is_other = np.abs(self.normals[old] @ self.normals.T) < tuning.AMBIGUOUS_FACING
+        count = np.count_nonzero(is_near & is_on & is_other, axis=1)
+        out[is_old] = count >= tuning.AMBIGUOUS_LEAST
+        return out
+
+    def without_points_on_two_surfaces(self, rotation: F64) -> Correspondences:
+        """Return these with no weight for :meth:`on_two_surfaces` where few points face.
+
+        The same ones where there are no such points.
+
+        Parameters
+        ----------
+        rotation : ndarray, shape (3, 3)
+            Of the state from which they were found.
+        """
+        normals = self.normals
+        directions = np.linalg.eigh((normals * self.weights[:, None]).T @ normals)[1]
+        is_false = np.zeros(len(normals), np.bool_)
+        for facing in (np.abs(normals @ directions) > tuning.WEAK_FACING).T:
+            some = np.flatnonzero(facing)
+            is_false[some[self.on_two_surfaces(some, rotation)]] = True
+        if not is_false.any():
+            return self
+        return replace(self, weights=np.where(is_false, 0.0, self.weights))
 
     def support_along(self, derivatives: F64) -> Support:
         """Return the sweeps that opened the surfaces which hold a direction.

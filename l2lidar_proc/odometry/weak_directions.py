@@ -7,7 +7,8 @@ wall, so the pose stays where it was predicted, and velocity, biases and gravity
 that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
 * only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
-  them for some sweeps: the rim of what has just been seen moves along with the view;
+  them for some sweeps: the rim of what has just been seen moves along with the view. Nor do points
+  count that lie as well on what points beside them show to be a surface along the direction;
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
@@ -123,9 +124,10 @@ class WeakAxes:
         is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
         settled = found.settled(age, strict=is_ignored)
         faces = (np.abs(derivatives) > tuning.WEAK_FACING) & settled
-        if self.scatter is None:
-            return faces
         some = np.flatnonzero(faces)
+        if self.scatter is None:
+            faces[some] = ~found.on_two_surfaces(some, state.rotation)
+            return faces
         if number == 0:  # the way that the carrier drives
             widths = self.surfaces.widths(found.cells[some], found.axis[some])
             faces[some] = widths > tuning.FACING_WIDTH
@@ -196,6 +198,7 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
     faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
+    faces &= (found.weights > 0.0)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
         return axes, 0

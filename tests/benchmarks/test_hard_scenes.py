@@ -211,6 +211,14 @@ def test_a_wood_does_not_show_a_range_bias_that_is_not_there() -> None:
     assert not any(one.quality.range_correction for one in estimates)
 
 
+def test_a_narrow_view_of_a_wall_does_not_run_away_along_it() -> None:
+    """It sped up to 0.4 m/s, and points at a jamb confirmed that: 1.1 m off, silently."""
+    row = row_of("flat, cone of 70 degrees", 263, 38.0)
+    assert row["end_m"] < 0.3
+    assert row["silent"] == 0
+    assert row["nees_pose"] > 0.9
+
+
 def test_the_pattern_on_a_far_wall_does_not_show_the_velocity_of_a_start() -> None:
     """It ran away at 2.5 m/s, and ended 4.8 m off."""
     row = row_of("starts", 2064, 12.0)

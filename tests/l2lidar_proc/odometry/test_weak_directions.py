@@ -397,3 +397,93 @@ def test_rims_of_a_map_that_has_only_just_begun_may_be_ignored(young: YoungSurfa
     assert fast is not None
     assert fast.free == (young is not YoungSurfaces.TRUSTED)
     assert fast.facing(state, found)[:, 0].any() == (young is not YoungSurfaces.IGNORED)
+
+
+def front_and_jamb(
+    rng: np.random.Generator, jamb: F64, beside: int, sweeps: int = 20
+) -> tuple[SurfelMap, F64]:
+    """Return a map of a wall's front and of a jamb 0.4 m deep in it, and points to match.
+
+    Points of the front come first, then so many beside the jamb, then those of the jamb given.
+    """
+    surfaces = SurfelMap(SIZES)
+    for number in range(sweeps):
+        front = rng.uniform((-2.0, 2.0, -0.8), (0.0, 2.0, 0.8), (3000, 3))
+        side = rng.uniform((0.0, 2.0, -0.8), (0.0, 2.4, 0.8), (1500, 3))
+        surfaces.add(np.vstack((front, side)) + rng.normal(0.0, 0.005, (4500, 3)), number)
+    front = rng.uniform((-2.0, 2.0, -0.8), (-0.3, 2.0, 0.8), (600, 3))
+    near = rng.uniform((-0.02, 2.0, -0.6), (0.02, 2.01, 0.6), (beside, 3))
+    return surfaces, np.vstack((front, near, jamb))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 130.0])
+def test_points_on_the_front_of_a_wall_do_not_face_as_the_jamb_beside_them(degrees: float) -> None:
+    rng = np.random.default_rng(9)
+    deep = rng.uniform((0.0, 2.1, -0.6), (0.0, 2.3, 0.6), (30, 3))
+    surfaces, points = front_and_jamb(rng, deep, 60)
+    turn = eskf.InertialState(HostNs(0), np.eye(3), *([np.zeros(3)] * 5)).boxplus(
+        np.r_[0.0, 0.0, np.deg2rad(degrees), np.zeros(eskf.ERRORS - 3)]
+    )
+    state = dataclasses.replace(at(), rotation=turn.rotation)
+    seen = source(points @ state.rotation)
+    found = correspondences(state, state, seen, surfaces, SurfaceConfig(), REACH)
+    facing = np.flatnonzero(np.abs(found.normals[:, 0]) > 0.9)
+    is_deep = found.index[facing] >= 660
+    assert np.count_nonzero(is_deep) > 20
+    assert np.count_nonzero(~is_deep) > 5
+    on_others = found.on_two_surfaces(facing, state.rotation)
+    assert not on_others[is_deep].any()
+    assert on_others[~is_deep].all()
+
+
+def test_of_many_points_that_face_a_direction_all_count() -> None:
+    rng = np.random.default_rng(10)
+    surfaces, points = front_and_jamb(rng, np.zeros((0, 3)), 3 * tuning.AMBIGUOUS_MOST)
+    state = at()
+    found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    facing = np.flatnonzero(np.abs(found.normals[:, 0]) > 0.9)
+    assert len(facing) > tuning.AMBIGUOUS_MOST
+    assert not found.on_two_surfaces(facing, state.rotation).any()
+    few = facing[: tuning.AMBIGUOUS_MOST]
+    assert found.on_two_surfaces(few, state.rotation).all()
+    surfaces.sweep_s = 0.9 * tuning.AMBIGUOUS_AGE_S / 19  # the map is too young to have drifted
+    young = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    assert not young.on_two_surfaces(few, state.rotation).any()
+    assert found.on_two_surfaces(few[:0], state.rotation).shape == (0,)
+
+
+def test_a_front_beside_a_jamb_does_not_tell_the_way_along_the_wall() -> None:
+    """A few of its points lie in the jamb's cells wherever the sensor is."""
+    rng = np.random.default_rng(11)
+    surfaces, points = front_and_jamb(rng, np.zeros((0, 3)), 20)
+    state = at()
+    seen = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    weak = weak_axes(state, seen.without_points_on_two_surfaces(state.rotation), surfaces)
+    assert weak is not None
+    assert np.abs(weak.axes[3, : weak.free]).max() > 0.99
+    prior = 0.1**2 * np.eye(eskf.ERRORS)
+    found = align(at(), prior, source(points), surfaces, SurfaceConfig(), 30)
+    assert found is not None
+    assert found.covariance[3, 3] > 0.099**2
+
+
+def test_where_most_of_what_is_seen_is_the_front_a_jamb_beside_it_does_not_fix_it() -> None:
+    """So many of its points are in the jamb's cells that by the eigenvalues, no way is weak."""
+    rng = np.random.default_rng(12)
+    surfaces, points = front_and_jamb(rng, np.zeros((0, 3)), 90)
+    points = np.vstack((points[:120], points[600:]))
+    state = at()
+    seen = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    left = seen.without_points_on_two_surfaces(state.rotation)
+    facing = np.abs(seen.normals[:, 0]) > 0.9
+    assert (seen.weights * seen.normals[:, 0] ** 2).sum() > 0.12 * seen.weights.sum()
+    assert (left.weights[facing] == 0.0).mean() > 0.95
+    assert (left.weights[~facing] > 0.0).mean() > 0.8
+    found = align(
+        state, 0.1**2 * np.eye(eskf.ERRORS), source(points), surfaces, SurfaceConfig(), 9
+    )
+    assert found is not None
+    assert found.covariance[3, 3] > 0.095**2
+    wall = points[:120]
+    alone = correspondences(state, state, source(wall), surfaces, SurfaceConfig(), REACH)
+    assert alone.without_points_on_two_surfaces(state.rotation) is alone
