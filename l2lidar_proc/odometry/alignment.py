@@ -174,7 +174,7 @@ def align(
         )
         if len(found.index) < least:
             break
-        if weak is not None and reject_ambiguous:
+        if weak is not None and reject_ambiguous:  # it has converged
             found = found.without_points_on_two_surfaces(at.rotation)
         step = _step(prior, root, at, found, weak)
         done = _is_small(step.state.boxminus(at)) or number >= last

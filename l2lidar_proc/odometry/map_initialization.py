@@ -258,20 +258,7 @@ class MapInitializer:
             if rest.missed and not rest.met and len(sweeps) < tuning.INITIAL_MISSED[0]:
                 return None
             self._zero_velocity.clear()
-        trial = self._in_motion(sweeps, since, initial)
-        # a rest that neither the IMU nor the sweeps prove
-        is_assumed = initial.at_rest and not is_static
-        leaves_open = is_assumed and trial.leaves_open(tuning.START_FIXED)
-        moves = initial.at_rest and (leaves_open or self._is_tilted(initial))
-        if (is_assumed and trial.met) or moves or (initial.at_rest and trial.is_doubtful):
-            # a quiet IMU may also be that of a carrier that glides, or that speeds up evenly
-            moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
-            margin = 0.0 if trial.is_doubtful else tuning.INITIAL_CLOSER
-            if (moves and moving.motions) or moving.fits_closer(trial, margin):
-                trial = moving
-            else:  # the maps are those of the latest one
-                initial = self._begin_anew(sweeps, since, may_rest)
-                trial = self._in_motion(sweeps, since, initial)
+        trial = self._unproven(sweeps, since, initial, is_static=is_static)
         if rest.motions and not trial.disproves(rest):
             if not rest.met:
                 return None if len(sweeps) < tuning.INITIAL_MISSED[1] else []
@@ -279,6 +266,27 @@ class MapInitializer:
             self._zero_velocity.anchored(start, self._samples(sweeps, since))
             return self._at_rest(sweeps, since, start, initial.covariance).motions
         return trial.motions if trial.met or late or not trial.motions else None
+
+    def _unproven(
+        self, sweeps: list[Sweep], since: HostNs, initial: InitialState, *, is_static: bool
+    ) -> Trial:
+        """Begin the map in motion, or from a rest that IMU and sweeps do not both prove.
+
+        A quiet IMU may also be that of a carrier that glides, or that speeds up evenly.
+        """
+        trial = self._in_motion(sweeps, since, initial)
+        if not initial.at_rest:
+            return trial
+        leaves_open = not is_static and trial.leaves_open(tuning.START_FIXED)
+        moves = leaves_open or self._is_tilted(initial)
+        if not (moves or trial.is_doubtful or (trial.met and not is_static)):
+            return trial
+        moving = self._in_motion(sweeps, since, self._initial(sweeps, since, may_rest=False))
+        margin = 0.0 if trial.is_doubtful else tuning.INITIAL_CLOSER
+        if (moves and moving.motions) or moving.fits_closer(trial, margin):
+            return moving
+        # the maps are those of the latest one
+        return self._in_motion(sweeps, since, self._begin_anew(sweeps, since, may_rest=True))
 
     def begin_again_at_rest(
         self, sweeps: list[Sweep], state: InertialState, covariance: F64
