@@ -216,12 +216,12 @@ class Correspondences:
             return out
         is_old = (self.latest - self.opened[some]) * self.sweep_s >= tuning.AMBIGUOUS_AGE_S
         old = some[is_old]
-        points = self.points @ rotation.T
-        apart = points[old, None] - points
-        is_near = np.einsum("ijk,ijk->ij", apart, apart) < tuning.AMBIGUOUS_NEAR**2
-        distances = np.abs(np.einsum("ijk,jk->ij", apart, self.normals))
-        is_on = distances < tuning.AMBIGUOUS_THICKNESS
-        is_other = np.abs(self.normals[old] @ self.normals.T) < tuning.AMBIGUOUS_FACING
+        points, normals = self.points @ rotation.T, self.normals
+        squares, offsets = (points**2).sum(axis=1), (points * normals).sum(axis=1)
+        apart = squares[old, None] + squares - 2.0 * points[old] @ points.T
+        is_near = apart < tuning.AMBIGUOUS_NEAR**2
+        is_on = np.abs(points[old] @ normals.T - offsets) < tuning.AMBIGUOUS_THICKNESS
+        is_other = np.abs(normals[old] @ normals.T) < tuning.AMBIGUOUS_FACING
         count = np.count_nonzero(is_near & is_on & is_other, axis=1)
         out[is_old] = count >= tuning.AMBIGUOUS_LEAST
         return out

@@ -31,6 +31,9 @@ SEEN: Final = np.dtype(
 )
 """A point of the last seconds, placed by the IMU."""
 
+AT_ONCE: Final = 20_000
+"""Points placed at once, at several velocities: more leave the cache, fewer take longer."""
+
 Seen = NDArray[np.void]
 """Points (N,), dtype SEEN."""
 
@@ -80,12 +83,16 @@ class Upright(NamedTuple):
         sights = self.points["sight"] @ axes.T
         places = _yawed(sights, yaw_rate * ages) + (self.points["place"] @ axes.T - sights)
         counts = np.zeros(len(errors), np.int64)
-        for number, move in enumerate(errors @ axes.T):
-            moved = places + ages[:, None] * move
-            for size in cells:
-                keys = _keys(*np.floor(moved / np.maximum(size, self.least)).astype(np.int64).T)
-                keys.sort()
-                counts[number] += np.count_nonzero(keys[1:] != keys[:-1]) + 1
+        moves = (errors @ axes.T)[:, :, None]
+        edges = [np.maximum(size, self.least)[:, None] for size in cells]
+        some = max(AT_ONCE // len(places), 1)
+        for first in range(0, len(errors), some):
+            part = slice(first, first + some)
+            moved = places.T + moves[part] * ages
+            for edge in edges:
+                keys = _keys(*np.floor(moved / edge).astype(np.int64).swapaxes(0, 1))
+                keys.sort(axis=1)
+                counts[part] += np.count_nonzero(np.diff(keys, axis=1), axis=1) + 1
         return counts
 
     def decimated(self, share: float) -> Upright:
@@ -219,8 +226,8 @@ def _yawed(points: F64, angles: F64 | float) -> F64:
 
 
 def _keys(*parts: I64) -> I64:
-    """Return one number for each combination of numbers (N,); neighbors differ in the last one."""
-    keys = np.zeros(len(parts[0]), np.int64)
+    """Return one number for each combination of numbers; neighbors differ in the last one."""
+    keys = np.zeros(parts[0].shape, np.int64)
     for part in parts:
         lowest = int(part.min())
         # four more, so that two steps beyond the last do not meet the next combination
