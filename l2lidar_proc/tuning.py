@@ -808,7 +808,9 @@ STILL_DRIFT: Final = 160.0  # squared Mahalanobis distance of a drift (6) that i
 # Share of the points that fixed the weakest direction at first, to tell that motion has blurred it
 # since. A creep of 0.05 m/s through a room: 0.1 at first, 0.01 after 2 s; at rest 0.06 to 0.12
 STILL_FIXED: Final = 0.04
-STILL_BLURRED: Final = 0.4  # of that share is left
+# Of that share is left, on average of two sweeps: a rosette at rest that fixed its height by few
+# points alternated between 0.1 and 0.03
+STILL_BLURRED: Final = 0.45
 STILL_DRIFT_S: Final = 0.5  # [s] how quickly a drift may have come about
 STILL_IMU_NS: Final = 250_000_000  # [ns] in which the IMU shows that rest has ended
 STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have begun to end

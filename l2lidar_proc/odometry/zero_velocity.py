@@ -61,8 +61,9 @@ class ZeroVelocityTest:
         self.anchor: InertialState | None = None
         self.ended_suddenly = False
         self._turned = 0  # the instant of the last sweep of a turn
-        # how well the first sweep at the anchor fixed the weakest direction, as a share of all
-        self._fixed: float | None = None
+        # how well the first and the latest sweep at the anchor fixed the weakest direction, as a
+        # share of all
+        self._fixed: tuple[float, float] | None = None
         self.clear()
 
     def clear(self) -> None:
@@ -214,9 +215,10 @@ class ZeroVelocityTest:
     def _is_blurred(self, found: Alignment) -> bool:
         """Return whether what fixed a direction at first has become blurred, as by motion."""
         share = degeneracy_ratio(found.claimed)
-        first = share if self._fixed is None else self._fixed
-        self._fixed = first
-        return first > tuning.STILL_FIXED and share < tuning.STILL_BLURRED * first
+        first, before = (share, share) if self._fixed is None else self._fixed
+        self._fixed = first, share
+        mean = 0.5 * (before + share)
+        return first > tuning.STILL_FIXED and mean < tuning.STILL_BLURRED * first
 
     def resume(self, state: InertialState) -> None:
         """Take the hypothesis up again at a state; no earlier sweep is compared any more."""
