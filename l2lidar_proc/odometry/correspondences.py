@@ -193,11 +193,12 @@ class Correspondences:
         return np.asarray(self.latest - self.opened >= age)
 
     def on_two_surfaces(self, some: I64, rotation: F64) -> NDArray[np.bool_]:
-        """Return which of some correspondences are of points on another surface as well.
+        """Return which of some correspondences are ambiguous: of points on another surface too.
 
-        The front of a wall has points beside a jamb wherever along it the sensor is. Of many
-        points most are real: none is said to be such a one. Nor are those on surfaces that have
-        only just been seen first, as no pose has drifted against these.
+        Where the pose is off along a wall, points of its front still come to lie beside the jambs
+        in the map, and seem to confirm the pose. Two cases are left out: many correspondences, of
+        which most are right, and surfaces mapped so recently that the pose cannot be off by much
+        against them.
 
         Parameters
         ----------
@@ -209,7 +210,8 @@ class Correspondences:
         Returns
         -------
         ndarray, shape (K,), dtype bool
-            Whether points nearby show a surface that faces elsewhere, and the point lies on it.
+            Whether the point lies on a surface that points nearby were matched with, and that
+            faces elsewhere.
         """
         out = np.zeros(len(some), np.bool_)
         if not 0 < len(some) <= tuning.AMBIGUOUS_MOST:
@@ -227,9 +229,9 @@ class Correspondences:
         return out
 
     def without_points_on_two_surfaces(self, rotation: F64) -> Correspondences:
-        """Return these with no weight for :meth:`on_two_surfaces` where few points face.
+        """Return these with zero weight where points are :meth:`on_two_surfaces`.
 
-        The same ones where there are no such points.
+        Asked for each principal direction that few points face. Returns itself if there are none.
 
         Parameters
         ----------

@@ -88,7 +88,10 @@ class Trial(NamedTuple):
         return self.last.inlier_ratio > other.last.inlier_ratio + margin
 
     def disproves(self, rest: Trial) -> bool:
-        """Return whether this trial, in motion, shows that a rest which the IMU shows is none."""
+        """Return whether this trial, in motion, fits so well that the sensor cannot be at rest.
+
+        The IMU of a carrier that glides may say that it is.
+        """
         if not (self.motions and self.met):
             return False
         speed = float(np.linalg.norm(self.motions[0].state.velocity))
@@ -392,7 +395,8 @@ class MapInitializer:
     ) -> Trial:
         """Add sweeps to an empty map where they are at rest, as long as they agree, or all.
 
-        What fits nowhere does not contradict the rest: little of a wood is in two sweeps alike.
+        A sweep that fits nowhere does not contradict the rest: two sweeps of a wood may have too
+        few surfaces in common.
         """
         matcher = self.matcher
         matcher.clear()

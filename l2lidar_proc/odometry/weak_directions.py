@@ -7,8 +7,8 @@ wall, so the pose stays where it was predicted, and velocity, biases and gravity
 that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefore tested:
 
 * only surfaces that face it count, as in X-ICP (Tuna et al. 2024), and only if the map has had
-  them for some sweeps: the rim of what has just been seen moves along with the view. Nor do points
-  count that lie as well on what points beside them show to be a surface along the direction;
+  them for some sweeps: the rim of what has just been seen moves along with the view. Points that
+  also lie on a surface along the direction do not count;
 * the sweep is moved both ways along the direction and matched again: what the residuals pull back,
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
