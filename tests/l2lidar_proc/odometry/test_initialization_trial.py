@@ -11,7 +11,7 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION
 from l2lidar_proc.odometry.alignment import Alignment
-from l2lidar_proc.odometry.map_initialization import Trial
+from l2lidar_proc.odometry.initialization_trial import Trial
 from tests.support.passing_sweeps import EPOCH, SPEED, motion_at
 
 MOTION = motion_at(SPEED, np.eye(ERRORS)).anchored_at(HostNs(EPOCH))
