@@ -1,7 +1,8 @@
-"""Converts any structured cloud with one time per point to a Sweep, or says why it cannot."""
+"""Sweeps: made of any structured cloud with one time per point, cropped, and joined."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Final
 
 import numpy as np
@@ -211,3 +212,48 @@ def _with_time(
         points[new] = cloud[old] if old != name else 0.0
     points["time"] = seconds
     return points
+
+
+def joined(sweeps: list[Sweep], least_ns: int) -> list[Sweep]:
+    """Return sweeps that last at least so long; a last one that is shorter is left out.
+
+    Parameters
+    ----------
+    sweeps : list of Sweep
+        Ascending, with the same fields.
+    least_ns : int
+    """
+    out: list[Sweep] = []
+    some: list[Sweep] = []
+    for sweep in sweeps:
+        some.append(sweep)
+        if sweep.end - some[0].start >= least_ns:
+            out.append(some[0] if len(some) == 1 else _one(some))
+            some = []
+    return out
+
+
+def cropped(sweep: Sweep, nearest: float, farthest: float) -> Sweep:
+    """Return the sweep without points that are not finite or out of a range [m]."""
+    points = sweep.points
+    squared = sum(points[axis].astype(np.float64) ** 2 for axis in "xyz")
+    inside = (squared >= nearest**2) & (squared <= farthest**2) & np.isfinite(points["time"])
+    return (
+        sweep
+        if inside.all()
+        else dataclasses.replace(sweep, points=records.selected(points, inside))
+    )
+
+
+def _one(sweeps: list[Sweep]) -> Sweep:
+    points = records.joined([sweep.points for sweep in sweeps])
+    shift = [(sweep.start - sweeps[0].start) * 1e-9 for sweep in sweeps]
+    counts = [len(sweep.points) for sweep in sweeps]
+    points["time"] += np.repeat(shift, counts).astype(points["time"].dtype)
+    return Sweep(
+        sweeps[0].start,
+        sweeps[-1].end,
+        points,
+        sum(sweep.packets for sweep in sweeps),
+        sum(sweep.missing for sweep in sweeps),
+    )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import F64, Sweep
-from l2lidar_proc import tuning
+from l2lidar_proc import cloud, tuning
 from l2lidar_proc.motion.head_line import HeadAngle
 from l2lidar_proc.odometry.fan_halves import (
     Halves,
@@ -28,7 +28,6 @@ from l2lidar_proc.odometry.fan_halves import (
     between_halves,
     halves,
 )
-from l2lidar_proc.odometry.map_initialization import joined
 from l2lidar_proc.odometry.range_bias import RangeBias, SeenAgain
 from l2lidar_proc.odometry.uncertainty import Corrections, IntrinsicErrors
 
@@ -103,7 +102,7 @@ class LidarIntrinsics:
         if self._unshown and sweep.start <= self._unshown[-1].start:
             self._unshown = []  # the clock was set, and they might never last for a turn
         self._unshown.append(sweep)
-        for turn in joined(self._unshown, _TURN_NS):
+        for turn in cloud.joined(self._unshown, _TURN_NS):
             self._unshown = []
             if halves(turn.points) is not None:
                 self._is_shown = True

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node import records
 from l2lidar_node.types import F64, STANDARD_GRAVITY, HostNs, Sweep
-from l2lidar_proc import tuning
+from l2lidar_proc import cloud, tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, VELOCITY, InertialState
 from l2lidar_proc.motion.static import InitialState, initial_state
 from l2lidar_proc.motion.sweep_motion import SweepMotion
@@ -129,7 +129,7 @@ class MapInitializer:
         held.append(sweep)
         if held[-1].end - held[0].start < tuning.INITIAL_NS:
             return None
-        whole = joined(held, tuning.INITIAL_SWEEP_NS)
+        whole = cloud.joined(held, tuning.INITIAL_SWEEP_NS)
         if len(whole) < 2 or whole[-1].end < sweep.end:
             return None
         # the very first sweep is seldom whole
@@ -618,48 +618,3 @@ class MapInitializer:
         worst = min(float(np.linalg.eigvalsh(velocity)[-1]), most**2)
         covariance[3:, 3:] += turn**2 * worst * np.eye(3)
         return covariance
-
-
-def joined(sweeps: list[Sweep], least_ns: int) -> list[Sweep]:
-    """Return sweeps that last at least so long; a last one that is shorter is left out.
-
-    Parameters
-    ----------
-    sweeps : list of Sweep
-        Ascending, with the same fields.
-    least_ns : int
-    """
-    out: list[Sweep] = []
-    some: list[Sweep] = []
-    for sweep in sweeps:
-        some.append(sweep)
-        if sweep.end - some[0].start >= least_ns:
-            out.append(some[0] if len(some) == 1 else _one(some))
-            some = []
-    return out
-
-
-def cropped(sweep: Sweep, nearest: float, farthest: float) -> Sweep:
-    """Return the sweep without points that are not finite or out of a range [m]."""
-    points = sweep.points
-    squared = sum(points[axis].astype(np.float64) ** 2 for axis in "xyz")
-    inside = (squared >= nearest**2) & (squared <= farthest**2) & np.isfinite(points["time"])
-    return (
-        sweep
-        if inside.all()
-        else dataclasses.replace(sweep, points=records.selected(points, inside))
-    )
-
-
-def _one(sweeps: list[Sweep]) -> Sweep:
-    points = records.joined([sweep.points for sweep in sweeps])
-    shift = [(sweep.start - sweeps[0].start) * 1e-9 for sweep in sweeps]
-    counts = [len(sweep.points) for sweep in sweeps]
-    points["time"] += np.repeat(shift, counts).astype(points["time"].dtype)
-    return Sweep(
-        sweeps[0].start,
-        sweeps[-1].end,
-        points,
-        sum(sweep.packets for sweep in sweeps),
-        sum(sweep.missing for sweep in sweeps),
-    )

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from l2lidar_node.types import F64, HostNs, Sweep
-from l2lidar_proc import tuning
+from l2lidar_proc import cloud, tuning
 from l2lidar_proc.motion import carrier_priors, filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
@@ -32,7 +32,7 @@ from l2lidar_proc.odometry.innovation_gate import GatedAlignment, InnovationGate
 from l2lidar_proc.odometry.innovations import InnovationTest
 from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
-from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer, cropped
+from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
 from l2lidar_proc.odometry.start_velocity import StartVelocity
@@ -159,7 +159,7 @@ class Odometry:
             if not 0 < step <= tuning.TIME_JUMP_NS:
                 self._begin_time_line(self._predictor.reference(sweep))
                 status.append(Status.RESTARTED)
-        sweep = cropped(sweep, self.config.min_range, self.config.max_range)
+        sweep = cloud.cropped(sweep, self.config.min_range, self.config.max_range)
         self._reported = sweep  # as the unit reports it, for what is mapped again
         head = self._intrinsics.head(sweep)
         # at rest the samples show it themselves
