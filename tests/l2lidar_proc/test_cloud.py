@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from l2lidar_node.types import POINT, HostNs
-from l2lidar_proc.cloud import CloudError, to_sweep, without_time
+from l2lidar_node.types import POINT, HostNs, Sweep
+from l2lidar_proc.cloud import CloudError, cropped, joined, to_sweep, without_time
 
 STAMP = HostNs(1_700_000_000_123_456_789)
 OFFSETS_NS = np.array([0, 8_000, 50_000_000, 99_992_000], dtype=np.int64)
@@ -162,3 +162,34 @@ def test_without_time() -> None:
     assert slim.dtype.names == ("x", "y", "z", "intensity", "range")
     assert slim.dtype.itemsize == 20
     assert slim["range"].tolist() == [1, 1, 1]
+
+
+def measured(start: int, seconds: float, ranges: list[float], missing: int = 0) -> Sweep:
+    points = np.zeros(len(ranges), dtype=POINT)
+    points["y"] = ranges
+    points["time"] = np.linspace(0.0, seconds, len(ranges))
+    points.flags.writeable = False
+    return Sweep(HostNs(start), HostNs(start + int(seconds * 1e9)), points, 10, missing)
+
+
+def test_cropped_keeps_what_is_in_range() -> None:
+    sweep = measured(STAMP, 0.1, [0.49, 0.5, -3.0, 8.0, 8.01, np.nan], missing=2)
+    kept = cropped(sweep, 0.5, 8.0)
+    assert kept.points["y"].tolist() == [0.5, -3.0, 8.0]
+    np.testing.assert_array_equal(kept.points, sweep.points[1:4])
+    assert (kept.start, kept.end, kept.packets, kept.missing) == (sweep.start, sweep.end, 10, 2)
+    assert cropped(kept, 0.5, 8.0) is kept
+
+
+def test_joined_sweeps_last_long_enough_and_keep_every_instant() -> None:
+    spans = [(0, 0.05), (50, 0.05), (100, 0.1), (200, 0.05)]  # the last one stays too short
+    sweeps = [
+        measured(STAMP + ms * 1_000_000, seconds, [1.0 + k, 2.0], k)
+        for k, (ms, seconds) in enumerate(spans)
+    ]
+    first, second = joined(sweeps, 100_000_000)
+    assert second is sweeps[2]
+    assert (first.start, first.end) == (sweeps[0].start, sweeps[1].end)
+    assert (first.packets, first.missing) == (20, 1)
+    assert first.points["y"].tolist() == [1.0, 2.0, 2.0, 2.0]
+    np.testing.assert_allclose(first.points["time"], [0.0, 0.05, 0.05, 0.1], atol=1e-7)
