@@ -51,6 +51,7 @@ from l2lidar_proc.odometry.pose_hypotheses import (
 )
 from l2lidar_proc.odometry.range_bias import SeenAgain
 from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.surfels import YoungSurfaces
 from l2lidar_proc.odometry.uncertainty import Corrections, MapDrift
 from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
 from l2lidar_proc.odometry.wall_profile import Spots, extract_spots
@@ -238,7 +239,9 @@ class SweepMatcher:
         """Return the alignment that can be believed, as :meth:`match`."""
         if len(source.points) < self.config.min_points or not len(self.surfaces):
             return Match(None, MatchStatus.REJECTED)
-        motion = self._with_turned_way(motion)
+        # the first sweeps after a start are compared at several velocities, by what they fix
+        if not (initial and self.surfaces.young is YoungSurfaces.TRUSTED):
+            motion = self._with_turned_axis(motion)
         loose = self._place_is_loose(motion.covariance) or rotation_is_loose(motion.covariance)
         young = self.is_young
         strict = loose and not initial and not young
@@ -342,21 +345,23 @@ class SweepMatcher:
             return None
         return np.asarray(np.linalg.eigh(self._scatter)[1][:, 0])
 
-    def _with_turned_way(self, motion: SweepMotion) -> SweepMotion:
-        """Return a predicted motion that allows for bare walls which do not run quite straight.
+    def _with_turned_axis(self, motion: SweepMotion) -> SweepMotion:
+        """Return a predicted motion that allows for a loosest direction which is not known well.
 
-        Place and velocity are uncertain along the walls as they were, by meters if nothing faced
-        the way for long. That is not quite along the walls as they are, and millimeters across
-        would be taken for meters along.
+        Where surfaces leave a direction free, place and velocity are uncertain along it by meters.
+        Each sweep sees that direction a few degrees off. What it measures across, to millimeters,
+        would then be taken for a measurement along (Huang, Mourikis and Roumeliotis 2010 show it
+        for the unobservable directions of SLAM).
         """
-        way = self._wall_direction
-        if way is None:
-            return motion
-        across = np.eye(3) - np.outer(way, way)
+        axis, turn = self._wall_direction, tuning.WAY_TURN
+        if axis is None:
+            axes = np.linalg.eigh(motion.covariance[VELOCITY, VELOCITY])[1]
+            axis, turn = axes[:, -1], tuning.LOOSE_AXIS_TURN
+        across = np.eye(3) - np.outer(axis, axis)
         covariance = motion.covariance.copy()
         for errors in (POSITION, VELOCITY):
-            along = float(way @ covariance[errors, errors] @ way)
-            covariance[errors, errors] += tuning.WAY_TURN**2 * along * across
+            along = float(axis @ covariance[errors, errors] @ axis)
+            covariance[errors, errors] += turn**2 * along * across
         return dataclasses.replace(motion, covariance=covariance)
 
     def _place_is_loose(self, covariance: F64) -> bool:

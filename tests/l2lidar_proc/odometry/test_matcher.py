@@ -360,6 +360,32 @@ def test_millimeters_across_the_way_are_not_meters_along_it(
     assert np.sqrt(found().covariance[3, 3]) < 0.7
 
 
+def test_millimeters_across_a_loose_direction_are_not_centimeters_along_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody drives, so each sweep sees the direction that it leaves free a few degrees off."""
+    rng, matcher = np.random.default_rng(26), SweepMatcher(OdometryConfig(), np.zeros(3))
+    for _ in range(tuning.YOUNG_SWEEPS + 1):
+        extended(matcher, corridor(rng, 4000))
+    before = np.array([np.cos(0.05), np.sin(0.05), 0.0])
+    predicted = motion(TIGHT, np.array([0.0, 0.002, 0.0]))
+    covariance = predicted.covariance.copy()
+    for errors, along in ((eskf.POSITION, 0.05), (eskf.VELOCITY, 0.5)):
+        covariance[errors, errors] = 3e-4**2 * np.eye(3) + along**2 * np.outer(before, before)
+    predicted = dataclasses.replace(predicted, covariance=covariance)
+    seen = source(corridor(rng, 2000))
+
+    def found() -> Alignment:
+        alignment = matcher.match(seen, predicted).alignment
+        assert alignment is not None
+        return alignment
+
+    assert abs(found().state.position[0]) < 0.02
+    assert np.sqrt(found().covariance[3, 3]) > 0.04
+    monkeypatch.setattr(tuning, "LOOSE_AXIS_TURN", 0.0)
+    assert np.sqrt(found().covariance[3, 3]) < 0.03
+
+
 def test_a_place_that_is_uncertain_along_bare_walls_is_not_loose() -> None:
     """Where some of the walls have moved, a sweep fits badly, and no other place fits better."""
     rng = np.random.default_rng(25)
