@@ -573,6 +573,10 @@ BLUR_SPEED: Final = 0.15
 # blow (room, yard, warehouse, seeds 2 to 6): NEES of the place from 1 to 4, where 3 is right
 BLUR_SHARE: Final = 0.5
 DOUBT_PAUSE_NS: Final = 1_000_000_000  # [ns]
+# Length of the points' mean direction, above which a view is narrow. Observed: 0.56 to 0.70 for an
+# L2, 0.83 if its carrier leaves 120 degrees, 0.88 to 0.95 for cameras and cones. A cone whose gyro
+# was not believed turned by 66 mrad at rest
+NARROW_VIEW: Final = 0.77
 NIS_MOST: Final = 25.0  # by which variances are raised at most, or lowered
 # Variances are lowered to so many times what the window shows. Tuned on: velocities of the hard
 # runs, seeds 0 to 3; from 1.25 to 1.5, 85 to 99 % of them are within their 95 % bound.

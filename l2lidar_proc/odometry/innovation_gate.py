@@ -171,6 +171,18 @@ class InnovationGate:
         return not is_fixed_anew and other.fits_closer_than(found, matcher.config.surfaces)
 
 
+def is_narrow(points: F64) -> bool:
+    """Return whether a view is narrow: whether its points (N, 3) lie in much the same direction.
+
+    By the length of their mean direction (mean resultant length; Mardia and Jupp 2000, 9.2).
+    """
+    ranges = np.linalg.norm(points, axis=1)
+    directions = points[ranges > 0.0] / ranges[ranges > 0.0, None]
+    if not len(directions):
+        return True
+    return float(np.linalg.norm(directions.mean(axis=0))) > tuning.NARROW_VIEW
+
+
 def inflated_prior(covariance: F64, item: Correction) -> F64 | None:
     """Return the covariance that a prior must have had, if a correction contradicts it.
 

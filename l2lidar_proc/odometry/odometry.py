@@ -28,7 +28,12 @@ from l2lidar_proc.odometry.estimate import (
     gaps_in,
 )
 from l2lidar_proc.odometry.first_rest import FirstRest
-from l2lidar_proc.odometry.innovation_gate import GatedAlignment, InnovationGate, Prediction
+from l2lidar_proc.odometry.innovation_gate import (
+    GatedAlignment,
+    InnovationGate,
+    Prediction,
+    is_narrow,
+)
 from l2lidar_proc.odometry.innovations import InnovationTest
 from l2lidar_proc.odometry.late_gravity import LateGravity
 from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
@@ -334,7 +339,8 @@ class Odometry:
         """Return what passes the innovation gate of a prediction and its alignment.
 
         The other predictions hold the velocity instead of using the accelerometer, and the rate as
-        well instead of using the gyro.
+        well instead of using the gyro. A narrow view fits its map at other turns too, so there the
+        gyro is used in any case.
         """
         assert self._posterior is not None
         before = self._posterior
@@ -346,7 +352,7 @@ class Odometry:
         others = []
         if given.motion.use_forces:
             others.append(functools.partial(held, ImuUse.GYRO))
-        if not given.motion.imu.missing.all():
+        if not (given.motion.imu.missing.all() or is_narrow(given.source.points)):
             others.append(functools.partial(held, ImuUse.NOTHING))
         return self._gate.passed(self.matcher, given, found, others, blurred=blurred)
 

@@ -21,6 +21,7 @@ from l2lidar_proc.odometry.innovation_gate import (
     InnovationGate,
     Prediction,
     inflated_prior,
+    is_narrow,
 )
 from l2lidar_proc.odometry.innovations import correction
 from l2lidar_proc.odometry.matcher import SweepMatcher
@@ -318,3 +319,22 @@ def test_a_loose_prediction_does_not_replace_what_fits_as_well(
     assert found is not None
     assert matcher.fits_badly(found)
     assert gated(matcher, strange, predicted, found) == (predicted, strange, found, False)
+
+
+@pytest.mark.parametrize(
+    ("opening_deg", "narrow"),
+    [(360.0, False), (180.0, False), (100.0, True), (70.0, True)],
+)
+def test_a_view_is_narrow_by_its_opening_angle(opening_deg: float, narrow: bool) -> None:
+    rng = np.random.default_rng(5)
+    cosines = rng.uniform(np.cos(np.radians(opening_deg / 2.0)), 1.0, 4000)
+    azimuths = rng.uniform(0.0, 2.0 * np.pi, len(cosines))
+    sines = np.sqrt(1.0 - cosines**2)
+    directions = np.column_stack((sines * np.cos(azimuths), cosines, sines * np.sin(azimuths)))
+    ranges = rng.uniform(0.5, 30.0, (len(cosines), 1))
+    assert is_narrow(ranges * directions) is narrow
+
+
+def test_a_view_of_nothing_is_narrow() -> None:
+    assert is_narrow(np.zeros((0, 3)))
+    assert is_narrow(np.zeros((3, 3)))
