@@ -392,17 +392,20 @@ class Odometry:
         information = found.information[eskf.POSITION, eskf.POSITION]
         better = start.search(whole, information, vertical)
         motions: list[SweepMotion] = []
-        if better is not None and better.is_news:
+        if better is not None and not better.is_news:
+            better = None
+        if better is not None:
             self._walls.correct(state, better.state)
             motion = motion.with_state(better.state, better.covariance)
-            if start.is_first:
-                first = start.beginning(whole.with_state(better.state, better.covariance))
-                motions = self._initializer.begin_with(start.sweeps, start.since, *first)
+            whole = whole.with_state(better.state, better.covariance)
+        if start.is_first and better is not None and better.is_open:
+            first = start.beginning(whole)
+            motions = self._initializer.begin_with(start.sweeps, start.since, *first)
         elif start.is_first and not start.is_open:
             fitted = start.fitted(whole)
             if fitted is not None:
                 motions = self._initializer.begin_as_fitted(
-                    start.sweeps, start.since, fitted, covariance
+                    start.sweeps, start.since, fitted, motion.covariance
                 )
         if motions:
             start.replace(start.sweeps, motions)

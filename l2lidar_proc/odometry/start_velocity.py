@@ -69,11 +69,14 @@ class FoundVelocity(NamedTuple):
     covariance : ndarray, shape (18, 18)
     is_news : bool
         Whether the state before was another one, or less certain.
+    is_open : bool
+        Whether the sweeps leave some of the velocity open; else only gravity may have changed.
     """
 
     state: InertialState
     covariance: F64
     is_news: bool
+    is_open: bool = True
 
 
 class FittedStart(NamedTuple):
@@ -210,16 +213,18 @@ class StartVelocity:
         """
         before = motion
         lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
-        if vertical is not None and vertical.is_certain:
-            motion = with_level_gravity(motion, vertical.direction, lasted)
         strengths, directions = np.linalg.eigh(information)
         weak = directions[:, strengths < tuning.START_SHARE * strengths[-1]]
         if self.is_awaited:
             weak = np.column_stack((weak, self._open_axes.T))
+        if vertical is not None and vertical.is_certain:
+            free = level_span(weak, motion.state.gravity)
+            motion = with_level_gravity(motion, vertical.direction, lasted, free)
         axes = level_span(weak, motion.state.gravity)
         if not len(axes):
-            is_leveled = motion is not before
-            return FoundVelocity(motion.state, motion.covariance, True) if is_leveled else None
+            if motion is before:
+                return None
+            return FoundVelocity(motion.state, motion.covariance, is_news=True, is_open=False)
         seen = placed(self._passed, motion, self._lever, axes)
         turned = with_yaw_rate(motion, seen, axes) if self.is_first else motion
         if turned is not motion:
@@ -312,12 +317,15 @@ def level_span(directions: F64, gravity: F64) -> F64:
     return np.asarray(axes[:, lengths > tuning.START_LEVEL].T)
 
 
-def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> SweepMotion:
+def with_level_gravity(
+    motion: SweepMotion, vertical: F64, seconds: float, free: F64
+) -> SweepMotion:
     """Return a motion with gravity along the vertical of the place, the same if it is there.
 
     It leaves it where a young map confirms a velocity that grows: the acceleration passes for a
     tilt. The place is then more certain than what has been learned about gravity. And it was
-    never there where the carrier accelerated at the start.
+    never there where the carrier accelerated at the start. Where the sweeps fix the place, they
+    have corrected the velocity all the time, whatever gravity was.
 
     Parameters
     ----------
@@ -325,7 +333,9 @@ def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> Sw
     vertical : ndarray, shape (3,)
         Unit vector, map axes.
     seconds : float
-        For how long gravity may have accelerated the state.
+        For how long gravity may have accelerated the state,
+    free : ndarray, shape (K, 3)
+        and along which level axes, orthonormal, map axes.
     """
     state, covariance = motion.state, motion.covariance
     axes = level_basis(vertical).T
@@ -335,7 +345,9 @@ def with_level_gravity(motion: SweepMotion, vertical: F64, seconds: float) -> Sw
     is_known = float(np.linalg.eigvalsh(known)[-1]) < tuning.START_LEVEL_KNOWN**2
     if is_known and tilt @ np.linalg.solve(known + noise, tilt) < tuning.START_LEVEL_SIGMAS**2:
         return motion
-    error = _accelerated(tilt @ axes, seconds)
+    lean = tilt @ axes
+    error = _accelerated(free.T @ (free @ lean), seconds)
+    error[GRAVITY] = lean
     covariance = covariance + np.outer(error, error)
     h = np.zeros((2, ERRORS))
     h[:, GRAVITY] = axes

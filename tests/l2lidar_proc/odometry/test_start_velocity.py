@@ -86,13 +86,14 @@ def tilted_motion(degrees: float, sigma: float, growing_s: float = 1.1) -> Sweep
 
 
 UP = np.array([0.0, 0.0, 1.0])
+LEVEL = np.eye(3)[:2]
 
 
 @pytest.mark.parametrize("degrees", [-4.0, 2.5])
 def test_gravity_that_has_run_away_returns_to_the_vertical_of_the_place(degrees: float) -> None:
     """And so does the velocity that it has made meanwhile."""
     motion = tilted_motion(degrees, 0.05)
-    found = with_level_gravity(motion, UP, 1.1)
+    found = with_level_gravity(motion, UP, 1.1, LEVEL)
     assert found is not motion
     gravity, sigmas = found.state.gravity, np.sqrt(np.diag(found.covariance))
     assert np.abs(gravity[:2]).max() < 0.1
@@ -103,10 +104,25 @@ def test_gravity_that_has_run_away_returns_to_the_vertical_of_the_place(degrees:
     assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
 
 
+def test_a_velocity_that_sweeps_have_fixed_is_kept_when_gravity_is_leveled() -> None:
+    """It was right, and gravity had only made up for the speed that the map began without.
+
+    By the velocity that 2.2 s of that gravity would have made, a start ran 3.7 m away.
+    """
+    motion = tilted_motion(2.5, 0.05, growing_s=0.0)
+    fixed = with_level_gravity(motion, UP, 2.2, np.zeros((0, 3)))
+    assert np.abs(fixed.state.gravity[:2]).max() < 0.1
+    assert fixed.state.velocity == pytest.approx(SPEED, abs=1e-3)
+    along_y = with_level_gravity(motion, UP, 2.2, LEVEL[1:])
+    assert along_y.state.velocity == pytest.approx(SPEED, abs=1e-3)
+    free = with_level_gravity(motion, UP, 2.2, LEVEL)
+    assert abs(free.state.velocity[0] - SPEED[0]) > 0.5
+
+
 def test_gravity_of_an_accelerated_start_is_put_to_the_vertical_of_the_place() -> None:
     """A carrier that set off at 1.2 m/s^2, which is within what such a start leaves open."""
     motion = tilted_motion(-7.0, 0.5, 2.2)
-    found = with_level_gravity(motion, UP, 2.2)
+    found = with_level_gravity(motion, UP, 2.2, LEVEL)
     assert np.abs(found.state.gravity[:2]).max() < 0.1
     error = found.state.velocity - SPEED
     assert np.abs(error).max() < 0.5, "it was 2.6 m/s"
@@ -116,10 +132,10 @@ def test_gravity_of_an_accelerated_start_is_put_to_the_vertical_of_the_place() -
 def test_gravity_within_its_sigma_is_left_alone() -> None:
     for degrees, sigma in ((0.5, 0.05), (-2.5, 0.2)):
         motion = tilted_motion(degrees, sigma)
-        assert with_level_gravity(motion, UP, 1.1) is motion
+        assert with_level_gravity(motion, UP, 1.1, LEVEL) is motion
     # down or up is the same axis
     motion = tilted_motion(4.0, 0.05)
-    one, other = (with_level_gravity(motion, vertical, 1.1).state for vertical in (UP, -UP))
+    one, other = (with_level_gravity(motion, vertical, 1.1, LEVEL).state for vertical in (UP, -UP))
     assert other.gravity == pytest.approx(one.gravity)
 
 
