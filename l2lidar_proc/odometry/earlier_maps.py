@@ -193,18 +193,29 @@ class _LevelFit(NamedTuple):
         [ns]
     shift : ndarray, shape (3,)
         From the predicted place [m], map axes.
+    velocity : ndarray, shape (3, 3)
+        Covariance of the velocity, map axes [m^2/s^2].
     fixes_height : bool
     """
 
     stamp: int
     shift: F64
+    velocity: F64
     fixes_height: bool
 
-    def agrees_with(self, other: _LevelFit) -> bool:
-        """Return whether two sweeps fit at one place."""
-        fixed = self.fixes_height and other.fixes_height
-        most = tuning.EARLIER_SAME[1] if fixed else tuning.REVISIT_SAME_M
-        return float(np.linalg.norm(self.shift - other.shift)) < most
+    def agrees_with(self, before: _LevelFit) -> bool:
+        """Return whether this sweep and one before it fit at one place.
+
+        The sensor may have moved between the two otherwise than predicted, as far as its velocity
+        was not known.
+        """
+        change = self.shift - before.shift
+        way = float(np.linalg.norm(change))
+        if self.fixes_height and before.fixes_height:
+            return way < tuning.EARLIER_SAME[1]
+        seconds = (self.stamp - before.stamp) * 1e-9
+        unknown = seconds * float(np.sqrt(change @ before.velocity @ change)) / max(way, 1e-9)
+        return way < tuning.REVISIT_SAME_M + unknown
 
 
 class _LevelFits:
@@ -405,7 +416,7 @@ class MapRevisit:
             return None, False
         stamp, fits = int(motion.state.stamp), self._fits
         free = unobserved_directions(found.information[POSITION, POSITION])
-        fits.add(_LevelFit(stamp, move, not free.size))
+        fits.add(_LevelFit(stamp, move, motion.covariance[VELOCITY, VELOCITY], not free.size))
         is_doubted = part.is_contradicted or self._returned.at(stamp) or fits.disagree
         is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
         return found, (is_likely and not is_doubted) or fits.are_one_place

@@ -461,6 +461,31 @@ def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(
     assert found == [False] * (sweeps - 1) + [True]
 
 
+@pytest.mark.parametrize(
+    ("axis", "sigma", "agree"),
+    [(0, 0.01, False), (0, 0.3, True), (1, 0.3, False)],  # the places differ along x
+)
+def test_places_agree_as_far_as_the_velocity_between_them_is_unknown(
+    axis: int, sigma: float, agree: bool
+) -> None:
+    """A right place was told 4 cm apart by two sweeps, and the place 1.4 m beside it was kept."""
+    rng, revisit, matcher = (
+        np.random.default_rng(54),
+        MapRevisit(),
+        drifted_matcher(0.6, drift=ALONG),
+    )
+    part = OlderPart(matcher.part_of(np.arange(28) < 14), False, True)
+    found = []
+    for number in range(2):
+        sweep = later(motion(TIGHT, PLACE + ALONG - (0.05 * number, 0.0, 0.0)), 0.2 * number)
+        covariance = sweep.covariance.copy()
+        covariance[VELOCITY.start + axis, VELOCITY.start + axis] = sigma**2
+        seen = source(corner(rng, strip=60, floor=0) - PLACE)
+        sweep = sweep.with_state(sweep.state, covariance)
+        found.append(revisit.search(seen, part, sweep, FrameJump()) is not None)
+    assert found == [False, agree]
+
+
 @pytest.mark.parametrize("known", [0.4, 0.6])
 def test_what_is_met_at_once_with_all_of_the_map_has_to_be_confirmed(known: float) -> None:
     rng, revisit, matcher = np.random.default_rng(45), MapRevisit(), drifted_matcher(known)
