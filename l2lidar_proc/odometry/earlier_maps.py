@@ -214,8 +214,8 @@ class _LevelFit(NamedTuple):
         if self.fixes_height and before.fixes_height:
             return way < tuning.EARLIER_SAME[1]
         seconds = (self.stamp - before.stamp) * 1e-9
-        unknown = seconds * float(np.sqrt(change @ before.velocity @ change)) / max(way, 1e-9)
-        return way < tuning.REVISIT_SAME_M + unknown
+        variance = max(float(change @ before.velocity @ change), 0.0) / max(way, 1e-9) ** 2
+        return way < tuning.REVISIT_SAME_M + seconds * float(np.sqrt(variance))
 
 
 class _LevelFits:

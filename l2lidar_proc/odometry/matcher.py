@@ -239,7 +239,7 @@ class SweepMatcher:
         """Return the alignment that can be believed, as :meth:`match`."""
         if len(source.points) < self.config.min_points or not len(self.surfaces):
             return Match(None, MatchStatus.REJECTED)
-        # the first sweeps after a start are compared at several velocities, by what they fix
+        # a start tries its first sweeps at several velocities: what they fix tells which is right
         if not (initial and self.surfaces.young is YoungSurfaces.TRUSTED):
             motion = self._with_turned_axis(motion)
         loose = self._place_is_loose(motion.covariance) or rotation_is_loose(motion.covariance)

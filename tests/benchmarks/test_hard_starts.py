@@ -153,7 +153,7 @@ def test_bare_walls_tell_a_walker_nothing_that_is_wrong() -> None:
 
 
 def test_a_start_with_a_wrong_velocity_that_nothing_left_open_begins_again() -> None:
-    """The first two sweeps fitted at 0.5 m/s more or less; all poses were 0.3 m off the first."""
+    """The first two sweeps fitted at a wrong velocity; all poses were 0.3 m off the first one."""
     given = recording(scenario(STARTS, 1009, 5.0))
     track = tracked(given)
     again = max(k for k, names in enumerate(track.status) if "STARTING" in names)

@@ -425,6 +425,12 @@ def test_one_sweep_relocalizes_a_pose_by_a_likely_drift_unless_it_has_just_retur
         assert (again is not None) == counts
 
 
+def contradicted_part() -> OlderPart:
+    """Return the older part of a map that has drifted along a wall, and contradicts the pose."""
+    matcher = drifted_matcher(0.6, drift=ALONG)
+    return OlderPart(matcher.part_of(np.arange(28) < 14), is_due=False, is_contradicted=True)
+
+
 @pytest.mark.parametrize(
     ("floors", "away", "others", "sweeps"),
     [
@@ -441,12 +447,7 @@ def test_where_sweeps_fit_elsewhere_as_well_more_have_to_agree(
     floors: tuple[int, int], away: float, others: int, sweeps: int
 ) -> None:
     """A wrong place wanders with what is in sight. A sweep of two seconds ago does not count."""
-    rng, revisit, matcher = (
-        np.random.default_rng(54),
-        MapRevisit(),
-        drifted_matcher(0.6, drift=ALONG),
-    )
-    part = OlderPart(matcher.part_of(np.arange(28) < 14), False, True)
+    rng, revisit, part = np.random.default_rng(54), MapRevisit(), contradicted_part()
 
     def is_back(nearer: float, seconds: float, floor: int) -> bool:
         """Search with a sweep that fits nearer by so much."""
@@ -469,12 +470,7 @@ def test_places_agree_as_far_as_the_velocity_between_them_is_unknown(
     axis: int, sigma: float, agree: bool
 ) -> None:
     """A right place was told 4 cm apart by two sweeps, and the place 1.4 m beside it was kept."""
-    rng, revisit, matcher = (
-        np.random.default_rng(54),
-        MapRevisit(),
-        drifted_matcher(0.6, drift=ALONG),
-    )
-    part = OlderPart(matcher.part_of(np.arange(28) < 14), False, True)
+    rng, revisit, part = np.random.default_rng(54), MapRevisit(), contradicted_part()
     found = []
     for number in range(2):
         sweep = later(motion(TIGHT, PLACE + ALONG - (0.05 * number, 0.0, 0.0)), 0.2 * number)
