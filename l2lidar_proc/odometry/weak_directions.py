@@ -167,7 +167,7 @@ def weak_axes(
         return None
     axes = axes[:, weak]
     if scatter is None or not _is_way(axes[:, 0], state.gravity):
-        axes, free = _free_first(axes, found)
+        axes, free = _free_first(axes, found, state.gravity)
         return WeakAxes(scale, axes, surfaces, free=free)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
@@ -176,7 +176,7 @@ def weak_axes(
     return WeakAxes(scale, axes, surfaces, scatter)
 
 
-def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
+def _free_first(axes: F64, found: Correspondences, gravity: F64) -> tuple[F64, int]:
     """Return weak directions (6, K) with those of the place first that no surface faces.
 
     Parameters
@@ -184,6 +184,8 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     axes : ndarray, shape (6, K)
         Orthonormal, weakest first.
     found : Correspondences
+    gravity : ndarray, shape (3,)
+        [m/s^2]; zero if unknown.
 
     Returns
     -------
@@ -194,10 +196,13 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     """
     normals = found.normals
     strength, places = np.linalg.eigh((normals * found.weights[:, None]).T @ normals)
-    places = places[:, strength < tuning.WEAK_SHARE * strength[-1]]
+    places, is_height = _height_apart(
+        places[:, strength < tuning.WEAK_SHARE * strength[-1]], gravity
+    )
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
-    faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None]
+    # floors and ceilings tell the height at once: rims do not look like them
+    faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None] | is_height
     faces &= (found.weights > 0.0)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]
     if not places.shape[1]:
@@ -206,6 +211,29 @@ def _free_first(axes: F64, found: Correspondences) -> tuple[F64, int]:
     others, lengths, _ = np.linalg.svd(axes - free @ (free.T @ axes), full_matrices=False)
     others = others[:, lengths > tuning.FREE_LEFT]
     return np.column_stack((free, others[:, ::-1])), free.shape[1]
+
+
+def _height_apart(places: F64, gravity: F64) -> tuple[F64, NDArray[np.bool_]]:
+    """Return directions (3, K) of which one is about the vertical, if any is, and which (K,).
+
+    Floor and ceiling may say as little as what faces the way along a corridor. The two directions
+    are then any two of a plane.
+
+    Parameters
+    ----------
+    places : ndarray, shape (3, K)
+        Orthonormal.
+    gravity : ndarray, shape (3,)
+        [m/s^2]
+    """
+    within = places.T @ gravity
+    length = float(np.linalg.norm(within))
+    is_height = np.zeros(places.shape[1], np.bool_)
+    if length <= tuning.WEAK_HEIGHT * float(np.linalg.norm(gravity)):
+        return places, is_height
+    is_height[0] = True
+    turn = np.linalg.qr(np.column_stack((within / length, np.eye(len(within)))))[0]
+    return np.asarray(places @ turn), is_height
 
 
 def _is_way(axis: F64, gravity: F64) -> bool:

@@ -399,6 +399,40 @@ def test_rims_of_a_map_that_has_only_just_begun_may_be_ignored(young: YoungSurfa
     assert fast.facing(state, found)[:, 0].any() == (young is not YoungSurfaces.IGNORED)
 
 
+@pytest.mark.parametrize("lean", [0.0, 0.14])
+def test_a_young_floor_tells_the_height_though_walls_say_far_more(lean: float) -> None:
+    """It was left out like a rim, the velocity went up, and pitch with it: 32 m after 12 s.
+
+    Also where the level that the IMU believes in leans against it.
+    """
+    rng = np.random.default_rng(8)
+    surfaces = SurfelMap(SIZES)
+
+    def seen(count: int) -> F64:
+        points = walls(rng, count)
+        return points[(points[:, 2] > -0.9) | (rng.random(count) < 0.15)]
+
+    for number in range(4):
+        surfaces.add(np.vstack((seen(6000), reveals(rng, 240))), number)
+    surfaces.young = YoungSurfaces.IGNORED
+    points = np.vstack((seen(2500), reveals(rng, 120)))
+    state = dataclasses.replace(at(0.02, 0.0, 0.0), gravity=9.8 * np.array([lean, 0.0, -1.0]))
+    found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
+    scatter = (found.normals * found.weights[:, None]).T @ found.normals
+    assert scatter[2, 2] < tuning.WEAK_SHARE * scatter[1, 1]  # what this is about
+    weak = weak_axes(state, found, surfaces)
+    assert weak is not None
+    assert weak.free == 1
+    assert abs(weak.axes[3, 0]) > 0.95
+    # without any floor, the height is free as well
+    bare = walls(rng, 2500)
+    bare = bare[bare[:, 2] > -0.9]
+    found = correspondences(state, state, source(bare), surfaces, SurfaceConfig(), REACH)
+    other = weak_axes(state, found, surfaces)
+    assert other is not None
+    assert other.free == 2
+
+
 def front_and_jamb(
     rng: np.random.Generator, jamb: F64, beside: int, sweeps: int = 20
 ) -> tuple[SurfelMap, F64]:
