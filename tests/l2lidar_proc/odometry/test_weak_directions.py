@@ -11,6 +11,7 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
+from l2lidar_proc.odometry import weak_directions
 from l2lidar_proc.odometry.alignment import Alignment, align
 from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.correspondences import Source, correspondences
@@ -431,6 +432,20 @@ def test_a_young_floor_tells_the_height_though_walls_say_far_more(lean: float) -
     other = weak_axes(state, found, surfaces)
     assert other is not None
     assert other.free == 2
+
+
+def test_the_height_is_told_apart_from_the_way_where_both_are_as_weak() -> None:
+    """Any two directions of their plane are then the eigenvectors."""
+    mixed = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0]]).T / np.sqrt(2.0)
+    places, is_height = weak_directions._height_apart(mixed, np.array([0.5, 0.0, -9.8]))
+    assert places.T @ places == pytest.approx(np.eye(2))
+    assert is_height.sum() == 1
+    assert abs(places[2, is_height]) > 0.99
+    assert abs(places[0, ~is_height]) > 0.99
+    for level, gravity in ((np.eye(3)[:, :2], [0.0, 0.0, -9.8]), (mixed, [0.0, 0.0, 0.0])):
+        places, is_height = weak_directions._height_apart(level, np.array(gravity))
+        assert not is_height.any()
+        assert places is level
 
 
 def front_and_jamb(
