@@ -32,6 +32,20 @@ class Carrier:
         """Take a velocity, given as to :func:`peak_speed_after`."""
         self.peak_speed = peak_speed_after(self.peak_speed, state, covariance, seconds)
 
+    def note_found(self, state: InertialState, covariance: F64) -> None:
+        """Take a velocity that a search has found, given as to :func:`peak_speed_after`.
+
+        It is not known well, but whoever seems to drive by it is taken for a carrier that drives.
+        """
+        speed, sigma = _speed(state, covariance)
+        if is_driving_speed(speed) and speed > tuning.PRIOR_LEARN_SIGMAS * sigma:
+            self.peak_speed = max(self.peak_speed, speed)
+
+    def may_drive(self, state: InertialState, covariance: F64) -> bool:
+        """Return whether its velocity may be that of one that drives, given as for the others."""
+        speed, sigma = _speed(state, covariance)
+        return is_driving_speed(speed + tuning.PRIOR_LEARN_SIGMAS * sigma)
+
     def with_priors(
         self,
         state: InertialState,
@@ -159,11 +173,16 @@ def peak_speed_after(
     seconds : float
         Time since this was done last.
     """
-    speed = float(np.linalg.norm(state.velocity))
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1]))
+    speed, sigma = _speed(state, covariance)
     if sigma > tuning.PRIOR_LEARN_SIGMA:
         return max(before, speed - tuning.PRIOR_LEARN_SIGMAS * sigma)
     return max(before * float(np.exp(-seconds / tuning.PRIOR_MEMORY_S)), speed)
+
+
+def _speed(state: InertialState, covariance: F64) -> tuple[float, float]:
+    """Return the speed and the sigma of the velocity along its least certain axis [m/s]."""
+    variance = float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])
+    return float(np.linalg.norm(state.velocity)), float(np.sqrt(variance))
 
 
 def bound_speed(

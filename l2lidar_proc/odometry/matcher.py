@@ -162,6 +162,11 @@ class SweepMatcher:
         return self._sweeps < tuning.YOUNG_SWEEPS
 
     @property
+    def begins_between_walls(self) -> bool:
+        """Whether the map has begun in motion, between bare walls, with the velocity open."""
+        return self.surfaces.young is YoungSurfaces.IGNORED
+
+    @property
     def observes_height(self) -> bool:
         """Whether sweeps have fixed the height of late, now and then at least."""
         fixed, total = self._height_fixed_s

@@ -408,6 +408,7 @@ class Odometry:
                     start.sweeps, start.since, fitted, motion.covariance
                 )
         if motions:
+            self._carrier.note_found(motions[-1].state, motions[-1].covariance)
             start.replace(start.sweeps, motions)
             motion = motions[-1]
             self._walls.clear()
@@ -443,7 +444,11 @@ class Odometry:
         before = self._posterior[0]
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
         self._carrier.note_speed(after, covariance, lasted)
-        self.matcher.driving = self._carrier.drives
+        # between bare walls, rims of the view hold a wrong velocity as if it were moved by hand
+        between_walls = self.matcher.begins_between_walls
+        self.matcher.driving = self._carrier.drives or (
+            between_walls and self._carrier.may_drive(after, covariance)
+        )
         posterior = self._with_priors(before.position, after, covariance, lasted)
         bounded = carrier_priors.bound_speed(*posterior, self.config.max_speed)
         is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)

@@ -437,6 +437,33 @@ def test_of_a_velocity_that_is_hardly_known_only_the_least_speed_counts() -> Non
     assert carrier_priors.peak_speed_after(0.3, state, loose, 60.0) == 0.3
 
 
+@pytest.mark.parametrize(
+    ("speed", "sigma", "may_drive", "drives_if_found"),
+    [
+        (0.3, 0.2, False, False),
+        (0.3, 0.3, True, False),
+        (0.9, 0.2, True, True),
+        (0.9, 0.5, True, False),  # it may as well stand
+    ],
+)
+def test_a_carrier_may_drive_by_what_is_known_of_its_velocity(
+    speed: float, sigma: float, may_drive: bool, drives_if_found: bool
+) -> None:
+    state = dataclasses.replace(some_state(), velocity=np.array([0.0, speed, 0.0]))
+    loose = np.eye(eskf.ERRORS) * 1e-4
+    loose[8, 8] = sigma**2
+    carrier = carrier_priors.Carrier()
+    assert carrier.may_drive(state, loose) == may_drive
+    assert not carrier.drives
+    carrier.note_found(state, loose)
+    assert carrier.drives == drives_if_found
+    carrier.peak_speed = 2.0
+    carrier.note_found(state, loose)
+    assert carrier.peak_speed == 2.0
+    known = 1e-4 * np.eye(eskf.ERRORS)
+    assert carrier.may_drive(state, known) == (speed > tuning.DRIVING_SPEED)
+
+
 def test_what_is_moved_by_hand_is_drawn_to_zero_by_its_own_speed() -> None:
     level = dataclasses.replace(
         some_state(), velocity=np.array([0.0, 0.4, 0.0]), gravity=np.zeros(3)
