@@ -10,7 +10,7 @@ from l2lidar_proc.motion.passed_places import correction_of_passed
 from l2lidar_proc.odometry.vertical_lines import LINE, Lines
 from l2lidar_proc.odometry.wall_profile import SPOT, WallProfile
 from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
-from tests.l2lidar_proc.odometry.test_wall_profile import AXES, DOORS, SPEED, passed, state_at
+from tests.support.passed_walls import AXES, DOORS, SPEED, passed, state_at
 
 
 def test_axes_are_level() -> None:
