@@ -297,8 +297,11 @@ def _samples(spots: Spots, now: int, axes: F64) -> NDArray[np.void]:
     for side in (is_left, ~is_left):
         if side.sum() < tuning.PROFILE_SIDE:
             continue
-        # walls are straight or bend a little; errors of the beams depend on where they point
-        behind = _without_trend(depth[side], samples["along"][side], sight[side, 0])
+        # walls are straight or bend a little, and lean as the sensor seems to; errors of the beams
+        # depend on where they point
+        behind = _without_trend(
+            depth[side], samples["along"][side], sight[side, 0], sight[side, 2]
+        )
         samples["depth"][side, 0] = behind
         # what comes back depends on the range, and on the incidence: distance over range. The
         # distance is that of the wall, or it would explain how bright a recessed door is
