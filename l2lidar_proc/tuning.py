@@ -694,6 +694,8 @@ VERTICAL_TILTED: Final = 3.0  # sigmas: farther off, the accelerometer does not 
 
 START_NS: Final = 2_200_000_000  # [ns] of the points compared
 START_PAUSE_NS: Final = 1_100_000_000  # [ns] between searches
+# [ns] in which a search that finds nothing is made again. Derived: a door is passed every 2 to 4 s
+START_AWAITED_NS: Final = 5_000_000_000
 START_WATCHED_NS: Final = 12_000_000_000  # [ns] of the searches; by then gravity is known
 # Share of the information along the strongest direction, below which the first sweeps leave a
 # velocity open: it was wrong in 14 of 22 starts, above in 1 of 86,
@@ -720,6 +722,16 @@ START_BETTER: Final = 0.5  # of the variance before, at most: else nothing is fo
 # Difference of logarithms between the most and the least likely velocity by the profile of walls.
 # Observed at the right velocity: 500 to 5000; without edges in view 0 to 310
 START_PROFILE: Final = 500.0
+# [m/s, m/s^2] between motions along walls that are compared, 0.2 m in the time of the points; and
+# into how many each of them is divided that is likely by the logarithm. Tuned on: corridors, of
+# which spinning lidars and L2 with 80 and 120 degrees begin in motion, seeds 0 to 15
+START_WALL_STEPS: Final = (0.1, 0.3)
+START_WALL_FINER: Final = (5, 5)
+START_WALL_LIKELY: Final = 8.0
+START_WALL_REFINED: Final = 30  # at most. Bounds the time to 0.4 s
+# [m/s^2] error besides, 1 sigma: with it, and the one above for the velocity, the NEES of 133 such
+# searches is 1.1 and 1.3
+START_ACCELERATION_NOISE: Final = 0.05
 # The poses of the first 0.3 s were found with the velocity that is to be judged. Tuned on starts 0
 # to 200: what the later ones show of it is off by 0.05 m/s (median; a tenth by more than 0.12)
 START_FITTED_NS: Final = 300_000_000  # [ns]

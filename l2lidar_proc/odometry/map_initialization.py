@@ -27,7 +27,7 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.initialization_trial import Trial
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
-from l2lidar_proc.odometry.start_velocity import FittedStart
+from l2lidar_proc.odometry.start_velocity import Beginning, FittedStart
 from l2lidar_proc.odometry.surfels import YoungSurfaces
 from l2lidar_proc.odometry.vertical_direction import Vertical, vertical_direction
 from l2lidar_proc.odometry.wall_profile import are_walls
@@ -346,7 +346,7 @@ class MapInitializer:
         return Trial(motions, met, last, missed)
 
     def begin_with(
-        self, sweeps: list[Sweep], since: HostNs, start: InertialState, covariance: F64
+        self, sweeps: list[Sweep], since: HostNs, beginning: Beginning
     ) -> list[SweepMotion]:
         """Begin the map of a start in motion again, with what has been found out since.
 
@@ -356,9 +356,8 @@ class MapInitializer:
             Those since the start.
         since : HostNs
             As for :meth:`begin`.
-        start : InertialState
-            At the reference of the first sweep; its pose does not count.
-        covariance : ndarray, shape (18, 18)
+        beginning : Beginning
+            Of these sweeps.
 
         Returns
         -------
@@ -366,7 +365,7 @@ class MapInitializer:
             One for each sweep; the IMU alone carries it through one that fits nowhere.
         """
         self._young = YoungSurfaces.IGNORED
-        return self._again(sweeps, since, start, covariance)
+        return self._again(sweeps, since, beginning)
 
     def begin_as_fitted(
         self, sweeps: list[Sweep], since: HostNs, fitted: FittedStart, covariance: F64
@@ -395,22 +394,35 @@ class MapInitializer:
         known[VELOCITY] = known[:, VELOCITY] = 0.0
         known[VELOCITY, VELOCITY] = fitted.velocity_sigma**2 * np.eye(3)
         self._young = YoungSurfaces.TRUSTED
-        return self._again(sweeps, since, fitted.state, known)
+        begun = Beginning(fitted.state, known, fitted.state, np.zeros((6, 6)))
+        return self._again(sweeps, since, begun)
 
     def _again(
-        self, sweeps: list[Sweep], since: HostNs, start: InertialState, covariance: F64
+        self, sweeps: list[Sweep], since: HostNs, beginning: Beginning
     ) -> list[SweepMotion]:
         """Begin the map of a start in motion again, with a state at the first reference."""
         assert self.moving is not None
-        first = self._at_cloud_origin(self.moving.initial)
+        pose, (state, covariance, first, way) = (
+            self._at_cloud_origin(self.moving.initial),
+            beginning,
+        )
         # the first pose of all stays where it is
-        position = first.position + self._lead_s * (start.velocity - self._lead_velocity)
-        start = dataclasses.replace(start, rotation=first.rotation, position=position)
+        turn = pose.rotation @ first.rotation.T
+        lead = self._lead_s * (turn @ first.velocity - self._lead_velocity)
+        start = dataclasses.replace(
+            state,
+            rotation=turn @ state.rotation,
+            position=pose.position + lead + turn @ (state.position - first.position),
+            velocity=turn @ state.velocity,
+            gravity=turn @ state.gravity,
+        )
         known = self.moving.initial.covariance.copy()
         found = slice(VELOCITY.start, ERRORS)
         known[found, found] = covariance[found, found]
         initial = dataclasses.replace(self.moving.initial, covariance=known)
-        return self._round(sweeps, since, start, initial, may_miss=True).motions
+        motions = self._round(sweeps, since, start, initial, may_miss=True).motions
+        self.matcher.drift.first_pose = self.matcher.drift.first_pose + way
+        return motions
 
     def _in_motion(self, sweeps: list[Sweep], since: HostNs, initial: InitialState) -> Trial:
         """Begin the map in motion: level where it is built, and with its velocity left open.

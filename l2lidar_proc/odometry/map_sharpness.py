@@ -25,7 +25,6 @@ from l2lidar_proc.odometry.wall_profile import (
     Spots,
     are_walls,
     extract_spots,
-    likelihood_of,
     log_likelihood,
 )
 from l2lidar_proc.odometry.wall_velocity import level_axes
@@ -52,7 +51,7 @@ def _steps(reach: float, step: float) -> list[float]:
 
 
 def velocity_log_likelihoods(
-    seen: Seen, now: int, axes: F64, errors: F64, gravity: F64, walls: Spots | None
+    seen: Seen, now: int, axes: F64, errors: F64, gravity: F64
 ) -> F64 | None:
     """Return how likely errors of the velocity are, as logarithms (M,); None if nobody can tell.
 
@@ -67,19 +66,71 @@ def velocity_log_likelihoods(
         What has to be added to the velocity along each axis [m/s].
     gravity : ndarray, shape (3,)
         [m/s^2]
-    walls : ndarray, dtype SPOT, or None
-        As :func:`wall_spots` returns them.
     """
-    along = level_axes(axes[0], gravity)
-    if walls is not None:
-        logs = log_likelihood(walls, now, along, errors[:, 0])
-        has_edges = np.ptp(logs) > tuning.START_PROFILE
-        return np.log(likelihood_of(logs, errors[:, 0])) if has_edges else None
-    things = posts_and_walls(seen, along)
+    things = posts_and_walls(seen, level_axes(axes[0], gravity))
     if sum(len(one.points) for one in things) < tuning.START_POSTS:
         return None
     counts = _cells(things, now, errors @ axes, tuning.START_CELLS)
     return np.asarray(counts.min() - counts)
+
+
+def motion_along_walls(
+    walls: Spots, now: int, axes: F64, age: float, prior: F64
+) -> tuple[F64, F64] | None:
+    """Return what to add to the velocity along walls and to the acceleration, and its covariance.
+
+    A carrier that speeds up as it starts looks like one that leans, so gravity is wrong by its
+    acceleration. Both errors are searched together: on a coarse grid, and on a finer one near the
+    likeliest of it.
+
+    Parameters
+    ----------
+    walls : ndarray, dtype SPOT
+        As :func:`wall_spots` returns them.
+    now : int
+        Instant of the state that has placed them [ns].
+    axes : ndarray, shape (3, 3)
+        As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
+    age : float
+        How long before that instant the velocity is asked for [s].
+    prior : ndarray, shape (2, 2)
+        Covariance of that velocity [m/s] and the acceleration since [m/s^2].
+
+    Returns
+    -------
+    tuple of (ndarray, shape (2,), ndarray, shape (2, 2)), or None
+        None where the walls have no edges that tell.
+    """
+    weight = np.linalg.inv(prior)
+
+    def searched(errors: F64) -> tuple[F64, F64]:
+        """Return logarithms (M,) for errors (M, 2): of what walls say, and with the prior."""
+        speeds, accelerations = errors.T
+        logs = log_likelihood(walls, now, axes, speeds + age * accelerations, accelerations)
+        unlikely = 0.5 * np.einsum("ni,ij,nj->n", errors, weight, errors)
+        return logs, logs / tuning.PROFILE_DEPENDENT - unlikely
+
+    sigmas = np.sqrt(np.diag(prior)).tolist()
+    lines = [candidates(*one) for one in zip(sigmas, tuning.START_WALL_STEPS, strict=True)]
+    coarse = np.array([*itertools.product(*lines)])
+    logs, likely = searched(coarse)
+    if np.ptp(logs) < tuning.START_PROFILE:
+        return None
+    best = np.argsort(-likely)[: tuning.START_WALL_REFINED]
+    best = best[likely[best] > likely.max() - tuning.START_WALL_LIKELY]
+    parts = [
+        ((np.arange(count) + 0.5) / count - 0.5) * (line[1] - line[0])
+        for line, count in zip(lines, tuning.START_WALL_FINER, strict=True)
+    ]
+    fine = (coarse[best, None] + np.array([*itertools.product(*parts)])).reshape(-1, 2)
+    return moments(fine, searched(fine)[1])
+
+
+def moments(errors: F64, logs: F64) -> tuple[F64, F64]:
+    """Return mean (K,) and covariance (K, K) of errors (M, K), so likely by logarithms (M,)."""
+    weights = np.exp(logs - logs.max())
+    mean = np.average(errors, axis=0, weights=weights)
+    return mean, np.atleast_2d(np.cov(errors.T, aweights=weights, bias=True))
 
 
 def yaw_rate_error(

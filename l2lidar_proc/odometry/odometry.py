@@ -399,8 +399,9 @@ class Odometry:
             motion = motion.with_state(better.state, better.covariance)
             whole = whole.with_state(better.state, better.covariance)
         if start.is_first and better is not None and better.is_open:
-            first = start.beginning(whole)
-            motions = self._initializer.begin_with(start.sweeps, start.since, *first)
+            motions = self._initializer.begin_with(
+                start.sweeps, start.since, start.beginning(whole)
+            )
         elif start.is_first and not start.is_open:
             fitted = start.fitted(whole)
             if fitted is not None:

@@ -32,6 +32,8 @@ from l2lidar_proc.motion.filter import (
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.map_sharpness import (
     candidates,
+    moments,
+    motion_along_walls,
     velocity_log_likelihoods,
     wall_spots,
     yaw_rate_error,
@@ -40,7 +42,8 @@ from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.pose_hypotheses import level_basis
 from l2lidar_proc.odometry.posts_and_walls import SEEN, Seen
 from l2lidar_proc.odometry.vertical_direction import Vertical
-from l2lidar_proc.odometry.wall_profile import velocity_jacobian
+from l2lidar_proc.odometry.wall_profile import acceleration_jacobian, velocity_jacobian
+from l2lidar_proc.odometry.wall_velocity import level_axes
 
 
 class Passed(NamedTuple):
@@ -79,6 +82,27 @@ class FoundVelocity(NamedTuple):
     is_open: bool = True
 
 
+class Beginning(NamedTuple):
+    """State at the first of the sweeps with which a map is to begin again.
+
+    Attributes
+    ----------
+    state : InertialState
+        At its reference.
+    covariance : ndarray, shape (18, 18)
+        Not that of its pose.
+    first : InertialState
+        At the first pose of all: that of the same sweep, or an earlier one.
+    way_covariance : ndarray, shape (6, 6)
+        Of the motion between the two, place and turn about the map's axes [m, rad].
+    """
+
+    state: InertialState
+    covariance: F64
+    first: InertialState
+    way_covariance: F64
+
+
 class FittedStart(NamedTuple):
     """Beginning of a start as the poses since then show it.
 
@@ -103,8 +127,8 @@ class FittedStart(NamedTuple):
 class StartVelocity:
     """The sweeps since a start in motion, which tell its velocity again and again.
 
-    A first search has the whole start; the map then begins again if it was wrong. Later ones
-    correct the state, as long as the map is young: what a wrong velocity has put there holds it.
+    With the first search that finds it, the map begins again. Later ones correct the state, as
+    long as the map is young: what a wrong velocity has put there holds it.
 
     Parameters
     ----------
@@ -116,7 +140,7 @@ class StartVelocity:
     since : HostNs
         What the sweeps reach back to.
     is_first : bool
-        Whether nothing has been searched so far.
+        Whether no search has found anything so far, and the next one may begin the map again.
     is_open : bool
         Whether the velocity was open at the start, and has not become known since.
     """
@@ -131,14 +155,17 @@ class StartVelocity:
         self._open_axes: F64 = np.zeros((0, 3))
         self._begun_with: SweepMotion | None = None  # motion of the first sweep, as far as known
         self._next = self._last = 0
+        self._begun = HostNs(0)  # reference of the first sweep of all
+        self._was_searched = False
+        self._is_found = False  # by the latest search
         self.since = HostNs(0)
         self.is_first = False
         self.is_open = False
 
     @property
     def is_awaited(self) -> bool:
-        """Whether the first search will tell a velocity that is open until then."""
-        return self.is_first and self.is_open
+        """Whether the first search is yet to tell a velocity that is open until then."""
+        return self.is_first and self.is_open and not self._was_searched
 
     @property
     def sweeps(self) -> list[Sweep]:
@@ -166,6 +193,7 @@ class StartVelocity:
         """
         self.clear()
         self.since, self.is_first = since, True
+        self._begun = motions[0].state.stamp
         self.is_open = len(open_axes) > 0
         # the first motion has the prior's covariance
         self._begun_with = motions[0].with_state(motions[0].state, motions[1].covariance)
@@ -180,8 +208,8 @@ class StartVelocity:
             self.note(sweep, motion)
 
     def note(self, sweep: Sweep, motion: SweepMotion) -> None:
-        """Take a sweep with its motion; clear all if no search ran for twice START_NS."""
-        if sweep.end - self.since > 2 * tuning.START_NS:
+        """Take a sweep with its motion; clear all if a search is overdue by START_NS."""
+        if sweep.end - self._next > tuning.START_NS:
             self.clear()
             return
         state = motion.state
@@ -192,6 +220,8 @@ class StartVelocity:
         """Take how well the velocity is known by now, covariance (3, 3) [m^2/s^2]."""
         worst = float(np.linalg.eigvalsh(covariance)[-1])
         self.is_open &= worst > tuning.PRIOR_LEARN_SIGMA**2
+        if self._was_searched:
+            self.is_first &= self.is_open
 
     def is_due(self, end: HostNs) -> bool:
         """Return whether it is time for a search, at the end of a sweep."""
@@ -215,8 +245,9 @@ class StartVelocity:
         lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
         strengths, directions = np.linalg.eigh(information)
         weak = directions[:, strengths < tuning.START_SHARE * strengths[-1]]
-        if self.is_awaited:
-            weak = np.column_stack((weak, self._open_axes.T))
+        if self.is_first and self.is_open:
+            others = self._open_axes.T - weak @ (weak.T @ self._open_axes.T)
+            weak = np.column_stack((weak, others))
         if vertical is not None and vertical.is_certain:
             free = level_span(weak, motion.state.gravity)
             motion = with_level_gravity(motion, vertical.direction, lasted, free)
@@ -232,6 +263,7 @@ class StartVelocity:
         is_news = motion is not before
         covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
         found = _measured(seen, motion.state, covariance, axes, first=self.is_first)
+        self._is_found = found is not None
         if found is None:
             return FoundVelocity(motion.state, covariance, True) if is_news else None
         state, posterior, sigmas = found
@@ -244,8 +276,8 @@ class StartVelocity:
         was_open = float(np.linalg.eigvalsh(prior)[-1]) > tuning.START_OPEN**2
         return FoundVelocity(state, posterior, is_news or is_other or was_open)
 
-    def beginning(self, motion: SweepMotion) -> tuple[InertialState, F64]:
-        """Return the state (and its covariance, (18, 18)) at :attr:`reference`.
+    def beginning(self, motion: SweepMotion) -> Beginning:
+        """Return how the sweeps here began.
 
         What gravity and the accelerometer's bias may be wrong by has accelerated it since; how its
         attitude and place were known then, is not asked for.
@@ -255,10 +287,19 @@ class StartVelocity:
         motion : SweepMotion
             Of the latest sweep, reaching back to :attr:`since`.
         """
+        first, state = motion.state_at(self._begun), motion.state_at(self.reference)
+        covariance = motion.covariance
+        if self._is_found:
+            covariance = _with_open_turns(motion.state, covariance)
         age = 1e-9 * (motion.state.stamp - self.reference)
         back = np.eye(ERRORS)
         back[VELOCITY] = [velocity_jacobian(motion.state, age, axis) for axis in np.eye(3)]
-        return motion.state_at(self.reference), back @ motion.covariance @ back.T
+        covariance = back @ covariance @ back.T
+        lead = 1e-9 * (self.reference - self._begun)
+        way = np.zeros((6, ERRORS))
+        way[:3] = [lead * velocity_jacobian(state, 0.5 * lead, axis) for axis in np.eye(3)]
+        way[3:, GYRO_BIAS] = lead * state.rotation
+        return Beginning(state, covariance, first, way @ covariance @ way.T)
 
     def fitted(self, motion: SweepMotion) -> FittedStart | None:
         """Return how the start began, as the poses after the first ones show it; None if too few.
@@ -299,22 +340,37 @@ class StartVelocity:
 
     def end_search(self, end: HostNs) -> None:
         """Wait until the next search, with the sweeps that it will need."""
-        self.is_first = False
+        is_late = end - self.since > tuning.START_AWAITED_NS
+        self.is_first &= self.is_open and not (self._is_found or is_late)
+        self._was_searched = True
         self._next = end + tuning.START_PAUSE_NS
-        if end > self._last:
-            self._passed = []
-        oldest = self._next - tuning.START_NS
-        self._passed = [one for one in self._passed if one.sweep.start >= oldest]
-        if self._passed:
+        self._passed = [] if end > self._last else self._since(self._next - tuning.START_NS)
+        if self._passed and not self.is_first:
             self.since = self._passed[0].sweep.start
+
+    def _since(self, oldest: int) -> list[Passed]:
+        """Return the sweeps that do not begin before an instant [ns]."""
+        return [one for one in self._passed if one.sweep.start >= oldest]
 
 
 def level_span(directions: F64, gravity: F64) -> F64:
-    """Return orthonormal level axes (K, 3) along directions (3, M), as far as these are level."""
+    """Return orthonormal axes (K, 3) within the span of directions, as far as it is about level.
+
+    They lie in it exactly: what the sweeps leave free is along a floor, not along the level that
+    the IMU believes in.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (3, M)
+    gravity : ndarray, shape (3,)
+        [m/s^2]
+    """
+    basis, sizes, _ = np.linalg.svd(directions, full_matrices=False)
+    basis = basis[:, sizes > tuning.START_LEVEL]
     up = gravity / np.linalg.norm(gravity)
-    flat = directions - np.outer(up, up @ directions)
-    axes, lengths, _ = np.linalg.svd(flat, full_matrices=False)
-    return np.asarray(axes[:, lengths > tuning.START_LEVEL].T)
+    flat = basis - np.outer(up, up @ basis)
+    _, lengths, combined = np.linalg.svd(flat, full_matrices=False)
+    return np.asarray((combined @ basis.T)[lengths > tuning.START_LEVEL])
 
 
 def with_level_gravity(
@@ -385,6 +441,21 @@ def with_yaw_rate(motion: SweepMotion, seen: Seen, axes: F64) -> SweepMotion:
     gain = covariance @ h / prior
     after = state.boxplus(gain * error)
     return motion.with_state(after, covariance - (prior - sigma**2) * np.outer(gain, gain))
+
+
+def _with_open_turns(state: InertialState, covariance: F64) -> F64:
+    """Return a covariance (18, 18) with roll and pitch rates as little known as at the start.
+
+    What registrations have told about them is the echo of a wrong velocity: floors and walls fit
+    together at it with another rate.
+    """
+    up = state.rotation.T @ (state.gravity / np.linalg.norm(state.gravity))
+    yaw = np.outer(up, up)
+    kept = np.eye(ERRORS)
+    kept[GYRO_BIAS, GYRO_BIAS] = yaw
+    out = kept @ covariance @ kept.T
+    out[GYRO_BIAS, GYRO_BIAS] += tuning.START_GYRO_BIAS_SIGMA[1] ** 2 * (np.eye(3) - yaw)
+    return np.asarray(out)
 
 
 def _accelerated(acceleration: F64, seconds: float) -> F64:
@@ -472,35 +543,57 @@ def _measured(
 ) -> tuple[InertialState, F64, float] | None:
     """Return the posterior of the velocity along axes, and by how many sigmas it was off.
 
-    It is computed on a grid; mean and variance become those of the state (assumed density
-    filtering). None if that tells little more than the prior.
+    Beside walls, the acceleration along them is found as well. It is computed on a grid; mean and
+    variance become those of the state (assumed density filtering). None if that tells little more
+    of the velocity than the prior.
     """
-    strengths, turn = np.linalg.eigh(axes @ covariance[VELOCITY, VELOCITY] @ axes.T)
-    axes, sigmas = turn.T @ axes, np.sqrt(strengths)
-    walls = wall_spots(seen, axes, state.gravity)
-    step = tuning.START_STEP if walls is None else tuning.PROFILE_STEP
-    steps = (candidates(sigma, step) for sigma in sigmas.tolist())
-    errors = np.array([*itertools.product(*steps)])
     now = int(state.stamp)
-    logs = velocity_log_likelihoods(seen, now, axes, errors, state.gravity, walls)
-    if logs is None:
-        return None
-    logs = logs - 0.5 * ((errors / sigmas) ** 2).sum(axis=1)
-    if first and walls is None:
-        # posts at even distances look alike at several velocities, and carriers are not fast
-        speeds = axes @ state.velocity + errors
-        logs = logs - 0.5 * ((speeds / tuning.START_VELOCITY_SIGMA[1]) ** 2).sum(axis=1)
-    weights = np.exp(logs - logs.max())
-    mean = np.average(errors, axis=0, weights=weights)
-    left = np.atleast_2d(np.cov(errors.T, aweights=weights, bias=True))
-    left += tuning.START_NOISE**2 * np.eye(len(axes))
     age = 0.5e-9 * (now - int(seen["stamp"].min()))
-    h = np.stack([velocity_jacobian(state, age, axis) for axis in axes])
-    cross = covariance @ h.T
-    prior = h @ cross
-    if np.trace(left) > tuning.START_BETTER * np.trace(prior):
+    walls = wall_spots(seen, axes, state.gravity)
+    if walls is None:
+        h = np.stack([velocity_jacobian(state, age, axis) for axis in axes])
+        prior = h @ covariance @ h.T
+        found = _sharpest_velocity(seen, state, covariance, axes, first=first)
+        noise = np.full(len(axes), tuning.START_NOISE**2)
+    else:
+        along = axes[0]
+        h = np.stack((velocity_jacobian(state, age, along), acceleration_jacobian(state, along)))
+        prior = h @ covariance @ h.T
+        frame = level_axes(along, state.gravity)
+        found = motion_along_walls(walls, now, frame, age, prior)
+        noise = np.array([tuning.START_NOISE, tuning.START_ACCELERATION_NOISE]) ** 2
+    if found is None:
         return None
-    gain = np.linalg.solve(prior, cross.T).T
+    mean, left = found[0], found[1] + np.diag(noise)
+    of_velocity = slice(0, len(axes))
+    before = np.trace(prior[of_velocity, of_velocity])
+    if np.trace(left[of_velocity, of_velocity]) > tuning.START_BETTER * before:
+        return None
+    gain = np.linalg.solve(prior, h @ covariance).T
     after = state.boxplus(np.asarray(gain @ mean, np.float64))
     posterior = covariance + gain @ (left - prior) @ gain.T
     return after, posterior, float(np.sqrt(mean @ np.linalg.solve(left, mean)))
+
+
+def _sharpest_velocity(
+    seen: Seen, state: InertialState, covariance: F64, axes: F64, *, first: bool
+) -> tuple[F64, F64] | None:
+    """Return the error of the velocity along axes (K,) and its covariance (K, K), by posts.
+
+    None where there are too few.
+    """
+    strengths, turn = np.linalg.eigh(axes @ covariance[VELOCITY, VELOCITY] @ axes.T)
+    sigmas = np.sqrt(strengths)
+    steps = (candidates(sigma, tuning.START_STEP) for sigma in sigmas.tolist())
+    errors = np.array([*itertools.product(*steps)])
+    principal = turn.T @ axes
+    logs = velocity_log_likelihoods(seen, int(state.stamp), principal, errors, state.gravity)
+    if logs is None:
+        return None
+    logs = logs - 0.5 * ((errors / sigmas) ** 2).sum(axis=1)
+    if first:
+        # posts at even distances look alike at several velocities, and carriers are not fast
+        speeds = principal @ state.velocity + errors
+        logs = logs - 0.5 * ((speeds / tuning.START_VELOCITY_SIGMA[1]) ** 2).sum(axis=1)
+    mean, left = moments(errors, logs)
+    return turn @ mean, turn @ left @ turn.T

@@ -182,6 +182,14 @@ def velocity_jacobian(state: InertialState, age: float, along: F64) -> F64:
     return h
 
 
+def acceleration_jacobian(state: InertialState, along: F64) -> F64:
+    """Return the derivatives (18,) of the acceleration along a direction."""
+    h = np.zeros(ERRORS)
+    h[GRAVITY] = along
+    h[ACCEL_BIAS] = -state.rotation.T @ along
+    return h
+
+
 def _candidates(sigma: float) -> F64:
     """Return the errors of the velocity to compare [m/s], evenly spaced."""
     reach = min(tuning.PROFILE_SIGMAS * sigma, tuning.PROFILE_REACH)
@@ -214,7 +222,9 @@ def likelihood_of(logs: F64, errors: F64) -> F64:
     return np.asarray(likelihood / likelihood.max() + np.finfo(float).tiny)
 
 
-def log_likelihood(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
+def log_likelihood(
+    spots: Spots, now: int, axes: F64, errors: F64, accelerations: F64 | None = None
+) -> F64:
     """Return how likely each of some errors (M,) of the velocity along walls is, as a logarithm.
 
     A row of a wall is a Markov process along the way: from one spot to the next, brightness and
@@ -230,16 +240,22 @@ def log_likelihood(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
     axes : ndarray, shape (3, 3)
         As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them.
     errors : ndarray, shape (M,)
-        What has to be added to the state's velocity [m/s].
+        What has to be added to the state's velocity [m/s],
+    accelerations : ndarray, shape (M,), or None
+        and to its acceleration since the spots were seen [m/s^2]; None if that is right.
     """
+    if accelerations is None:
+        accelerations = np.zeros(len(errors))
     samples = _samples(records.decimated(spots, tuning.PROFILE_MOST), now, axes)
     if len(samples) < 2:
         return np.zeros(len(errors))
-    width = np.ptp(samples["along"]) + np.ptp(samples["age"]) * np.abs(errors).max() + 1.0
+    age = samples["age"]
+    reach = np.abs(errors).max() + 0.5 * age.max() * np.abs(accelerations).max()
+    width = np.ptp(samples["along"]) + 2.0 * age.max() * reach + 1.0
     along = samples["along"] + 2.0 * width * samples["row"]
     found = np.zeros(len(errors))
-    for number, error in enumerate(errors.tolist()):
-        shifted = along - error * samples["age"]
+    for number, (error, acceleration) in enumerate(zip(errors, accelerations, strict=True)):
+        shifted = along - (error - 0.5 * acceleration * age) * age
         order = np.argsort(shifted)
         apart = np.diff(shifted[order])
         in_row = apart < width

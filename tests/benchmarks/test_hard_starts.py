@@ -130,6 +130,22 @@ def test_narrow_views_and_other_sensors_begin_in_motion(family: str, seed: int) 
     assert off[-10:].max() < 0.25
 
 
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_carrier_that_speeds_up_between_walls_is_not_taken_for_one_that_leans(seed: int) -> None:
+    """Its map began with a tilt of 8 degrees and a velocity 2 m/s off: 6 and 32 m off after 12 s.
+
+    In the first case, nothing shows the velocity for 4 s.
+    """
+    given = in_motion("spinning lidar, corridor", seed, 12.0)
+    track = tracked(given)
+    assert track.covariances is not None
+    found = errors(given, track)
+    off = np.linalg.norm(found.position, axis=1)
+    assert off[-10:].max() < 0.5
+    squared = normalized(np.hstack([found.position, found.turn]), track.covariances)
+    assert np.mean(squared < QUANTILE[6]) > 0.85
+
+
 def test_a_gyro_without_a_head_beside_it_counts_as_measured() -> None:
     """It counted as one beside a head, ten times as noisy: a camera ended 0.9 m off."""
     given = in_motion("camera, looking into rooms", 1, 2.0)

@@ -9,12 +9,15 @@ from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.odometry.map_sharpness import (
+    motion_along_walls,
     velocity_log_likelihoods,
     wall_spots,
     yaw_rate_error,
 )
 from l2lidar_proc.odometry.posts_and_walls import upright
 from l2lidar_proc.odometry.start_velocity import placed
+from l2lidar_proc.odometry.wall_profile import Spots
+from tests.support.passed_walls import Opening, passed, state_at
 from tests.support.passing_sweeps import (
     GRAVITY,
     SPEED,
@@ -25,6 +28,8 @@ from tests.support.passing_sweeps import (
     passed_at,
     seen_from,
 )
+
+NEAR_NICHES = (Opening(1.2, 2.0, 0.4, 0.45), Opening(4.5, 5.2, 0.4, 0.45))
 
 
 def errors_of(logs: F64 | None, errors: F64) -> F64:
@@ -45,9 +50,8 @@ def test_posts_are_sharpest_at_the_true_velocity(passing: list[Sweep], error: fl
     motion = motion_at(wrong, np.eye(eskf.ERRORS))
     seen = placed(passed_at(passing, wrong), motion, np.zeros(3), X)
     errors = grid(20)
-    logs = velocity_log_likelihoods(
-        seen, int(motion.state.stamp), X, errors, GRAVITY, wall_spots(seen, X, GRAVITY)
-    )
+    assert wall_spots(seen, X, GRAVITY) is None
+    logs = velocity_log_likelihoods(seen, int(motion.state.stamp), X, errors, GRAVITY)
     assert errors_of(logs, errors)[0] == pytest.approx(-error, abs=0.11)
 
 
@@ -57,9 +61,7 @@ def test_both_level_directions_are_found_at_once(passing: list[Sweep]) -> None:
     axes = np.vstack((X, Y))
     seen = placed(passed_at(passing, wrong), motion, np.zeros(3), axes)
     errors = grid(10, 10)
-    logs = velocity_log_likelihoods(
-        seen, int(motion.state.stamp), axes, errors, GRAVITY, wall_spots(seen, axes, GRAVITY)
-    )
+    logs = velocity_log_likelihoods(seen, int(motion.state.stamp), axes, errors, GRAVITY)
     assert errors_of(logs, errors) == pytest.approx([-0.6, 0.4], abs=0.21)
 
 
@@ -69,11 +71,51 @@ def test_beside_bare_walls_nobody_can_tell() -> None:
     wrong = np.array([0.1, 0.0, 0.0])
     motion = motion_at(wrong, np.eye(eskf.ERRORS))
     seen = placed(passed_at(sweeps, wrong), motion, np.zeros(3), X)
-    now = int(motion.state.stamp)
-    assert (
-        velocity_log_likelihoods(seen, now, X, grid(10), GRAVITY, wall_spots(seen, X, GRAVITY))
-        is None
-    )
+    walls = wall_spots(seen, X, GRAVITY)
+    assert walls is not None
+    prior = np.diag([0.7, 0.5]) ** 2
+    assert motion_along_walls(walls, int(motion.state.stamp), np.eye(3), 1.1, prior) is None
+
+
+START_S = 2.2
+AGE_S = 0.5 * START_S
+
+
+def sheared(seed: int, openings: tuple[Opening, ...], velocity: float, change: float) -> Spots:
+    """Return spots as a sensor places them whose motion is off.
+
+    By a velocity [m/s] in the middle of the time, and by an acceleration [m/s^2].
+    """
+    spots = passed(seed, openings, 0.0, seconds=START_S)
+    age = 1e-9 * (int(state_at(START_S).stamp) - spots["stamp"])
+    now = velocity + AGE_S * change
+    spots["place"][:, 0] += now * age - 0.5 * change * age**2
+    return spots
+
+
+@pytest.mark.parametrize(("velocity", "change"), [(0.0, 0.0), (1.3, 1.1), (-0.4, -1.2)])
+def test_walls_show_a_velocity_and_an_acceleration(velocity: float, change: float) -> None:
+    """As of a carrier that speeds up while its first sweeps are taken for level."""
+    now, prior = int(state_at(START_S).stamp), np.diag([0.8, 0.6]) ** 2
+    squared = []
+    for seed in range(6):
+        walls = sheared(seed, NEAR_NICHES, velocity, change)
+        found = motion_along_walls(walls, now, np.eye(3), AGE_S, prior)
+        assert found is not None
+        mean, covariance = found
+        assert mean == pytest.approx([velocity, change], abs=0.5)
+        covariance += np.diag([tuning.START_NOISE, tuning.START_ACCELERATION_NOISE]) ** 2
+        error = mean - (velocity, change)
+        squared.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(squared) < 4.0  # 2 where the covariance is right
+
+
+def test_an_acceleration_that_is_known_is_not_searched() -> None:
+    now, prior = int(state_at(START_S).stamp), np.diag([0.8, 0.001]) ** 2
+    found = motion_along_walls(sheared(1, NEAR_NICHES, 0.5, 0.0), now, np.eye(3), AGE_S, prior)
+    assert found is not None
+    assert found[0] == pytest.approx([0.5, 0.0], abs=0.12)
+    assert np.sqrt(found[1][1, 1]) < 0.0011
 
 
 @pytest.mark.parametrize("axes", [X, np.vstack((X, Y))], ids=["along", "both ways"])

@@ -114,7 +114,7 @@ def test_what_scan_lines_meet_on_a_wall_does_not_pass_for_a_post(pace: float) ->
     pattern = wall(np.array([-10.0, 20.0]), 0.0, step=2.5, count=9)
     seen = np.concatenate((seen_often(SOME_POSTS), seen_often(pattern, np.array([pace, 0.0]))))
     errors = np.linspace(-3.0, 3.0, 61)[:, None]
-    logs = velocity_log_likelihoods(seen, NOW, X, errors, GRAVITY, None)
+    logs = velocity_log_likelihoods(seen, NOW, X, errors, GRAVITY)
     assert logs is not None
     assert errors[np.argmax(logs), 0] == pytest.approx(0.0, abs=0.11)
 
@@ -122,10 +122,10 @@ def test_what_scan_lines_meet_on_a_wall_does_not_pass_for_a_post(pace: float) ->
 def test_a_wall_still_shows_the_velocity_towards_it() -> None:
     seen = seen_often(wall(np.array([-8.0, 12.0]), 0.0, step=1.2, count=14))
     errors = np.linspace(-2.0, 2.0, 41)[:, None]
-    logs = velocity_log_likelihoods(seen, NOW, Y, errors, GRAVITY, None)
+    logs = velocity_log_likelihoods(seen, NOW, Y, errors, GRAVITY)
     assert logs is not None
     assert errors[np.argmax(logs), 0] == pytest.approx(0.0, abs=0.11)
-    logs = velocity_log_likelihoods(seen, NOW, X, errors, GRAVITY, None)
+    logs = velocity_log_likelihoods(seen, NOW, X, errors, GRAVITY)
     assert logs is not None
     assert np.ptp(logs) < 5.0  # along it, nothing does
 

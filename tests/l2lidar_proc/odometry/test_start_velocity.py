@@ -46,13 +46,21 @@ def test_what_sweeps_measured_across_counts(passing: list[Sweep]) -> None:
     assert np.abs(off[middle, 1]).max() < 1e-4
 
 
-def test_axes_are_level_and_orthonormal() -> None:
-    leaning = np.array([[0.9, 0.1, 0.3], [0.0, 0.05, 1.0]]).T
-    axes = level_span(leaning, GRAVITY)
-    assert axes @ axes.T == pytest.approx(np.eye(1))
-    assert abs(axes[0, 2]) < 1e-12
-    assert abs(axes[0] @ np.array([0.9, 0.1, 0.0])) == pytest.approx(np.hypot(0.9, 0.1))
-    assert level_span(np.eye(3), GRAVITY).shape == (2, 3)
+def test_axes_lie_in_what_is_free_as_level_as_they_can() -> None:
+    """A corridor along a floor that leans against the level that the IMU believes in."""
+    leaning = np.array([0.99, 0.0, 0.14]) / np.linalg.norm([0.99, 0.0, 0.14])
+    for twice in (leaning[:, None], np.column_stack((leaning, leaning))):
+        (axis,) = level_span(twice, GRAVITY)
+        assert abs(axis @ leaning) == pytest.approx(1.0)
+    # if the height is free as well, any direction of the plane may have been given
+    across = np.array([-leaning[2], 0.0, leaning[0]])
+    plane = np.column_stack((leaning + across, leaning - across)) / np.sqrt(2.0)
+    (axis,) = level_span(plane, GRAVITY)
+    assert abs(axis[0]) == pytest.approx(1.0)
+    both = level_span(np.eye(3), GRAVITY)
+    assert both.shape == (2, 3)
+    assert both @ both.T == pytest.approx(np.eye(2))
+    assert level_span(np.eye(3)[:, 2:], GRAVITY).shape == (0, 3)
     assert level_span(np.zeros((3, 0)), GRAVITY).shape == (0, 3)
 
 
@@ -192,6 +200,17 @@ def test_a_wrong_velocity_of_a_start_is_corrected_however_certain(
     assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
 
 
+def test_what_was_open_at_the_start_is_searched_although_it_seems_fixed(
+    passing: list[Sweep],
+) -> None:
+    wrong, covariance = SPEED - np.array([0.7, 0.0, 0.0]), known_to(0.8)
+    found = begun(passing, wrong, covariance, X).search(
+        motion_at(wrong, covariance), np.eye(3), None
+    )
+    assert found is not None
+    assert found.state.velocity == pytest.approx(SPEED, abs=0.15)
+
+
 @pytest.mark.parametrize("claimed", [0.002, 0.05])
 def test_a_wrong_yaw_rate_of_a_start_is_corrected_however_certain(
     passing: list[Sweep], claimed: float
@@ -241,6 +260,7 @@ def test_later_a_change_that_is_too_large_misleads(passing: list[Sweep]) -> None
 def test_searches_follow_each_other_and_end(passing: list[Sweep]) -> None:
     start = begun(passing, SPEED, known_to(1.0), X)
     end = passing[-1].end
+    assert start.search(motion_at(SPEED, known_to(1.0)), FREE, None) is not None
     start.end_search(end)
     assert not start.is_first
     assert start.is_open
@@ -333,13 +353,21 @@ def test_too_few_poses_show_no_beginning(passing: list[Sweep]) -> None:
     assert start.fitted(motion_at(SPEED, known_to(0.05))) is None
 
 
-def test_the_beginning_is_uncertain_by_what_has_accelerated_it_since(passing: list[Sweep]) -> None:
-    start = begun(passing, SPEED, known_to(0.05), np.zeros((0, 3)))
+def uncertain_motion() -> SweepMotion:
+    """Return a motion with a gravity known to 0.1 m/s^2 and a gyro's bias to 0.002 rad/s."""
     motion = motion_at(SPEED, known_to(0.05))
     covariance = motion.covariance.copy()
     covariance[eskf.GRAVITY, eskf.GRAVITY] = 0.1**2 * np.eye(3)
-    state, found = start.beginning(motion.with_state(motion.state, covariance))
-    assert state.stamp == start.reference
+    covariance[eskf.GYRO_BIAS, eskf.GYRO_BIAS] = 0.002**2 * np.eye(3)
+    return motion.with_state(motion.state, covariance)
+
+
+def test_the_beginning_is_uncertain_by_what_has_accelerated_it_since(passing: list[Sweep]) -> None:
+    start = begun(passing, SPEED, known_to(0.05), np.zeros((0, 3)))
+    motion = uncertain_motion()
+    state, found, first, way = start.beginning(motion)
+    assert state.stamp == first.stamp == start.reference
+    assert not way.any()
     age = 1e-9 * (motion.state.stamp - start.reference)
     assert age > 2.0
     sigmas = np.sqrt(np.diag(found)[eskf.VELOCITY])
@@ -347,3 +375,66 @@ def test_the_beginning_is_uncertain_by_what_has_accelerated_it_since(passing: li
     # it was slower if gravity has accelerated it more
     assert found[eskf.VELOCITY.start, eskf.GRAVITY.start] == pytest.approx(-0.01 * age)
     assert np.linalg.eigvalsh(found)[0] > 0.0
+
+
+def test_a_search_that_finds_nothing_is_made_again_with_the_sweeps_since(
+    passing: list[Sweep],
+) -> None:
+    """The map then begins again after the first pose, by what is known of the way since."""
+    start = begun(passing, SPEED, known_to(1.0), X)
+    assert start.is_awaited
+    first, end = start.reference, passing[-1].end
+    start.end_search(end)
+    assert start.is_first
+    assert not start.is_awaited
+    assert start.since == EPOCH  # the way since the first pose is needed
+    assert start.reference >= end + tuning.START_PAUSE_NS - tuning.START_NS
+    state, covariance, begun_at, way = start.beginning(uncertain_motion())
+    assert state.stamp == start.reference
+    assert begun_at.stamp == first
+    lead = 1e-9 * (start.reference - first)
+    assert lead > 1.0
+    assert state.position - begun_at.position == pytest.approx(lead * SPEED, abs=1e-6)
+    # against what the velocity then, and the acceleration before, may have been off by
+    rng = np.random.default_rng(4)
+    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(eskf.ERRORS))
+    errors = rng.standard_normal((4000, eskf.ERRORS)) @ root.T
+    moved = lead * errors[:, eskf.VELOCITY] - 0.5 * lead**2 * errors[:, eskf.GRAVITY]
+    assert np.sqrt(np.diag(way)[:3]) == pytest.approx(moved.std(axis=0), rel=0.1)
+    assert np.sqrt(np.diag(way)[3:]) == pytest.approx(0.002 * lead, rel=0.01)
+
+
+@pytest.mark.parametrize(("late", "known"), [(True, False), (False, True)])
+def test_a_first_search_is_not_awaited_for_ever(
+    passing: list[Sweep], late: bool, known: bool
+) -> None:
+    """Nor where the velocity has become known meanwhile."""
+    start = begun(passing, SPEED, known_to(1.0), X)
+    start.note_velocity((tuning.PRIOR_LEARN_SIGMA + 0.01) ** 2 * np.eye(3))
+    end = HostNs(EPOCH + tuning.START_AWAITED_NS + 1) if late else passing[-1].end
+    start.end_search(end)
+    assert start.is_first != late
+    if known:
+        start.note_velocity((tuning.PRIOR_LEARN_SIGMA - 0.01) ** 2 * np.eye(3))
+    assert not start.is_first
+
+
+def test_rates_that_were_learned_with_a_wrong_velocity_are_open_again(
+    passing: list[Sweep],
+) -> None:
+    """Roll and pitch; the yaw rate has been searched. Of a motion whose velocity was not found."""
+    covariance = known_to(0.8)
+    covariance[eskf.GYRO_BIAS, eskf.GYRO_BIAS] = 0.002**2 * np.eye(3)
+    wrong = SPEED - np.array([0.7, 0.0, 0.0])
+    start = begun(passing, wrong, covariance, X)
+    motion = motion_at(wrong, covariance)
+    before = np.sqrt(np.diag(start.beginning(motion).covariance)[eskf.GYRO_BIAS])
+    assert before == pytest.approx([0.002, 0.002, 0.002])
+    found = start.search(motion, FREE, None)
+    assert found is not None
+    after = start.beginning(motion.with_state(found.state, found.covariance)).covariance
+    sigmas = np.sqrt(np.diag(after)[eskf.GYRO_BIAS])
+    assert sigmas[:2] == pytest.approx(tuning.START_GYRO_BIAS_SIGMA[1], rel=0.01)
+    assert sigmas[2] <= 0.0021
+    assert not after[eskf.GYRO_BIAS.start, eskf.VELOCITY].any()
+    assert np.linalg.eigvalsh(after)[0] > -1e-12

@@ -187,6 +187,33 @@ def test_the_direction_may_be_turned_round() -> None:
     assert found == pytest.approx(log_likelihood(spots, now, AXES, ERRORS), rel=1e-3)
 
 
+def test_an_acceleration_shears_what_was_seen_before_by_its_square() -> None:
+    """Both errors at once, against spots that a sensor with them has placed."""
+    spots = passed(3, DOORS, 0.0, seconds=4.0)
+    now, error, acceleration = int(state_at(4.0).stamp), 0.3, -0.4
+    age = 1e-9 * (now - spots["stamp"])
+    off = spots.copy()
+    off["place"][:, 0] += error * age - 0.5 * acceleration * age**2
+    right = log_likelihood(spots, now, AXES, np.zeros(1))
+    assert log_likelihood(
+        off, now, AXES, np.array([error]), np.array([acceleration])
+    ) == pytest.approx(right, rel=0.02)
+    for wrong in (0.0, 0.4):
+        found = log_likelihood(off, now, AXES, np.array([error]), np.array([wrong]))
+        assert found[0] < right[0] - 100.0
+
+
+@pytest.mark.parametrize("lean", [0.04, -0.06])
+def test_walls_that_seem_to_lean_are_walls(lean: float) -> None:
+    """A sensor whose roll is off sees them so: no spot counted, and it ended 12 m off."""
+    spots = passed(5, DOORS, 0.1)
+    upright_ones = likelihood(spots)
+    spots["place"][:, 1] += lean * (spots["place"][:, 2] + 0.5)
+    (mean, sigma), (expected, _) = mean_and_sigma(likelihood(spots)), mean_and_sigma(upright_ones)
+    assert sigma < 0.08
+    assert mean == pytest.approx(expected, abs=sigma)
+
+
 def chain(
     brightness: list[float], along: list[float], *, copies: int = tuning.PROFILE_SIDE
 ) -> Spots:
@@ -438,6 +465,24 @@ def test_the_velocity_is_that_of_the_middle() -> None:
         step[k] = 1e-5
         slope = (velocity(state.boxplus(step)) - velocity(state.boxplus(-step))) / 2e-5
         assert h[k] == pytest.approx(slope, abs=1e-6)
+
+
+def test_the_acceleration_is_what_gravity_and_the_accelerometer_make() -> None:
+    """Against numerical derivatives."""
+    rng = np.random.default_rng(9)
+    state = state_at(1.0).boxplus(rng.normal(0.0, 0.3, eskf.ERRORS))
+    along, force = np.array([0.8, 0.6, 0.0]), np.array([0.1, -0.2, 9.7])
+    h = wall_profile.acceleration_jacobian(state, along)
+    for k in range(eskf.ERRORS):
+        if k in range(*eskf.ROTATION.indices(eskf.ERRORS)):
+            continue  # the attitude is taken for known
+        step = np.zeros(eskf.ERRORS)
+        step[k] = 1e-5
+        there, back = (
+            along @ (state.rotation @ (force - one.accel_bias) + one.gravity)
+            for one in (state.boxplus(step), state.boxplus(-step))
+        )
+        assert h[k] == pytest.approx((there - back) / 2e-5, abs=1e-6)
 
 
 def test_spots_are_compared_about_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
