@@ -42,7 +42,11 @@ from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.pose_hypotheses import level_basis
 from l2lidar_proc.odometry.posts_and_walls import SEEN, Seen
 from l2lidar_proc.odometry.vertical_direction import Vertical
-from l2lidar_proc.odometry.wall_profile import acceleration_jacobian, velocity_jacobian
+from l2lidar_proc.odometry.wall_profile import (
+    Spots,
+    acceleration_jacobian,
+    velocity_jacobian,
+)
 from l2lidar_proc.odometry.wall_velocity import level_axes
 
 
@@ -157,7 +161,7 @@ class StartVelocity:
         self._next = self._last = 0
         self._begun = HostNs(0)  # reference of the first sweep of all
         self._was_searched = False
-        self._is_found = False  # by the latest search
+        self._is_found = self._is_beside_walls = False  # of the latest search
         self.since = HostNs(0)
         self.is_first = False
         self.is_open = False
@@ -262,8 +266,10 @@ class StartVelocity:
             motion, seen = turned, placed(self._passed, turned, self._lever, axes)
         is_news = motion is not before
         covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
-        found = _measured(seen, motion.state, covariance, axes, first=self.is_first)
+        walls = wall_spots(seen, axes, motion.state.gravity)
+        found = _measured(seen, walls, motion.state, covariance, axes, first=self.is_first)
         self._is_found = found is not None
+        self._is_beside_walls = walls is not None
         if found is None:
             return FoundVelocity(motion.state, covariance, True) if is_news else None
         state, posterior, sigmas = found
@@ -289,8 +295,13 @@ class StartVelocity:
         """
         first, state = motion.state_at(self._begun), motion.state_at(self.reference)
         covariance = motion.covariance
-        if self._is_found:
+        if self._is_found and self._is_beside_walls:
             covariance = _with_open_turns(motion.state, covariance)
+        else:  # the sweeps have fixed the attitude, then and now
+            assert self._begun_with is not None
+            turn = self._begun_with.state.rotation @ first.rotation.T
+            first = dataclasses.replace(first, rotation=turn @ first.rotation)
+            state = dataclasses.replace(state, rotation=turn @ state.rotation)
         age = 1e-9 * (motion.state.stamp - self.reference)
         back = np.eye(ERRORS)
         back[VELOCITY] = [velocity_jacobian(motion.state, age, axis) for axis in np.eye(3)]
@@ -446,8 +457,8 @@ def with_yaw_rate(motion: SweepMotion, seen: Seen, axes: F64) -> SweepMotion:
 def _with_open_turns(state: InertialState, covariance: F64) -> F64:
     """Return a covariance (18, 18) with roll and pitch rates as little known as at the start.
 
-    What registrations have told about them is the echo of a wrong velocity: floors and walls fit
-    together at it with another rate.
+    What registrations have told about them is the echo of a wrong velocity: between walls, floors
+    and ceilings fit together at it with another rate.
     """
     up = state.rotation.T @ (state.gravity / np.linalg.norm(state.gravity))
     yaw = np.outer(up, up)
@@ -539,7 +550,13 @@ def _deviations(passed: list[Passed], motion: SweepMotion, lever: F64) -> F64:
 
 
 def _measured(
-    seen: Seen, state: InertialState, covariance: F64, axes: F64, *, first: bool
+    seen: Seen,
+    walls: Spots | None,
+    state: InertialState,
+    covariance: F64,
+    axes: F64,
+    *,
+    first: bool,
 ) -> tuple[InertialState, F64, float] | None:
     """Return the posterior of the velocity along axes, and by how many sigmas it was off.
 
@@ -549,7 +566,6 @@ def _measured(
     """
     now = int(state.stamp)
     age = 0.5e-9 * (now - int(seen["stamp"].min()))
-    walls = wall_spots(seen, axes, state.gravity)
     if walls is None:
         h = np.stack([velocity_jacobian(state, age, axis) for axis in axes])
         prior = h @ covariance @ h.T

@@ -196,12 +196,13 @@ def _free_first(axes: F64, found: Correspondences, gravity: F64) -> tuple[F64, i
     """
     normals = found.normals
     strength, places = np.linalg.eigh((normals * found.weights[:, None]).T @ normals)
-    places, is_height = _height_apart(
-        places[:, strength < tuning.WEAK_SHARE * strength[-1]], gravity
-    )
+    places = places[:, strength < tuning.WEAK_SHARE * strength[-1]]
+    is_height = np.zeros(places.shape[1], np.bool_)
+    if found.young is YoungSurfaces.IGNORED:
+        places, is_height = _height_apart(places, gravity)
     faces = np.abs(normals @ places) > tuning.WEAK_FACING
     strict = found.young is not YoungSurfaces.TRUSTED
-    # floors and ceilings tell the height at once: rims do not look like them
+    # between bare walls, floor and ceiling tell the height at once: no rim looks like them
     faces &= found.settled(tuning.WEAK_AGE, strict=strict)[:, None] | is_height
     faces &= (found.weights > 0.0)[:, None]
     places = places[:, np.count_nonzero(faces, axis=0) <= tuning.FREE_FACING]

@@ -27,6 +27,7 @@ from tests.support.passing_sweeps import (
     X,
     motion_at,
     passed_at,
+    seen_from,
 )
 
 
@@ -419,22 +420,41 @@ def test_a_first_search_is_not_awaited_for_ever(
     assert not start.is_first
 
 
-def test_rates_that_were_learned_with_a_wrong_velocity_are_open_again(
-    passing: list[Sweep],
+def walls_with_niches(rng: np.random.Generator, along: float) -> F64:
+    """Return where upright scan lines meet two walls beside a place along them, (N, 2)."""
+    lines = along + rng.uniform(-6.0, 6.0, 60)
+    in_niche = (np.abs(lines + 1.5) < 0.5) | (np.abs(lines - 2.5) < 0.5)
+    right, left = np.where(in_niche, -1.6, -1.2), np.full(60, 1.2)
+    return np.vstack((np.column_stack((lines, right)), np.column_stack((lines, left))))
+
+
+@pytest.mark.parametrize("between_walls", [False, True])
+def test_rates_that_were_learned_between_walls_with_a_wrong_velocity_are_open_again(
+    passing: list[Sweep], between_walls: bool
 ) -> None:
-    """Roll and pitch; the yaw rate has been searched. Of a motion whose velocity was not found."""
+    """Roll and pitch. Elsewhere what the sweeps have told about them stays, and the attitude."""
+    speed, sweeps = SPEED, passing
+    if between_walls:
+        speed = SPEED * [1.0, 0.0, 0.0]
+        sweeps = seen_from(np.random.default_rng(2), walls_with_niches, speed)
     covariance = known_to(0.8)
     covariance[eskf.GYRO_BIAS, eskf.GYRO_BIAS] = 0.002**2 * np.eye(3)
-    wrong = SPEED - np.array([0.7, 0.0, 0.0])
-    start = begun(passing, wrong, covariance, X)
-    motion = motion_at(wrong, covariance)
-    before = np.sqrt(np.diag(start.beginning(motion).covariance)[eskf.GYRO_BIAS])
-    assert before == pytest.approx([0.002, 0.002, 0.002])
+    wrong = speed - np.array([0.7, 0.0, 0.0])
+    start = begun(sweeps, wrong, covariance, X)
+    motion = motion_at(wrong, covariance, 0.01)
     found = start.search(motion, FREE, None)
     assert found is not None
-    after = start.beginning(motion.with_state(found.state, found.covariance)).covariance
+    assert found.state.velocity == pytest.approx(speed, abs=0.15)
+    state, after, first, _ = start.beginning(motion.with_state(found.state, found.covariance))
     sigmas = np.sqrt(np.diag(after)[eskf.GYRO_BIAS])
-    assert sigmas[:2] == pytest.approx(tuning.START_GYRO_BIAS_SIGMA[1], rel=0.01)
-    assert sigmas[2] <= 0.0021
+    opened = tuning.START_GYRO_BIAS_SIGMA[1]
+    assert sigmas[:2] == pytest.approx(opened if between_walls else 0.002, rel=0.01)
     assert not after[eskf.GYRO_BIAS.start, eskf.VELOCITY].any()
     assert np.linalg.eigvalsh(after)[0] > -1e-12
+    # that of the first pose, as the gyro carries it back or as the sweeps have fixed it
+    carried = motion.with_state(found.state, found.covariance).state_at(start.reference)
+    fixed = motion_at(wrong, covariance).anchored_at(start.reference).state
+    expected = carried if between_walls else fixed
+    assert not np.allclose(carried.rotation, fixed.rotation, atol=1e-3)
+    for one in (first, state):
+        assert one.rotation == pytest.approx(expected.rotation, abs=1e-9)
