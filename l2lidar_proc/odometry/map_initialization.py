@@ -390,11 +390,14 @@ class MapInitializer:
             shift = fitted.shift + before
             self.matcher.drift.shift_first_pose(shift)
             return []
+        assert self.moving is not None
         known = covariance.copy()
         known[VELOCITY] = known[:, VELOCITY] = 0.0
         known[VELOCITY, VELOCITY] = fitted.velocity_sigma**2 * np.eye(3)
         self._young = YoungSurfaces.TRUSTED
-        begun = Beginning(fitted.state, known, fitted.state, np.zeros((6, 6)))
+        # the sweeps have fixed the attitude, then and now
+        start = dataclasses.replace(fitted.state, rotation=self.moving.initial.state.rotation)
+        begun = Beginning(start, known, start, np.zeros((6, 6)))
         return self._again(sweeps, since, begun)
 
     def _again(

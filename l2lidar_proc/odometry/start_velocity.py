@@ -246,6 +246,7 @@ class StartVelocity:
             That the map shows, map axes.
         """
         before = motion
+        self._is_found = self._is_beside_walls = False
         lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
         strengths, directions = np.linalg.eigh(information)
         weak = directions[:, strengths < tuning.START_SHARE * strengths[-1]]
