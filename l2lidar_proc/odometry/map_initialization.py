@@ -405,10 +405,8 @@ class MapInitializer:
     ) -> list[SweepMotion]:
         """Begin the map of a start in motion again, with a state at the first reference."""
         assert self.moving is not None
-        pose, (state, covariance, first, way) = (
-            self._at_cloud_origin(self.moving.initial),
-            beginning,
-        )
+        pose = self._at_cloud_origin(self.moving.initial)
+        state, covariance, first, way = beginning
         # the first pose of all stays where it is
         turn = pose.rotation @ first.rotation.T
         lead = self._lead_s * (turn @ first.velocity - self._lead_velocity)

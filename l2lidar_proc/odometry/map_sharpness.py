@@ -7,7 +7,7 @@ upright things count (:mod:`~l2lidar_proc.odometry.posts_and_walls`): floors and
 same at any velocity.
 
 Beside bare walls the fewest cells are those of a sensor at rest, since the rims of the view move
-along with it. There the profile of the walls tells the velocity
+along with it. There the profile of the walls tells the velocity, and the acceleration
 (:mod:`~l2lidar_proc.odometry.wall_profile`).
 """
 

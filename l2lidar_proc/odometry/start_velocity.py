@@ -5,6 +5,8 @@ wrong one confirms it. Over two seconds a wrong one smears every post. So the sw
 start are placed as the IMU carries the sensor through them, and the velocity with which they make
 the sharpest map is searched (:mod:`~l2lidar_proc.odometry.map_sharpness`).
 
+Between walls, the acceleration since is searched with it, as it passes for a tilt until then.
+
 In a hall, a wrong velocity moves what is far ahead to the side, as a turn does. So the first
 sweeps may have learned a wrong yaw rate with it, of 4 degrees per second. That smears the map at
 any velocity, so the yaw rate is searched first.
