@@ -203,7 +203,7 @@ WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off i
 # Points on surfaces that face a direction of the place: with no more than so many, the whole sweep
 # tells nothing about it. Tuned on: narrow views, seeds 100 to 115; 8 do as well, 0 worse
 FREE_FACING: Final = 4
-WEAK_HEIGHT: Final = 0.7  # cosine to the vertical of a direction that counts as the height
+WEAK_HEIGHT: Final = 0.7  # cosine to the vertical of what counts as the height: 45 degrees
 FREE_LEFT: Final = 0.5  # length that is left of a weak direction beside the free ones
 WEAK_AGE: Final = 8  # sweeps since a surface was opened: until then it is a rim of the view
 # A point also lies on another surface if so many points near it have one that faces elsewhere, and

@@ -80,8 +80,8 @@ def motion_along_walls(
     """Return what to add to the velocity along walls and to the acceleration, and its covariance.
 
     A carrier that speeds up as it starts looks like one that leans, so gravity is wrong by its
-    acceleration. Both errors are searched together: on a coarse grid, and on a finer one near the
-    likeliest of it.
+    acceleration. Both errors are searched together: on a coarse grid, and on a finer one about the
+    likeliest errors of that.
 
     Parameters
     ----------

@@ -183,7 +183,7 @@ def velocity_jacobian(state: InertialState, age: float, along: F64) -> F64:
 
 
 def acceleration_jacobian(state: InertialState, along: F64) -> F64:
-    """Return the derivatives (18,) of the acceleration along a direction."""
+    """Return the derivatives (18,) of the acceleration along a direction, the attitude known."""
     h = np.zeros(ERRORS)
     h[GRAVITY] = along
     h[ACCEL_BIAS] = -state.rotation.T @ along
