@@ -39,7 +39,8 @@ FOLDERS: Final = (
     "l2lidar_proc/deskew", "l2lidar_proc/motion",
 )  # fmt: skip
 _ODOMETRY: Final = (
-    "alignment", "correspondences", "estimate", "matcher", "prediction", "zero_velocity",
+    "estimate", "matcher", "prediction", "registration/alignment", "registration/correspondences",
+    "zero_velocity",
 )  # fmt: skip
 FILES: Final = (
     "l2lidar_node/clouds.py", "l2lidar_node/frames.py", "l2lidar_node/rotations.py",
@@ -50,8 +51,10 @@ TESTS: Final = (
     "tests/l2lidar_node/clouds",
     "tests/l2lidar_node/recording",
     *(f"tests/l2lidar_proc/odometry/test_{name}.py" for name in (
-        "alignment", "estimate", "kiss", "matcher", "prediction", "surfel_map", "zero_velocity",
+        "estimate", "kiss", "matcher", "prediction", "zero_velocity",
     )),
+    "tests/l2lidar_proc/odometry/local_map",
+    "tests/l2lidar_proc/odometry/registration/test_alignment.py",
     "tests/benchmarks/test_deskew.py",
     "tests/l2lidar_proc/test_hostile_input.py",
     "tests/l2lidar_node/test_frames.py",

@@ -70,7 +70,7 @@ FAULTS: Final = (
         (f"{_PROC}/motion/test_preintegration.py",),
     ),
     Fault(
-        "l2lidar_proc/odometry/map_initialization.py",
+        "l2lidar_proc/odometry/initialization/map_initialization.py",
         "place = initial.state.rotation @ self.matcher.lever",
         "place = 0.0 * self.matcher.lever",
         (f"{_PROC}/odometry/test_odometry.py",),

@@ -259,7 +259,7 @@ WALL_FLAT: Final = 0.1  # of the scatter's second eigenvalue: below it the first
 # 17 mm to 15 m, 24-30 mm to 25 m. A floor of 10 mm and a part linear in range fit that within
 # 2 mm. The floor is part of the parameter point_noise, whose size hides the rest: half or double
 # the slope changes no ATE by more than its spread
-# (tests/l2lidar_proc/odometry/test_alignment.py).
+# (tests/l2lidar_proc/odometry/registration/test_alignment.py).
 RANGE_NOISE_SLOPE: Final = 0.0011  # [m/m]
 RANGE_NOISE_FACTOR: Final = 2.0  # on the standard deviation: neighbors err together
 
@@ -308,7 +308,7 @@ LINE_SURE: Final = 20.0  # votes from which on more of them add nothing. Bounds 
 LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ at least
 
 # ---- odometry: wall profile. Tuned on: hard corridors, seeds 100 to 115, at first with the true
-# poses; the rest in the corridor of tests/l2lidar_proc/odometry/test_wall_profile.py.
+# poses; the rest in the corridor of tests/l2lidar_proc/odometry/walls/test_wall_profile.py.
 
 PROFILE_RANGE: Final = 10.0  # [m] farther away, lines on a wall are meters apart
 PROFILE_CELL: Final = 0.03  # [m] of a spot along the way, 2.5 times the range noise,

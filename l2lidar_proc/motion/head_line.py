@@ -9,8 +9,8 @@ It is measured in turns that are like those before them, at rest or in smooth mo
 carrier walks nothing is measured: a harmonic of its steps may be near the line.
 
 Where a mount really rocks in step with the head, the clouds show the same as wrong beam angles,
-which are estimated as well (:mod:`l2lidar_proc.odometry.lidar_intrinsics`). Without the line it is
-left to them.
+which are estimated as well (:mod:`l2lidar_proc.odometry.intrinsics.lidar_intrinsics`). Without the
+line it is left to them.
 """
 
 from __future__ import annotations

@@ -38,11 +38,11 @@ from l2lidar_proc.motion.filter import (
     with_loose_pose,
 )
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
-from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.free_space import SeenThrough
+from l2lidar_proc.odometry.local_map.free_space import SeenThrough
 from l2lidar_proc.odometry.matcher import SweepMatcher
-from l2lidar_proc.odometry.pose_hypotheses import is_explained_by_drift, level_basis
+from l2lidar_proc.odometry.registration.alignment import Alignment, unobserved_directions
+from l2lidar_proc.odometry.registration.correspondences import Source
+from l2lidar_proc.odometry.registration.pose_hypotheses import is_explained_by_drift, level_basis
 from l2lidar_proc.odometry.uncertainty import FrameJump
 
 

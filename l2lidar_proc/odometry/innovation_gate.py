@@ -12,10 +12,10 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import POSITION, VELOCITY
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.alignment import Alignment
-from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.innovations import MOTION, Correction, correction
 from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.registration.alignment import Alignment
+from l2lidar_proc.odometry.registration.correspondences import Source
 
 
 class Prediction(NamedTuple):

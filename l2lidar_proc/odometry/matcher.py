@@ -30,31 +30,31 @@ from l2lidar_proc.motion.filter import (
     update_with_information,
 )
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.alignment import (
+from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.estimate import AlignmentQuality
+from l2lidar_proc.odometry.intrinsics.range_bias import SeenAgain
+from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
+from l2lidar_proc.odometry.local_map.free_space import SeenThrough, seen_through
+from l2lidar_proc.odometry.local_map.surfel_map import SurfelMap
+from l2lidar_proc.odometry.local_map.surfels import YoungSurfaces
+from l2lidar_proc.odometry.registration.alignment import (
     Alignment,
     align,
     degeneracy_ratio,
     unobserved_directions,
     weakest_direction,
 )
-from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.correspondences import Source
-from l2lidar_proc.odometry.estimate import AlignmentQuality
-from l2lidar_proc.odometry.free_space import SeenThrough, seen_through
-from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
-from l2lidar_proc.odometry.pose_hypotheses import (
+from l2lidar_proc.odometry.registration.correspondences import Source
+from l2lidar_proc.odometry.registration.pose_hypotheses import (
     is_explained_by_drift,
     level_basis,
     level_hypotheses,
     pose_hypotheses,
     rotation_is_loose,
 )
-from l2lidar_proc.odometry.range_bias import SeenAgain
-from l2lidar_proc.odometry.surfel_map import SurfelMap
-from l2lidar_proc.odometry.surfels import YoungSurfaces
 from l2lidar_proc.odometry.uncertainty import Corrections, MapDrift
-from l2lidar_proc.odometry.vertical_lines import Lines, extract_lines
-from l2lidar_proc.odometry.wall_profile import Spots, extract_spots
+from l2lidar_proc.odometry.walls.vertical_lines import Lines, extract_lines
+from l2lidar_proc.odometry.walls.wall_profile import Spots, extract_spots
 
 
 class MatchStatus(Enum):
@@ -534,7 +534,7 @@ class SweepMatcher:
         motion : SweepMotion
             Places the points.
         axes : ndarray, shape (3, 3)
-            As :func:`~l2lidar_proc.odometry.wall_velocity.level_axes` returns them, of the
+            As :func:`~l2lidar_proc.odometry.walls.wall_velocity.level_axes` returns them, of the
             direction along which the walls run.
         """
         seen = xyz(sweep.points)

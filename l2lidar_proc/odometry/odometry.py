@@ -17,7 +17,6 @@ from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry import kiss
-from l2lidar_proc.odometry.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.earlier_maps import EarlierMaps, MapRevisit, Relocalization
 from l2lidar_proc.odometry.estimate import (
@@ -27,7 +26,10 @@ from l2lidar_proc.odometry.estimate import (
     estimate_of,
     gaps_in,
 )
-from l2lidar_proc.odometry.first_rest import FirstRest
+from l2lidar_proc.odometry.initialization.first_rest import FirstRest
+from l2lidar_proc.odometry.initialization.late_gravity import LateGravity
+from l2lidar_proc.odometry.initialization.map_initialization import InitializedMap, MapInitializer
+from l2lidar_proc.odometry.initialization.start_velocity import StartVelocity
 from l2lidar_proc.odometry.innovation_gate import (
     GatedAlignment,
     InnovationGate,
@@ -35,14 +37,12 @@ from l2lidar_proc.odometry.innovation_gate import (
     is_narrow,
 )
 from l2lidar_proc.odometry.innovations import InnovationTest
-from l2lidar_proc.odometry.late_gravity import LateGravity
-from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
-from l2lidar_proc.odometry.map_initialization import InitializedMap, MapInitializer
+from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
-from l2lidar_proc.odometry.start_velocity import StartVelocity
+from l2lidar_proc.odometry.registration.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.uncertainty import FrameJump
-from l2lidar_proc.odometry.wall_velocity import WallVelocity, level_axes
+from l2lidar_proc.odometry.walls.wall_velocity import WallVelocity, level_axes
 from l2lidar_proc.odometry.zero_velocity import (
     ZeroVelocityTest,
     free_pose,

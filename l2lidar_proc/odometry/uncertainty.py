@@ -20,7 +20,7 @@ from l2lidar_node import rotations
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import InertialState, pose_covariance, skew
-from l2lidar_proc.odometry.correspondences import Support
+from l2lidar_proc.odometry.registration.correspondences import Support
 
 
 class Corrections(NamedTuple):

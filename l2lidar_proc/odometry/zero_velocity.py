@@ -30,7 +30,11 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.static import StaticReference, static_reference
-from l2lidar_proc.odometry.alignment import Alignment, degeneracy_ratio, unobserved_directions
+from l2lidar_proc.odometry.registration.alignment import (
+    Alignment,
+    degeneracy_ratio,
+    unobserved_directions,
+)
 
 
 def with_unnoticed_motion(covariance: F64) -> F64:

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from l2lidar_node import records
 from l2lidar_node.types import F64, I64
-from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.local_map.surfel_map import SurfelMap
 from l2lidar_proc.slam.se3 import error, magnitude, transformed
 
 BITS: Final = 21

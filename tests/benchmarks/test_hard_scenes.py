@@ -18,7 +18,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
 from l2lidar_proc.odometry.odometry import Odometry, Phase
-from l2lidar_proc.odometry.wall_velocity import WallVelocity
+from l2lidar_proc.odometry.walls.wall_velocity import WallVelocity
 from tests.benchmarks.hard_runs import end_of, estimates_of, tracked
 
 pytest.importorskip("open3d")

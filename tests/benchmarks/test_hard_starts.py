@@ -14,7 +14,7 @@ from benchmarks.hard_scores import QUANTILE, errors, normalized
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import cloud_pose
-from l2lidar_proc.odometry.map_initialization import MapInitializer
+from l2lidar_proc.odometry.initialization.map_initialization import MapInitializer
 from l2lidar_proc.odometry.odometry import Odometry
 from tests.benchmarks.hard_runs import estimates_of, tracked
 

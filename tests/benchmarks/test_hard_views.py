@@ -16,8 +16,8 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.vertical_lines import LINE
-from l2lidar_proc.odometry.wall_profile import SPOT
+from l2lidar_proc.odometry.walls.vertical_lines import LINE
+from l2lidar_proc.odometry.walls.wall_profile import SPOT
 from tests.benchmarks.hard_runs import end_of, tracked
 
 pytest.importorskip("open3d")

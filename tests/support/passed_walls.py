@@ -10,7 +10,7 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
-from l2lidar_proc.odometry.wall_profile import SPOT, Spots
+from l2lidar_proc.odometry.walls.wall_profile import SPOT, Spots
 
 AXES = np.eye(3)
 EPOCH = 1_700_000_000_000_000_000  # [ns]

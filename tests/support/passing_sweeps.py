@@ -12,7 +12,7 @@ from l2lidar_node.types import F64, IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion, predict_sweep
-from l2lidar_proc.odometry.start_velocity import Passed
+from l2lidar_proc.odometry.initialization.start_velocity import Passed
 
 EPOCH = 1_700_000_000_000_000_000  # [ns]
 GRAVITY = np.array([0.0, 0.0, -9.81])

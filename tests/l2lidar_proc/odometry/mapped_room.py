@@ -10,9 +10,9 @@ from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.registration.correspondences import Source
 from tests.l2lidar_proc.motion.analytic import EPOCH, Motion
 
 TIGHT, LOOSE = (0.005, 0.01), (0.01, 0.25)  # standard deviations [rad, m]

@@ -21,7 +21,6 @@ from l2lidar_proc.motion.filter import (
 )
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.earlier_maps import (
     EarlierMaps,
     MapRevisit,
@@ -29,9 +28,10 @@ from l2lidar_proc.odometry.earlier_maps import (
     Relocalization,
     moved,
 )
-from l2lidar_proc.odometry.free_space import SeenThrough
+from l2lidar_proc.odometry.local_map.free_space import SeenThrough
+from l2lidar_proc.odometry.local_map.surfel_map import SurfelMap
 from l2lidar_proc.odometry.matcher import SweepMatcher
-from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.registration.correspondences import Source
 from l2lidar_proc.odometry.uncertainty import FrameJump
 from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,

@@ -13,9 +13,7 @@ from l2lidar_node.types import HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, VELOCITY, InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.innovation_gate import (
     GatedAlignment,
     InnovationGate,
@@ -25,6 +23,8 @@ from l2lidar_proc.odometry.innovation_gate import (
 )
 from l2lidar_proc.odometry.innovations import correction
 from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.registration.alignment import Alignment
+from l2lidar_proc.odometry.registration.correspondences import Source
 from tests.l2lidar_proc.motion.analytic import at
 from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,

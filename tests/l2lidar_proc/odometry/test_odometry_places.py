@@ -13,14 +13,14 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, POSITION, ROTATION, InertialState
 from l2lidar_proc.motion.static import initial_state
-from l2lidar_proc.odometry.alignment import align
 from l2lidar_proc.odometry.config import OdometryConfig, SurfaceConfig
-from l2lidar_proc.odometry.correspondences import Source
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.local_map.surfel_map import SurfelMap
 from l2lidar_proc.odometry.matcher import SweepMatcher, xyz
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.prediction import Predictor
-from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.registration.alignment import align
+from l2lidar_proc.odometry.registration.correspondences import Source
 from tests.l2lidar_proc.odometry.odometry_places import SEED, driven_round, shaken, visited
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, errors, feed, recording
 from tests.support.odometry_runs import record, sweeps, truth

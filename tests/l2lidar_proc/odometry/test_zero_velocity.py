@@ -14,12 +14,12 @@ from l2lidar_node import rotations
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GYRO_BIAS, POSE, POSITION, VELOCITY, InertialState
-from l2lidar_proc.odometry.alignment import Alignment
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
-from l2lidar_proc.odometry.lidar_intrinsics import LidarIntrinsics
-from l2lidar_proc.odometry.map_initialization import MapInitializer
+from l2lidar_proc.odometry.initialization.map_initialization import MapInitializer
+from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.odometry import Odometry
+from l2lidar_proc.odometry.registration.alignment import Alignment
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, drive, feed
 from tests.support.build import REAL_L2

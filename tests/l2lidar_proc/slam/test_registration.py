@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import F64
-from l2lidar_proc.odometry.surfel_map import SurfelMap
+from l2lidar_proc.odometry.local_map.surfel_map import SurfelMap
 from l2lidar_proc.slam import places, se3
 from l2lidar_proc.slam.config import LoopConfig
 from l2lidar_proc.slam.places import Place

@@ -1,0 +1,291 @@
+"""The rest with which a map may begin, as long as it may still turn out to be none.
+
+A carrier that glides while its motors shake the IMU passes for a sensor at rest, and so does one
+that creeps. So the sweeps of the first rest are kept for some seconds, as the unit reports them.
+If sweeps or IMU end it, the map may begin again with them, as in motion. It also begins again with
+them when the unit is known better than in the map, also in the first seconds after the rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from l2lidar_node.types import F64, Sweep
+from l2lidar_proc import tuning
+from l2lidar_proc.motion.filter import InertialState, with_loose_pose
+from l2lidar_proc.motion.sweep_motion import SweepMotion
+from l2lidar_proc.odometry.initialization.map_initialization import InitializedMap, MapInitializer
+from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
+from l2lidar_proc.odometry.matcher import SweepMatcher
+from l2lidar_proc.odometry.registration.correspondences import Source
+from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
+
+
+class EndedRest(NamedTuple):
+    """A rest that motion has ended.
+
+    Attributes
+    ----------
+    sweeps : list of Sweep
+        As the unit would have measured them with what is known of it now.
+    state : InertialState
+        At rest, at any stamp.
+    covariance : ndarray, shape (18, 18)
+    moved : ndarray, shape (6, 6)
+        Covariance of the shift and turn by which this may move poses [m, rad].
+    """
+
+    sweeps: list[Sweep]
+    state: InertialState
+    covariance: F64
+    moved: F64
+
+
+class RemappedRest(NamedTuple):
+    """A map that has begun again with a rest that motion has ended.
+
+    Attributes
+    ----------
+    matcher : SweepMatcher
+        With the map; the latest sweep is in it.
+    motion : SweepMotion
+        Of the latest sweep, in the map.
+    fresh : float
+        Share of its points that fell where there was no map before.
+    """
+
+    matcher: SweepMatcher
+    motion: SweepMotion
+    fresh: float
+
+
+class FirstRest:
+    """The sweeps of the first rest.
+
+    Parameters
+    ----------
+    initializer : MapInitializer
+    zero_velocity : ZeroVelocityTest
+    intrinsics : LidarIntrinsics
+
+    Attributes
+    ----------
+    initializer : MapInitializer
+        Begins the map again; to be replaced by that of each map that goes on from there.
+    sweeps : list of Sweep
+        As the unit reports them, oldest first; none if the map did not begin at rest, or so long
+        ago that the rest is beyond doubt.
+    """
+
+    def __init__(
+        self,
+        initializer: MapInitializer,
+        zero_velocity: ZeroVelocityTest,
+        intrinsics: LidarIntrinsics,
+    ) -> None:
+        self.initializer = initializer
+        self._zero_velocity = zero_velocity
+        self._intrinsics = intrinsics
+        self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
+        self.sweeps: list[Sweep] = []
+        # its sweeps, and state and covariance at its end, for a moment
+        self._ended: tuple[list[Sweep], InertialState, F64] | None = None
+
+    def begin(self, sweeps: list[Sweep]) -> None:
+        """Take the sweeps with which a map has begun at rest."""
+        self.sweeps, self._mapped_with = sweeps, self._corrections
+        self._ended = None
+
+    def note(self, sweep: Sweep) -> None:
+        """Take another sweep of this rest, if it is still the first one."""
+        if self.sweeps:
+            self.sweeps.append(sweep)
+
+    def end(self) -> None:
+        """Forget all of it."""
+        self.sweeps, self._ended = [], None
+
+    def end_with(self, state: InertialState, covariance: F64, *, moving: int = 0) -> None:
+        """Take that motion has ended the rest; its sweeps are kept for a moment.
+
+        Parameters
+        ----------
+        state : InertialState
+            At rest, at any stamp.
+        covariance : ndarray, shape (18, 18)
+        moving : int
+            So many of the latest sweeps show the motion.
+        """
+        rested = self.sweeps[: len(self.sweeps) - moving]
+        self.end()
+        self._ended = (rested, state, covariance) if rested else None
+
+    def recalibrated(self, now: InertialState) -> EndedRest | None:
+        """Return the rest that has just ended with what is known of the unit now, if that is more.
+
+        Where the sensor sees to one side only, corrected angles and ranges shift it against a map
+        without them, and nothing would undo that: in a hall, 34 mm of range shifted it by 37 mm.
+        With the same knowledge the rest is returned only once.
+
+        Parameters
+        ----------
+        now : InertialState
+            In motion.
+        """
+        if self._ended is None:
+            return None
+        sweeps, state, covariance = self._ended
+        far = float(np.linalg.norm(now.position - state.position))
+        if now.stamp - sweeps[-1].end > tuning.ENDED_REST_NS or far > tuning.ENDED_REST_M:
+            self._ended = None
+        if self._ended is None or not self._is_known_better:
+            return None
+        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
+        turn = tuning.BEAM_DRIFT_TURN * max(angles)
+        shift = tuning.BEAM_DRIFT_SHIFT * max(angles) + ranges
+        self._mapped_with = self._corrections  # tried once with what is known now
+        return EndedRest(
+            [self._intrinsics.applied_to(one) for one in sweeps],
+            state,
+            covariance,
+            np.diag(np.square([shift] * 3 + [turn] * 3)),
+        )
+
+    def mapped_again(self, reported: Sweep, motion: SweepMotion) -> RemappedRest | None:
+        """Return the map begun again with a rest that has just ended, if the unit is known better.
+
+        None also where the latest sweep does not meet that map.
+
+        Parameters
+        ----------
+        reported : Sweep
+            The latest, as the unit reports it.
+        motion : SweepMotion
+            Of that sweep, in the map in use.
+        """
+        ended = self.recalibrated(motion.state)
+        if ended is None:
+            return None
+        initializer = self.initializer.for_another_map()
+        initializer.matcher.drift.corrections = self._intrinsics.corrections
+        initializer.map_rest(ended.sweeps, ended.state, ended.covariance)
+        matcher, sweep = initializer.matcher, self._intrinsics.applied_to(reported)
+        covariance = with_loose_pose(motion.state, motion.covariance, ended.moved)
+        loose = dataclasses.replace(motion, covariance=covariance)
+        found = matcher.match(matcher.source(sweep, loose), loose).alignment
+        if found is None:
+            return None
+        matcher.meet(found, 0.0)
+        motion = motion.with_state(found.state, found.covariance)
+        fresh = matcher.extend(matcher.deskewed(sweep, motion), motion, motion.state)
+        return RemappedRest(matcher, motion, fresh)
+
+    def end_doubt(self) -> None:
+        """Keep no sweeps of a rest that has lasted so long that it was one."""
+        if self.sweeps and self.sweeps[-1].end - self.sweeps[0].start > tuning.RETRY_NS:
+            self.sweeps = []
+
+    def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> bool | None:
+        """Begin the map again, if the beams are known better than in it.
+
+        Parameters
+        ----------
+        still : SweepMotion
+            Of the latest sweep.
+        doubted : bool
+            The sweeps deviate: the beams are estimated now, whenever that was done last.
+
+        Returns
+        -------
+        bool or None
+            Whether the sweeps agree that the sensor rests; None where the map stays as it is.
+        """
+        if not self.sweeps:
+            return None
+        if doubted or self._intrinsics.is_due_at_rest(self.sweeps):
+            self._intrinsics.learn_at_rest(self.sweeps, still.state.rest_force)
+        if not self._is_known_better:
+            return None
+        self._mapped_with = self._corrections
+        better = [self._intrinsics.applied_to(one) for one in self.sweeps]
+        self.initializer.matcher.drift.corrections = self._intrinsics.corrections
+        return self.initializer.begin_again_at_rest(better, still.state, still.covariance)
+
+    def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
+        """Return whether unknown beams may be why sweeps deviate; the sensor rests as before then.
+
+        Parameters
+        ----------
+        still : SweepMotion
+            Of the latest sweep.
+        seen : Source
+            Its points.
+        """
+        if not self.sweeps or self._intrinsics.is_other:
+            return False
+        worse = self._intrinsics.errors.beams[1]
+        turn, shift = tuning.BEAM_DRIFT_TURN * worse, tuning.BEAM_DRIFT_SHIFT * worse
+        rotation, middle = still.state.rotation, seen.points.mean(axis=0)
+        if not self._zero_velocity.has_drifted_within(turn, shift, rotation, middle):
+            return False
+        self._zero_velocity.resume(still.state)
+        return True
+
+    def begun_in_motion(
+        self, sweeps: list[Sweep], state: InertialState, covariance: F64
+    ) -> InitializedMap | None:
+        """Return the map begun again as in motion, if the IMU has soon ended what passed for rest.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            All those of the rest.
+        state : InertialState
+            At rest, at any stamp.
+        covariance : ndarray, shape (18, 18)
+        """
+        if not sweeps or sweeps[-1].end - sweeps[0].start > tuning.RETRY_SHORT_NS:
+            return None
+        motions = self.initializer.begin_again_in_motion(sweeps, state, covariance)
+        if not motions:
+            return None
+        self._forget_intrinsics()
+        return InitializedMap(motions, sweeps, 0, sweeps[0].start)
+
+    def retried(self, sweeps: list[Sweep]) -> InitializedMap | None:
+        """Return the map begun again, as in motion, with sweeps that have shown motion.
+
+        None if that does not fit, or leads too far away for what passed for a rest.
+
+        Parameters
+        ----------
+        sweeps : list of Sweep
+            All those of the rest.
+        """
+        self._forget_intrinsics()
+        for may_rest in (False, True):
+            motions = self.initializer.begin(sweeps, sweeps[0].start, may_rest)
+            if motions:
+                way = float(np.linalg.norm(motions[-1].state.position))
+                if way < tuning.RETRY_FARTHEST_M:
+                    return InitializedMap(motions, sweeps, 0, sweeps[0].start)
+        return None
+
+    def _forget_intrinsics(self) -> None:
+        """Forget what the beams have shown of themselves: the sensor moved."""
+        self._intrinsics.forget()
+        self._mapped_with = self._corrections
+
+    @property
+    def _is_known_better(self) -> bool:
+        """Whether the unit is known to be wrong by more than in the map."""
+        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
+        return bool(max(angles) > tuning.BEAM_CHANGE or ranges > tuning.RANGE_BIAS_CHANGE)
+
+    @property
+    def _corrections(self) -> F64:
+        """Of the beam angles [rad] and of the ranges [m], shape (4,)."""
+        return np.append(*self._intrinsics.corrections)

@@ -1,0 +1,1 @@
+"""What a unit's own calibration is wrong by: beam angles and ranges, learned on the way."""

@@ -1,0 +1,1 @@
+"""Alignment of a sweep with the map: correspondences, weak directions, and the state after it."""

@@ -1,0 +1,1 @@
+"""Velocity along bare walls, where surfaces leave it free."""
