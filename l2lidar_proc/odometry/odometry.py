@@ -392,17 +392,15 @@ class Odometry:
         information = found.information[eskf.POSITION, eskf.POSITION]
         better = start.search(whole, information, vertical)
         motions: list[SweepMotion] = []
-        if better is not None and not better.is_news:
-            better = None
         if better is not None:
             self._walls.correct(state, better.state)
             motion = motion.with_state(better.state, better.covariance)
             whole = whole.with_state(better.state, better.covariance)
-        if start.is_first and better is not None and better.is_open:
+        if start.may_begin_again and better is not None and better.is_open:
             motions = self._initializer.begin_with(
                 start.sweeps, start.since, start.beginning(whole)
             )
-        elif start.is_first and not start.is_open:
+        elif start.may_begin_again and not start.is_open:
             fitted = start.fitted(whole)
             if fitted is not None:
                 motions = self._initializer.begin_as_fitted(

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -69,22 +70,36 @@ class Passed(NamedTuple):
     position: F64
 
 
+class SearchPhase(Enum):
+    """How far the search for the velocity of a start has come."""
+
+    NO_START = "no start"  # nothing is searched
+    FIRST = "first"  # the first search is yet to be made
+    REPEATED = "repeated"  # none has found the velocity so far: the next is made as the first
+    FOLLOWING = "following"  # one has, or it is known by other means: the next correct the state
+
+
+class ShownBy(Enum):
+    """What has shown the velocity in a search."""
+
+    NOTHING = "nothing"
+    POSTS = "posts"
+    WALLS = "walls"  # bare ones, between which the acceleration is found as well
+
+
 class FoundVelocity(NamedTuple):
-    """State with the velocity that some seconds of points show.
+    """Another state than before, or a more certain one, that some seconds of points show.
 
     Attributes
     ----------
     state : InertialState
     covariance : ndarray, shape (18, 18)
-    is_news : bool
-        Whether the state before was another one, or less certain.
     is_open : bool
         Whether the sweeps leave some of the velocity open; else only gravity may have changed.
     """
 
     state: InertialState
     covariance: F64
-    is_news: bool
     is_open: bool = True
 
 
@@ -143,10 +158,9 @@ class StartVelocity:
 
     Attributes
     ----------
+    phase : SearchPhase
     since : HostNs
         What the sweeps reach back to.
-    is_first : bool
-        Whether no search has found anything so far, and the next one may begin the map again.
     is_open : bool
         Whether the velocity was open at the start, and has not become known since.
     """
@@ -162,16 +176,20 @@ class StartVelocity:
         self._begun_with: SweepMotion | None = None  # motion of the first sweep, as far as known
         self._next = self._last = 0
         self._begun = HostNs(0)  # reference of the first sweep of all
-        self._was_searched = False
-        self._is_found = self._is_beside_walls = False  # of the latest search
+        self._shown_by = ShownBy.NOTHING  # in the latest search
+        self.phase = SearchPhase.NO_START
         self.since = HostNs(0)
-        self.is_first = False
         self.is_open = False
 
     @property
     def is_awaited(self) -> bool:
         """Whether the first search is yet to tell a velocity that is open until then."""
-        return self.is_first and self.is_open and not self._was_searched
+        return self.phase is SearchPhase.FIRST and self.is_open
+
+    @property
+    def may_begin_again(self) -> bool:
+        """Whether the map may begin again with what the next search finds."""
+        return self.phase in (SearchPhase.FIRST, SearchPhase.REPEATED)
 
     @property
     def sweeps(self) -> list[Sweep]:
@@ -198,7 +216,7 @@ class StartVelocity:
             Directions along which they leave the velocity open.
         """
         self.clear()
-        self.since, self.is_first = since, True
+        self.since, self.phase = since, SearchPhase.FIRST
         self._begun = motions[0].state.stamp
         self.is_open = len(open_axes) > 0
         # the first motion has the prior's covariance
@@ -226,8 +244,8 @@ class StartVelocity:
         """Take how well the velocity is known by now, covariance (3, 3) [m^2/s^2]."""
         worst = float(np.linalg.eigvalsh(covariance)[-1])
         self.is_open &= worst > tuning.PRIOR_LEARN_SIGMA**2
-        if self._was_searched:
-            self.is_first &= self.is_open
+        if self.phase is SearchPhase.REPEATED and not self.is_open:
+            self.phase = SearchPhase.FOLLOWING
 
     def is_due(self, end: HostNs) -> bool:
         """Return whether it is time for a search, at the end of a sweep."""
@@ -236,7 +254,7 @@ class StartVelocity:
     def search(
         self, motion: SweepMotion, information: F64, vertical: Vertical | None
     ) -> FoundVelocity | None:
-        """Return the state with the velocity that the sweeps show; None where they show none.
+        """Return the state with the velocity that the sweeps show; None where it is not news.
 
         Parameters
         ----------
@@ -247,12 +265,12 @@ class StartVelocity:
         vertical : Vertical or None
             That the map shows, map axes.
         """
-        before = motion
-        self._is_found = self._is_beside_walls = False
-        lasted = 1e-9 * (tuning.START_NS if self.is_first else tuning.START_PAUSE_NS)
+        before, first = motion, self.may_begin_again
+        self._shown_by = ShownBy.NOTHING
+        lasted = 1e-9 * (tuning.START_NS if first else tuning.START_PAUSE_NS)
         strengths, directions = np.linalg.eigh(information)
         weak = directions[:, strengths < tuning.START_SHARE * strengths[-1]]
-        if self.is_first and self.is_open:
+        if first and self.is_open:
             others = self._open_axes.T - weak @ (weak.T @ self._open_axes.T)
             weak = np.column_stack((weak, others))
         if vertical is not None and vertical.is_certain:
@@ -262,28 +280,28 @@ class StartVelocity:
         if not len(axes):
             if motion is before:
                 return None
-            return FoundVelocity(motion.state, motion.covariance, is_news=True, is_open=False)
+            return FoundVelocity(motion.state, motion.covariance, is_open=False)
         seen = placed(self._passed, motion, self._lever, axes)
-        turned = with_yaw_rate(motion, seen, axes) if self.is_first else motion
+        turned = with_yaw_rate(motion, seen, axes) if first else motion
         if turned is not motion:
             motion, seen = turned, placed(self._passed, turned, self._lever, axes)
         is_news = motion is not before
-        covariance = doubted(motion.covariance, axes, lasted, first=self.is_first)
+        covariance = doubted(motion.covariance, axes, lasted, first=first)
         walls = wall_spots(seen, axes, motion.state.gravity)
-        found = _measured(seen, walls, motion.state, covariance, axes, first=self.is_first)
-        self._is_found = found is not None
-        self._is_beside_walls = walls is not None
+        found = _measured(seen, walls, motion.state, covariance, axes, first=first)
         if found is None:
-            return FoundVelocity(motion.state, covariance, True) if is_news else None
+            return FoundVelocity(motion.state, covariance) if is_news else None
+        self._shown_by = ShownBy.POSTS if walls is None else ShownBy.WALLS
         state, posterior, sigmas = found
         change = float(np.linalg.norm(state.velocity - motion.state.velocity))
         prior = axes @ motion.covariance[VELOCITY, VELOCITY] @ axes.T
         is_other = change > tuning.START_CHANGE and sigmas > tuning.START_SIGNIFICANT
-        if not self.is_first:
+        if not first:
             # the sweeps since have told much more
             is_other &= change < tuning.START_MOST_CHANGE
         was_open = float(np.linalg.eigvalsh(prior)[-1]) > tuning.START_OPEN**2
-        return FoundVelocity(state, posterior, is_news or is_other or was_open)
+        is_news = is_news or is_other or was_open
+        return FoundVelocity(state, posterior) if is_news else None
 
     def beginning(self, motion: SweepMotion) -> Beginning:
         """Return how the sweeps here began.
@@ -298,7 +316,7 @@ class StartVelocity:
         """
         first, state = motion.state_at(self._begun), motion.state_at(self.reference)
         covariance = motion.covariance
-        if self._is_found and self._is_beside_walls:
+        if self._shown_by is ShownBy.WALLS:
             covariance = _with_open_turns(motion.state, covariance)
         else:  # the sweeps have fixed the attitude, then and now
             assert self._begun_with is not None
@@ -355,11 +373,12 @@ class StartVelocity:
     def end_search(self, end: HostNs) -> None:
         """Wait until the next search, with the sweeps that it will need."""
         is_late = end - self.since > tuning.START_AWAITED_NS
-        self.is_first &= self.is_open and not (self._is_found or is_late)
-        self._was_searched = True
+        is_sought = self.is_open and self._shown_by is ShownBy.NOTHING and not is_late
+        is_repeated = self.may_begin_again and is_sought
+        self.phase = SearchPhase.REPEATED if is_repeated else SearchPhase.FOLLOWING
         self._next = end + tuning.START_PAUSE_NS
         self._passed = [] if end > self._last else self._since(self._next - tuning.START_NS)
-        if self._passed and not self.is_first:
+        if self._passed and not is_repeated:
             self.since = self._passed[0].sweep.start
 
     def _since(self, oldest: int) -> list[Passed]:

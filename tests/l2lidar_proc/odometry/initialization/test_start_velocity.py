@@ -12,6 +12,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.initialization.start_velocity import (
+    SearchPhase,
     StartVelocity,
     doubted,
     level_span,
@@ -155,7 +156,6 @@ def test_a_search_levels_gravity_by_a_certain_vertical(passing: list[Sweep]) -> 
         found = start.search(motion, np.eye(3), Vertical(UP, agreement))
         assert (found is not None) == is_leveled
         if found is not None:
-            assert found.is_news
             assert abs(found.state.gravity[0]) < 0.1
 
 
@@ -191,7 +191,6 @@ def test_a_wrong_velocity_of_a_start_is_corrected_however_certain(
     assert start.is_due(end)
     found = start.search(motion_at(wrong, covariance), FREE, None)
     assert found is not None
-    assert found.is_news
     error = (found.state.velocity - SPEED)[0]
     sigma = np.sqrt(found.covariance[6, 6])
     assert abs(error) < 0.12
@@ -222,7 +221,6 @@ def test_a_wrong_yaw_rate_of_a_start_is_corrected_however_certain(
     start = begun(passing, wrong, covariance, X)
     found = start.search(motion_at(wrong, covariance, 0.07), FREE, None)
     assert found is not None
-    assert found.is_news
     bias, sigma = found.state.gyro_bias[2], np.sqrt(found.covariance[11, 11])
     assert abs(bias) < 0.01
     assert abs(bias) < 3.0 * sigma
@@ -235,8 +233,7 @@ def test_a_wrong_yaw_rate_of_a_start_is_corrected_however_certain(
 def test_a_right_velocity_is_no_news(passing: list[Sweep]) -> None:
     covariance = known_to(0.05)
     found = begun(passing, SPEED, covariance, X).search(motion_at(SPEED, covariance), FREE, None)
-    assert found is not None
-    assert not found.is_news
+    assert found is None
 
 
 def test_where_all_is_fixed_nothing_is_searched(passing: list[Sweep]) -> None:
@@ -252,10 +249,9 @@ def test_later_a_change_that_is_too_large_misleads(passing: list[Sweep]) -> None
     for off, is_news in ((0.4, True), (1.1, False)):
         wrong = SPEED - np.array([off, 0.0, 0.0])
         start = begun(passing, wrong, covariance, np.zeros((0, 3)))
-        start.is_first = False
+        start.phase = SearchPhase.FOLLOWING
         found = start.search(motion_at(wrong, covariance), FREE, None)
-        assert found is None or found.is_news == is_news
-        assert found is not None or not is_news
+        assert (found is not None) == is_news
 
 
 def test_searches_follow_each_other_and_end(passing: list[Sweep]) -> None:
@@ -263,7 +259,7 @@ def test_searches_follow_each_other_and_end(passing: list[Sweep]) -> None:
     end = passing[-1].end
     assert start.search(motion_at(SPEED, known_to(1.0)), FREE, None) is not None
     start.end_search(end)
-    assert not start.is_first
+    assert start.phase is SearchPhase.FOLLOWING
     assert start.is_open
     assert not start.is_due(HostNs(end + tuning.START_PAUSE_NS - 1))
     assert start.is_due(HostNs(end + tuning.START_PAUSE_NS))
@@ -386,7 +382,7 @@ def test_a_search_that_finds_nothing_is_made_again_with_the_sweeps_since(
     assert start.is_awaited
     first, end = start.reference, passing[-1].end
     start.end_search(end)
-    assert start.is_first
+    assert start.phase is SearchPhase.REPEATED
     assert not start.is_awaited
     assert start.since == EPOCH  # the way since the first pose is needed
     assert start.reference >= end + tuning.START_PAUSE_NS - tuning.START_NS
@@ -414,10 +410,10 @@ def test_a_first_search_is_not_awaited_for_ever(
     start.note_velocity((tuning.PRIOR_LEARN_SIGMA + 0.01) ** 2 * np.eye(3))
     end = HostNs(EPOCH + tuning.START_AWAITED_NS + 1) if late else passing[-1].end
     start.end_search(end)
-    assert start.is_first != late
+    assert start.may_begin_again != late
     if known:
         start.note_velocity((tuning.PRIOR_LEARN_SIGMA - 0.01) ** 2 * np.eye(3))
-    assert not start.is_first
+    assert start.phase is SearchPhase.FOLLOWING
 
 
 def walls_with_niches(rng: np.random.Generator, along: float) -> F64:
