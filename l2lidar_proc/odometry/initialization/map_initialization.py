@@ -147,6 +147,8 @@ class MapInitializer:
             return None
         if not motions:
             del held[0]
+            while len(held) > 1 and held[-1].end - held[0].start >= tuning.INITIAL_MAX_NS:
+                del held[0]
             return None
         self._lead_velocity = motions[0].state.velocity
         return InitializedMap([motions[0]] * seed + motions, whole, seed, held[0].start)
