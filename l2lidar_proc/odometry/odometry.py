@@ -115,7 +115,7 @@ class Odometry:
         self.matcher = SweepMatcher(self.config, self._lever)
         self._initializer = self._map_initializer()
         self._first_rest = FirstRest(self._initializer, self._zero_velocity, self._intrinsics)
-        self._start = StartVelocity(self._lever)
+        self._start = StartVelocity(self._lever, self._intrinsics)
         self._carrier = carrier_priors.Carrier()
         self._unmatched_ns = 0  # of sweeps with enough points since the latest match
         self._was_blind = False  # a sweep since then had few
@@ -379,9 +379,9 @@ class Odometry:
         After it comes whether the map has begun again with that velocity, and has the sweep.
         """
         start = self._start
-        if not start.sweeps:
+        if not len(start):
             return motion, False
-        start.note(sweep, motion)
+        start.note(self._reported, motion)
         if found is None or not start.is_due(sweep.end):
             return motion, False
         state, covariance, span = motion.state, motion.covariance, (start.since, sweep.end)
@@ -398,17 +398,17 @@ class Odometry:
             whole = whole.with_state(better.state, better.covariance)
         if start.may_begin_again and better is not None and better.is_open:
             motions = self._initializer.begin_with(
-                start.sweeps, start.since, start.beginning(whole)
+                start.sweeps(), start.since, start.beginning(whole)
             )
         elif start.may_begin_again and not start.is_open:
             fitted = start.fitted(whole)
             if fitted is not None:
                 motions = self._initializer.begin_as_fitted(
-                    start.sweeps, start.since, fitted, motion.covariance
+                    start.sweeps(), start.since, fitted, motion.covariance
                 )
         if motions:
             self._carrier.note_found(motions[-1].state, motions[-1].covariance)
-            start.replace(start.sweeps, motions)
+            start.replace(motions)
             motion = motions[-1]
             self._walls.clear()
             self._innovations.clear()

@@ -37,6 +37,12 @@ class Corrections(NamedTuple):
     angles: F64
     ranges: float
 
+    def differ_from(self, others: Corrections) -> bool:
+        """Return whether clouds with these are so different that a map should begin again."""
+        angle = float(np.abs(self.angles - others.angles).max())
+        shift = abs(self.ranges - others.ranges)
+        return angle > tuning.BEAM_CHANGE or shift > tuning.RANGE_BIAS_CHANGE
+
 
 class IntrinsicErrors(NamedTuple):
     """What corrected clouds may be wrong by, 1 sigma.

@@ -89,14 +89,14 @@ class FirstRest:
         self.initializer = initializer
         self._zero_velocity = zero_velocity
         self._intrinsics = intrinsics
-        self._mapped_with: F64 = np.zeros(4)  # the corrections of the sweeps in the map
+        self._mapped_with = intrinsics.corrections  # the sweeps in the map
         self.sweeps: list[Sweep] = []
         # its sweeps, and state and covariance at its end, for a moment
         self._ended: tuple[list[Sweep], InertialState, F64] | None = None
 
     def begin(self, sweeps: list[Sweep]) -> None:
         """Take the sweeps with which a map has begun at rest."""
-        self.sweeps, self._mapped_with = sweeps, self._corrections
+        self.sweeps, self._mapped_with = sweeps, self._intrinsics.corrections
         self._ended = None
 
     def note(self, sweep: Sweep) -> None:
@@ -143,10 +143,11 @@ class FirstRest:
             self._ended = None
         if self._ended is None or not self._is_known_better:
             return None
-        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
-        turn = tuning.BEAM_DRIFT_TURN * max(angles)
-        shift = tuning.BEAM_DRIFT_SHIFT * max(angles) + ranges
-        self._mapped_with = self._corrections  # tried once with what is known now
+        known, before = self._intrinsics.corrections, self._mapped_with
+        angle = float(np.abs(known.angles - before.angles).max())
+        turn = tuning.BEAM_DRIFT_TURN * angle
+        shift = tuning.BEAM_DRIFT_SHIFT * angle + abs(known.ranges - before.ranges)
+        self._mapped_with = known  # tried once with what is known now
         return EndedRest(
             [self._intrinsics.applied_to(one) for one in sweeps],
             state,
@@ -209,7 +210,7 @@ class FirstRest:
             self._intrinsics.learn_at_rest(self.sweeps, still.state.rest_force)
         if not self._is_known_better:
             return None
-        self._mapped_with = self._corrections
+        self._mapped_with = self._intrinsics.corrections
         better = [self._intrinsics.applied_to(one) for one in self.sweeps]
         self.initializer.matcher.drift.corrections = self._intrinsics.corrections
         return self.initializer.begin_again_at_rest(better, still.state, still.covariance)
@@ -277,15 +278,9 @@ class FirstRest:
     def _forget_intrinsics(self) -> None:
         """Forget what the beams have shown of themselves: the sensor moved."""
         self._intrinsics.forget()
-        self._mapped_with = self._corrections
+        self._mapped_with = self._intrinsics.corrections
 
     @property
     def _is_known_better(self) -> bool:
         """Whether the unit is known to be wrong by more than in the map."""
-        *angles, ranges = np.abs(self._corrections - self._mapped_with).tolist()
-        return bool(max(angles) > tuning.BEAM_CHANGE or ranges > tuning.RANGE_BIAS_CHANGE)
-
-    @property
-    def _corrections(self) -> F64:
-        """Of the beam angles [rad] and of the ranges [m], shape (4,)."""
-        return np.append(*self._intrinsics.corrections)
+        return self._intrinsics.corrections.differ_from(self._mapped_with)

@@ -43,6 +43,7 @@ from l2lidar_proc.odometry.initialization.map_sharpness import (
 )
 from l2lidar_proc.odometry.initialization.posts_and_walls import SEEN, Seen
 from l2lidar_proc.odometry.initialization.vertical_direction import Vertical
+from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.registration.pose_hypotheses import level_basis
 from l2lidar_proc.odometry.walls.wall_profile import (
@@ -59,6 +60,7 @@ class Passed(NamedTuple):
     Attributes
     ----------
     sweep : Sweep
+        As the unit reports it.
     stamp : HostNs
         Its reference.
     position : ndarray, shape (3,)
@@ -134,7 +136,8 @@ class FittedStart(NamedTuple):
     velocity_sigma : float
         [m/s]
     is_other : bool
-        Whether the map began with another velocity, as far as either is known.
+        Whether the map is to begin again: it began with another velocity, as far as either is
+        known, or the unit is known better by now.
     shift : ndarray, shape (3,)
         From where the first sweep was to where it was estimated [m], map axes.
     """
@@ -155,6 +158,7 @@ class StartVelocity:
     ----------
     lever : ndarray, shape (3,)
         Place of the IMU in the cloud frame [m].
+    intrinsics : LidarIntrinsics
 
     Attributes
     ----------
@@ -165,8 +169,9 @@ class StartVelocity:
         Whether the velocity was open at the start, and has not become known since.
     """
 
-    def __init__(self, lever: F64) -> None:
+    def __init__(self, lever: F64, intrinsics: LidarIntrinsics) -> None:
         self._lever = lever
+        self._intrinsics = intrinsics
         self.clear()
 
     def clear(self) -> None:
@@ -176,6 +181,7 @@ class StartVelocity:
         self._begun_with: SweepMotion | None = None  # motion of the first sweep, as far as known
         self._next = self._last = 0
         self._begun = HostNs(0)  # reference of the first sweep of all
+        self._mapped_with = self._intrinsics.corrections  # the first sweeps
         self._shown_by = ShownBy.NOTHING  # in the latest search
         self.phase = SearchPhase.NO_START
         self.since = HostNs(0)
@@ -191,10 +197,17 @@ class StartVelocity:
         """Whether the map may begin again with what the next search finds."""
         return self.phase in (SearchPhase.FIRST, SearchPhase.REPEATED)
 
-    @property
+    def __len__(self) -> int:
+        """Return the number of sweeps since :attr:`since`."""
+        return len(self._passed)
+
     def sweeps(self) -> list[Sweep]:
-        """The sweeps since :attr:`since`."""
-        return [one.sweep for one in self._passed]
+        """Return these sweeps, as the unit would have measured them with what is known now."""
+        return [one.sweep for one in self._corrected()]
+
+    def _corrected(self) -> list[Passed]:
+        applied = self._intrinsics.applied_to
+        return [one._replace(sweep=applied(one.sweep)) for one in self._passed]
 
     @property
     def reference(self) -> HostNs:
@@ -209,6 +222,7 @@ class StartVelocity:
         Parameters
         ----------
         sweeps : list of Sweep
+            As the unit reports them.
         motions : list of SweepMotion
         since : HostNs
             The first motion reaches back to it.
@@ -223,13 +237,14 @@ class StartVelocity:
         self._begun_with = motions[0].with_state(motions[0].state, motions[1].covariance)
         self._open_axes = open_axes
         self._next, self._last = since + tuning.START_NS, since + tuning.START_WATCHED_NS
-        self.replace(sweeps, motions)
-
-    def replace(self, sweeps: list[Sweep], motions: list[SweepMotion]) -> None:
-        """Take other motions for the sweeps so far."""
-        self._passed = []
         for sweep, motion in zip(sweeps, motions, strict=True):
             self.note(sweep, motion)
+
+    def replace(self, motions: list[SweepMotion]) -> None:
+        """Take other motions for the sweeps so far."""
+        passed, self._passed = self._passed, []
+        for one, motion in zip(passed, motions, strict=True):
+            self.note(one.sweep, motion)
 
     def note(self, sweep: Sweep, motion: SweepMotion) -> None:
         """Take a sweep with its motion; clear all if a search is overdue by START_NS."""
@@ -281,10 +296,11 @@ class StartVelocity:
             if motion is before:
                 return None
             return FoundVelocity(motion.state, motion.covariance, is_open=False)
-        seen = placed(self._passed, motion, self._lever, axes)
+        passed = self._corrected()
+        seen = placed(passed, motion, self._lever, axes)
         turned = with_yaw_rate(motion, seen, axes) if first else motion
         if turned is not motion:
-            motion, seen = turned, placed(self._passed, turned, self._lever, axes)
+            motion, seen = turned, placed(passed, turned, self._lever, axes)
         is_news = motion is not before
         covariance = doubted(motion.covariance, axes, lasted, first=first)
         walls = wall_spots(seen, axes, motion.state.gravity)
@@ -364,11 +380,13 @@ class StartVelocity:
         sigma = max(float(np.sqrt(variance * spread)), tuning.START_FITTED_SIGMA)
         change = state.velocity - self._begun_with.state.velocity
         unknown = self._begun_with.covariance[VELOCITY, VELOCITY] + sigma**2 * np.eye(3)
-        is_other = (
+        is_other = bool(
             float(np.linalg.norm(change)) > tuning.START_FITTED_CHANGE
             and change @ np.linalg.solve(unknown, change) > tuning.START_SIGNIFICANT**2
         )
-        return FittedStart(state, sigma, bool(is_other), off[0] - design[0] @ fit)
+        # halves of the fan that are apart have turned the sweeps
+        is_known_better = self._intrinsics.corrections.differ_from(self._mapped_with)
+        return FittedStart(state, sigma, is_other or is_known_better, off[0] - design[0] @ fit)
 
     def end_search(self, end: HostNs) -> None:
         """Wait until the next search, with the sweeps that it will need."""

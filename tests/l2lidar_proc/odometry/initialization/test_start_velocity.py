@@ -20,6 +20,9 @@ from l2lidar_proc.odometry.initialization.start_velocity import (
     with_level_gravity,
 )
 from l2lidar_proc.odometry.initialization.vertical_direction import Vertical
+from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
+from tests.l2lidar_proc.odometry.odometry_world import recording
+from tests.support.odometry_runs import sweeps
 from tests.support.passing_sweeps import (
     EPOCH,
     GRAVITY,
@@ -161,7 +164,7 @@ def test_a_search_levels_gravity_by_a_certain_vertical(passing: list[Sweep]) -> 
 
 def begun(sweeps: list[Sweep], velocity: F64, covariance: F64, open_axes: F64) -> StartVelocity:
     """Return the search of a start whose sweeps a velocity has placed."""
-    start = StartVelocity(np.zeros(3))
+    start = StartVelocity(np.zeros(3), LidarIntrinsics())
     motion = motion_at(velocity, covariance)
     motions = [motion.anchored_at(one.stamp) for one in passed_at(sweeps, velocity)]
     start.begin(sweeps, motions, HostNs(EPOCH), open_axes)
@@ -265,14 +268,14 @@ def test_searches_follow_each_other_and_end(passing: list[Sweep]) -> None:
     assert start.is_due(HostNs(end + tuning.START_PAUSE_NS))
     # what the next one does not need is forgotten
     assert start.since >= end + tuning.START_PAUSE_NS - tuning.START_NS
-    assert start.since == start.sweeps[0].start
+    assert start.since == start.sweeps()[0].start
     start.note_velocity((tuning.PRIOR_LEARN_SIGMA + 0.01) ** 2 * np.eye(3))
     assert start.is_open
     start.note_velocity((tuning.PRIOR_LEARN_SIGMA - 0.01) ** 2 * np.eye(3))
     start.note_velocity(np.eye(3))
     assert not start.is_open
     start.end_search(HostNs(EPOCH + tuning.START_WATCHED_NS + 1))
-    assert not start.sweeps
+    assert not len(start)
     assert not start.is_due(HostNs(EPOCH + 10 * tuning.START_WATCHED_NS))
 
 
@@ -283,7 +286,7 @@ def test_a_start_that_was_interrupted_is_forgotten(passing: list[Sweep]) -> None
     for late, count in ((2 * tuning.START_NS, SWEEPS + 1), (2 * tuning.START_NS + 1, 0)):
         end = HostNs(EPOCH + late)
         start.note(dataclasses.replace(passing[-1], end=end), motion)
-        assert len(start.sweeps) == count
+        assert len(start) == len(start.sweeps()) == count
     assert not start.is_open
     assert not start.is_due(HostNs(EPOCH + tuning.START_WATCHED_NS))
 
@@ -304,7 +307,7 @@ def with_wrong_beginning(
             off += 0.2 * X[0]
         state = dataclasses.replace(state, position=state.position + off)
         motions[number] = dataclasses.replace(motion, state=state)
-    start.replace(sweeps, motions)
+    start.replace(motions)
     return start
 
 
@@ -343,6 +346,34 @@ def test_a_start_began_with_another_velocity_as_far_as_either_is_known(
     fitted = start.fitted(motion_at(SPEED, known_to(0.05)))
     assert fitted is not None
     assert fitted.is_other == is_other
+
+
+@pytest.mark.parametrize(("angle", "is_other"), [(0.0008, False), (-0.001, True)])
+def test_a_start_begins_again_when_the_beams_are_known_better(
+    passing: list[Sweep], angle: float, is_other: bool
+) -> None:
+    """Its first sweeps are turned by what their halves are apart; its velocity was right."""
+    start = with_wrong_beginning(passing, 0.003, SPEED)
+    start._intrinsics.angles = np.array([0.0, angle, 0.0])
+    fitted = start.fitted(motion_at(SPEED, known_to(0.05)))
+    assert fitted is not None
+    assert fitted.is_other == is_other
+
+
+def test_sweeps_are_returned_as_they_are_known_to_be_now() -> None:
+    reported = list(sweeps(recording("room", "walk"), "turn"))[3:6]
+    motion = motion_at(SPEED, known_to(0.05))
+    motions = [motion.anchored_at(one.end) for one in reported]
+    intrinsics = LidarIntrinsics()
+    start = StartVelocity(np.zeros(3), intrinsics)
+    start.begin(reported, motions, reported[0].start, np.zeros((0, 3)))
+    assert start.sweeps() == reported
+    intrinsics.angles = np.array([0.005, -0.003, 0.0])
+    for one, sweep in zip(start.sweeps(), reported, strict=True):
+        assert one.points["x"] == pytest.approx(intrinsics.applied_to(sweep).points["x"], abs=1e-3)
+        assert np.abs(one.points["x"] - sweep.points["x"]).max() > 0.005
+    intrinsics.angles = np.zeros(3)
+    assert start.sweeps() == reported
 
 
 def test_too_few_poses_show_no_beginning(passing: list[Sweep]) -> None:
