@@ -162,6 +162,30 @@ def test_a_carrier_that_speeds_up_between_walls_does_not_run_away(family: str, s
     assert off[-1] @ np.linalg.solve(track.covariances[-1, :3, :3], off[-1]) < 16.3  # 99.9 %
 
 
+@pytest.mark.parametrize(
+    ("family", "seed", "people"),
+    [
+        ("corridor, imperfect", 4, 12),  # 24 m off after 12 s
+        ("corridor, 120 degrees, imperfect", 7, 8),  # 9 m, and silent
+    ],
+)
+def test_people_beside_a_carrier_between_walls_do_not_make_its_velocity(
+    family: str, seed: int, people: int
+) -> None:
+    """Those who walk along with it look like walls that it does not pass."""
+    crowded = replace(
+        scenario(family, seed, 12.0), rest_s=0.0, people=people, family=f"{family} with people"
+    )
+    given = recording(crowded)
+    track = tracked(given)
+    assert track.covariances is not None
+    off = errors(given, track).position
+    sure = np.einsum(
+        "ni,nij,nj->n", off[1:], np.linalg.inv(track.covariances[1:, :3, :3]), off[1:]
+    )
+    assert np.mean(sure < QUANTILE[3]) > 0.8
+
+
 def test_a_gyro_without_a_head_beside_it_counts_as_measured() -> None:
     """It counted as one beside a head, ten times as noisy: a camera ended 0.9 m off."""
     given = in_motion("camera, looking into rooms", 1, 2.0)

@@ -9,7 +9,8 @@ dark ones, or near and deep ones, alternate about it. So the velocity at which n
 differ least is the most likely one.
 
 Such a profile needs no map, so errors of the map do not confirm themselves; nor does it have to
-tell one edge from another.
+tell one edge from another. What stands before a wall does not count: it may be people, who walk at
+a speed of their own.
 """
 
 from __future__ import annotations
@@ -324,7 +325,8 @@ def _samples(spots: Spots, now: int, axes: F64) -> NDArray[np.void]:
         distance = np.maximum(np.abs(sight[side, 1]) - behind, tuning.PROFILE_BESIDE)
         terms = np.log(reach[side]), np.log(distance)
         samples["brightness"][side, 0] = _without_trend(spots["brightness"][side], *terms)
-        is_wall[side] = (behind < tuning.PROFILE_BEHIND) & _is_wall(behind, variance[side])
+        is_wall[side] = _is_wall(behind, variance[side])
+        is_wall[side] &= (behind > -tuning.PROFILE_PROUD) & (behind < tuning.PROFILE_BEHIND)
     return samples[is_wall]
 
 

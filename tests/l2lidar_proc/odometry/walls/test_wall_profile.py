@@ -304,6 +304,23 @@ def test_what_stands_before_a_wall_rules_it_out(share: float, depth: float, is_w
     assert (len(wall_profile._samples(spots, int(spots["stamp"].max()), AXES)) > 0) == is_wall
 
 
+@pytest.mark.parametrize(("place", "speed"), [(6.0, 0.0), (2.5, SPEED), (-0.5, 2.0)])
+def test_people_before_a_wall_say_nothing_about_it(place: float, speed: float) -> None:
+    """One who walks beside the sensor looks like a rim of its view: 42 m off in a corridor."""
+    spots = passed(14, DOORS, 0.2, seconds=4.0)
+    now, is_right = int(spots["stamp"].max()), spots["sight"][:, 1] < 0.0
+    seconds = 1e-9 * (spots["stamp"] - EPOCH)
+    person = (spots["place"][:, 0] - place - (speed + 0.2) * seconds) / 0.08
+    is_hidden = is_right & (np.abs(person) < 1.0)
+    assert 0.01 < np.count_nonzero(is_hidden) / np.count_nonzero(is_right) < 0.06
+    depth = 0.04 + 0.15 * np.sqrt(1.0 - np.minimum(np.abs(person[is_hidden]), 1.0))
+    spots["place"][is_hidden, 1] += depth
+    spots["brightness"][is_hidden] -= 0.5
+    found = log_likelihood(spots, now, AXES, ERRORS)
+    alone = log_likelihood(spots[~is_hidden], now, AXES, ERRORS)
+    assert found - found.max() == pytest.approx(alone - alone.max(), abs=0.05 * np.ptp(alone))
+
+
 @pytest.mark.parametrize(
     ("share", "depth", "are"),
     [(0.0, 0.0, True), (0.25, -0.6, True), (0.25, 0.5, True), (0.6, -0.6, False)],
