@@ -189,6 +189,13 @@ FAMILIES: Final[dict[str, Scenario]] = {
         scene="office_corridor", motion="drive", sensor="spinning_16"
     ),
     "rosette lidar, flat": Scenario(scene="flat", motion="look", sensor="rosette"),
+    # people who walk beside a carrier, between walls that hardly fix its place
+    "people in a corridor": Scenario(
+        scene="office_corridor", motion="drive", people=12, imperfect=True
+    ),
+    "people in a corridor, 120 degrees": Scenario(
+        scene="office_corridor", motion="drive", people=8, sector_deg=120.0, imperfect=True
+    ),
 }
 """Scenarios by the name of their family; seed and length are set by :func:`scenario`."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks import bench_odometry_hard
@@ -17,6 +19,14 @@ def tracked(some: Recording) -> Track:
     track = bench_odometry_hard.track_of(bench_odometry_hard.OURS, some)
     assert track is not None
     return track
+
+
+def scaled(some: Recording, factor: float) -> Recording:
+    """Return a recording with all points moved by so little that only rounding differs."""
+    points = some.points.copy()
+    for axis in "xyz":
+        points[axis] = (points[axis].astype(np.float64) * factor).astype(np.float32)
+    return replace(some, points=points)
 
 
 def estimates_of(some: Recording, odometry: Odometry | None = None) -> list[OdometryEstimate]:
