@@ -372,7 +372,7 @@ class MapInitializer:
     def begin_as_fitted(
         self, sweeps: list[Sweep], since: HostNs, fitted: FittedStart, covariance: F64
     ) -> list[SweepMotion]:
-        """Begin the map of a start in motion again, if it began with another velocity than fitted.
+        """Begin the map of a start in motion again, if the fit of its beginning says so.
 
         Otherwise the first pose is as uncertain as it is off the fit.
 
@@ -387,7 +387,7 @@ class MapInitializer:
         list of SweepMotion
             As :meth:`begin_with` returns it; empty if the map stays.
         """
-        if not fitted.is_other:
+        if not fitted.begins_again:
             before = self._lead_s * (fitted.state.velocity - self._lead_velocity)
             shift = fitted.shift + before
             self.matcher.drift.shift_first_pose(shift)

@@ -135,7 +135,7 @@ class FittedStart(NamedTuple):
         At the reference of the first sweep; its pose is that of the estimate.
     velocity_sigma : float
         [m/s]
-    is_other : bool
+    begins_again : bool
         Whether the map is to begin again: it began with another velocity, as far as either is
         known, or the unit is known better by now.
     shift : ndarray, shape (3,)
@@ -144,7 +144,7 @@ class FittedStart(NamedTuple):
 
     state: InertialState
     velocity_sigma: float
-    is_other: bool
+    begins_again: bool
     shift: F64
 
 

@@ -284,9 +284,9 @@ def test_the_imu_carries_a_sweep_that_fits_nowhere_when_the_map_begins_again() -
         assert motion.state.position == pytest.approx(place, abs=0.02)
 
 
-def fitted(motion: SweepMotion, velocity: F64, shift: F64, *, is_other: bool) -> FittedStart:
+def fitted(motion: SweepMotion, velocity: F64, shift: F64, *, begins_again: bool) -> FittedStart:
     state = dataclasses.replace(motion.state, velocity=velocity)
-    return FittedStart(state, 0.02, is_other, shift)
+    return FittedStart(state, 0.02, begins_again, shift)
 
 
 def test_a_start_that_the_poses_since_confirm_keeps_its_map() -> None:
@@ -299,7 +299,7 @@ def test_a_start_that_the_poses_since_confirm_keeps_its_map() -> None:
     found = start.initializer.begin_as_fitted(
         begun.sweeps[begun.seed :],
         begun.since,
-        fitted(first, first.state.velocity, shift, is_other=False),
+        fitted(first, first.state.velocity, shift, begins_again=False),
         first.covariance,
     )
     assert found == []
@@ -319,7 +319,7 @@ def test_a_start_at_another_velocity_begins_again_and_keeps_its_attitude() -> No
     (_, velocity, _), *_ = true_states(walk(), motions)
     # as a fit may have it, which knows nothing of the attitude
     turn = rotations.matrices(rotations.exp(np.array([0.05, 0.0, 0.1])))
-    given = fitted(motions[0], velocity, np.zeros(3), is_other=True)
+    given = fitted(motions[0], velocity, np.zeros(3), begins_again=True)
     given = given._replace(
         state=dataclasses.replace(given.state, rotation=turn @ given.state.rotation)
     )

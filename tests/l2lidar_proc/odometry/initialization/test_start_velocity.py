@@ -325,12 +325,12 @@ def test_later_poses_show_how_a_start_began(passing: list[Sweep], wrong: float) 
     assert fitted.state.stamp == start.reference
     assert fitted.velocity_sigma == tuning.START_FITTED_SIGMA
     assert np.abs(fitted.state.velocity - SPEED).max() < 0.1
-    assert fitted.is_other
+    assert fitted.begins_again
     assert fitted.shift == pytest.approx(0.2 * X[0], abs=0.03)
 
 
 @pytest.mark.parametrize(
-    ("velocity", "sigma", "noise", "is_other"),
+    ("velocity", "sigma", "noise", "begins_again"),
     [
         (SPEED, 0.05, 0.003, False),
         (0.5 * SPEED, 0.05, 0.003, True),
@@ -340,24 +340,24 @@ def test_later_poses_show_how_a_start_began(passing: list[Sweep], wrong: float) 
     ],
 )
 def test_a_start_began_with_another_velocity_as_far_as_either_is_known(
-    passing: list[Sweep], velocity: F64, sigma: float, noise: float, is_other: bool
+    passing: list[Sweep], velocity: F64, sigma: float, noise: float, begins_again: bool
 ) -> None:
     start = with_wrong_beginning(passing, noise, velocity, sigma)
     fitted = start.fitted(motion_at(SPEED, known_to(0.05)))
     assert fitted is not None
-    assert fitted.is_other == is_other
+    assert fitted.begins_again == begins_again
 
 
-@pytest.mark.parametrize(("angle", "is_other"), [(0.0008, False), (-0.001, True)])
+@pytest.mark.parametrize(("angle", "begins_again"), [(0.0008, False), (-0.001, True)])
 def test_a_start_begins_again_when_the_beams_are_known_better(
-    passing: list[Sweep], angle: float, is_other: bool
+    passing: list[Sweep], angle: float, begins_again: bool
 ) -> None:
     """Its first sweeps are turned by what their halves are apart; its velocity was right."""
     start = with_wrong_beginning(passing, 0.003, SPEED)
     start._intrinsics.angles = np.array([0.0, angle, 0.0])
     fitted = start.fitted(motion_at(SPEED, known_to(0.05)))
     assert fitted is not None
-    assert fitted.is_other == is_other
+    assert fitted.begins_again == begins_again
 
 
 def test_sweeps_are_returned_as_they_are_known_to_be_now() -> None:
