@@ -19,11 +19,12 @@ was wrong by more. So the directions of the place that nothing faces come first,
 no point says anything about them.
 
 A carrier that drives leaves the rims of its view behind, and what is wrong by its velocity adds up
-soon. There, four things are stricter, and in turn surfaces count sooner:
+soon. There, five things are stricter, and in turn surfaces count sooner:
 
 * a surface faces the direction only if the error of its own normal cannot explain that;
 * nor if it is hardly wider than the noise of the ranges: a scan line on the leaf of a door, just
   behind its frame, looks like the reveal, and moves along with the view;
+* nor if few sweeps have seen it: people leave surfaces behind as they walk through;
 * the direction is that of the walls: what faces it is left out, and normals count as well as they
   are known;
 * it is steadied over the last sweeps. One that differs from sweep to sweep lets the strong
@@ -130,7 +131,8 @@ class WeakAxes:
             return faces
         if number == 0:  # the way that the carrier drives
             widths = self.surfaces.widths(found.cells[some], found.axis[some])
-            faces[some] = widths > tuning.FACING_WIDTH
+            sweeps = self.surfaces.cells(found.cells[some])["sweeps"]
+            faces[some] = (widths > tuning.FACING_WIDTH) & (sweeps >= tuning.FACING_SWEEPS)
             some = np.flatnonzero(faces)
         axis = self.scale * self.axes[:, number]
         moves = np.cross(axis[:3], found.points[some]) @ state.rotation.T + axis[_PLACE]

@@ -239,6 +239,23 @@ def test_surfaces_count_sooner_where_the_carrier_drives() -> None:
     assert driven.facing(at(), found)[is_reveal, 0].mean() > 0.5
 
 
+@pytest.mark.parametrize(("sweeps", "counts"), [(3, False), (4, True)])
+def test_what_people_have_left_behind_does_not_tell_the_way(sweeps: int, counts: bool) -> None:
+    """A surface counts if enough sweeps have seen it, however long ago it was first seen."""
+    rng, surfaces = np.random.default_rng(14), SurfelMap(SIZES)
+    for number in range(12):
+        seen = reveals(rng, 600 * (2 <= number < 2 + sweeps))
+        surfaces.add(np.vstack((walls(rng, 4000), seen)), number)
+    seen = np.vstack((walls(rng, 2000), reveals(rng, 90)))
+    found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
+    driven = weak_axes(at(), found, surfaces, NOTHING)
+    assert driven is not None
+    is_reveal = (found.index >= 2000) & (np.abs(found.normals[:, 0]) > 0.9)
+    assert np.count_nonzero(is_reveal) > 20
+    facing = driven.facing(at(), found)[is_reveal, 0]
+    assert (facing.mean() > 0.5) == counts
+
+
 def test_up_is_no_way_to_drive() -> None:
     """A shaft leaves the height open: there the carrier is as any other."""
     rng = np.random.default_rng(10)
