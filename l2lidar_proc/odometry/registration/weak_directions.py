@@ -24,7 +24,8 @@ soon. There, five things are stricter, and in turn surfaces count sooner:
 * a surface faces the direction only if the error of its own normal cannot explain that;
 * nor if it is hardly wider than the noise of the ranges: a scan line on the leaf of a door, just
   behind its frame, looks like the reveal, and moves along with the view;
-* nor if few sweeps have seen it: people leave surfaces behind as they walk through;
+* nor if few sweeps have seen it, as people leave surfaces behind: not in a map that began with an
+  open velocity, where what faces the way may be seen for a moment only;
 * the direction is that of the walls: what faces it is left out, and normals count as well as they
   are known;
 * it is steadied over the last sweeps. One that differs from sweep to sweep lets the strong
@@ -131,8 +132,10 @@ class WeakAxes:
             return faces
         if number == 0:  # the way that the carrier drives
             widths = self.surfaces.widths(found.cells[some], found.axis[some])
-            sweeps = self.surfaces.cells(found.cells[some])["sweeps"]
-            faces[some] = (widths > tuning.FACING_WIDTH) & (sweeps >= tuning.FACING_SWEEPS)
+            faces[some] = widths > tuning.FACING_WIDTH
+            if found.young is YoungSurfaces.TRUSTED:  # others tell young surfaces apart by age
+                sweeps = self.surfaces.cells(found.cells[some])["sweeps"]
+                faces[some] &= sweeps >= tuning.FACING_SWEEPS
             some = np.flatnonzero(faces)
         axis = self.scale * self.axes[:, number]
         moves = np.cross(axis[:3], found.points[some]) @ state.rotation.T + axis[_PLACE]
