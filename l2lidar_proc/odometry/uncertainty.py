@@ -38,7 +38,14 @@ class Corrections(NamedTuple):
     ranges: float
 
     def differ_from(self, others: Corrections) -> bool:
-        """Return whether clouds with these are so different that a map should begin again."""
+        """Return whether clouds with these are so different that a map should begin again.
+
+        By BEAM_CHANGE [rad] of any angle, or RANGE_BIAS_CHANGE [m], of ``tuning``.
+
+        Parameters
+        ----------
+        others : Corrections
+        """
         angle = float(np.abs(self.angles - others.angles).max())
         shift = abs(self.ranges - others.ranges)
         return angle > tuning.BEAM_CHANGE or shift > tuning.RANGE_BIAS_CHANGE

@@ -58,6 +58,16 @@ def start_of(run: Run, first: int = 0) -> Start:
     return Start(initializer, zero_velocity, list(sweeps(run, "turn"))[first:])
 
 
+def begun_in_motion() -> tuple[Start, list[Sweep], list[SweepMotion]]:
+    """Return a start with whole sweeps only, the six of its map, and their motions."""
+    start = start_of(walk(), 1)
+    assert start.add_all().seed == 0
+    some = start.sweeps[:6]
+    motions = start.initializer.begin(some, some[0].start)
+    assert motions is not None
+    return start, some, motions
+
+
 def true_states(run: Run, motions: list[SweepMotion]) -> list[tuple[F64, F64, F64]]:
     """Return where the IMU was, its velocity, and how it was turned, in the map's frame.
 
@@ -84,24 +94,20 @@ def true_states(run: Run, motions: list[SweepMotion]) -> list[tuple[F64, F64, F6
 
 def true_beginning(run: Run, motions: list[SweepMotion], number: int) -> Beginning:
     """Return the true beginning of the sweeps from one of them on, of the first pose of all."""
-    first, *_ = true_states(run, motions)
-    here = true_states(run, motions)[number]
-    gravity = motions[0].state.gravity
-    states = [
-        dataclasses.replace(
+    true = true_states(run, motions)
+
+    def state_of(k: int) -> InertialState:
+        place, velocity, turn = true[k]
+        return dataclasses.replace(
             motions[0].state,
-            stamp=motion.state.stamp,
+            stamp=motions[k].state.stamp,
             position=place,
             velocity=velocity,
             rotation=turn,
-            gravity=gravity,
         )
-        for motion, (place, velocity, turn) in (
-            (motions[0], first),
-            (motions[number], here),
-        )
-    ]
-    return Beginning(states[1], 0.01 * np.eye(ERRORS), states[0], np.diag([4.0] * 3 + [1.0] * 3))
+
+    way = np.diag([4.0] * 3 + [1.0] * 3)
+    return Beginning(state_of(number), 0.01 * np.eye(ERRORS), state_of(0), way)
 
 
 def turned(state: InertialState, turn: F64) -> InertialState:
@@ -121,9 +127,7 @@ def test_at_rest_all_sweeps_have_one_pose() -> None:
     assert start.zero_velocity.anchor is not None
     assert len(begun.motions) == len(begun.sweeps) >= 2
     first = begun.motions[0].state
-    assert first.position == pytest.approx(
-        first.rotation @ LEVER
-    )  # the map's origin is the cloud's
+    assert first.position == pytest.approx(first.rotation @ LEVER)  # the map begins at the cloud's
     for motion in begun.motions:
         assert not motion.state.velocity.any()
         assert motion.state.position == pytest.approx(first.position)
@@ -201,12 +205,7 @@ def test_of_long_sweeps_with_few_points_the_latest_is_held() -> None:
 @pytest.mark.parametrize("number", [0, 2])
 def test_a_map_begins_again_where_the_first_pose_of_all_was(number: int) -> None:
     """From the first sweep on, or from a later one; the first pose stays where it is."""
-    start = start_of(walk(), 1)
-    begun = start.add_all()
-    assert begun.seed == 0
-    some = start.sweeps[:6]
-    predicted = start.initializer.begin(some, some[0].start)
-    assert predicted is not None
+    start, some, predicted = begun_in_motion()
     known = start.matcher.drift.first_pose.copy()
     beginning = true_beginning(walk(), predicted, number)
     motions = start.initializer.begin_with(some[number:], some[number].start, beginning)
@@ -243,12 +242,7 @@ def test_a_sweep_that_was_not_whole_keeps_its_pose_when_the_map_begins_again() -
 
 def test_how_a_beginning_is_turned_does_not_matter() -> None:
     """The axes are those of the first pose, which stays; all else turns with it."""
-    start = start_of(walk(), 1)
-    begun = start.add_all()
-    assert begun.seed == 0
-    some = start.sweeps[:6]
-    predicted = start.initializer.begin(some, some[0].start)
-    assert predicted is not None
+    start, some, predicted = begun_in_motion()
     beginning = true_beginning(walk(), predicted, 2)
     turn = rotations.matrices(rotations.exp(np.array([0.1, -0.2, 0.4])))
     other = beginning._replace(
@@ -266,12 +260,7 @@ def test_how_a_beginning_is_turned_does_not_matter() -> None:
 
 
 def test_the_imu_carries_a_sweep_that_fits_nowhere_when_the_map_begins_again() -> None:
-    start = start_of(walk(), 1)
-    begun = start.add_all()
-    assert begun.seed == 0
-    some = start.sweeps[:6]
-    predicted = start.initializer.begin(some, some[0].start)
-    assert predicted is not None
+    start, some, predicted = begun_in_motion()
     strange = some[3].points.copy()
     rng = np.random.default_rng(3)
     for axis in "xyz":
