@@ -54,7 +54,7 @@ class Scenario:
     cone_deg : float
         Opening angle of a cone about the sensor's axis; 360 = all.
     carrier : str
-        One of :data:`view.CARRIERS`, or empty.
+        One of :data:`scanner.CARRIERS`, or empty.
     people : int
     particles : float
         Rain or dust, see ``RangeNoise.particles``.
@@ -393,7 +393,7 @@ def prepare(given: Scenario) -> Setting:
         World(scene.glass) if len(scene.glass) else None,
         World(scene.mirrors) if len(scene.mirrors) else None,
     )
-    window = View(
+    view = View(
         sector=np.deg2rad(given.sector_deg),
         towards=float(rng.normal(0.0, 0.2)) if given.sector_deg < 360.0 else 0.0,
         cone=np.deg2rad(given.cone_deg),
@@ -402,13 +402,13 @@ def prepare(given: Scenario) -> Setting:
     for k in range(given.covers):
         at = given.seconds * (k + 1.0) / (given.covers + 1.0) + rng.uniform(-2.0, 2.0)
         covered.append((float(at), float(at + rng.uniform(2.0, 4.0))))
-    bias = ImuNoise(
+    noise = ImuNoise(
         gyro_bias=tuple(rng.normal(0.0, 0.015, 3).tolist()),
         accel_bias=tuple(rng.normal(0.0, 0.08, 3).tolist()),
     )
     if given.sensor != "l2":  # nothing turns beside the IMU
-        bias = replace(bias, gyro_line=0.0, gyro_noise=0.006, accel_noise=0.03)
-    return Setting(world, motion, window, bias, covered)
+        noise = replace(noise, gyro_line=0.0, gyro_noise=0.006, accel_noise=0.03)
+    return Setting(world, motion, view, noise, covered)
 
 
 def _motion(given: Scenario, scene: Scene) -> Motion:
