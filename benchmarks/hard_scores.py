@@ -21,7 +21,7 @@ FAILED_SHARE: Final = 0.01  # of the way, at the end
 FAILED_LEAST_M: Final = 0.3
 SILENT_SIGMAS: Final = 3.0
 SILENT_LEAST_M: Final = 0.1  # errors below do no harm, whatever the covariance says
-FEWEST: Final = 0.7  # poses for each sweep: with fewer it is lost
+FEWEST: Final = 0.7  # poses for each sweep: a method with fewer gave up
 QUANTILE: Final = {3: 7.8147, 6: 12.5916}  # 95 % of chi-squared
 
 
@@ -162,8 +162,10 @@ def normalized(error: F64, covariance: F64) -> F64:
 
 
 def sequence(status: Sequence[tuple[str, ...]]) -> str:
-    """Return what was said in order, as ``ok x40, DEGENERATE x3``, without a long middle."""
-    runs = [(" ".join(sorted(names)) or "ok", len(list(same))) for names, same in groupby(status)]
+    """Return what was said in order, as ``ALIGNED x40, DEGENERATE x3``, without a long middle."""
+    runs = [
+        (" ".join(sorted(names)) or "ALIGNED", len(list(same))) for names, same in groupby(status)
+    ]
     words = [f"{name} x{count}" for name, count in runs]
     if len(words) > 12:
         words = [*words[:6], f"... {len(words) - 10} more ...", *words[-4:]]

@@ -239,8 +239,10 @@ def test_too_few_poses_count_as_a_failure(given: Recording) -> None:
 
 
 def test_a_sequence_is_short_to_read() -> None:
-    assert sequence([(), (), ("LOST", "IMU_GAP"), ()]) == "ok x2, IMU_GAP LOST x1, ok x1"
-    long = [(("ok",) if k % 2 else ()) for k in range(60)]
+    assert sequence([(), (), ("LOST", "IMU_GAP"), ()]) == (
+        "ALIGNED x2, IMU_GAP LOST x1, ALIGNED x1"
+    )
+    long = [(("DEGENERATE",) if k % 2 else ()) for k in range(60)]
     assert "more" in sequence(long)
     assert len(sequence(long)) < 200
 
@@ -276,7 +278,7 @@ def test_the_page_tells_of_every_scene_and_failure(
     ]
     reached = list(bench_odometry_hard.targets(rows))
     assert not all(target.met for target in reached)
-    text = bench_odometry_hard.write(rows, reached).read_text()
+    text = bench_odometry_hard.write(rows, reached, ["--full", "--page"]).read_text()
     assert "| calm |" in text
     assert "| 100 %, 0.00 | 100 %, 0.00 |" in text
     assert "| hard, 0 |" in text
@@ -294,20 +296,45 @@ def test_seeds_that_were_not_used_for_tuning_have_a_page_of_their_own(
     monkeypatch.setattr(bench_odometry_hard, "PAGE", pages[0])
     monkeypatch.setattr(bench_odometry_hard, "UNSEEN_PAGE", pages[1])
     figures = score(given, true_track(given))
-    last = bench_odometry_hard.TUNED[0][-1]
+    last = bench_odometry_hard.TUNED[bench_odometry_hard.ALL_OTHERS][-1][-1]
     for first, page in ((last, pages[0]), (last + 1, pages[1])):
         rows = [
             {"family": name, "method": "ours", "seed": seed, "seconds": 4.0, **figures}
             for name, seed in (("room, imperfect", first), ("calm", first + 1))
         ]
         reached = list(bench_odometry_hard.targets(rows))
-        assert bench_odometry_hard.write(rows, reached) == page
+        arguments = ["--families", "narrow starts", "--first-seed", str(first), "--page"]
+        assert bench_odometry_hard.write(rows, reached, arguments) == page
     assert f"seeds {last} to {last + 1}, some used for tuning" in pages[0].read_text()
     later = [{**row, "seed": 101} for row in rows]
-    assert bench_odometry_hard.write(later, reached) == pages[0]
+    assert bench_odometry_hard.write(later, reached, []) == pages[0]
     unseen = pages[1].read_text()
     assert f"seeds {last + 1} to {last + 2}, which were not used for tuning" in unseen
-    assert f'BENCH_ARGS="--full --first-seed {last + 1} --page"' in unseen
+    command = f"--families 'narrow starts' --first-seed {last + 1} --page"
+    assert f'BENCH_ARGS="{command}"' in unseen
     assert "other methods" not in unseen
     alone = 1e3 * figures["scale_ate_m"]
     assert f"Off by 0.2 %, it makes an ATE by itself: {alone:.1f} mm in room." in unseen
+
+
+def test_seeds_used_for_tuning_are_those_of_the_family() -> None:
+    assert bench_odometry_hard.is_tuned(STARTS, 300)
+    assert not bench_odometry_hard.is_tuned(STARTS, 700)
+    assert bench_odometry_hard.is_tuned(MIXED, 700)
+    assert not bench_odometry_hard.is_tuned(MIXED, 0)
+    assert bench_odometry_hard.is_tuned("room, imperfect", 0)
+    assert not bench_odometry_hard.is_tuned("room, imperfect", 300)
+
+
+def test_help_and_documents_name_the_seeds_used_for_tuning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        bench_odometry_hard.main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for spans in bench_odometry_hard.TUNED.values():
+        for seeds in spans:
+            assert f"{seeds[0]} to {seeds[-1]}" in text
+    page = (Path(__file__).parents[2] / "docs" / "odometry.md").read_text()
+    advised = int(page.partition("--full --jobs 2 --first-seed ")[2].partition(" ")[0])
+    assert not bench_odometry_hard.is_tuned(bench_odometry_hard.ALL_OTHERS, advised)
