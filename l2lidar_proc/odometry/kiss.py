@@ -18,6 +18,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
+from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 
 if TYPE_CHECKING:
     from kiss_icp.config import KISSConfig
@@ -289,10 +290,10 @@ class PlainOdometry:
         stamp = HostNs(sweep.start + round(last * 1e9))
         status: tuple[Status, ...] = ()
         if self._last is not None:
-            step = stamp - self._last.stamp
-            if -tuning.LONG_GAP_NS < step <= 0:
+            order = sweep_order(stamp - self._last.stamp)
+            if order is SweepOrder.LATE:
                 return [self._last.refusing(points)]
-            if not 0 < step <= tuning.TIME_JUMP_NS:
+            if order is SweepOrder.OTHER_TIME_LINE:
                 self._last = None
                 status = (Status.RESTARTED,)
         if not few:

@@ -41,6 +41,7 @@ from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
 from l2lidar_proc.odometry.registration.alignment import Alignment, unobserved_directions
+from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.odometry.uncertainty import FrameJump
 from l2lidar_proc.odometry.walls.wall_velocity import WallVelocity, level_axes
 from l2lidar_proc.odometry.zero_velocity import (
@@ -158,10 +159,10 @@ class Odometry:
         """
         status: list[Status] = []
         if self._last is not None:
-            step = self._predictor.reference(sweep) - self._last.stamp
-            if -tuning.LONG_GAP_NS < step <= 0:
+            order = sweep_order(self._predictor.reference(sweep) - self._last.stamp)
+            if order is SweepOrder.LATE:
                 return [self._last.refusing(sweep.points)]
-            if not 0 < step <= tuning.TIME_JUMP_NS:
+            if order is SweepOrder.OTHER_TIME_LINE:
                 self._begin_time_line(self._predictor.reference(sweep))
                 status.append(Status.RESTARTED)
         sweep = cloud.cropped(sweep, self.config.min_range, self.config.max_range)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import Check, HostNs, Level, Sweep
-from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples, Sequencer
 from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.motion.sweep_motion import still_trajectory
@@ -19,6 +18,7 @@ from l2lidar_proc.odometry.estimate import DOUBTFUL, OdometryEstimate, Status
 from l2lidar_proc.odometry.imu_calibration import ExtrinsicCheck
 from l2lidar_proc.odometry.kiss import PlainOdometry
 from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.recording.outputs import Trajectory
 
 _MS: Final = 1_000_000
@@ -227,7 +227,7 @@ class OdometryPipeline:
     def _note_unanswered(self, sweep: Sweep) -> None:
         """Count a sweep without an estimate if it will never have one: its clock stands still."""
         before = self._latest_start
-        if before is not None and -tuning.LONG_GAP_NS < sweep.start - before <= 0:
+        if before is not None and sweep_order(sweep.start - before) is SweepOrder.LATE:
             self.counts[Status.REFUSED] += 1
 
     def _registered(self, sweep: Sweep) -> list[OdometryEstimate]:

@@ -30,6 +30,7 @@ from l2lidar_proc.odometry.initialization.vertical_direction import Vertical, ve
 from l2lidar_proc.odometry.local_map.surfels import YoungSurfaces
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
+from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.odometry.walls.wall_profile import are_walls
 from l2lidar_proc.odometry.walls.wall_velocity import level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
@@ -122,8 +123,8 @@ class MapInitializer:
         """Hold a sweep; return the map if it can begin now."""
         held = self.held
         step = sweep.start - held[-1].start if held else 1
-        if -tuning.LONG_GAP_NS < step <= 0:
-            return None  # it came twice, or late
+        if sweep_order(step) is SweepOrder.LATE:
+            return None
         if abs(step) >= tuning.LONG_GAP_NS:
             held.clear()
         held.append(sweep)
