@@ -18,6 +18,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
+from l2lidar_proc.odometry.interface import Phase, SweepOdometry
 from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 
 if TYPE_CHECKING:
@@ -110,7 +111,10 @@ class KissMatcher:
         return float(self._parts.threshold.get_threshold())
 
     def register(self, points: F64, guess: F64, most: float = np.inf) -> F64 | None:
-        """Return the pose (4, 4) that aligns points (N, 3) with the map, None without a map.
+        """Return the pose (4, 4) that aligns points (N, 3) with the map.
+
+        None where there is no map, where the points are too few, and where KISS-ICP finds no
+        finite pose.
 
         Parameters
         ----------
@@ -248,8 +252,8 @@ def _thinned(points: F64, size: float) -> F64:
 _UNKNOWN = 1.0  # KISS-ICP gives no covariance: a meter and a radian
 
 
-class PlainOdometry:
-    """KISS-ICP with the interface of :class:`l2lidar_proc.odometry.odometry.Odometry`.
+class PlainOdometry(SweepOdometry):
+    """Unmodified KISS-ICP as an odometry; it uses no IMU.
 
     Parameters
     ----------
@@ -258,10 +262,13 @@ class PlainOdometry:
 
     def __init__(self, config: OdometryConfig) -> None:
         self.config = config
+        self.T_cloud_imu = np.eye(4)
+        self.phase = Phase.TRACKING
+        self.motion = None
         self.reset()
 
     def configure(self, config: OdometryConfig) -> None:
-        """Take new settings; they come into force with :meth:`reset`."""
+        """Take new settings: limits of the range at once, KISS-ICP's own with :meth:`reset`."""
         self.config = config
 
     def reset(self) -> None:
@@ -272,11 +279,20 @@ class PlainOdometry:
     def imu(self, samples: Samples) -> None:
         """Take IMU samples and ignore them."""
 
-    def register(self, sweep: Sweep) -> list[OdometryEstimate]:
+    @property
+    def newest_imu(self) -> HostNs | None:
+        """None: no sample is kept."""
+        return None
+
+    def extrapolated(self, stamp: HostNs) -> OdometryEstimate | None:
+        """Return None: nothing tells the motion between sweeps."""
+        return None
+
+    def register(self, sweep: Sweep, *, may_skip: bool = False) -> list[OdometryEstimate]:
         """Return the pose of the sweep's last point, as KISS-ICP registers it.
 
         A sweep that is late by less than a second is refused. Further back, or far ahead, the
-        clock was set: the map is kept, the velocity is unknown.
+        clock was set: the map is kept, the velocity is unknown. None is skipped.
         """
         points = sweep.points
         xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import deque
-from enum import Enum
 from typing import Final
 
 import numpy as np
@@ -37,6 +36,7 @@ from l2lidar_proc.odometry.innovation_gate import (
     is_narrow,
 )
 from l2lidar_proc.odometry.innovations import InnovationTest
+from l2lidar_proc.odometry.interface import Phase
 from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
@@ -52,15 +52,6 @@ from l2lidar_proc.odometry.zero_velocity import (
 
 LIBRARIES: Final = (*kiss.LIBRARIES, eskf.LIBRARY, "scipy.spatial.transform")
 """Imported with the first sweeps, unless something has done so before."""
-
-
-class Phase(Enum):
-    """State of the odometry."""
-
-    INITIALIZING = "initializing"  # the first sweeps are held until the map can begin
-    TRACKING = "tracking"  # each sweep is predicted and aligned with the map
-    STATIONARY = "stationary"  # the sensor is at rest: the pose is held, each sweep tests it
-    LOST = "lost"  # a new map has begun at the predicted pose and no sweep has met it yet
 
 
 class Odometry:

@@ -16,8 +16,9 @@ from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import DOUBTFUL, OdometryEstimate, Status
 from l2lidar_proc.odometry.imu_calibration import ExtrinsicCheck
+from l2lidar_proc.odometry.interface import Phase, SweepOdometry
 from l2lidar_proc.odometry.kiss import PlainOdometry
-from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.recording.outputs import Trajectory
 
@@ -54,7 +55,7 @@ class OdometryPipeline:
 
     Attributes
     ----------
-    odometry : Odometry or PlainOdometry
+    odometry : SweepOdometry
     trajectory : Trajectory
         Of the cloud frame.
     sweeps : int
@@ -93,7 +94,7 @@ class OdometryPipeline:
 
         A rotation that is known better than by mounts takes the place of its own.
         """
-        self.odometry: Odometry | PlainOdometry = (
+        self.odometry: SweepOdometry = (
             PlainOdometry(self._config)
             if self._config.mode == "plain"
             else Odometry(self._config, self.extrinsics.mounted(T_cloud_imu))
@@ -102,10 +103,13 @@ class OdometryPipeline:
 
     def is_mounted(self, T_cloud_imu: NDArray[np.float64]) -> bool:
         """Return whether a mount (4, 4) is the one that is used, or none is."""
-        odometry = self.odometry
-        return not isinstance(odometry, Odometry) or np.allclose(
-            self.extrinsics.mounted(T_cloud_imu), odometry.T_cloud_imu, atol=1e-6
+        return not self._uses_imu or np.allclose(
+            self.extrinsics.mounted(T_cloud_imu), self.odometry.T_cloud_imu, atol=1e-6
         )
+
+    @property
+    def _uses_imu(self) -> bool:
+        return not isinstance(self.odometry, PlainOdometry)
 
     def configure(self, config: OdometryConfig) -> None:
         """Take new live settings."""
@@ -126,9 +130,7 @@ class OdometryPipeline:
         self._backlog = 0
         self._skipped = 0  # in a row
         self.counts: Counter[Status] = Counter()
-        odometry = self.odometry
-        mount = odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
-        self.check = ExtrinsicCheck(mount[:3, :3])
+        self.check = ExtrinsicCheck(self.odometry.T_cloud_imu[:3, :3])
         self.last: OdometryEstimate | None = None
         self._latest_start: HostNs | None = None  # of the sweep that was registered last
 
@@ -138,7 +140,7 @@ class OdometryPipeline:
 
     def _remember(self, sweep: Sweep, registered: list[OdometryEstimate]) -> None:
         odometry = self.odometry
-        if not registered or not isinstance(odometry, Odometry) or odometry.motion is None:
+        if not registered or odometry.motion is None:
             return
         last = registered[-1]
         if Status.REFUSED in last.status:
@@ -165,8 +167,7 @@ class OdometryPipeline:
     @property
     def newest_imu(self) -> HostNs | None:
         """Stamp of the newest IMU sample; None before the first, and where none is used."""
-        odometry = self.odometry
-        return None if isinstance(odometry, PlainOdometry) else odometry.newest_imu
+        return self.odometry.newest_imu
 
     def corrected(self, samples: Samples) -> Samples:
         """Return IMU samples (N,) as they are used; changes nothing, so any thread may ask."""
@@ -185,9 +186,8 @@ class OdometryPipeline:
         """
         was_in_degrees = self.convention.in_degrees
         samples = self._usable(self.convention.corrected(self.extrinsics.corrected(samples)))
-        odometry = self.odometry
-        if self.convention.in_degrees != was_in_degrees and isinstance(odometry, Odometry):
-            self.mount(odometry.T_cloud_imu)
+        if self.convention.in_degrees != was_in_degrees and self._uses_imu:
+            self.mount(self.odometry.T_cloud_imu)
         self.odometry.imu(samples)
         self.check.imu(samples)
 
@@ -232,26 +232,22 @@ class OdometryPipeline:
 
     def _registered(self, sweep: Sweep) -> list[OdometryEstimate]:
         """Register a sweep, or let it pass where too many others wait."""
-        odometry = self.odometry
-        if isinstance(odometry, PlainOdometry):
-            return odometry.register(sweep)
         may_skip = self._backlog >= _BACKLOG and self._skipped < self._max_skipped
-        registered = odometry.register(sweep, may_skip=may_skip)
+        registered = self.odometry.register(sweep, may_skip=may_skip)
         is_skipped = any(Status.SKIPPED in estimate.status for estimate in registered)
         self._skipped = self._skipped + 1 if is_skipped else 0
         return registered
 
     def _watch(self, estimate: OdometryEstimate) -> None:
         """Check the IMU against a pose; begin again where its accelerometer points backwards."""
-        odometry = self.odometry
-        if isinstance(odometry, PlainOdometry):
+        if not self._uses_imu:
             return
         self.check.pose(estimate)
         if not estimate.is_aligned:
             return
-        T_map_imu = estimate.T_map_lidar @ odometry.T_cloud_imu
+        T_map_imu = estimate.T_map_lidar @ self.odometry.T_cloud_imu
         if self.convention.watch(estimate.stamp, T_map_imu[:3, :3], T_map_imu[:3, 3]):
-            self.mount(odometry.T_cloud_imu)
+            self.mount(self.odometry.T_cloud_imu)
 
 
 def judge(

@@ -37,7 +37,7 @@ from l2lidar_proc.motion.imu_corrections import ImuConvention, ImuExtrinsics
 from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
-from l2lidar_proc.odometry.odometry import LIBRARIES, Odometry
+from l2lidar_proc.odometry.odometry import LIBRARIES
 from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
 from l2lidar_proc.recording import outputs
 from l2lidar_proc.ros import odometry_messages as messages
@@ -294,8 +294,7 @@ class OdometryNode(ManagedNode):
     @property
     def _imu_mount(self) -> F64:
         """Where the odometry has the IMU, (4, 4)."""
-        odometry = self.pipeline.odometry
-        return odometry.T_cloud_imu if isinstance(odometry, Odometry) else np.eye(4)
+        return self.pipeline.odometry.T_cloud_imu
 
     def _say(self, note: str) -> None:
         """Warn of something once."""
@@ -373,9 +372,9 @@ class OdometryNode(ManagedNode):
 
     def _go_on_from_here(self) -> None:
         """Let dead reckoning go on from the latest sweep."""
-        odometry, newest = self.pipeline.odometry, self.pipeline.newest_imu
-        if newest is not None and isinstance(odometry, Odometry):
-            self._poses.go_on_from(odometry.extrapolated(newest))
+        newest = self.pipeline.newest_imu
+        if newest is not None:
+            self._poses.go_on_from(self.pipeline.odometry.extrapolated(newest))
 
     def _show_map(self) -> None:
         last = self.pipeline.last

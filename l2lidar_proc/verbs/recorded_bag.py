@@ -25,7 +25,6 @@ from l2lidar_proc.motion.gyro_alignment import CoarseRotation, coarse_rotation
 from l2lidar_proc.motion.imu_corrections import ImuConvention
 from l2lidar_proc.odometry.config import OdometryNodeConfig, OdometryTopics
 from l2lidar_proc.odometry.estimate import BaseFrame, Status
-from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.recording import bag
 from l2lidar_proc.verbs.recorded import Observer, OdometryRun, OdometryRunner, Progress
 
@@ -308,10 +307,10 @@ class _Listener:
 
         Sensors are seldom mounted like that: then their motion has to tell whether it is so.
         """
-        odometry = self.runner.pipeline.odometry
-        if not isinstance(odometry, Odometry) or not self._force.any():
+        if not self._force.any():
             return False
-        up = odometry.T_cloud_imu[:3, :3] @ self._force / np.linalg.norm(self._force)
+        T_cloud_imu = self.runner.pipeline.odometry.T_cloud_imu
+        up = T_cloud_imu[:3, :3] @ self._force / np.linalg.norm(self._force)
         return bool(up[2] < _UPRIGHT)
 
     @property
@@ -455,8 +454,7 @@ class _Listener:
 
     def _mount(self, imu_frame: str) -> None:
         self._imu_frame = imu_frame
-        odometry = self.runner.pipeline.odometry
-        if not self._cloud_frame or not isinstance(odometry, Odometry):
+        if not self._cloud_frame:
             return
         T_cloud_imu = self._frames.find(self._cloud_frame, imu_frame)
         if imu_frame == self._cloud_frame:

@@ -17,7 +17,8 @@ from l2lidar_node.emulator.unit.units import UNITS, UnitErrors, unit as named_un
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import Status
-from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.interface import Phase
+from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.walls.wall_velocity import WallVelocity
 from tests.benchmarks.hard_runs import end_of, estimates_of, tracked
 

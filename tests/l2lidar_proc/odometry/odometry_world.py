@@ -13,7 +13,8 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.types import Sweep
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
-from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.interface import Phase
+from l2lidar_proc.odometry.odometry import Odometry
 from tests.support.odometry_runs import Run, record, sweeps, truth
 
 T_CLOUD_IMU = np.eye(4)

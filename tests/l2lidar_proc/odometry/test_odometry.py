@@ -16,9 +16,10 @@ from l2lidar_node.types import F64, POINT, HostNs, Level, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
+from l2lidar_proc.odometry.interface import Phase
 from l2lidar_proc.odometry.local_map.free_space import SeenThrough
 from l2lidar_proc.odometry.matcher import SweepMatcher
-from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.pipeline import OdometryPipeline, judge
 from l2lidar_proc.odometry.uncertainty import MapDrift
 from tests.l2lidar_proc.odometry.odometry_world import (

@@ -16,10 +16,11 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
+from l2lidar_proc.odometry.interface import Phase
 from l2lidar_proc.odometry.intrinsics.fan_halves import angle_derivatives, between_halves, halves
 from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import xyz
-from l2lidar_proc.odometry.odometry import Odometry, Phase
+from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.verbs.recorded import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
 from tests.support.odometry_runs import record, sweeps
