@@ -38,6 +38,7 @@ from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
 from l2lidar_proc.motion.config import MotionConfig
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.motion.tracker import MotionTracker
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
@@ -138,16 +139,15 @@ def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]
     errors: dict[str, list[F64]] = {method: [] for method in METHODS}
     trackers = {name: MotionTracker(MotionConfig()) for name in METHODS[3:]}
     odometry = Odometry(OdometryConfig(), MotionConfig().T_cloud_imu)
-    fed = 0
     clouds: dict[str, F64] = {}
-    for item in recording.sweeps:
-        until = int(np.searchsorted(recording.samples["stamp"], item.sweep.end)) + 1
-        for first in range(fed, until, 5):
-            part = recording.samples[first : min(first + 5, until)]
+    scans = (item.sweep for item in recording.sweeps)
+    replayed = replay(scans, recording.samples)
+    for item, (_, samples) in zip(recording.sweeps, replayed, strict=True):
+        for first in range(0, len(samples), 5):
+            part = samples[first : first + 5]
             for tracker in trackers.values():
                 tracker.imu(part)
             odometry.imu(part)
-        fed = until
         for instant, velocity in _true_velocities(recording, item):
             trackers["true velocity"].velocity(instant, velocity, "truth")
         if item.start_s >= _SETTLED_S:
@@ -231,15 +231,12 @@ def _thicknesses(run: Run) -> dict[str, F64]:
     trackers = {name: MotionTracker(MotionConfig()) for name in ("gyro only", "odometry")}
     odometry = Odometry(OdometryConfig(), MotionConfig().T_cloud_imu)
     found: dict[str, list[F64]] = {"none": [], **{name: [] for name in trackers}}
-    fed = 0
-    for sweep in odometry_runs.sweeps(run, "turn"):
-        until = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        for first in range(fed, until, 5):
-            part = run.imu[first : min(first + 5, until)]
+    for sweep, samples in replay(odometry_runs.sweeps(run, "turn"), run.imu):
+        for first in range(0, len(samples), 5):
+            part = samples[first : first + 5]
             for tracker in trackers.values():
                 tracker.imu(part)
             odometry.imu(part)
-        fed = until
         if sweep.start - odometry_runs.EPOCH >= _SETTLED_S * 1e9:
             found["none"].append(_flat_patches(_xyz(sweep.points)))
             for name, tracker in trackers.items():
@@ -345,14 +342,12 @@ def _cost_targets(costs: dict[str, float]) -> list[Target]:
 def _changed_bits(recording: Recording) -> int:
     """Return how many sweeps of a still sensor do not come out bit for bit."""
     pipeline = Pipeline(build(ProcConfig, {"keep_time": True}))
-    fed = changed = 0
-    for item in recording.sweeps:
-        until = int(np.searchsorted(recording.samples["stamp"], item.sweep.end)) + 1
-        pipeline.imu(recording.samples[fed:until])
-        fed = until
-        pipeline.sweep(item.sweep, 0)
+    changed = 0
+    for sweep, samples in replay((item.sweep for item in recording.sweeps), recording.samples):
+        pipeline.imu(samples)
+        pipeline.sweep(sweep, 0)
         (done,) = pipeline.poll(0)
-        changed += done.points.tobytes() != item.sweep.points.tobytes()
+        changed += done.points.tobytes() != sweep.points.tobytes()
     return changed
 
 

@@ -39,6 +39,7 @@ from benchmarks.hard_scenarios import (
 from benchmarks.hard_scores import Track, score
 from benchmarks.odometry_methods import Rows
 from benchmarks.results import FOLDER, Target, at_least, at_most, keep, measured_on, verdicts
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.kiss import PlainOdometry
 from l2lidar_proc.odometry.odometry import Odometry
@@ -103,13 +104,10 @@ def track_of(method: str, given: Recording) -> Track | None:
 def _ours(given: Recording) -> Track:
     odometry = Odometry(OdometryConfig(), given.T_cloud_imu)
     estimates = []
-    first = 0
     methods.load_libraries()
     begin = time.process_time()
-    for sweep in given.sweeps():
-        last = int(np.searchsorted(given.imu["stamp"], sweep.end)) + 1
-        odometry.imu(given.imu[first:last])
-        first = last
+    for sweep, samples in replay(given.sweeps(), given.imu):
+        odometry.imu(samples)
         estimates += odometry.register(sweep)
     seconds = time.process_time() - begin
     return Track(

@@ -23,6 +23,7 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc.deskew.config import DeskewConfig, ProcConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.kiss import PlainKiss, PlainOdometry
 from l2lidar_proc.odometry.odometry import LIBRARIES, Odometry
@@ -106,11 +107,8 @@ def _ours(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:
     T_cloud_imu[:3, 3] = wire.IMU_POSITION_M
     odometry = Odometry(OdometryConfig(), T_cloud_imu)
     out: list[tuple[int, F64]] = []
-    first = 0
-    for sweep in some:
-        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        odometry.imu(run.imu[first:last])
-        first = last
+    for sweep, samples in replay(some, run.imu):
+        odometry.imu(samples)
         out += [(item.stamp, item.T_map_lidar) for item in odometry.register(sweep)]
     return out
 
@@ -125,11 +123,8 @@ def _deskewed(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:
     pipeline = Pipeline(ProcConfig(deskew=DeskewConfig(reference="end")))
     kiss = PlainKiss(OdometryConfig())
     out: list[tuple[int, F64]] = []
-    first = 0
-    for sweep in some:
-        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        pipeline.imu(run.imu[first:last])
-        first = last
+    for sweep, samples in replay(some, run.imu):
+        pipeline.imu(samples)
         pipeline.sweep(sweep, sweep.end)
         for item in pipeline.poll(sweep.end + 10**9):
             xyz = np.stack([item.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
@@ -151,11 +146,8 @@ def _deskew_file(run: Run, cut: str, path: Path) -> None:
     """
     pipeline = Pipeline(ProcConfig(deskew=DeskewConfig(reference="middle")))
     found: list[Deskewed] = []
-    first = 0
-    for sweep in odometry_runs.sweeps(run, cut):
-        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        pipeline.imu(run.imu[first:last])
-        first = last
+    for sweep, samples in replay(odometry_runs.sweeps(run, cut), run.imu):
+        pipeline.imu(samples)
         pipeline.sweep(sweep, sweep.end)
         found += pipeline.poll(sweep.end + 10**9)
     xyz = [np.stack([item.points[axis] for axis in "xyz"], axis=1) for item in found]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -31,6 +32,29 @@ def earlier(samples: Samples, by_ms: float) -> Samples:
     moved = samples.copy()
     moved["stamp"] -= round(by_ms * 1e6)
     return moved
+
+
+def replay(sweeps: Iterable[Sweep], samples: Samples) -> Iterator[tuple[Sweep, Samples]]:
+    """Yield the sweeps of a recording, each with the samples that it needs and none had yet.
+
+    Parameters
+    ----------
+    sweeps : iterable of Sweep
+        In order.
+    samples : ndarray, shape (N,), dtype IMU_SAMPLE
+        Of the whole recording, in order.
+
+    Yields
+    ------
+    sweep : Sweep
+    samples : ndarray, shape (M,), dtype IMU_SAMPLE
+        Up to the first one that is not before the sweep's end; a view.
+    """
+    first = 0
+    for sweep in sweeps:
+        last = int(np.searchsorted(samples["stamp"], sweep.end)) + 1
+        yield sweep, samples[first:last]
+        first = last
 
 
 @dataclass(frozen=True, slots=True)

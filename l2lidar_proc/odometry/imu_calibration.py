@@ -23,7 +23,7 @@ from l2lidar_node.types import F64, IMU_SAMPLE, Sweep
 from l2lidar_proc.motion import gyro_alignment as gyro
 from l2lidar_proc.motion.config import ImuConfig
 from l2lidar_proc.motion.gyro_alignment import GyroAlignment, GyroError, GyroModel, Turns
-from l2lidar_proc.motion.imu_buffer import Samples
+from l2lidar_proc.motion.imu_buffer import Samples, replay
 from l2lidar_proc.motion.imu_corrections import ImuExtrinsics
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
@@ -243,11 +243,8 @@ def _poses(
     odometry = Odometry(config, known.mounted(ImuConfig().T_cloud_imu))
     right = known.corrected(samples)
     estimates: list[OdometryEstimate] = []
-    first = 0
-    for number, sweep in enumerate(sweeps):
-        last = int(np.searchsorted(right["stamp"], sweep.end)) + 1
-        odometry.imu(right[first:last])
-        first = last
+    for number, (sweep, some) in enumerate(replay(sweeps, right)):
+        odometry.imu(some)
         estimates += odometry.register(sweep)
         progress((number + 1) / len(sweeps))
     return estimates

@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks import bench_odometry_hard
 from benchmarks.hard_recordings import Recording
 from benchmarks.hard_scores import Track, score
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
@@ -33,11 +34,8 @@ def estimates_of(some: Recording, odometry: Odometry | None = None) -> list[Odom
     """Return all estimates of a recording, by a given odometry or a new one."""
     odometry = odometry or Odometry(OdometryConfig(), some.T_cloud_imu)
     estimates: list[OdometryEstimate] = []
-    first = 0
-    for sweep in some.sweeps():
-        last = int(np.searchsorted(some.imu["stamp"], sweep.end)) + 1
-        odometry.imu(some.imu[first:last])
-        first = last
+    for sweep, samples in replay(some.sweeps(), some.imu):
+        odometry.imu(samples)
         estimates += odometry.register(sweep)
     return estimates
 

@@ -13,6 +13,7 @@ from benchmarks.hard_recordings import EPOCH, Recording, recording
 from benchmarks.hard_scenarios import Imperfections, scenario
 from benchmarks.hard_scores import QUANTILE, Track, errors, normalized
 from l2lidar_node.types import HostNs
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
@@ -97,16 +98,13 @@ def test_a_narrow_view_finds_its_old_place_again_though_the_clock_went_back(
     odometry = Odometry(OdometryConfig(), narrow.T_cloud_imu)
     found: list[OdometryEstimate] = []
     stamps = []
-    first = 0
-    for sweep in narrow.sweeps():
-        last = int(np.searchsorted(narrow.imu["stamp"], sweep.end)) + 1
-        imu, one, back = narrow.imu[first:last].copy(), sweep, 0
+    for sweep, samples in replay(narrow.sweeps(), narrow.imu):
+        imu, one, back = samples.copy(), sweep, 0
         if sweep.start >= jump:
             back = hour
             imu["stamp"] -= hour
             one = replace(sweep, start=HostNs(sweep.start - hour), end=HostNs(sweep.end - hour))
         odometry.imu(imu)
-        first = last
         some = odometry.register(one)
         found += some
         stamps += [item.stamp + back for item in some]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from l2lidar_node.types import IMU_SAMPLE, POINT, HostNs, Sweep
-from l2lidar_proc.motion.imu_buffer import ImuBuffer, Reason, Sequencer
+from l2lidar_proc.motion.imu_buffer import ImuBuffer, Reason, Sequencer, replay
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -182,3 +182,14 @@ def test_the_number_that_waits_is_bounded() -> None:
     released = sequencer.release(None, 1)
     assert [r.sweep for r in released] == sweeps[:5]
     assert {r.reason for r in released} == {Reason.CROWDED}
+
+
+def test_a_replay_gives_each_sample_once_before_the_sweep_that_ends_with_it() -> None:
+    given = samples(*range(0, 1000, 4))
+    some = [sweep(BASE + start * MS) for start in (0, 201, 402)]
+    replayed = list(replay(some, given))
+    assert [one for one, _ in replayed] == some
+    stamps = np.concatenate([part["stamp"] for _, part in replayed])
+    assert (stamps == given["stamp"][: len(stamps)]).all()
+    for one, part in replayed:
+        assert part["stamp"][-2] < one.end <= part["stamp"][-1]

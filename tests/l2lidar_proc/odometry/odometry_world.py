@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import Sweep
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate
 from l2lidar_proc.odometry.interface import Phase
@@ -36,11 +37,8 @@ def feed(
     """Give the odometry sweeps and, before each, the samples up to its end."""
     imu = run.imu if imu is None else imu
     out: list[OdometryEstimate] = []
-    first = 0
-    for number, sweep in enumerate(some):
-        last = int(np.searchsorted(imu["stamp"], sweep.end)) + 1
-        odometry.imu(imu[first:last])
-        first = last
+    for number, (sweep, samples) in enumerate(replay(some, imu)):
+        odometry.imu(samples)
         out += odometry.register(sweep, may_skip=may_skip(number))
         # it goes back to them when the rest ends, so they have to be of that rest
         assert odometry.phase is Phase.STATIONARY or not odometry._at_rest

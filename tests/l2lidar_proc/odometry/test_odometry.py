@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, POINT, HostNs, Level, Sweep
 from l2lidar_proc import tuning
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import OdometryEstimate, Status
 from l2lidar_proc.odometry.interface import Phase
@@ -520,11 +521,9 @@ def test_only_a_backlog_makes_a_pipeline_skip_and_never_many_in_a_row() -> None:
         (9, 1, "1010"),
     ):
         pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU, max_skipped=most)
-        first, skipped = 0, []
-        for sweep in list(sweeps(run, "turn"))[:12]:
-            last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-            pipeline.imu(run.imu[first:last])
-            first = last
+        skipped = []
+        for sweep, samples in replay(list(sweeps(run, "turn"))[:12], run.imu):
+            pipeline.imu(samples)
             pipeline.sweep(sweep, sweep.end, backlog)
             skipped += [Status.SKIPPED in item.status for item in pipeline.poll(sweep.end)]
         begun = skipped.index(True) if "1" in expected else 4
@@ -537,16 +536,14 @@ def test_a_live_odometry_begins_again_when_its_gyro_turns_out_to_measure_in_degr
     imu = run.imu.copy()
     imu["angular_velocity"] = np.rad2deg(imu["angular_velocity"])
     pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU)
-    first, since = 0, 0
+    since = 0
     estimates: list[OdometryEstimate] = []
-    for sweep in sweeps(run, "turn"):
-        last = int(np.searchsorted(imu["stamp"], sweep.end)) + 1
-        for sample in imu[first:last].reshape(-1, 1):
+    for sweep, samples in replay(sweeps(run, "turn"), imu):
+        for sample in samples.reshape(-1, 1):
             pipeline.imu(sample)
             if not since and pipeline.convention.in_degrees:
                 since = int(sample["stamp"][0])
                 estimates.clear()
-        first = last
         pipeline.sweep(sweep, sweep.end)
         estimates += pipeline.poll(sweep.end)
     assert 0 < since < imu["stamp"][-1] - 2_000_000_000
@@ -587,11 +584,8 @@ def test_a_clock_of_clouds_that_stands_still_is_said_to() -> None:
 def test_sweeps_that_are_held_until_the_map_begins_are_not_refused() -> None:
     run = recording("room", "walk")
     pipeline = OdometryPipeline(OdometryConfig(), T_CLOUD_IMU)
-    first = 0
-    for sweep in list(sweeps(run, "turn"))[:2]:
-        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        pipeline.imu(run.imu[first:last])
-        first = last
+    for sweep, samples in replay(list(sweeps(run, "turn"))[:2], run.imu):
+        pipeline.imu(samples)
         pipeline.sweep(sweep, sweep.end)
         assert pipeline.poll(sweep.end) == []
     assert not pipeline.counts

@@ -15,6 +15,7 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
 from l2lidar_proc.motion.head_line import HeadAngle, LineRates
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.odometry.prediction import LONGEST_NS, DeadReckoning, ImuUse, Predictor
@@ -33,14 +34,12 @@ def track(world: str, motion: str) -> list[tuple[Any, Any, Any]]:
     found, run = [], recording(world, motion)
     odometry = Odometry(OdometryConfig(), T_CLOUD_IMU)
     reckoning = DeadReckoning(T_CLOUD_IMU, GAP_NS)
-    first = 0
-    for sweep in sweeps(run, "turn"):
-        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        for begin in range(first, last, STEP):
-            samples = run.imu[begin : min(begin + STEP, last)]
-            odometry.imu(samples)
-            carried = carry(reckoning, samples)
-        first, newest = last, HostNs(int(run.imu["stamp"][last - 1]))
+    for sweep, samples in replay(sweeps(run, "turn"), run.imu):
+        for begin in range(0, len(samples), STEP):
+            some = samples[begin : begin + STEP]
+            odometry.imu(some)
+            carried = carry(reckoning, some)
+        newest = HostNs(int(samples["stamp"][-1]))
         full = odometry.extrapolated(newest)
         odometry.register(sweep)
         corrected = odometry.extrapolated(newest)

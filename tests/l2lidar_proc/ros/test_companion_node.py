@@ -17,6 +17,7 @@ from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import from_cloud, from_time
 from l2lidar_node.settings import SettingError
 from l2lidar_node.types import STANDARD_GRAVITY, Sweep
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.ros.companion_node import make_nodes
 from tests.l2lidar_proc.odometry.odometry_world import recording
 from tests.l2lidar_proc.ros.bench import Bench
@@ -63,14 +64,12 @@ def play(bench: CompanionBench, run: Run, seconds: float) -> list[Sweep]:
             and bench.peer.count_publishers("/points_deskewed")
         )
     )
-    sent, first = [], 0
-    for sweep in sweeps(run, "turn"):
+    sent = []
+    for sweep, samples in replay(sweeps(run, "turn"), run.imu):
         if sweep.end - EPOCH > seconds * 1e9:
             break
-        last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-        for sample in run.imu[first:last]:
+        for sample in samples:
             bench.send_sample(sample)
-        first = last
         bench.send_cloud(sweep.points, sweep.start)
         sent.append(sweep)
         count = len(sent)

@@ -25,6 +25,7 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from l2lidar_node.ros.conversions import from_cloud, from_time  # noqa: E402
 from l2lidar_node.types import Sweep  # noqa: E402
+from l2lidar_proc.motion.imu_buffer import replay  # noqa: E402
 from l2lidar_proc.odometry.estimate import OdometryEstimate  # noqa: E402
 from l2lidar_proc.odometry.kiss import PlainOdometry  # noqa: E402
 from l2lidar_proc.ros.odometry_messages import matrix  # noqa: E402
@@ -84,14 +85,11 @@ class OdometryBench(Bench):
     def send(self, run: Any, some: Any) -> None:
         """Send sweeps, each after the samples that cover it."""
         pipeline = self.node._pipeline
-        first = 0
-        for sweep in some:
-            last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-            for sample in run.imu[first:last]:
+        for sweep, samples in replay(some, run.imu):
+            for sample in samples:
                 self.send_sample(sample)
                 self.executor.spin_once(timeout_sec=0.0)
-            first = last
-            newest = int(run.imu["stamp"][last - 1])
+            newest = int(samples["stamp"][-1])
             if not isinstance(pipeline.odometry, PlainOdometry):  # which has no use for them
                 self.until(lambda newest=newest: (pipeline.newest_imu or 0) >= newest)
             before = pipeline.sweeps

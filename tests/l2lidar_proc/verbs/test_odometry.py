@@ -10,6 +10,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from l2lidar_node.types import Sweep
+from l2lidar_proc.motion.imu_buffer import replay
 from l2lidar_proc.odometry.config import OdometryNodeConfig
 from l2lidar_proc.recording import bag
 from l2lidar_proc.recording.bag import RecordingError
@@ -27,12 +28,10 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
     some = list(sweeps(run, "turn"))[:count]
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
-    first = 0
     with bag.BagFile(path) as writer:
         writer.connect("/imu/data", bag.IMU, 1000, reliable=False, latched=False)
-        for sweep in some:
-            last = int(np.searchsorted(run.imu["stamp"], sweep.end)) + 1
-            for sample in run.imu[first:last]:
+        for sweep, samples in replay(some, run.imu):
+            for sample in samples:
                 seconds, rest = divmod(int(sample["stamp"]), 10**9)
                 time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
                 vector = types["geometry_msgs/msg/Vector3"]
@@ -48,7 +47,6 @@ def write_bag(path: Path, count: int) -> list[Sweep]:
                 )
                 data = store.serialize_cdr(message, bag.IMU)
                 writer.write("/imu/data", int(sample["stamp"]), data)
-            first = last
             writer.cloud("/points", sweep.end, sweep.points, sweep.start, FRAME)
     return some
 
