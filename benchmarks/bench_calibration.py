@@ -415,12 +415,14 @@ def imu(seed: int) -> Iterator[Row | Target]:
     told = []
     covered = True
     for number, (name, item) in enumerate(result.estimates.items()):
-        unit, factor = imu_calibration.UNITS[number]
+        about = imu_calibration.IMU_PARAMETERS[number]
         if name.startswith("bias") or item.verdict is Verdict.UNKNOWN:
             continue
         off = item.value - float(true[number])
         covered &= abs(off) <= 3.0 * item.sd
-        told.append(f"{name} {off * factor:+.3f} +- {item.sd * factor:.3f} {unit}")
+        told.append(
+            f"{name} {off * about.factor:+.3f} +- {item.sd * about.factor:.3f} {about.unit}"
+        )
     yield {
         **_empty("imu", seed + 1),
         "corrected": "; ".join(told),

@@ -283,14 +283,14 @@ def over_time(turns: Turns) -> tuple[F64, F64]:
 
 
 def _about(result: ImuResult, firmware: str, known: CalibrationFile | None) -> dict[str, Any]:
-    from l2lidar_proc.odometry.imu_calibration import UNITS
+    from l2lidar_proc.odometry.imu_calibration import IMU_PARAMETERS
 
     parameters = {}
-    for (name, item), (unit, factor) in zip(result.estimates.items(), UNITS, strict=True):
+    for (name, item), about in zip(result.estimates.items(), IMU_PARAMETERS, strict=True):
         parameters[name] = {
-            "value": round(item.value * factor, 4),
-            "sd": round(item.sd * factor, 4),
-            "unit": unit,
+            "value": round(item.value * about.factor, 4),
+            "sd": round(item.sd * about.factor, 4),
+            "unit": about.unit,
             "verdict": item.verdict.value,
         }
     return {
@@ -314,7 +314,7 @@ def _about(result: ImuResult, firmware: str, known: CalibrationFile | None) -> d
 
 def _show(result: ImuResult, known: CalibrationFile | None) -> None:
     """Print the result."""
-    from l2lidar_proc.odometry.imu_calibration import ENOUGH, UNITS
+    from l2lidar_proc.odometry.imu_calibration import ENOUGH, IMU_PARAMETERS
 
     if not _has_beams(known):
         say(
@@ -326,14 +326,14 @@ def _show(result: ImuResult, known: CalibrationFile | None) -> None:
         table.add_column(heading, overflow="fold")
     colors = {Verdict.CORRECTED: "green", Verdict.UNCHANGED: "default"}
     words = {Verdict.UNCHANGED: "as drawn", Verdict.SHOWN: "for information"}
-    for (name, item), (unit, factor) in zip(result.estimates.items(), UNITS, strict=True):
+    for (name, item), about in zip(result.estimates.items(), IMU_PARAMETERS, strict=True):
         is_known = item.verdict is not Verdict.UNKNOWN
         verdict = words.get(item.verdict, item.verdict.value)
         verdict += f": {item.reason}" if item.reason else ""
         table.add_row(
-            f"{name} [{unit}]".replace("[", "\\["),
-            f"{item.value * factor:+.3f}" if is_known else "",
-            f"+- {item.sd * factor:.3f}",
+            f"{name} [{about.unit}]".replace("[", "\\["),
+            f"{item.value * about.factor:+.3f}" if is_known else "",
+            f"+- {item.sd * about.factor:.3f}",
             f"[{colors.get(item.verdict, 'yellow')}]{verdict}[/]",
         )
     out.print(table)

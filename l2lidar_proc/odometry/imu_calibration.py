@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l2lidar_node import rotations
 from l2lidar_node.calibration.file import ImuCalibration
@@ -29,23 +30,111 @@ from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import CUTS, OdometryEstimate
 from l2lidar_proc.odometry.odometry import Odometry
 
-NAMES: Final = (
-    *(f"rotation {axis}" for axis in "xyz"),
-    *(f"scale {axis}" for axis in "xyz"),
-    *(f"skew {axes}" for axes in ("xy", "xz", "yz")),
-    *(f"bias {axis}" for axis in "xyz"),
-    "time offset",
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuParameter:
+    """One parameter of an IMU; deviations are in its own unit (rad, 1, rad/s, s).
+
+    Attributes
+    ----------
+    name : str
+    unit : str
+        For people.
+    factor : float
+        From its own unit to that.
+    model_sd : float
+        What gyro and odometry are off beyond what the recording shows, with calibrated beams.
+        From virtual units: a gyro line in step with the head turns with the motion and leaves 0.04
+        degrees in rotations, poses leave up to 0.02 % in scales.
+    reported_sd : float
+        What beams as reported add to that. Their error is fixed in the sensor, so the pose is off
+        by what depends on how it is turned: a part of every turn, as a scale is. No part of the
+        recording says otherwise. Over virtual units 3 and 11 to 14 it was 0.06 degrees, 0.07 %,
+        0.8 mrad and 0.1 ms at the most.
+    largest_sd : float
+        Beyond that nothing is known that the drawing does not say as well: half of its tolerance
+        for scales (1 %), a seventh for rotations (2 degrees), since twice as much shows in a
+        sweep.
+    prior_sd : float
+        What the check in a running odometry begins with. A misalignment of 2 mrad is what data
+        sheets allow; without that a robot that only turns about one axis could not tell a rotation
+        about the others from it.
+    """
+
+    name: str
+    unit: str
+    factor: float
+    model_sd: float
+    reported_sd: float
+    largest_sd: float
+    prior_sd: float
+
+
+IMU_PARAMETERS: Final = (
+    *(
+        ImuParameter(
+            name=f"rotation {axis}",
+            unit="deg",
+            factor=float(np.rad2deg(1.0)),
+            model_sd=float(np.deg2rad(0.04)),
+            reported_sd=float(np.deg2rad(0.05)),
+            largest_sd=float(np.deg2rad(0.3)),
+            prior_sd=float(np.deg2rad(20.0)),
+        )
+        for axis in "xyz"
+    ),
+    *(
+        ImuParameter(
+            name=f"scale {axis}",
+            unit="%",
+            factor=100.0,
+            model_sd=2e-4,
+            reported_sd=5e-4,
+            largest_sd=5e-3,
+            prior_sd=0.02,
+        )
+        for axis in "xyz"
+    ),
+    *(
+        ImuParameter(
+            name=f"skew {axes}",
+            unit="mrad",
+            factor=1e3,
+            model_sd=5e-4,
+            reported_sd=5e-4,
+            largest_sd=5e-3,
+            prior_sd=0.002,
+        )
+        for axes in ("xy", "xz", "yz")
+    ),
+    *(
+        ImuParameter(
+            name=f"bias {axis}",
+            unit="rad/s",
+            factor=1.0,
+            model_sd=1.5e-3,
+            reported_sd=0.0,
+            largest_sd=2e-2,
+            prior_sd=0.2,
+        )
+        for axis in "xyz"
+    ),
+    ImuParameter(
+        name="time offset",
+        unit="ms",
+        factor=1e3,
+        model_sd=5e-5,
+        reported_sd=1e-4,
+        largest_sd=1e-3,
+        prior_sd=0.05,
+    ),
 )
 """Parameters in the order of :mod:`gyro_alignment`."""
 
-UNITS: Final = (
-    *[("deg", float(np.rad2deg(1.0)))] * 3,
-    *[("%", 100.0)] * 3,
-    *[("mrad", 1e3)] * 3,
-    *[("rad/s", 1.0)] * 3,
-    ("ms", 1e3),
-)
-"""Unit for people and factor, in the same order."""
+_MODEL_SD: Final = np.array([one.model_sd for one in IMU_PARAMETERS])
+_REPORTED_SD: Final = np.array([one.reported_sd for one in IMU_PARAMETERS])
+_LARGEST_SD: Final = np.array([one.largest_sd for one in IMU_PARAMETERS])
+_PRIOR_SD: Final = np.array([one.prior_sd for one in IMU_PARAMETERS])
 
 ENOUGH: Final = 10.0
 """Excitation of an axis [rad^2/s] that gives rotations to 0.05 degrees and scales to 0.1 %.
@@ -53,29 +142,6 @@ ENOUGH: Final = 10.0
 1 rad/s for 10 s: with poses good to 0.05 degrees at 4.35 Hz and 0.04 rad/s of gyro noise the rate
 of an interval is known to 0.0036 rad/sqrt(s), and the square root of the excitation divides it.
 """
-
-_MODEL_SD: Final = np.array(
-    [*[np.deg2rad(0.04)] * 3, *[2e-4] * 3, *[5e-4] * 3, *[1.5e-3] * 3, 5e-5]
-)
-"""What gyro and odometry are off beyond what the recording shows, with calibrated beams.
-
-From virtual units: a gyro line in step with the head turns with the motion and leaves 0.04 degrees
-in rotations, poses leave up to 0.02 % in scales."""
-
-_REPORTED_SD: Final = np.array(
-    [*[np.deg2rad(0.05)] * 3, *[5e-4] * 3, *[5e-4] * 3, *[0.0] * 3, 1e-4]
-)
-"""What beams as reported add to that.
-
-Their error is fixed in the sensor, so the pose is off by what depends on how it is turned: a part
-of every turn, as a scale is. No part of the recording says otherwise. Over virtual units 3 and 11
-to 14 it was 0.06 degrees, 0.07 %, 0.8 mrad and 0.1 ms at the most."""
-
-_LARGEST_SD: Final = np.array(
-    [*[np.deg2rad(0.3)] * 3, *[5e-3] * 3, *[5e-3] * 3, *[2e-2] * 3, 1e-3]
-)
-"""Beyond that nothing is known that the drawing does not say as well: half of its tolerance for
-scales (1 %), a seventh for rotations (2 degrees), since twice as much shows in a sweep."""
 
 _SIGNIFICANT: Final = 2.0  # standard deviations of a correction that is worth having
 _PASSES: Final = 3
@@ -105,10 +171,6 @@ _KNOWN: Final = np.deg2rad(0.25)
 _KNOWN_S: Final = 1e-3
 _CERTAIN: Final = 4.0  # standard deviations: an error that is reported
 
-# A misalignment of 2 mrad is what data sheets allow; without that a robot that only turns about
-# one axis could not tell a rotation about the others from it.
-_PRIOR_SD: Final = np.array([*[np.deg2rad(20.0)] * 3, *[0.02] * 3, *[0.002] * 3, *[0.2] * 3, 0.05])
-
 Progress = Callable[[float], None]
 
 
@@ -119,7 +181,7 @@ class ImuResult:
     Attributes
     ----------
     estimates : dict of Estimate
-        By the names of :data:`NAMES`.
+        By the names of :data:`IMU_PARAMETERS`.
     weakest : str
         What is known worst, in words.
     refusals : tuple of Refusal
@@ -253,14 +315,19 @@ def _poses(
 def _aligned(
     estimates: Sequence[OdometryEstimate], samples: Samples, model: GyroModel
 ) -> GyroAlignment:
-    good = [item for item in estimates if item.is_aligned]
-    if not good:
+    stamps, turns = _aligned_turns(estimates)
+    if not len(stamps):
         raise GyroError(
             "no sweep could be aligned; record in a furnished room, and turn more slowly"
         )
-    stamps = np.array([item.stamp for item in good], dtype=np.int64)
-    turns = np.array([rotations.from_matrix(item.T_map_lidar[:3, :3]) for item in good])
     return gyro.align(stamps, turns, samples, model)
+
+
+def _aligned_turns(estimates: Sequence[OdometryEstimate]) -> tuple[NDArray[np.int64], F64]:
+    """Return stamps (N,) [ns] and attitudes (N, 4), wxyz, of the sweeps that were aligned."""
+    good = [item for item in estimates if item.is_aligned]
+    stamps = np.array([item.stamp for item in good], dtype=np.int64)
+    return stamps, np.array([rotations.from_matrix(item.T_map_lidar[:3, :3]) for item in good])
 
 
 def _model_sd(beams_calibrated: bool) -> F64:
@@ -297,13 +364,11 @@ def judged(
     aligned = sum(item.is_aligned for item in estimates)
     sd = np.hypot(found.sd, model_sd)
     items = {
-        name: _estimate(number, float(found.model.values[number]), float(sd[number]), found)
-        for number, name in enumerate(NAMES)
+        one.name: _estimate(number, float(found.model.values[number]), float(sd[number]), found)
+        for number, one in enumerate(IMU_PARAMETERS)
     }
     drawn = GyroModel.of(np.where(_is_bias(), found.model.values, 0.0))
-    good = [item for item in estimates if item.is_aligned]
-    stamps = np.array([item.stamp for item in good], dtype=np.int64)
-    turns = np.array([rotations.from_matrix(item.T_map_lidar[:3, :3]) for item in good])
+    stamps, turns = _aligned_turns(estimates)
     return ImuResult(
         items,
         _weakest(sd, found),
@@ -417,11 +482,11 @@ def _contradictions(found: GyroAlignment, model_sd: F64) -> list[Refusal]:
     part, column = np.unravel_index(int(np.argmax(away / limit)), away.shape)
     if away[part, column] <= limit[part, column]:
         return []
-    name, (unit, factor) = NAMES[which[column]], UNITS[which[column]]
+    parameter = IMU_PARAMETERS[which[column]]
     return [
         Refusal(
-            f"part {part + 1} of {len(away)} of the recording says {name} "
-            f"{away[part, column] * factor:.2f} {unit} off the others",
+            f"part {part + 1} of {len(away)} of the recording says {parameter.name} "
+            f"{away[part, column] * parameter.factor:.2f} {parameter.unit} off the others",
             "fasten what is loose, keep people out, and record again",
         )
     ]
