@@ -4,9 +4,9 @@
 reference, but controllers want 20 to 50 poses a second, and RViz drops a cloud whose transform has
 not come yet. :class:`DeadReckoning` therefore moves the latest estimate by the mean rate and the
 mean specific force of the samples of each step. At every sweep its state is replaced by
-:meth:`~l2lidar_proc.odometry.odometry.Odometry.extrapolated`, whose full covariance takes fifty
-times as long. For a step of 20 ms the mean is as good as every sample by itself: over the quarter
-of a second to the next sweep the two differ by less than a millimeter.
+:meth:`~l2lidar_proc.odometry.odometry.Odometry.extrapolated`, whose full covariance takes much
+longer. For a step of 20 ms the mean is as good as every sample by itself; docs/odometry.md says by
+how much the two differ.
 """
 
 from __future__ import annotations
