@@ -17,7 +17,6 @@ import numpy as np
 from kiss_icp.pybind import kiss_icp_pybind
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from benchmarks import calibration_units, deskew_rounds
 from benchmarks.results import (
@@ -34,6 +33,7 @@ from l2lidar_node import rotations
 from l2lidar_node.emulator.unit.inertial import ImuNoise
 from l2lidar_node.settings import build
 from l2lidar_node.types import F64, HostNs
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.deskew.config import ProcConfig
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.deskew.pipeline import Pipeline
@@ -152,7 +152,7 @@ def evaluate(recording: Recording) -> tuple[dict[str, list[F64]], dict[str, F64]
             trackers["true velocity"].velocity(instant, velocity, "truth")
         if item.start_s >= _SETTLED_S:
             clouds = {
-                "none": _xyz(item.sweep.points),
+                "none": positions(item.sweep.points),
                 "per packet": _per_packet(recording, item),
                 **{name: _ours(tracker, item) for name, tracker in trackers.items()},
             }
@@ -173,7 +173,7 @@ def _follow(odometry: Odometry, tracker: MotionTracker, item: TrueSweep) -> None
 
 def _ours(tracker: MotionTracker, item: TrueSweep) -> F64:
     path, _ = tracker.trajectory(item.sweep.start, item.sweep.end)
-    return _xyz(deskew(item.sweep.points, item.sweep.start, path, item.sweep.start))
+    return positions(deskew(item.sweep.points, item.sweep.start, path, item.sweep.start))
 
 
 def _true_velocities(recording: Recording, item: TrueSweep) -> list[tuple[HostNs, F64]]:
@@ -190,13 +190,13 @@ def _per_packet(recording: Recording, item: TrueSweep) -> F64:
     q = rotations.normalised(recording.samples["orientation_wxyz"][np.maximum(newest, 0)])
     turn = rotations.matrices(rotations.multiply(rotations.conjugate(q[0]), q))
     packet = np.unique(item.packet_start_s, return_inverse=True)[1]
-    return np.asarray(np.einsum("nij,nj->ni", turn[packet], _xyz(item.sweep.points)))
+    return np.asarray(np.einsum("nij,nj->ni", turn[packet], positions(item.sweep.points)))
 
 
 def _kiss(recording: Recording, item: TrueSweep) -> F64:
     """Let kiss-icp's preprocessing move the points to the end, given the true motion."""
     delta = _pose(recording, item.start_s, item.end_s)
-    vector = kiss_icp_pybind._Vector3dVector(_xyz(item.sweep.points))
+    vector = kiss_icp_pybind._Vector3dVector(positions(item.sweep.points))
     times = item.sweep.points["time"].astype(np.float64)
     return np.asarray(
         kiss_icp_pybind._Preprocessor(1e6, 0.0, True, 1)._preprocess(vector, times, delta)
@@ -238,11 +238,11 @@ def _thicknesses(run: Run) -> dict[str, F64]:
                 tracker.imu(part)
             odometry.imu(part)
         if sweep.start - odometry_runs.EPOCH >= _SETTLED_S * 1e9:
-            found["none"].append(_flat_patches(_xyz(sweep.points)))
+            found["none"].append(_flat_patches(positions(sweep.points)))
             for name, tracker in trackers.items():
                 path, _ = tracker.trajectory(sweep.start, sweep.end)
                 points = deskew(sweep.points, sweep.start, path, sweep.start)
-                found[name].append(_flat_patches(_xyz(points)))
+                found[name].append(_flat_patches(positions(points)))
         for estimate in odometry.register(sweep):
             trackers["odometry"].velocity(estimate.stamp, estimate.velocity, "odometry")
     return {name: np.concatenate(parts) for name, parts in found.items()}
@@ -279,7 +279,7 @@ def cost(recording: Recording, rounds: int = 100) -> dict[str, float]:
         tracker.velocity(instant, velocity, "truth")
     assert not tracker.trajectory(item.sweep.start, item.sweep.end)[1].is_still
     delta = _pose(recording, item.start_s, item.end_s)
-    xyz = _xyz(item.sweep.points)
+    xyz = positions(item.sweep.points)
     vector = kiss_icp_pybind._Vector3dVector(xyz)
     times = item.sweep.points["time"].astype(np.float64)
     kiss = kiss_icp_pybind._Preprocessor(1e6, 0.0, True, 1)
@@ -349,10 +349,6 @@ def _changed_bits(recording: Recording) -> int:
         (done,) = pipeline.poll(0)
         changed += done.points.tobytes() != sweep.points.tobytes()
     return changed
-
-
-def _xyz(points: NDArray[np.void]) -> F64:
-    return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
 PAGE: Final = Path("docs") / "deskew.md"

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from benchmarks.results import KeptRows
 from l2lidar_node.protocol import wire
 from l2lidar_node.types import F64, HostNs, Sweep
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.deskew.config import DeskewConfig, ProcConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline
 from l2lidar_proc.motion.imu_buffer import replay
@@ -127,7 +128,7 @@ def _deskewed(run: Run, some: list[Sweep]) -> list[tuple[int, F64]]:
         pipeline.imu(samples)
         pipeline.sweep(sweep, sweep.end)
         for item in pipeline.poll(sweep.end + 10**9):
-            xyz = np.stack([item.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+            xyz = positions(item.points)
             kiss.register(xyz[np.linalg.norm(xyz, axis=1) > 0.4], np.empty(0))
             pose = kiss.pose.copy()
             if out:

@@ -100,6 +100,16 @@ def to_sweep(
     return Sweep(HostNs(stamp + before), HostNs(stamp + int(times[-1])), points, 0, 0)
 
 
+def positions(points: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return x, y and z of structured points (N,), float64, shape (N, 3), row by row in memory."""
+    return np.stack([points[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+
+
+def positions_by_axis(points: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return x, y and z of structured points (N,), float64, shape (3, N), each contiguous."""
+    return np.stack([points[axis] for axis in "xyz"], dtype=np.float64)
+
+
 def without_time(points: NDArray[np.void]) -> NDArray[np.void]:
     """Return the points without any field of times, packed."""
     names = [name for name in points.dtype.names or () if name not in TIME_FIELDS]

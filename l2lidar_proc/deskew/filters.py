@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node import records
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.deskew.config import FilterConfig
 
 Points = NDArray[np.void]
@@ -54,7 +55,7 @@ def on_a_line(points: Points, config: FilterConfig) -> Mask:
     config : FilterConfig
         The settings ``isolated_*``. Bright points stay: dust and fog are dim.
     """
-    xyz = _xyz(points)
+    xyz = positions(points)
     times = points["time"].astype(np.float64)
     reach = (config.isolated_slots + 0.5) * slot_time(points["time"])
     distance = np.linalg.norm(xyz, axis=1)
@@ -95,17 +96,13 @@ def _open3d(points: Points):  # type: ignore[no-untyped-def]  # open3d has no ty
         import open3d  # heavy, and only these two filters need it
     except ImportError:
         raise FilterError("filters 'statistical' and 'radius': open3d is not installed") from None
-    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(_xyz(points)))
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(positions(points)))
 
 
 def _mask(kept: list[int], count: int) -> Mask:
     mask = np.zeros(count, dtype=np.bool_)
     mask[np.asarray(kept, dtype=np.intp)] = True
     return mask
-
-
-def _xyz(points: Points) -> NDArray[np.float64]:
-    return np.stack([points[name].astype(np.float64) for name in "xyz"], axis=-1)
 
 
 Filter = Callable[[Points, FilterConfig], Mask]

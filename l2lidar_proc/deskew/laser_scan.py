@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l2lidar_node.types import F32, F64
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.deskew.config import ScanConfig
 
 _STEEP: Final = 0.9  # cosine between x and the vertical from which on z gives the heading
@@ -148,7 +149,7 @@ class ScanBuilder:
 
     def _around_the_slice(self, points: NDArray[np.void], T_scan_cloud: F64) -> _Slice:
         flat = points.reshape(-1)
-        xyz = np.stack([flat[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        xyz = positions(flat)
         height = xyz @ T_scan_cloud[2, :3] + T_scan_cloud[2, 3]
         with np.errstate(invalid="ignore"):
             kept = (height >= self.config.height_min - _MARGIN_M) & (

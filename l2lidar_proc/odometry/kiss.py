@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from l2lidar_node import rotations
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
@@ -295,7 +296,7 @@ class PlainOdometry(SweepOdometry):
         clock was set: the map is kept, the velocity is unknown. None is skipped.
         """
         points = sweep.points
-        xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        xyz = positions(points)
         times = points["time"].astype(np.float64)
         finite = np.isfinite(xyz).all(axis=1) & np.isfinite(times)
         points, xyz, times = points[finite], xyz[finite], times[finite]

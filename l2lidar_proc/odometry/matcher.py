@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from l2lidar_node import records
 from l2lidar_node.types import F64, HostNs, Sweep
 from l2lidar_proc import tuning
+from l2lidar_proc.cloud import positions_by_axis
 from l2lidar_proc.deskew.deskew import coordinates, deskew
 from l2lidar_proc.motion.carrier_priors import is_driving_speed
 from l2lidar_proc.motion.filter import (
@@ -768,4 +769,4 @@ def xyz(points: NDArray[np.void]) -> F64:
 
     Each axis is contiguous: that is how the maps compute with them.
     """
-    return np.stack([points[axis] for axis in "xyz"], dtype=np.float64).T
+    return positions_by_axis(points).T

@@ -17,6 +17,7 @@ from tf2_msgs.msg import TFMessage
 from l2lidar_node import rotations
 from l2lidar_node.ros.conversions import STAMP, diagnostic_status, to_time
 from l2lidar_node.types import F64, Check, HostNs, Level, split_stamp
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.odometry.estimate import BaseMotion, OdometryEstimate, Status
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ def moved(points: NDArray[np.void], matrix: F64) -> NDArray[np.void]:
     out = np.empty(len(points), [(name, points.dtype[name]) for name in names])
     for name in names:
         out[name] = points[name]
-    xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    xyz = positions(points)
     for axis, column in zip("xyz", (xyz @ matrix[:3, :3].T + matrix[:3, 3]).T, strict=True):
         out[axis] = column
     return out

@@ -36,6 +36,7 @@ from l2lidar_node.ros.managed_node import ManagedNode
 from l2lidar_node.ros.parameters import ParameterSet
 from l2lidar_node.ros.program import StartError, run
 from l2lidar_node.types import F64, Check, HostNs, Level, is_ros_time
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, steady_timer
 from l2lidar_proc.ros.map_transform import FARTHEST_NS, MapTransform
@@ -435,7 +436,7 @@ def _sweep(
     points = from_cloud(cloud)
     if not {"x", "y", "z"} <= set(points.dtype.names or ()):
         raise ValueError("the cloud has no x, y, z")
-    xyz = np.stack([points[axis].reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
+    xyz = positions(points.reshape(-1))
     pose = messages.matrix(odometry.pose.pose)
     remarks = status.message.split(",") if status is not None else []
     covariance = np.array(odometry.pose.covariance, np.float64).reshape(6, 6)

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from l2lidar_node.types import F64, HostNs
+from l2lidar_proc.cloud import positions
 from l2lidar_proc.odometry.estimate import CUTS, BaseFrame, OdometryEstimate
 from l2lidar_proc.recording.outputs import STAMPED_POSE, StampedPoses, Trajectory
 from l2lidar_proc.slam.config import SlamConfig
@@ -81,7 +82,7 @@ class OdometrySweep:
     def of(cls, estimate: OdometryEstimate, base: BaseFrame) -> OdometrySweep:
         """Return an estimate of the odometry as a sweep of the base frame."""
         motion = base.motion(estimate)
-        points = np.stack([estimate.points[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        points = positions(estimate.points)
         return cls(
             estimate.stamp,
             motion.T_odom_base,

@@ -21,6 +21,7 @@ from l2lidar_node import records
 from l2lidar_node.clouds import OPTICAL_CENTRE_M
 from l2lidar_node.types import F64, I64
 from l2lidar_proc import tuning
+from l2lidar_proc.cloud import positions_by_axis
 from l2lidar_proc.odometry.local_map.cell_grid import begins_of_runs, distinct_in_runs
 from l2lidar_proc.odometry.local_map.principal_axes import principal_axes, products
 
@@ -157,7 +158,7 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], head: Halv
     head : Halves
         Of the cloud.
     """
-    at = np.stack([moved[name].astype(np.float64) for name in "xyz"])
+    at = positions_by_axis(moved)
     cell = cell_numbers(at)
     count = int(cell.max()) + 1 if len(cell) else 0
     rising = head.sign > 0.0
@@ -219,7 +220,7 @@ def angles_at_rest(
     None instead where no cell can be compared.
     """
     points = records.joined([some for some, _ in sweeps])
-    at = np.stack([points[name].astype(np.float64) for name in "xyz"])
+    at = positions_by_axis(points)
     along = np.concatenate([angle_derivatives(*some) for some in sweeps], axis=2)
     sign = np.concatenate([head.sign for _, head in sweeps])
     line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)

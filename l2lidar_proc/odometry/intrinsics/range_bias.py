@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from l2lidar_node.types import F64
 from l2lidar_proc import tuning
+from l2lidar_proc.cloud import positions_by_axis
 from l2lidar_proc.odometry.intrinsics.fan_halves import cell_numbers
 from l2lidar_proc.odometry.local_map.principal_axes import principal_axes, products
 
@@ -55,7 +56,7 @@ class RangeBias:
         """Correct the ranges of points (N,) in place."""
         if not self.correction:
             return
-        at = _places(points)
+        at = positions_by_axis(points)
         share = self.correction / np.maximum(np.linalg.norm(at, axis=0), self.correction)
         for name, line in zip("xyz", at, strict=True):
             points[name] = line + share * line
@@ -208,7 +209,7 @@ def bend_of_planes(points: NDArray[np.void], rest_force: F64 | None = None) -> t
     force = np.zeros(3) if rest_force is None else rest_force
     least = tuning.RANGE_BIAS_GROUND * float(np.linalg.norm(force))
     information = gradient = 0.0
-    for places, along, normal in _planes(_flat_cells(_places(points))):
+    for places, along, normal in _planes(_flat_cells(positions_by_axis(points))):
         # measured = plane - correction * cosine of the incidence
         sights = places / np.linalg.norm(places, axis=1)[:, None]
         middle = places.mean(axis=0)
@@ -383,7 +384,3 @@ def _flat_cells(at: F64) -> _Flat:
     places, normals = means[:, flat].T, axes[flat, 0]
     outward = np.sign((normals * places).sum(axis=1))
     return _Flat(places, normals * outward[:, None], counts[flat])
-
-
-def _places(points: NDArray[np.void]) -> F64:
-    return np.stack([points[name].astype(np.float64) for name in "xyz"])
