@@ -76,7 +76,7 @@ class Odometry:
     motion : SweepMotion or None
         Of the sweep that was registered last.
     matcher : SweepMatcher
-        Holds the maps, whose origin is the IMU's first place.
+        Holds the maps; their origin is that of the cloud frame where the first map began.
     """
 
     def __init__(self, config: OdometryConfig, T_cloud_imu: F64) -> None:
@@ -159,9 +159,11 @@ class Odometry:
         sweep = cloud.cropped(sweep, self.config.min_range, self.config.max_range)
         self._reported = sweep  # as the unit reports it, for what is mapped again
         head = self._intrinsics.head(sweep)
-        # at rest the samples show it themselves
-        moves = self.phase is Phase.TRACKING
-        self._predictor.may_have_head_lines = not (moves and self._intrinsics.is_other)
+        # The gyro's noise in the settings has room for the lines of an L2's spinning head. Without
+        # such a head it is taken for less, but only while tracking: at rest the samples show the
+        # noise themselves, and until a map begins, and while lost, the larger noise is kept.
+        tracks_without_head = self.phase is Phase.TRACKING and self._intrinsics.is_other
+        self._predictor.may_have_head_lines = not tracks_without_head
         if head is not None:
             self._predictor.note_head(head, sweep.end)
         self.matcher.notes_sights = self.config.correct_beams and self._intrinsics.learns_from_map
@@ -181,12 +183,18 @@ class Odometry:
         return [self._track(sweep, status)]
 
     def extrapolated(self, stamp: HostNs) -> OdometryEstimate | None:
-        """Return the IMU's continuation of the latest estimate, None before the first.
+        """Return the IMU's continuation of the latest estimate.
 
         Parameters
         ----------
         stamp : HostNs
-            Not before the latest reference; best not after the newest IMU sample.
+            After the latest reference; best not after the newest IMU sample.
+
+        Returns
+        -------
+        OdometryEstimate or None
+            None before the first estimate, at an instant not after the latest reference, and more
+            than :data:`tuning.TIME_JUMP_NS` after it.
         """
         if self._posterior is None or self._last is None:
             return None
@@ -556,7 +564,10 @@ class Odometry:
         self._innovations.clear()
 
     def _note_aligned(self, sweep: Sweep, predicted: SweepMotion, found: Alignment) -> None:
-        """Take an aligned sweep for the end of being lost, and perhaps for the start of a rest."""
+        """Test the innovation of an aligned sweep, and whether the sensor is at rest with it.
+
+        The sensor is tracked again if it was lost.
+        """
         state, covariance = found.state, found.covariance
         self._innovations.take(predicted.state, predicted.covariance, state, covariance)
         self._forget_unmatched()

@@ -1,9 +1,11 @@
-"""The rest with which a map may begin, as long as it may still turn out to be none.
+"""Sweeps of the rest with which a map began: the map may begin again with them.
 
 A carrier that glides while its motors shake the IMU passes for a sensor at rest, and so does one
 that creeps. So the sweeps of the first rest are kept for some seconds, as the unit reports them.
-If sweeps or IMU end it, the map may begin again with them, as in motion. It also begins again with
-them when the unit is known better than in the map, also in the first seconds after the rest.
+If the IMU or later sweeps show that the sensor moves, it may have moved since the start: then the
+map begins again with the sweeps as in motion, if that fits. The map also begins again when the
+intrinsics of the unit are known better than in the map, during the rest or in the first seconds
+after it.
 """
 
 from __future__ import annotations
