@@ -189,7 +189,7 @@ class ImuBuffer:
             self._append(sample)
             return True
         if abs(stamp - newest) > self._jump_ns:
-            return self._is_jump(sample, newest)
+            return self._confirm_jump(sample, newest)
         self._drop_suspect()
         if stamp > newest:
             self._append(sample)
@@ -206,8 +206,11 @@ class ImuBuffer:
             self._tally["reordered"] += 1
         return False
 
-    def _is_jump(self, sample: Samples, newest: int) -> bool:
-        """Start afresh if a sample of another time is not the first; else wait for the next."""
+    def _confirm_jump(self, sample: Samples, newest: int) -> bool:
+        """Start afresh with the second sample of another time, else wait for it.
+
+        Return whether the buffer has started afresh.
+        """
         suspect = self._suspect
         stamp = int(sample["stamp"][0])
         if suspect is not None:

@@ -484,7 +484,7 @@ class Odometry:
         if gaps_in(predicted):
             return None
         status = [Status.PREDICTED, Status.SKIPPED]
-        if self._stays_at_rest(sweep):
+        if self._test_rest(sweep):
             rested = self._predictor.static_update(state, covariance, predicted.state.stamp)
             motion = predicted.at_rest(*rested)
             self._keep_at_rest(motion)
@@ -572,7 +572,7 @@ class Odometry:
         self._innovations.take(predicted.state, predicted.covariance, state, covariance)
         self._forget_unmatched()
         samples = self._predictor.samples(sweep.end - tuning.STILL_TEST_NS, sweep.end)
-        rests = self._zero_velocity.watch(state, covariance, samples)
+        rests = self._zero_velocity.detect_rest(state, covariance, samples)
         self.phase = Phase.STATIONARY if rests else Phase.TRACKING
         if rests:
             self._innovations.clear()
@@ -625,7 +625,7 @@ class Odometry:
         """Hold the pose; return None if IMU or sweep show motion, then the sweep is tracked."""
         first = self._first_rest
         sweeps = first.sweeps
-        if not self._stays_at_rest(sweep):
+        if not self._test_rest(sweep):
             assert self._posterior is not None
             begun = first.begun_in_motion(sweeps, *self._posterior)
             if begun is not None:
@@ -652,10 +652,11 @@ class Odometry:
             # the IMU proves the rest, and so young a map contradicts nothing
             status += [Status.PREDICTED, Status.UNMATCHED]
         else:
-            stays = self._zero_velocity.stays(found)
+            stays = self._zero_velocity.test_registration(found)
             if self.config.correct_beams:
                 remapped = first.map_with_known_beams(still, doubted=not stays)
-                stays = stays or (remapped is None and first.unknown_beams_explain(still, source))
+                if remapped is None and not stays:
+                    stays = first.resume_if_beams_explain(still, source)
             if not (stays if remapped is None else remapped):
                 return self._retry_in_motion(sweep, status)
         first.end_doubt()
@@ -675,12 +676,16 @@ class Odometry:
             self.matcher.extend(estimate.points, still, still.state)
         return estimate
 
-    def _stays_at_rest(self, sweep: Sweep) -> bool:
-        """Return whether the sensor rests and the IMU does not object; if it does, let go."""
+    def _test_rest(self, sweep: Sweep) -> bool:
+        """Test a rest by the IMU over a sweep, end it if that shows motion.
+
+        Return whether the sensor is at rest. If the rest ends, the state to go on from is the one
+        before the motion can have begun.
+        """
         if self.phase is not Phase.STATIONARY:
             return False
         samples = self._predictor.samples(sweep.end - tuning.STILL_IMU_NS, sweep.end)
-        if not self._zero_velocity.holds(samples):
+        if not self._zero_velocity.test_imu(samples):
             if self._at_rest:
                 # the onset of the motion is in samples that passed for rest
                 self._posterior = self._at_rest[0]

@@ -103,8 +103,8 @@ class ZeroVelocityTest:
         least = min(np.linalg.norm(moved), np.linalg.norm(seen))
         return self.drifted and bool(np.linalg.norm(turned) <= turn and least <= way)
 
-    def anchored(self, state: InertialState, samples: Samples) -> bool:
-        """Begin with the hypothesis at a state; return whether the IMU allows it.
+    def try_anchor(self, state: InertialState, samples: Samples) -> bool:
+        """Set the anchor at a state, if the IMU allows it; return whether it does.
 
         Parameters
         ----------
@@ -119,8 +119,8 @@ class ZeroVelocityTest:
             self._turned = state.stamp
         return self.anchor is not None
 
-    def watch(self, state: InertialState, covariance: F64, samples: Samples) -> bool:
-        """Test a state in motion for rest; if it is at rest, set the anchor and return True.
+    def detect_rest(self, state: InertialState, covariance: F64, samples: Samples) -> bool:
+        """Test the latest states for rest; if they are at rest, set the anchor and return True.
 
         Parameters
         ----------
@@ -142,10 +142,10 @@ class ZeroVelocityTest:
         way = np.array([state.boxminus(other)[POSE] for other in recent])
         if not (np.abs(way) < _both(*tuning.STILL_NEAR)).all():
             return False
-        return self.anchored(state, samples)
+        return self.try_anchor(state, samples)
 
-    def holds(self, samples: Samples) -> bool:
-        """Return whether there is an anchor and the IMU does not object; if it does, let go.
+    def test_imu(self, samples: Samples) -> bool:
+        """Test the anchor by the IMU, drop it if samples show motion; return whether there is one.
 
         Parameters
         ----------
@@ -159,8 +159,8 @@ class ZeroVelocityTest:
         self.clear()
         return False
 
-    def stays(self, found: Alignment) -> bool:
-        """Return whether the hypothesis stands the test of a sweep; if not, let go.
+    def test_registration(self, found: Alignment) -> bool:
+        """Test the anchor by a sweep, drop it if that shows motion; return whether it stands.
 
         Parameters
         ----------

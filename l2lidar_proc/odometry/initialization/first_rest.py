@@ -217,8 +217,8 @@ class FirstRest:
         self.initializer.matcher.drift.corrections = self._intrinsics.corrections
         return self.initializer.begin_again_at_rest(better, still.state, still.covariance)
 
-    def unknown_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
-        """Return whether unknown beams may be why sweeps deviate; the sensor rests as before then.
+    def resume_if_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
+        """Resume the rest if unknown beam angles may be why sweeps deviate; return whether so.
 
         Parameters
         ----------

@@ -177,7 +177,7 @@ class MapInitializer:
         initial = self._begin_anew(sweeps, since, may_rest)
         start = self._at_cloud_origin(initial)
         self._zero_velocity.clear()
-        is_static = initial.at_rest and self._zero_velocity.anchored(
+        is_static = initial.at_rest and self._zero_velocity.try_anchor(
             start, self._samples(sweeps, since)
         )
         rest = Trial([], met=False)
@@ -193,7 +193,7 @@ class MapInitializer:
             if not rest.met:
                 return None if len(sweeps) < tuning.INITIAL_MISSED[1] else []
             self._begin_anew(sweeps, since, may_rest)
-            self._zero_velocity.anchored(start, self._samples(sweeps, since))
+            self._zero_velocity.try_anchor(start, self._samples(sweeps, since))
             return self._at_rest(sweeps, since, start, initial.covariance).motions
         return trial.motions if trial.met or late or not trial.motions else None
 
@@ -340,7 +340,7 @@ class MapInitializer:
                 found, status = matcher.match(source, trial, initial=True)
                 if found is None:
                     missed |= status is not MatchStatus.NEW_MAP
-                elif self._zero_velocity.stays(found):
+                elif self._zero_velocity.test_registration(found):
                     met, last = True, found
                 else:
                     return Trial([], False)

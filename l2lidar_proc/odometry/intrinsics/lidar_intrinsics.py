@@ -141,7 +141,7 @@ class LidarIntrinsics:
         points = sweep.points.copy()
         for name, line in zip("xyz", angle_derivatives(points, found), strict=True):
             points[name] += self.angles @ line
-        self.ranges.applied_to(points)
+        self.ranges.correct(points)
         return dataclasses.replace(sweep, points=points)
 
     def learn(

@@ -52,7 +52,7 @@ class RangeBias:
         left = self._estimate - correction
         return float(np.sqrt(self._variance + left**2))
 
-    def applied_to(self, points: NDArray[np.void]) -> None:
+    def correct(self, points: NDArray[np.void]) -> None:
         """Correct the ranges of points (N,) in place."""
         if not self.correction:
             return

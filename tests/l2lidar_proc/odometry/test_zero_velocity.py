@@ -231,14 +231,14 @@ def found_at(
 
 def anchored() -> ZeroVelocityTest:
     tested = ZeroVelocityTest()
-    assert tested.anchored(ORIGIN, resting(0.0, 0.0))
+    assert tested.try_anchor(ORIGIN, resting(0.0, 0.0))
     return tested
 
 
 def until_released(tested: ZeroVelocityTest, period: float, errors: Any) -> int:
     """Return how many sweeps the anchor stands."""
     for number, error in enumerate(errors):
-        if not tested.stays(found_at((number + 1) * period, np.array(error))):
+        if not tested.test_registration(found_at((number + 1) * period, np.array(error))):
             return number
     return len(errors)
 
@@ -312,12 +312,12 @@ def test_a_drift_that_turns_the_sensor_about_what_it_sees_is_small_there() -> No
     noise = rng.normal(0.0, [[3e-4] * 3 + [2e-3] * 3], (30, 6))
     drifted = noise + np.r_[turn, moved]
     tested = ZeroVelocityTest()
-    assert tested.anchored(dataclasses.replace(ORIGIN, rotation=rotation), resting(0.0, 0.0))
+    assert tested.try_anchor(dataclasses.replace(ORIGIN, rotation=rotation), resting(0.0, 0.0))
     found = found_at(0.0, np.zeros(6))
     for number, error in enumerate((*noise[:10], *drifted)):
         state = dataclasses.replace(ORIGIN, rotation=rotation).boxplus(np.r_[error, np.zeros(12)])
         state = dataclasses.replace(state, stamp=HostNs(EPOCH + round((number + 1) * 0.23e9)))
-        if not tested.stays(dataclasses.replace(found, state=state)):
+        if not tested.test_registration(dataclasses.replace(found, state=state)):
             break
     assert tested.drifted
     assert tested.has_drifted_within(0.009, 0.006, rotation, arm)
@@ -330,7 +330,7 @@ def test_along_a_direction_that_nothing_fixes_rest_is_up_to_the_imu() -> None:
     share = 0.9 * tuning.DEGENERATE_SHARE
     corridor = (share, 0.5, 0.5 - share)
     tested = anchored()
-    assert not tested.stays(found_at(0.23, np.zeros(6), corridor))
+    assert not tested.test_registration(found_at(0.23, np.zeros(6), corridor))
     assert tested.anchor is None
     assert not tested.drifted
     quiet = resting(1.0, 0.01)
@@ -339,10 +339,10 @@ def test_along_a_direction_that_nothing_fixes_rest_is_up_to_the_imu() -> None:
         drifts = np.zeros((60, 6))
         drifts[:, axis] = 0.01 * 0.23 * np.arange(60)
         tested = ZeroVelocityTest()
-        assert tested.anchored(state, quiet)
+        assert tested.try_anchor(state, quiet)
         sweeps = iter(enumerate(drifts, 1))
         while tested.anchor is not None and (sweep := next(sweeps, None)) is not None:
-            tested.stays(found_at(0.23 * sweep[0], sweep[1], corridor))
+            tested.test_registration(found_at(0.23 * sweep[0], sweep[1], corridor))
         assert (tested.anchor is not None) == stands
         assert tested.drifted != stands
 
@@ -366,7 +366,7 @@ def test_rest_is_taken_up_when_poses_and_samples_have_shown_it_for_the_test_time
             error[VELOCITY] = [speed, 0.0, 0.0]
             stamp = HostNs(EPOCH + round(seconds * 1e9))
             state = dataclasses.replace(ORIGIN, stamp=stamp).boxplus(error)
-            if tested.watch(state, known, samples):
+            if tested.detect_rest(state, known, samples):
                 assert tested.anchor is not None
                 assert not tested.anchor.velocity.any()
                 return seconds

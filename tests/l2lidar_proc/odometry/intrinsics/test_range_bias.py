@@ -76,7 +76,7 @@ def test_points_move_along_their_rays() -> None:
     ranges.learn(points)
     assert ranges.correction == pytest.approx(-0.03, abs=0.003)
     moved = points.copy()
-    ranges.applied_to(moved)
+    ranges.correct(moved)
     before, after = (np.stack([some[name] for name in "xyz"], axis=1) for some in (points, moved))
     lengths = np.linalg.norm(before, axis=1)
     np.testing.assert_allclose(
@@ -90,7 +90,7 @@ def test_what_was_corrected_is_not_corrected_again() -> None:
     for seed in range(20):
         points = box(0.03, seed)
         used = ranges.correction
-        ranges.applied_to(points)
+        ranges.correct(points)
         ranges.learn(points, used=used)
     assert ranges.correction == pytest.approx(-0.03, abs=0.002)
     assert tuning.RANGE_BIAS_FLOOR <= ranges.sigma_with(ranges.correction) < 0.005
