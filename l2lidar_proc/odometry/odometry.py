@@ -25,7 +25,7 @@ from l2lidar_proc.odometry.estimate import (
     estimate_of,
     gaps_in,
 )
-from l2lidar_proc.odometry.initialization.first_rest import FirstRest
+from l2lidar_proc.odometry.initialization.first_rest import FirstRest, Remapping
 from l2lidar_proc.odometry.initialization.late_gravity import LateGravity
 from l2lidar_proc.odometry.initialization.map_initialization import InitializedMap, MapInitializer
 from l2lidar_proc.odometry.initialization.start_velocity import StartVelocity
@@ -647,17 +647,19 @@ class Odometry:
             return None
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
-        remapped = None
+        remapping = Remapping.NONE
         if found is None:
             # the IMU proves the rest, and so young a map contradicts nothing
             status += [Status.PREDICTED, Status.UNMATCHED]
         else:
-            stays = self._zero_velocity.test_registration(found)
+            at_rest = self._zero_velocity.test_registration(found)
             if self.config.correct_beams:
-                remapped = first.map_with_known_beams(still, doubted=not stays)
-                if remapped is None and not stays:
-                    stays = first.resume_if_beams_explain(still, source)
-            if not (stays if remapped is None else remapped):
+                remapping = first.map_with_known_beams(still, doubted=not at_rest)
+                if remapping is not Remapping.NONE:
+                    at_rest = remapping is Remapping.CONFIRMED
+                elif not at_rest:
+                    at_rest = first.resume_if_beams_explain(still, source)
+            if not at_rest:
                 return self._retry_in_motion(sweep, status)
         first.end_doubt()
         relocalization = self._relocalization(sweep, still)
@@ -671,7 +673,7 @@ class Odometry:
         estimate = self._estimate(
             sweep, still, status, self.matcher.quality(len(source.points), found)
         )
-        if remapped is None:  # else the beams have learned from all sweeps of this rest
+        if remapping is Remapping.NONE:  # else the beams have learned from all sweeps of this rest
             self._intrinsics.learn(sweep, estimate.points, at_rest=True)
             self.matcher.extend(estimate.points, still, still.state)
         return estimate

@@ -11,6 +11,7 @@ after it.
 from __future__ import annotations
 
 import dataclasses
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,23 @@ from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import InertialState, with_loose_pose
 from l2lidar_proc.motion.sweep_motion import SweepMotion
-from l2lidar_proc.odometry.initialization.map_initialization import InitializedMap, MapInitializer
+from l2lidar_proc.odometry.initialization.map_initialization import (
+    InitializedMap,
+    MapInitializer,
+    NotBegun,
+)
 from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.registration.correspondences import Source
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
+
+
+class Remapping(Enum):
+    """Whether the map of a rest has begun again, and what its sweeps show then."""
+
+    NONE = "the map stays as it is"
+    CONFIRMED = "the map has begun again, and its sweeps agree that the sensor is at rest"
+    REFUTED = "the map has begun again, and its sweeps show motion"
 
 
 class EndedRest(NamedTuple):
@@ -191,7 +204,7 @@ class FirstRest:
         if self.sweeps and self.sweeps[-1].end - self.sweeps[0].start > tuning.RETRY_NS:
             self.sweeps = []
 
-    def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> bool | None:
+    def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> Remapping:
         """Begin the map again, if the beams are known better than in it.
 
         Parameters
@@ -200,22 +213,18 @@ class FirstRest:
             Of the latest sweep.
         doubted : bool
             The sweeps deviate: the beams are estimated now, whenever that was done last.
-
-        Returns
-        -------
-        bool or None
-            Whether the sweeps agree that the sensor rests; None where the map stays as it is.
         """
         if not self.sweeps:
-            return None
+            return Remapping.NONE
         if doubted or self._intrinsics.is_due_at_rest(self.sweeps):
             self._intrinsics.learn_at_rest(self.sweeps, still.state.rest_force)
         if not self._is_known_better:
-            return None
+            return Remapping.NONE
         self._mapped_with = self._intrinsics.corrections
         better = [self._intrinsics.applied_to(one) for one in self.sweeps]
         self.initializer.matcher.drift.corrections = self._intrinsics.corrections
-        return self.initializer.begin_again_at_rest(better, still.state, still.covariance)
+        agree = self.initializer.begin_again_at_rest(better, still.state, still.covariance)
+        return Remapping.CONFIRMED if agree else Remapping.REFUTED
 
     def resume_if_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
         """Resume the rest if unknown beam angles may be why sweeps deviate; return whether so.
@@ -271,7 +280,7 @@ class FirstRest:
         self._forget_intrinsics()
         for may_rest in (False, True):
             motions = self.initializer.begin(sweeps, sweeps[0].start, may_rest)
-            if motions:
+            if not isinstance(motions, NotBegun):
                 way = float(np.linalg.norm(motions[-1].state.position))
                 if way < tuning.RETRY_FARTHEST_M:
                     return InitializedMap(motions, sweeps, 0, sweeps[0].start)

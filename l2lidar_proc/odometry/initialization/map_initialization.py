@@ -13,6 +13,7 @@ with that. Where the sweeps leave the velocity open, it is left open:
 from __future__ import annotations
 
 import dataclasses
+from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -37,6 +38,14 @@ from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose
 
 UP: Final = np.array([0.0, 0.0, 1.0])
 """Of a map whose first attitude is that of the accelerometer."""
+
+
+class NotBegun(Enum):
+    """Why sweeps have not begun a map; the value is a description."""
+
+    TOO_EARLY = "more sweeps are needed to tell"
+    FEW_POINTS = "none has enough points"
+    NO_FIT = "they do not fit together, neither at rest nor in motion"
 
 
 class MovingStart(NamedTuple):
@@ -143,10 +152,10 @@ class MapInitializer:
         enough = most > self._min_points
         lead = self._predictor.reference(whole[seed]) - self._predictor.reference(held[0])
         self._lead_s = 1e-9 * lead
-        motions = self.begin(whole[seed:], held[0].start) if enough else []
-        if motions is None:
+        motions = self.begin(whole[seed:], held[0].start) if enough else NotBegun.FEW_POINTS
+        if motions is NotBegun.TOO_EARLY:
             return None
-        if not motions:
+        if isinstance(motions, NotBegun):
             del held[0]
             while len(held) > 1 and held[-1].end - held[0].start >= tuning.INITIAL_MAX_NS:
                 del held[0]
@@ -156,7 +165,7 @@ class MapInitializer:
 
     def begin(
         self, sweeps: list[Sweep], since: HostNs, may_rest: bool = True
-    ) -> list[SweepMotion] | None:
+    ) -> list[SweepMotion] | NotBegun:
         """Begin the map with sweeps.
 
         Parameters
@@ -169,9 +178,9 @@ class MapInitializer:
 
         Returns
         -------
-        list of SweepMotion or None
-            One for each sweep; empty if they do not fit; None while it is too early to tell, as
-            where little comes back and it takes many sweeps at rest before one meets another.
+        list of SweepMotion or NotBegun
+            One for each sweep. It is too early to tell where little comes back, for instance, and
+            it takes many sweeps at rest before one meets another.
         """
         late = sweeps[-1].end - since >= tuning.INITIAL_MAX_NS
         initial = self._begin_anew(sweeps, since, may_rest)
@@ -184,18 +193,22 @@ class MapInitializer:
         if is_static:
             rest = self._at_rest(sweeps, since, start, initial.covariance)
             if rest.motions and not rest.missed:
-                return rest.motions if rest.met or late else None
+                return rest.motions if rest.met or late else NotBegun.TOO_EARLY
             if rest.missed and not rest.met and len(sweeps) < tuning.INITIAL_MISSED[0]:
-                return None
+                return NotBegun.TOO_EARLY
             self._zero_velocity.clear()
         trial = self._unproven(sweeps, since, initial, is_static=is_static)
         if rest.motions and not trial.disproves(rest):
             if not rest.met:
-                return None if len(sweeps) < tuning.INITIAL_MISSED[1] else []
+                is_early = len(sweeps) < tuning.INITIAL_MISSED[1]
+                return NotBegun.TOO_EARLY if is_early else NotBegun.NO_FIT
             self._begin_anew(sweeps, since, may_rest)
             self._zero_velocity.try_anchor(start, self._samples(sweeps, since))
-            return self._at_rest(sweeps, since, start, initial.covariance).motions
-        return trial.motions if trial.met or late or not trial.motions else None
+            rest = self._at_rest(sweeps, since, start, initial.covariance)
+            return rest.motions or NotBegun.NO_FIT
+        if not trial.motions:
+            return NotBegun.NO_FIT
+        return trial.motions if trial.met or late else NotBegun.TOO_EARLY
 
     def _unproven(
         self, sweeps: list[Sweep], since: HostNs, initial: InitialState, *, is_static: bool

@@ -15,7 +15,11 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion.filter import ERRORS, GRAVITY, VELOCITY, InertialState
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
-from l2lidar_proc.odometry.initialization.map_initialization import InitializedMap, MapInitializer
+from l2lidar_proc.odometry.initialization.map_initialization import (
+    InitializedMap,
+    MapInitializer,
+    NotBegun,
+)
 from l2lidar_proc.odometry.initialization.start_velocity import Beginning, FittedStart
 from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
@@ -64,7 +68,7 @@ def begun_in_motion() -> tuple[Start, list[Sweep], list[SweepMotion]]:
     assert start.add_all().seed == 0
     some = start.sweeps[:6]
     motions = start.initializer.begin(some, some[0].start)
-    assert motions is not None
+    assert not isinstance(motions, NotBegun)
     return start, some, motions
 
 

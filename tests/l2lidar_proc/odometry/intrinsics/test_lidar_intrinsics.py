@@ -16,6 +16,7 @@ from l2lidar_node.protocol import wire
 from l2lidar_node.types import IMU_SAMPLE, STANDARD_GRAVITY, HostNs, Sweep
 from l2lidar_proc import tuning
 from l2lidar_proc.odometry.config import OdometryConfig, OdometryNodeConfig
+from l2lidar_proc.odometry.initialization.first_rest import Remapping
 from l2lidar_proc.odometry.interface import Phase
 from l2lidar_proc.odometry.intrinsics.fan_halves import angle_derivatives, between_halves, halves
 from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
@@ -291,9 +292,10 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
     odometry, _ = at_rest()
     assert odometry._intrinsics._rested_ns == 0
     assert odometry.motion is not None
-    odometry._first_rest.map_with_known_beams(odometry.motion, doubted=False)
+    rest = odometry._first_rest
+    assert rest.map_with_known_beams(odometry.motion, doubted=False) is Remapping.NONE
     assert odometry._intrinsics._rested_ns == 0
-    odometry._first_rest.map_with_known_beams(odometry.motion, doubted=True)
+    rest.map_with_known_beams(odometry.motion, doubted=True)
     assert odometry._intrinsics._rested_ns > 600_000_000
 
 
