@@ -11,7 +11,7 @@ sweeps have mapped only tells the pose relative to these sweeps.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,6 +165,19 @@ class MapError:
 _ALLOWED, _EXPECTED = 0, 1
 """Of the two drifts, the one that has to be allowed for and the one that is expected."""
 
+_MAPPED: Final = np.dtype(
+    [
+        ("drift", np.float32, (2, 6, 6)),
+        ("way", np.float64),
+        ("swing", np.float64),
+    ]
+)
+"""How uncertain the map was where some sweeps in a row extended it.
+
+``drift`` holds the two covariances, ``way`` is how far the sensor had come in this map [m], and
+``swing`` the worse of the beam angles' errors, added up along that way [rad m].
+"""
+
 
 class MapDrift:
     """Uncertainty of the map in use, as a small motion of the whole map.
@@ -192,9 +205,7 @@ class MapDrift:
     """
 
     def __init__(self) -> None:
-        self._history = np.zeros((64, 2, 6, 6), np.float32)
-        self._ways = np.zeros(64)  # on which they were [m]
-        self._swings = np.zeros(64)  # the worse of the beam angles, added up along it [rad m]
+        self._history = np.zeros(64, _MAPPED)
         self.corrections = Corrections(np.zeros(3), 0.0)
         unknown = IntrinsicErrors((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA), 0.0, 0.0)
         self.errors = self.errors_began = unknown
@@ -251,16 +262,14 @@ class MapDrift:
         if not len(sweeps) or not self._known:
             return
         rows = self._rows(sweeps)
-        self._current = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
-        self._behind = float(shares @ self._ways[rows])
-        self._swung = float(shares @ self._swings[rows])
+        self._current = self._mean_drift(support)
+        self._behind = float(shares @ self._history["way"][rows])
+        self._swung = float(shares @ self._history["swing"][rows])
         if place is not None:
-            for direction, (sweeps, shares) in (*strongly, *([weakly] if weakly else [])):
-                rows = self._rows(sweeps)
-                holding = np.tensordot(shares, self._history[rows].astype(np.float64), 1)
+            for direction, holding in (*strongly, *([weakly] if weakly else [])):
                 along = np.zeros((6, 6))
                 along[:3, :3] = np.outer(direction, direction)
-                self._combine(place, self._current, holding, along)
+                self._combine(place, self._current, self._mean_drift(holding), along)
         self._fall()
 
     def _fall(self) -> None:
@@ -274,6 +283,12 @@ class MapDrift:
 
     def _rows(self, sweeps: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.clip(sweeps // self._group, 0, self._known - 1)
+
+    def _mean_drift(self, support: Support) -> F64:
+        """Return the drifts (2, 6, 6) that surfaces have on average."""
+        sweeps, shares = support
+        drifts = self._history["drift"][self._rows(sweeps)].astype(np.float64)
+        return np.asarray(np.tensordot(shares, drifts, 1))
 
     def _combine(self, place: F64, most: F64, some: F64, along: F64) -> F64:
         """Let errors (2, 6, 6) be ``some`` along a projection (6, 6) of a place, else ``most``.
@@ -367,17 +382,7 @@ class MapDrift:
             Of the covariance of the place. NIS does not show what turns the map: surfaces that
             err alike from sweep to sweep.
         """
-        while sweep // self._group >= tuning.DRIFT_ENTRIES:
-            self._share_entries()
-        row = sweep // self._group
-        if row >= len(self._history):
-            rows = min(2 * row, tuning.DRIFT_ENTRIES)
-            grown = np.zeros((rows, 2, 6, 6), np.float32)
-            grown[: len(self._history)] = self._history
-            more = np.zeros(rows - len(self._ways))
-            self._ways = np.concatenate((self._ways, more))
-            self._swings = np.concatenate((self._swings, more))
-            self._history = grown
+        row = self._row_for(sweep)
         worse = self.errors.beams[1]
         if self._known:
             step = float(np.linalg.norm(place - self._before))
@@ -386,8 +391,6 @@ class MapDrift:
         if self._way < tuning.UNIT_FROM_M:
             self.began = self.corrections
         self._before = place
-        self._ways[self._known : row + 1] = self._way
-        self._swings[self._known : row + 1] = self._swing
         moved = _carried(-place)
         added = moved @ covariance @ moved.T
         scale = np.repeat((np.sqrt(expected_share), 1.0), 3)
@@ -396,26 +399,38 @@ class MapDrift:
         # of sweeps that share an entry, the least certain: sight may have been lost in between
         if row < self._known:
             here = _carried(place)[:3]
-            more = here @ (found - self._history[row]) @ here.T
+            drift = self._history["drift"][row]
+            more = here @ (found - drift) @ here.T
             is_less_certain = np.trace(more, axis1=1, axis2=2) > 0.0
-            self._history[row][is_less_certain] = found[is_less_certain]
-        self._history[self._known : row + 1] = found
+            drift[is_less_certain] = found[is_less_certain]
+        fresh = self._history[self._known : row + 1]
+        fresh["drift"], fresh["way"], fresh["swing"] = found, self._way, self._swing
         self._known = max(self._known, row + 1)
+
+    def _row_for(self, sweep: int) -> int:
+        """Return the row of a sweep in the history, which grows, or is merged, to hold it."""
+        while sweep // self._group >= tuning.DRIFT_ENTRIES:
+            self._share_entries()
+        row = sweep // self._group
+        if row >= len(self._history):
+            rows = min(2 * row, tuning.DRIFT_ENTRIES)
+            self._history = _padded(self._history, rows)
+        return row
 
     def _share_entries(self) -> None:
         """Let twice as many sweeps share an entry: the history stays bounded.
 
         Of two that become one, the less certain counts.
         """
-        pairs = self._history.reshape(-1, 2, 2, 6, 6)  # entry, of the two, which drift
-        sizes = np.trace(pairs[..., :3, :3], axis1=-2, axis2=-1)
+        pairs = self._history.reshape(-1, 2)
+        drifts = pairs["drift"]  # entry, of the two, which drift, 6, 6
+        sizes = np.trace(drifts[..., :3, :3], axis1=-2, axis2=-1)
         worse = np.argmax(sizes, axis=1)[:, None, :, None, None]
-        merged = np.take_along_axis(pairs, worse, axis=1)[:, 0]
+        merged = pairs[:, 1].copy()
+        merged["drift"] = np.take_along_axis(drifts, worse, axis=1)[:, 0]
         self._group *= 2
         self._known = -(-self._known // 2)
-        self._history = np.concatenate((merged, np.zeros_like(merged)))
-        self._ways = np.pad(self._ways[1::2], (0, len(merged)))
-        self._swings = np.pad(self._swings[1::2], (0, len(merged)))
+        self._history = _padded(merged, len(self._history))
 
     def more_certain(self, place: F64) -> NDArray[np.bool_] | None:
         """Return which sweeps (S,) were far more certain of a place (3,) [m] than the latest.
@@ -424,7 +439,7 @@ class MapDrift:
         """
         if not self._known:
             return None
-        latest = self._history[self._known - 1, _ALLOWED].astype(np.float64)
+        latest = self._history["drift"][self._known - 1, _ALLOWED].astype(np.float64)
         return self._surer(place, latest, tuning.APART_LEAST)
 
     def more_certain_than_held(self, place: F64) -> NDArray[np.bool_] | None:
@@ -447,7 +462,7 @@ class MapDrift:
         squared = float(np.trace(here @ drift @ here.T))
         if squared < least**2:
             return None
-        history = self._history[: self._known, _ALLOWED].astype(np.float64)
+        history = self._history["drift"][: self._known, _ALLOWED].astype(np.float64)
         all_squared = np.einsum("jk,njk->n", here.T @ here, history)
         return np.repeat(all_squared < tuning.APART_SHARE**2 * squared, self._group)
 
@@ -498,6 +513,13 @@ class MapDrift:
     def reported_at(self, place: F64) -> F64:
         """Return :meth:`MapError.reported_at` a place (3,) [m] as of now."""
         return self.error.reported_at(place)
+
+
+def _padded(history: NDArray[np.void], rows: int) -> NDArray[np.void]:
+    """Return a history (N,) with further, empty rows: (rows,)."""
+    out = np.zeros(rows, _MAPPED)
+    out[: len(history)] = history
+    return out
 
 
 def _bent(place: F64, turn: F64) -> F64:

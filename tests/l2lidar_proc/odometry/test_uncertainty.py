@@ -467,7 +467,6 @@ def test_of_a_long_history_more_sweeps_share_an_entry(monkeypatch: pytest.Monkey
         whole.record(sweep, at, doubt)
         monkeypatch.setattr(tuning, "DRIFT_ENTRIES", most)
     assert len(bounded._history) <= most
-    assert len(bounded._ways) == len(bounded._swings) == len(bounded._history)
     group = bounded._group
     assert group * most >= 1000
     found, expected = bounded.more_certain(place), whole.more_certain(place)
