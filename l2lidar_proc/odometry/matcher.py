@@ -33,6 +33,7 @@ from l2lidar_proc.motion.filter import (
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import AlignmentQuality
+from l2lidar_proc.odometry.intrinsics.corrections import Corrections
 from l2lidar_proc.odometry.intrinsics.range_bias import SeenAgain
 from l2lidar_proc.odometry.kiss import KissMatcher, thinned_indices
 from l2lidar_proc.odometry.local_map.free_space import SeenThrough, seen_through
@@ -53,7 +54,7 @@ from l2lidar_proc.odometry.registration.pose_hypotheses import (
     pose_hypotheses,
     rotation_is_loose,
 )
-from l2lidar_proc.odometry.uncertainty import Corrections, MapDrift
+from l2lidar_proc.odometry.uncertainty import MapDrift
 from l2lidar_proc.odometry.walls.vertical_lines import Lines, extract_lines
 from l2lidar_proc.odometry.walls.wall_profile import Spots, extract_spots
 

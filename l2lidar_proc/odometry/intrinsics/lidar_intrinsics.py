@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from l2lidar_node.types import F64, Sweep
 from l2lidar_proc import cloud, tuning
 from l2lidar_proc.motion.head_line import HeadAngle
+from l2lidar_proc.odometry.intrinsics.corrections import Corrections, IntrinsicErrors
 from l2lidar_proc.odometry.intrinsics.fan_halves import (
     Halves,
     angle_derivatives,
@@ -30,7 +31,6 @@ from l2lidar_proc.odometry.intrinsics.fan_halves import (
     halves,
 )
 from l2lidar_proc.odometry.intrinsics.range_bias import RangeBias, SeenAgain
-from l2lidar_proc.odometry.uncertainty import Corrections, IntrinsicErrors
 
 # A whole turn of a slow head shows the pattern in any view, shorter clouds seldom in narrow ones.
 _TURN_NS: Final = 250_000_000

@@ -13,11 +13,11 @@ from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
+from l2lidar_proc.odometry.intrinsics.corrections import Corrections
 from l2lidar_proc.odometry.matcher import Match, MatchStatus, SweepMatcher, is_far
 from l2lidar_proc.odometry.registration.alignment import Alignment
 from l2lidar_proc.odometry.registration.correspondences import Source
 from l2lidar_proc.odometry.registration.pose_hypotheses import level_basis, level_grid
-from l2lidar_proc.odometry.uncertainty import Corrections
 from tests.l2lidar_proc.motion.analytic import EPOCH
 from tests.l2lidar_proc.odometry.mapped_room import (
     LOOSE,

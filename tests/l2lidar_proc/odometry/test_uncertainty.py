@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.uncertainty import Corrections, IntrinsicErrors, MapDrift
+from l2lidar_proc.odometry.intrinsics.corrections import Corrections, IntrinsicErrors
+from l2lidar_proc.odometry.uncertainty import MapDrift
 
 ZERO = np.zeros(3)
 SURE = np.diag([1e-6] * 6)
