@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -54,6 +54,19 @@ LIBRARIES: Final = (*kiss.LIBRARIES, eskf.LIBRARY, "scipy.spatial.transform")
 """Imported with the first sweeps, unless something has done so before."""
 
 
+class Posterior(NamedTuple):
+    """State after the measurements of a sweep.
+
+    Attributes
+    ----------
+    state : InertialState
+    covariance : ndarray, shape (18, 18)
+    """
+
+    state: InertialState
+    covariance: F64
+
+
 class Odometry:
     """LiDAR-inertial odometry.
 
@@ -95,10 +108,9 @@ class Odometry:
         """Forget map and motion; the next sweep begins a new map."""
         self.phase = Phase.INITIALIZING
         self.motion: SweepMotion | None = None
-        # state and covariance to go on from
-        self._posterior: tuple[InertialState, F64] | None = None
+        self._latest_posterior: Posterior | None = None  # None until a map has begun
         # posteriors of the present rest, oldest first
-        self._at_rest: deque[tuple[InertialState, F64]] = deque()
+        self._at_rest: deque[Posterior] = deque()
         self._predictor.reset()
         self._late_gravity = LateGravity(self._predictor)
         self._zero_velocity = ZeroVelocityTest()
@@ -196,7 +208,7 @@ class Odometry:
             None before the first estimate, at an instant not after the latest reference, and more
             than :data:`tuning.TIME_JUMP_NS` after it.
         """
-        if self._posterior is None or self._last is None:
+        if self._last is None:
             return None
         state, covariance = self._posterior
         if not 0 < stamp - state.stamp <= tuning.TIME_JUMP_NS:
@@ -221,6 +233,12 @@ class Odometry:
             self._jump,
             self.matcher.drift,
         )
+
+    @property
+    def _posterior(self) -> Posterior:
+        """What the next prediction begins from, once a map has begun."""
+        assert self._latest_posterior is not None
+        return self._latest_posterior
 
     @property
     def newest_imu(self) -> HostNs | None:
@@ -270,7 +288,6 @@ class Odometry:
 
     def _track(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate:
         """Predict, deskew, align, deskew again, extend the map."""
-        assert self._posterior is not None
         state, covariance = self._posterior
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         source = self.matcher.source(sweep, predicted)
@@ -285,16 +302,16 @@ class Odometry:
         status += gaps_in(predicted)
         if found is None:
             self._note_unmatched(sweep, len(source.points), status)
-            posterior = predicted.state, predicted.covariance
+            posterior = Posterior(predicted.state, predicted.covariance)
         else:
             found = self._with_wall_velocity(sweep, predicted, found)
             self._note_aligned(sweep, predicted, found)
             self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
-            posterior = found.state, found.covariance
+            posterior = Posterior(found.state, found.covariance)
             if blur is not None:
-                posterior = found.state, found.covariance + blur
-        motion = self._constrained(predicted, *posterior, status)
-        self._walls.correct(posterior[0], motion.state)
+                posterior = Posterior(found.state, found.covariance + blur)
+        motion = self._constrained(predicted, posterior, status)
+        self._walls.correct(posterior.state, motion.state)
         # after a blind stretch, a view that the map does not hold will not match later either, and
         # the prediction drifts; without such a stretch something may be in the way
         is_elsewhere = matched is MatchStatus.UNMAPPED and self._was_blind
@@ -342,7 +359,6 @@ class Odometry:
         well instead of using the gyro. A narrow view fits its map at other turns too, so there the
         gyro is used in any case.
         """
-        assert self._posterior is not None
         before = self._posterior
 
         def held(use: ImuUse) -> Prediction:
@@ -436,49 +452,44 @@ class Odometry:
         return dataclasses.replace(found, state=state, covariance=covariance)
 
     def _constrained(
-        self, predicted: SweepMotion, after: InertialState, covariance: F64, status: list[Status]
+        self, predicted: SweepMotion, posterior: Posterior, status: list[Status]
     ) -> SweepMotion:
         """Return the motion with the state after a sweep, held to what physics allows."""
-        assert self._posterior is not None
-        before = self._posterior[0]
+        before = self._posterior.state
         lasted = (predicted.state.stamp - before.stamp) * 1e-9
-        self._carrier.note_speed(after, covariance, lasted)
+        self._carrier.note_speed(*posterior, lasted)
         # between bare walls, rims of the view hold a wrong velocity as if it were moved by hand
         between_walls = self.matcher.begins_between_walls
         self.matcher.driving = self._carrier.drives or (
-            between_walls and self._carrier.may_drive(after, covariance)
+            between_walls and self._carrier.may_drive(*posterior)
         )
-        posterior = self._with_priors(before.position, after, covariance, lasted)
-        bounded = carrier_priors.bound_speed(*posterior, self.config.max_speed)
-        is_suspect = bounded[0] is not posterior[0] or self._is_suspect(predicted)
+        likely = self._with_priors(before.position, posterior, lasted)
+        bounded = Posterior(*carrier_priors.bound_speed(*likely, self.config.max_speed))
+        is_suspect = bounded.state is not likely.state or self._is_suspect(predicted)
         if is_suspect and Status.SUSPECT not in status:
             status.append(Status.SUSPECT)
         drift, gravity, velocity = self.matcher.drift, eskf.GRAVITY, eskf.VELOCITY
-        self._start.note_velocity(covariance[velocity, velocity])
-        drift.lean(posterior[0].gravity, posterior[1][gravity, gravity])
+        self._start.note_velocity(posterior.covariance[velocity, velocity])
+        drift.lean(likely.state.gravity, likely.covariance[gravity, gravity])
         drift.correct_velocity(
-            predicted.covariance[velocity, velocity], bounded[1][velocity, velocity]
+            predicted.covariance[velocity, velocity], bounded.covariance[velocity, velocity]
         )
         return predicted.with_state(*bounded)
 
-    def _with_priors(
-        self, place: F64, state: InertialState, covariance: F64, seconds: float
-    ) -> tuple[InertialState, F64]:
-        """Return a state, [s] after that at a place (3,), with the priors of carriers."""
+    def _with_priors(self, place: F64, posterior: Posterior, seconds: float) -> Posterior:
+        """Return a posterior, [s] after that at a place (3,), with the priors of carriers."""
         state, covariance = self._carrier.with_priors(
-            state,
-            covariance,
+            *posterior,
             seconds,
             # the prior of an open start has said already how fast carriers are
             least_speed=tuning.START_VELOCITY_SIGMA[1] if self._start.is_open else 0.0,
             height_observed=self.matcher.observes_height,
         )
         lean = float(np.linalg.norm(state.position - place)) * tuning.MAP_BEND**2
-        return state, eskf.with_leaning_gravity(state, covariance, lean)
+        return Posterior(state, eskf.with_leaning_gravity(state, covariance, lean))
 
     def _skip(self, sweep: Sweep) -> OdometryEstimate | None:
         """Carry the pose through a sweep by the IMU alone, if it can; the map stays as it is."""
-        assert self._posterior is not None
         state, covariance = self._posterior
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         if gaps_in(predicted):
@@ -489,7 +500,8 @@ class Odometry:
             motion = predicted.at_rest(*rested)
             self._keep_at_rest(motion)
         else:
-            motion = self._constrained(predicted, predicted.state, predicted.covariance, status)
+            posterior = Posterior(predicted.state, predicted.covariance)
+            motion = self._constrained(predicted, posterior, status)
             self._walls.correct(predicted.state, motion.state)
             self._keep(motion)
         quality = self.matcher.quality(len(sweep.points), None)
@@ -532,11 +544,10 @@ class Odometry:
         new part of the map is uncertain by. Else the next alignment, which compares with what was
         put there at the same wrong place, would confirm velocity and biases that led to it.
         """
-        assert self._posterior is not None
         state, covariance = self._posterior
         scale = np.ones(eskf.ERRORS)
         scale[eskf.POSITION] = np.sqrt(1.0 - min(fresh, tuning.DRIFT_MOST_FRESH))
-        self._posterior = state, covariance * np.outer(scale, scale)
+        self._latest_posterior = Posterior(state, covariance * np.outer(scale, scale))
 
     def _note_unmatched(self, sweep: Sweep, points: int, status: list[Status]) -> None:
         """Count a sweep that was not aligned: a few seconds of them, and the odometry is lost."""
@@ -626,13 +637,11 @@ class Odometry:
         first = self._first_rest
         sweeps = first.sweeps
         if not self._test_rest(sweep):
-            assert self._posterior is not None
             begun = first.begun_in_motion(sweeps, *self._posterior)
             if begun is not None:
                 self._enter_map(begun)
                 status.append(Status.STARTING)
             return None
-        assert self._posterior is not None
         state, covariance = self._posterior
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         trial = predicted.at_rest(state, free_pose())
@@ -690,8 +699,7 @@ class Odometry:
         if not self._zero_velocity.test_imu(samples):
             if self._at_rest:
                 # the onset of the motion is in samples that passed for rest
-                self._posterior = self._at_rest[0]
-            assert self._posterior is not None
+                self._latest_posterior = self._at_rest[0]
             self._first_rest.end_with(*self._posterior)
             self._leave_rest()
             return False
@@ -704,9 +712,8 @@ class Odometry:
 
     def _retry_in_motion(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate | None:
         """Begin the map again, as in motion, if the sensor was taken for still since its start."""
-        assert self._posterior is not None
         state, covariance = self._posterior
-        self._posterior = state, self._zero_velocity.widened(covariance)
+        self._latest_posterior = Posterior(state, self._zero_velocity.widened(covariance))
         sweeps = self._first_rest.sweeps
         self._first_rest.end_with(state, covariance, moving=1)
         test = self._zero_velocity
@@ -728,26 +735,27 @@ class Odometry:
 
     def _keep(self, motion: SweepMotion) -> None:
         """Remember a motion for the next prediction."""
-        belief = motion.state, motion.covariance
-        if motion.imu.missing.all() and self._posterior is not None:
-            belief = eskf.with_gyro_bias_of(*belief, *self._posterior)
+        posterior, before = Posterior(motion.state, motion.covariance), self._latest_posterior
+        if motion.imu.missing.all() and before is not None:
+            posterior = Posterior(*eskf.with_gyro_bias_of(*posterior, *before))
         self._predictor.steady_rate = motion.rate
-        self._posterior = belief
+        self._latest_posterior = posterior
         self.motion = motion
 
     def _keep_at_rest(self, motion: SweepMotion) -> None:
         """Remember a motion at rest, and those before it that motion cannot have begun in."""
         self._keep(motion)
         recent = self._at_rest
-        recent.append((motion.state, motion.covariance))
-        while len(recent) > 1 and motion.state.stamp - recent[1][0].stamp >= tuning.STILL_ONSET_NS:
+        recent.append(Posterior(motion.state, motion.covariance))
+        onset = motion.state.stamp - tuning.STILL_ONSET_NS
+        while len(recent) > 1 and recent[1].state.stamp <= onset:
             recent.popleft()
 
     def _begin_time_line(self, reference: HostNs) -> None:
         """Keep pose and map after a jump of time; the motion is unknown."""
-        assert self._posterior is not None
-        self._jump = self._jump.unseen(self._posterior[0])
-        self._posterior = eskf.after_time_jump(*self._posterior, HostNs(reference - 1))
+        before = self._posterior
+        self._jump = self._jump.unseen(before.state)
+        self._latest_posterior = Posterior(*eskf.after_time_jump(*before, HostNs(reference - 1)))
         self._zero_velocity.clear()
         self._forget_sweeps()
         self._gate.restart(reference)

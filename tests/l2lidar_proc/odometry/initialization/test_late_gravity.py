@@ -55,7 +55,6 @@ def test_gravity_is_known_within_two_seconds_of_the_first_sample(
     assert untrusted
     assert untrusted[-1] < samples["stamp"][0] + 2 * SECOND
     assert errors(run, estimates).max() < 0.01
-    assert odometry._posterior is not None
     state, covariance = odometry._posterior
     off = state.gravity + STANDARD_GRAVITY * up_by_truth(run, estimates[-1])
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[GRAVITY, GRAVITY])[-1]))

@@ -302,7 +302,6 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
 def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better() -> None:
     odometry, some = at_rest()
     rest, intrinsics = odometry._first_rest, odometry._intrinsics
-    assert odometry._posterior is not None
     state, covariance = odometry._posterior
     assert rest.recalibrated(state) is None  # it has not ended
     rest.end_with(state, covariance)
@@ -332,10 +331,9 @@ def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better(
 def test_what_showed_that_a_rest_had_ended_is_not_part_of_it() -> None:
     odometry, some = at_rest()
     rest = odometry._first_rest
-    assert odometry._posterior is not None
     rest.end_with(*odometry._posterior, moving=1)
     odometry._intrinsics.ranges.correction += 0.03
-    found = rest.recalibrated(odometry._posterior[0])
+    found = rest.recalibrated(odometry._posterior.state)
     assert found is not None
     assert [one.start for one in found.sweeps] == [one.start for one in some[:-1]]
     assert rest.sweeps == []
@@ -610,7 +608,6 @@ def test_a_run_over_a_recording_says_what_was_corrected() -> None:
 
 def test_a_rest_is_mapped_again_with_each_thing_that_becomes_known() -> None:
     odometry, _ = at_rest()
-    assert odometry._posterior is not None
     assert odometry.motion is not None
     odometry._first_rest.end_with(*odometry._posterior)
     for _ in range(2):
@@ -624,7 +621,6 @@ def test_a_rest_is_mapped_again_with_each_thing_that_becomes_known() -> None:
 
 def test_a_rest_before_a_gap_of_the_clock_is_not_mapped_again() -> None:
     odometry, some = at_rest()
-    assert odometry._posterior is not None
     assert odometry.motion is not None
     odometry._first_rest.end_with(*odometry._posterior)
     odometry._begin_time_line(HostNs(some[-1].end + 1))
