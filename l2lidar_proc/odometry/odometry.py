@@ -41,6 +41,7 @@ from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
 from l2lidar_proc.odometry.registration.alignment import Alignment, unobserved_directions
+from l2lidar_proc.odometry.registration.correspondences import Source
 from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.odometry.uncertainty import FrameJump
 from l2lidar_proc.odometry.walls.wall_velocity import WallVelocity, level_axes
@@ -65,6 +66,37 @@ class Posterior(NamedTuple):
 
     state: InertialState
     covariance: F64
+
+
+class Registration(NamedTuple):
+    """Scan-to-map registration of a sweep.
+
+    Attributes
+    ----------
+    predicted : SweepMotion
+    source : Source
+        Its points, deskewed by the prediction.
+    alignment : Alignment or None
+        None where the sweep does not fit, or tells nothing that can be believed.
+    match_status : MatchStatus
+        Of the first match, before the innovation gate.
+    blur : ndarray, shape (18, 18), or None
+        Covariance that the alignment does not show, as of :func:`blur_of`.
+    guess : InertialState
+        As of :meth:`SweepMatcher.extend`.
+    """
+
+    predicted: SweepMotion
+    source: Source
+    alignment: Alignment | None
+    match_status: MatchStatus
+    blur: F64 | None
+    guess: InertialState
+
+
+def _note_suspect(status: list[Status]) -> None:
+    if Status.SUSPECT not in status:
+        status.append(Status.SUSPECT)
 
 
 class Odometry:
@@ -287,68 +319,130 @@ class Odometry:
     # ---- tracking
 
     def _track(self, sweep: Sweep, status: list[Status]) -> OdometryEstimate:
-        """Predict, deskew, align, deskew again, extend the map."""
-        state, covariance = self._posterior
-        predicted = self._predictor.over_sweep(sweep, state, covariance)
+        """Align a sweep, correct the state, relocalize, report the sweep, and map it."""
+        registration = self._align(sweep, status)
+        corrected = self._correct(sweep, registration, status)
+        registration, located = self._relocalize(sweep, registration, corrected, status)
+        alignment = registration.alignment
+        motion, is_mapped = self._with_start_velocity(sweep, located, alignment, status)
+        if alignment is not None:
+            motion = self._late_gravity.estimated(motion)
+        self._keep(motion)
+        estimate = self._tracking_estimate(sweep, registration, motion, status)
+        self._learn_intrinsics(sweep, registration, motion, estimate)
+        if alignment is not None:
+            is_mapped |= self._map_ended_rest(motion)
+        if not is_mapped:
+            self._extend_map(registration, motion, estimate)
+        return estimate
+
+    def _align(self, sweep: Sweep, status: list[Status]) -> Registration:
+        """Predict the motion of a sweep, and align the sweep with the map if it fits."""
+        before = self._posterior
+        predicted = self._predictor.over_sweep(sweep, *before)
         source = self.matcher.source(sweep, predicted)
-        found, matched = self.matcher.match(source, predicted)
-        blur = blur_of(predicted, covariance)
+        first, match_status = self.matcher.match(source, predicted)
+        blur = blur_of(predicted, before.covariance)
         if blur is not None:
             self._innovations.clear()
-        gated = self._gated(sweep, Prediction(predicted, source), found, blurred=blur is not None)
-        predicted, source, found = gated.predicted, gated.source, gated.alignment
+        gated = self._gated(sweep, Prediction(predicted, source), first, blurred=blur is not None)
         if gated.is_suspect:
-            status.append(Status.SUSPECT)
-        status += gaps_in(predicted)
-        if found is None:
-            self._note_unmatched(sweep, len(source.points), status)
+            _note_suspect(status)
+        status += gaps_in(gated.predicted)
+        alignment = gated.alignment
+        if alignment is not None:
+            alignment = self._with_wall_velocity(sweep, gated.predicted, alignment)
+        return Registration(
+            gated.predicted, gated.source, alignment, match_status, blur, gated.predicted.state
+        )
+
+    def _correct(
+        self, sweep: Sweep, registration: Registration, status: list[Status]
+    ) -> SweepMotion:
+        """Return the motion of a sweep, corrected by its registration and the carrier's priors."""
+        predicted, alignment = registration.predicted, registration.alignment
+        if alignment is None:
+            self._note_unmatched(sweep, len(registration.source.points), status)
             posterior = Posterior(predicted.state, predicted.covariance)
         else:
-            found = self._with_wall_velocity(sweep, predicted, found)
-            self._note_aligned(sweep, predicted, found)
-            self.matcher.meet(found, (predicted.state.stamp - state.stamp) * 1e-9)
-            posterior = Posterior(found.state, found.covariance)
-            if blur is not None:
-                posterior = Posterior(found.state, found.covariance + blur)
+            self._note_aligned(sweep, predicted, alignment)
+            seconds = (predicted.state.stamp - self._posterior.state.stamp) * 1e-9
+            self.matcher.meet(alignment, seconds)
+            covariance = alignment.covariance
+            if registration.blur is not None:
+                covariance = covariance + registration.blur
+            posterior = Posterior(alignment.state, covariance)
         motion = self._constrained(predicted, posterior, status)
         self._walls.correct(posterior.state, motion.state)
+        return motion
+
+    def _relocalize(
+        self,
+        sweep: Sweep,
+        registration: Registration,
+        motion: SweepMotion,
+        status: list[Status],
+    ) -> tuple[Registration, SweepMotion]:
+        """Begin a new map if the odometry is lost; go on in an earlier one that the sweep meets.
+
+        Return registration and motion in the map that is then in use.
+        """
         # after a blind stretch, a view that the map does not hold will not match later either, and
         # the prediction drifts; without such a stretch something may be in the way
-        is_elsewhere = matched is MatchStatus.UNMAPPED and self._was_blind
+        is_elsewhere = registration.match_status is MatchStatus.UNMAPPED and self._was_blind
         if self._unmatched_ns >= (tuning.UNMAPPED_NS if is_elsewhere else tuning.LOST_NS):
             status.append(Status.LOST)
             motion = self._begin_new_map(motion)
-        guess = predicted.state
-        relocalization = self._relocalization(sweep, motion)
-        if relocalization is not None:
-            found, guess = relocalization.alignment, motion.state
-            motion = self._relocalize(relocalization, motion)
-            status.append(Status.RETURNED)
-        elif self._revisit.is_contradicted and Status.SUSPECT not in status:
-            status.append(Status.SUSPECT)
-        motion, is_mapped = self._with_start_velocity(sweep, motion, found, status)
-        if found is not None:
-            motion = self._late_gravity.estimated(motion)
-        self._keep(motion)
-        quality = self.matcher.quality(len(source.points), found)
-        quality = self._consistency(quality, found, motion.state.stamp)
-        if found is not None and not motion.imu.missing.all():
+        found = self._relocalization(sweep, motion)
+        if found is None:
+            if self._revisit.is_contradicted:
+                _note_suspect(status)
+            return registration, motion
+        status.append(Status.RETURNED)
+        return (
+            registration._replace(alignment=found.alignment, guess=motion.state),
+            self._return_to_map(found, motion),
+        )
+
+    def _tracking_estimate(
+        self, sweep: Sweep, registration: Registration, motion: SweepMotion, status: list[Status]
+    ) -> OdometryEstimate:
+        """Report a sweep with its motion and the quality of its registration."""
+        alignment = registration.alignment
+        quality = self.matcher.quality(len(registration.source.points), alignment)
+        quality = self._consistency(quality, alignment, motion.state.stamp)
+        if alignment is not None and not motion.imu.missing.all():
             variance = self._predictor.attitude_variance(sweep)
             quality = dataclasses.replace(quality, attitude_variance=variance)
-        estimate = self._estimate(sweep, motion, status, quality)
-        if found is not None:
-            self._intrinsics.learn(
-                sweep, estimate.points, at_rest=False, rest_force=motion.state.rest_force
-            )
-            if self.matcher.notes_sights:
-                self._intrinsics.learn_from_map(self.matcher.seen_again(source, found.state))
-            is_mapped |= self._map_ended_rest(motion)
-        is_new = matched is MatchStatus.NEW_MAP or Status.LOST in status
-        if not is_mapped and (found is not None or is_new):
-            expected_share = self._innovations.expected_share
-            fresh = self.matcher.extend(estimate.points, motion, guess, expected_share)
-            self._anchor_anew(fresh)
-        return estimate
+        return self._estimate(sweep, motion, status, quality)
+
+    def _learn_intrinsics(
+        self,
+        sweep: Sweep,
+        registration: Registration,
+        motion: SweepMotion,
+        estimate: OdometryEstimate,
+    ) -> None:
+        """Learn beam angles and range bias from a sweep, if it was aligned."""
+        source, alignment = registration.source, registration.alignment
+        if alignment is None:
+            return
+        rest_force = motion.state.rest_force
+        self._intrinsics.learn(sweep, estimate.points, at_rest=False, rest_force=rest_force)
+        if self.matcher.notes_sights:
+            seen = self.matcher.seen_again(source, alignment.state)
+            self._intrinsics.learn_from_map(seen)
+
+    def _extend_map(
+        self, registration: Registration, motion: SweepMotion, estimate: OdometryEstimate
+    ) -> None:
+        """Add a sweep to the map if it was aligned or the map begins with it."""
+        is_new = registration.match_status is MatchStatus.NEW_MAP or Status.LOST in estimate.status
+        if registration.alignment is None and not is_new:
+            return
+        expected_share = self._innovations.expected_share
+        fresh = self.matcher.extend(estimate.points, motion, registration.guess, expected_share)
+        self._anchor_anew(fresh)
 
     def _gated(
         self, sweep: Sweep, given: Prediction, found: Alignment | None, *, blurred: bool
@@ -466,8 +560,8 @@ class Odometry:
         likely = self._with_priors(before.position, posterior, lasted)
         bounded = Posterior(*carrier_priors.bound_speed(*likely, self.config.max_speed))
         is_suspect = bounded.state is not likely.state or self._is_suspect(predicted)
-        if is_suspect and Status.SUSPECT not in status:
-            status.append(Status.SUSPECT)
+        if is_suspect:
+            _note_suspect(status)
         drift, gravity, velocity = self.matcher.drift, eskf.GRAVITY, eskf.VELOCITY
         self._start.note_velocity(posterior.covariance[velocity, velocity])
         drift.lean(likely.state.gravity, likely.covariance[gravity, gravity])
@@ -618,7 +712,7 @@ class Odometry:
         part = self._revisit.part_due(self.matcher, motion.state, source)
         return None if part is None else self._revisit.search(source(), part, motion, self._jump)
 
-    def _relocalize(self, found: Relocalization, motion: SweepMotion) -> SweepMotion:
+    def _return_to_map(self, found: Relocalization, motion: SweepMotion) -> SweepMotion:
         """Go on in an earlier map; return the motion of the sweep that met it."""
         self._use(found.map.matcher)
         self._jump = found.map.jump
@@ -673,7 +767,7 @@ class Odometry:
         first.end_doubt()
         relocalization = self._relocalization(sweep, still)
         if relocalization is not None:
-            still = self._relocalize(relocalization, still)
+            still = self._return_to_map(relocalization, still)
             status.append(Status.RETURNED)
             self._keep(still)
         else:
