@@ -740,10 +740,10 @@ class Odometry:
         predicted = self._predictor.over_sweep(sweep, state, covariance)
         trial = predicted.at_rest(state, free_pose())
         source = self.matcher.source(sweep, trial)
-        found, matched = self.matcher.match(source, trial)
+        alignment, match_status = self.matcher.match(source, trial)
         gaps = gaps_in(predicted)
         status = [*status, *gaps]
-        if found is None and (gaps or matched is not MatchStatus.NEW_MAP):
+        if alignment is None and (gaps or match_status is not MatchStatus.NEW_MAP):
             self._zero_velocity.clear()
             self._first_rest.end()
             self._leave_rest()
@@ -751,11 +751,11 @@ class Odometry:
         rested = self._predictor.static_update(state, covariance, trial.state.stamp)
         still = predicted.at_rest(*rested)
         remapping = Remapping.NONE
-        if found is None:
+        if alignment is None:
             # the IMU proves the rest, and so young a map contradicts nothing
             status += [Status.PREDICTED, Status.UNMATCHED]
         else:
-            at_rest = self._zero_velocity.test_registration(found)
+            at_rest = self._zero_velocity.test_registration(alignment)
             if self.config.correct_beams:
                 remapping = first.map_with_known_beams(still, doubted=not at_rest)
                 if remapping is not Remapping.NONE:
@@ -773,9 +773,8 @@ class Odometry:
         else:
             still = self._late_gravity.estimated(still)
             self._keep_at_rest(still)
-        estimate = self._estimate(
-            sweep, still, status, self.matcher.quality(len(source.points), found)
-        )
+        quality = self.matcher.quality(len(source.points), alignment)
+        estimate = self._estimate(sweep, still, status, quality)
         if remapping is Remapping.NONE:  # else the beams have learned from all sweeps of this rest
             self._intrinsics.learn(sweep, estimate.points, at_rest=True)
             self.matcher.extend(estimate.points, still, still.state)
