@@ -171,22 +171,22 @@ class ImuConvention:
         self._recent = records.joined((self._recent, samples))[-_MOST_KEPT:]
         return samples
 
-    def watch(self, stamp: HostNs, R_odom_imu: F64, position: F64) -> bool:
+    def watch(self, stamp: HostNs, R_map_imu: F64, position: F64) -> bool:
         """Compare a pose with the samples; return whether the sign has just been found wrong.
 
         Parameters
         ----------
         stamp : HostNs
             Where it is before that of the pose before, the clock was set.
-        R_odom_imu : ndarray, shape (3, 3)
+        R_map_imu : ndarray, shape (3, 3)
         position : ndarray, shape (3,)
-            Of the IMU in the odometry frame [m].
+            Of the IMU in the map [m].
         """
         if self._poses and stamp < self._poses[-1][0]:
             self._poses = []
         if self._poses and stamp - self._poses[-1][0] < _SHORTEST_NS:
             return False
-        pose = np.column_stack([R_odom_imu, position])
+        pose = np.column_stack([R_map_imu, position])
         self._poses = [*self._poses[-2:], (stamp, pose)]
         if not self.reversed and len(self._poses) == 3:
             change = self._velocity_change()

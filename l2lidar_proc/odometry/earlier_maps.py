@@ -1,7 +1,7 @@
-"""The way back into maps that are more certain than the pose, and that a sweep meets again.
+"""Relocalization in earlier maps, and in the older part of the map in use.
 
-:class:`EarlierMaps` are kept when the odometry is lost. A map begun after a loss lies in the
-odometry frame where the prediction had come to, and stays as uncertain as that for good.
+:class:`EarlierMaps` keeps the maps that were in use until the odometry was lost. A map begun after
+a loss lies in the same map frame, at the predicted pose, and stays as uncertain as that for good.
 
 :class:`MapRevisit` looks for the older part of the map in use. Where a narrow view sees one wall
 only, the pose drifts; what it then adds to the map lies beside what was there before, and agrees
@@ -54,7 +54,7 @@ class EarlierMap:
     ----------
     matcher : SweepMatcher
     jump : FrameJump
-        How uncertain its place in the odometry frame is.
+        How uncertain its place in the map frame is.
     """
 
     matcher: SweepMatcher
@@ -63,7 +63,7 @@ class EarlierMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relocalization:
-    """The way back into an earlier map, or the older part of the one in use.
+    """An alignment of a sweep with an earlier map, or with the older part of the one in use.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Relocalization:
 
 
 class EarlierMaps:
-    """The largest of the maps that were lost, oldest first."""
+    """The largest of the maps in use until the odometry was lost, oldest first."""
 
     def __init__(self) -> None:
         self._maps: list[EarlierMap] = []

@@ -134,9 +134,8 @@ class OdometryEstimate:
     T_map_lidar : ndarray, shape (4, 4)
         Cloud coordinates to map coordinates. Where gravity is trusted z is up there.
     covariance : ndarray, shape (6, 6)
-        Of x, y, z and of the turns about the axes of the odometry frame [m, rad], relative to the
-        map, and from the first RESTARTED or LOST on what the map's own place is uncertain by,
-        until an earlier map is met again.
+        Of x, y, z and of the turns about the map's axes [m, rad], relative to the map; from the
+        first RESTARTED or LOST on also of the map's own place, until an earlier map is met again.
     velocity : ndarray, shape (3,)
         Of the cloud frame's origin, cloud axes [m/s].
     angular_velocity : ndarray, shape (3,)
@@ -152,7 +151,7 @@ class OdometryEstimate:
     gyro_bias, accel_bias : ndarray, shape (3,)
         Cloud axes [rad/s, m/s^2].
     gravity : ndarray, shape (3,)
-        Odometry axes [m/s^2]; zero when not trusted.
+        Map axes [m/s^2]; zero when not trusted.
     gyro_bias_covariance : ndarray, shape (9, 3)
         Of the errors of ``covariance`` (6) and of the gyro bias (3), each with the gyro bias
         [rad/s], cloud axes. What else the angular velocity is uncertain by is noise of samples.

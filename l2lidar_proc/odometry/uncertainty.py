@@ -499,14 +499,14 @@ def _carried(place: F64) -> F64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameJump:
-    """Uncertainty of the map's pose in the odometry frame; zero at the beginning.
+    """Uncertainty of where a map lies in the map frame; zero for the first map, which defines it.
 
-    Alignment with the map cannot tell, so this stays for good.
+    Alignment with the map does not observe it, so it stays for good.
 
     Attributes
     ----------
     place : ndarray, shape (3,)
-        Where the latest jump happened, odometry frame [m].
+        Where the latest jump happened, map frame [m].
     covariance : ndarray, shape (6, 6)
         Of x, y, z and of the turns about the frame's axes, there [m, rad].
     """
