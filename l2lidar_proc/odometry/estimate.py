@@ -37,7 +37,7 @@ class Status(Enum):
     UNMATCHED = "too few points match the map"
     SKIPPED = "skipped to catch up: clouds arrive faster than they can be aligned"
     DEGENERATE = "the scene does not constrain the pose in every direction"
-    SUSPECT = "contradicts max_speed, the IMU, earlier sweeps or walls: the covariance is widened"
+    SUSPECT = "contradicts max_speed, the IMU, earlier sweeps or walls: may be worse than it says"
     IMU_GAP = "IMU samples are missing within the span of this estimate"
     NO_IMU = "no IMU samples: constant motion is assumed"
     GRAVITY_UNTRUSTED = (
