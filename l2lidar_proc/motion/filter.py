@@ -1,7 +1,8 @@
 """Error-state Kalman filter of the IMU's pose, velocity, biases and gravity.
 
-The 18 errors are ordered rotation (3, sensor axes), position, velocity (map axes), gyro bias,
-accelerometer bias (sensor axes) and gravity (map axes). The first pose fixes the map frame, so
+IMU samples are turned to cloud axes before they get here; only the origin is the IMU's. The 18
+errors are ordered rotation (3, cloud axes), position, velocity (map axes), gyro bias,
+accelerometer bias (cloud axes) and gravity (map axes). The first pose fixes the map frame, so
 gravity is a state in it rather than its axis (as in FAST-LIO2, Xu et al. 2022). Measurements are a
 twist, a zero velocity, and a scan alignment in information form; notation and error definition
 follow Sola (2017), boxplus and boxminus Hertzberg et al. (2013).
@@ -53,11 +54,11 @@ class InertialState:
     ----------
     stamp : HostNs
     rotation : ndarray, shape (3, 3)
-        Sensor axes to map axes.
+        Cloud axes to map axes.
     position, velocity : ndarray, shape (3,)
         Of the IMU's origin in the map [m, m/s].
     gyro_bias, accel_bias : ndarray, shape (3,)
-        Sensor axes [rad/s, m/s^2].
+        Cloud axes [rad/s, m/s^2].
     gravity : ndarray, shape (3,)
         Acceleration of a falling body in the map [m/s^2].
     """
@@ -72,7 +73,7 @@ class InertialState:
 
     @property
     def pose(self) -> F64:
-        """Pose of the IMU in the map, shape (4, 4)."""
+        """Pose of the IMU's origin in the map, with cloud axes, shape (4, 4)."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.rotation, self.position
         return pose
@@ -452,7 +453,7 @@ def twist_jacobian(state: InertialState, lever: F64) -> F64:
 
 
 def body_velocity(state: InertialState, rate: F64, lever: F64) -> F64:
-    """Return the velocity of the cloud frame's origin in sensor axes [m/s], shape (3,).
+    """Return the velocity of the cloud frame's origin in cloud axes [m/s], shape (3,).
 
     Parameters
     ----------
@@ -460,7 +461,7 @@ def body_velocity(state: InertialState, rate: F64, lever: F64) -> F64:
     rate : ndarray, shape (3,)
         Angular velocity as measured, bias included [rad/s].
     lever : ndarray, shape (3,)
-        Place of the IMU in the cloud frame [m], sensor axes.
+        Place of the IMU in the cloud frame [m].
     """
     turning = rate - state.gyro_bias
     return np.asarray(state.rotation.T @ state.velocity - rotations.cross(turning, lever))
@@ -476,7 +477,7 @@ def update_twist(
     state : InertialState
     covariance : ndarray, shape (18, 18)
     measured : ndarray, shape (3,)
-        Over the ground, sensor axes [m/s].
+        Over the ground, cloud axes [m/s].
     noise : ndarray, shape (3, 3)
         Its covariance.
     rate, lever : ndarray, shape (3,)
@@ -497,17 +498,18 @@ def update_static(
 ) -> tuple[InertialState, F64]:
     """Return state and covariance after samples of a sensor at rest: a zero-velocity update.
 
-    The mean rate measures the gyro bias, the mean force gravity plus the accelerometer bias.
+    The mean rate measures the gyro bias, the mean force gravity plus the accelerometer bias. The
+    velocity becomes zero; stamp and position stay. Fewer than two samples change nothing.
 
     Parameters
     ----------
     state : InertialState
-        Its position stays, its velocity becomes zero.
     covariance : ndarray, shape (18, 18)
     samples : ndarray, shape (N,), dtype IMU_SAMPLE
-        Since this was done last, sensor axes.
+        Since this was done last, cloud axes.
     noise : Noise
     use_forces : bool
+        Whether the accelerometer is used.
     levels : bool
         The force corrects roll and pitch as well; otherwise the whole pose stays.
     """
@@ -586,7 +588,7 @@ def with_loose_pose(state: InertialState, covariance: F64, more: F64) -> F64:
         What is added, of x, y, z and of the turns about the map's axes [m, rad].
     """
     axes = np.zeros((6, 6))
-    axes[:3, 3:] = state.rotation.T  # turns come first here, about the sensor's axes
+    axes[:3, 3:] = state.rotation.T  # turns come first here, about the cloud's axes
     axes[3:, :3] = np.eye(3)
     pose = covariance[POSE, POSE] + axes @ more @ axes.T
     out = covariance.copy()

@@ -355,7 +355,7 @@ def initial_state(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Ini
     Parameters
     ----------
     samples : ndarray, shape (N,), dtype IMU_SAMPLE
-        Of the last moments up to and around the stamp, sensor axes; may be empty.
+        Of the last moments up to and around the stamp, cloud axes; may be empty.
     stamp : HostNs
     may_rest : bool
         False where the sensor is known to move, however quiet the IMU is.

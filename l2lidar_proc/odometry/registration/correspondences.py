@@ -1,8 +1,9 @@
 """Correspondences of a sweep's points with the map's surfaces: residuals, weights, derivatives.
 
-The residual of a point y (deskewed to the reference, IMU axes) measured dt after the reference is
-``n . (R y + p - m)``. It also depends on what deskewed the point, velocity, gravity and biases,
-linearly in dt: so a sweep corrects the motion within itself as well as its place.
+The residual of a point y, deskewed to the reference (from the IMU's origin, cloud axes) and
+measured dt after it, is ``n . (R y + p - m)``. Deskewing used the velocity, gravity and biases, so
+the residual depends on these too, linearly in dt: a sweep corrects the motion within itself as
+well as its place.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Source:
     times : ndarray, shape (N,)
         Instant of each point after the reference [s], negative before it.
     ranges : ndarray, shape (N,)
-        [m]
+        Distance of each point from the cloud frame's origin [m].
     denser : callable, optional
         Gives more points of the same sweep, which thinning has left out.
     """
@@ -78,7 +79,7 @@ class Correspondences:
     index : ndarray, shape (M,)
         Which of the source's points; one point may have two surfaces.
     points : ndarray, shape (M, 3)
-        Deskewed by the state's motion, IMU axes [m].
+        Deskewed by the state's motion, from the IMU's origin, cloud axes [m].
     times : ndarray, shape (M,)
         Instant after the reference [s].
     normals : ndarray, shape (M, 3)
@@ -432,7 +433,7 @@ def residual_jacobian(pose: F64, since: F64, rotation: F64) -> F64:
     since : ndarray, shape (M,)
         Instants after the reference [s].
     rotation : ndarray, shape (3, 3)
-        Sensor axes to map axes.
+        Cloud axes to map axes.
     """
     turn, place = pose[:, :3].T, pose[:, 3:].T
     half = 0.5 * since * since
