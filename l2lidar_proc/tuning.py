@@ -129,7 +129,7 @@ ACCEL_BIAS_SIGMA: Final = 0.15  # [m/s^2] of units; source: IMUs of this class
 
 TRACKER_MEMORY_S: Final = 25.0  # [s] longer than the longest sweep
 TRACKER_STEP_NS: Final = 100_000_000  # [ns] of the static detector
-TRACKER_REST_NS: Final = 5_000_000_000  # [ns] of samples at once while an odometry knows better
+TRACKER_IDLE_NS: Final = 5_000_000_000  # [ns] between updates while an odometry knows the motion
 TRACKER_WINDOW: Final = 10  # steps a static decision spans
 TRACKER_TURN: Final = 3  # steps of a turn of the head, over which its vibration averages out
 TRACKER_LAG_NS: Final = 500_000_000  # [ns] the filter waits for late velocities,

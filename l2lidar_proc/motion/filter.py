@@ -169,7 +169,7 @@ class Update(NamedTuple):
     state : InertialState
     covariance : ndarray, shape (18, 18)
     nis : float
-        Normalized innovation squared before the update; its mean is the number of components.
+        Normalized innovation squared before the update, not divided by its degrees of freedom.
     """
 
     state: InertialState
@@ -187,7 +187,8 @@ def predict(
     preintegrated: Preintegration,
     knot: int,
     noise: Noise,
-    blind_forces: bool = False,
+    *,
+    use_forces: bool = True,
 ) -> tuple[InertialState, F64]:
     """Return state and covariance (18, 18) at a later knot.
 
@@ -202,8 +203,8 @@ def predict(
     knot : int
         Not before the anchor.
     noise : Noise
-    blind_forces : bool
-        The forces were not used.
+    use_forces : bool
+        Whether ``preintegrated`` used the accelerometer; otherwise the velocity is held.
     """
     if knot <= preintegrated.anchor:
         return state.at(preintegrated, knot), covariance
@@ -240,7 +241,7 @@ def predict(
     sparse = np.where(gaps, 0.0, spans * 1e-9)
     gyro2 = gyro2 + np.add.reduceat(imu.rate_errors[:knot] * sparse, first) ** 2 / dt
     accel2 = accel2 + np.add.reduceat(imu.force_errors[:knot] * sparse, first) ** 2 / dt
-    if blind_forces:
+    if not use_forces:
         # the velocity is held, whatever attitude, biases and gravity are
         for moved in (VELOCITY, POSITION):
             for cause in (ROTATION, GYRO_BIAS, ACCEL_BIAS, GRAVITY):

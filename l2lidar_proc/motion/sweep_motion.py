@@ -243,6 +243,6 @@ def predict_sweep(
     )
     knot = imu.knot(reference)
     state, covariance = eskf.predict(
-        state, covariance, imu, preintegrated, knot, noise, not use_forces
+        state, covariance, imu, preintegrated, knot, noise, use_forces=use_forces
     )
     return SweepMotion(imu, preintegrated.anchored_at(knot), state, covariance, use_forces)

@@ -171,7 +171,7 @@ class MotionTracker:
         jumped = self.buffer.counts.jumps > jumps
         if jumped:
             self.filter.reset()
-        if is_needed or self.filter.behind_ns >= tuning.TRACKER_REST_NS:
+        if is_needed or self.filter.behind_ns >= tuning.TRACKER_IDLE_NS:
             self.filter.follow()
         return jumped
 

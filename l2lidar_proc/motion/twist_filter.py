@@ -360,7 +360,7 @@ class TwistFilter:
                 preintegrated,
                 len(imu.stamps) - 1,
                 self._noise(self._buffer.between(state.stamp, stamp)),
-                not self._uses_forces,
+                use_forces=self._uses_forces,
             )
             # places are of no interest, and would grow without bound
             self._state = dataclasses.replace(self._state, position=np.zeros(3))

@@ -78,10 +78,10 @@ class AlignmentQuality:
         How far predictions have lately been off, as KISS-ICP sees it.
     map_cells : int
         Cells in the map of surfaces.
-    nis : float
+    nis_per_dof : float
         Normalized innovation squared of the alignments of the last seconds, mean for each degree
         of freedom: 1 where predictions are as good as their covariance says; 0 at rest.
-    velocity_nis : float
+    velocity_nis_per_dof : float
         Likewise of the sum of what they corrected of the velocity: large where accelerometer and
         alignments contradict each other for seconds.
     variance_factor : float
@@ -108,8 +108,8 @@ class AlignmentQuality:
     weakest: tuple[float, float, float] = (0.0, 0.0, 0.0)
     kiss_threshold_m: float = 0.0
     map_cells: int = 0
-    nis: float = 0.0
-    velocity_nis: float = 0.0
+    nis_per_dof: float = 0.0
+    velocity_nis_per_dof: float = 0.0
     variance_factor: float = 1.0
     velocity_factor: float = 1.0
     unobserved: tuple[tuple[float, float, float], ...] = ()

@@ -109,7 +109,7 @@ class InnovationGate:
             return GatedAlignment(
                 dataclasses.replace(predicted, covariance=covariance), source, None, True
             )
-        is_doubted = item.nis >= tuning.NIS_DOUBT and not matcher.is_young
+        is_doubted = item.nis_per_dof >= tuning.NIS_DOUBT and not matcher.is_young
         is_checked = stamp >= self._next_check
         is_due = is_doubted or (is_checked and (fits_badly or matcher.lost_sight(found)))
         if wide is None:
@@ -201,10 +201,10 @@ def inflated_prior(covariance: F64, item: Correction) -> F64 | None:
     ndarray, shape (18, 18), or None
         Pose and velocity are as uncertain as the correction shows. None within the gate.
     """
-    if item.nis < tuning.NIS_GATE:
+    if item.nis_per_dof < tuning.NIS_GATE:
         return None
     scale = np.ones(len(covariance))
-    scale[MOTION] = np.sqrt(item.nis)
+    scale[MOTION] = np.sqrt(item.nis_per_dof)
     return np.asarray(covariance * np.outer(scale, scale))
 
 

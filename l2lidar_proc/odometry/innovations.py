@@ -51,7 +51,7 @@ class Correction(NamedTuple):
     allowed: F64
 
     @property
-    def nis(self) -> float:
+    def nis_per_dof(self) -> float:
         """Normalized innovation squared, for each degree of freedom."""
         return self.squared / max(self.freedoms, 1)
 
@@ -160,13 +160,13 @@ class InnovationTest:
             recent.popleft()
 
     @property
-    def nis(self) -> float:
+    def nis_per_dof(self) -> float:
         """Mean normalized innovation squared for each degree of freedom; 0 before the first."""
         freedoms = sum(item.freedoms for item in self._recent)
         return sum(item.squared for item in self._recent) / max(freedoms, 1)
 
     @property
-    def velocity_nis(self) -> float:
+    def velocity_nis_per_dof(self) -> float:
         """Normalized square of the sum of all corrections of the velocity, for each of its axes.
 
         1 on average if they are independent; 0 as long as there are few.
@@ -183,7 +183,7 @@ class InnovationTest:
         """What variances are to those assumed; None while there are few corrections."""
         if len(self._recent) < tuning.NIS_LEAST:
             return None
-        return max(self.nis, self.velocity_nis / tuning.NIS_CHANCE)
+        return max(self.nis_per_dof, self.velocity_nis_per_dof / tuning.NIS_CHANCE)
 
     @property
     def expected_share(self) -> float:

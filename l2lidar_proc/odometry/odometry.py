@@ -624,8 +624,8 @@ class Odometry:
             self._revisit.note_unobserved(stamp)
         return dataclasses.replace(
             quality,
-            nis=found.nis,
-            velocity_nis=found.velocity_nis,
+            nis_per_dof=found.nis_per_dof,
+            velocity_nis_per_dof=found.velocity_nis_per_dof,
             variance_factor=found.variance_factor,
             velocity_factor=found.velocity_factor,
             unobserved=tuple((x, y, z) for x, y, z in found.unobserved.T.tolist()),

@@ -297,8 +297,8 @@ def judge(
         "inlier ratio [%]": f"{100.0 * quality.inlier_ratio:.1f}",
         "residual [mm]": f"{1e3 * quality.residual_m:.1f}",
         "degeneracy ratio [%]": f"{100.0 * quality.degeneracy_ratio:.2f}",
-        "innovations (NIS, 1 = as expected)": f"{quality.nis:.2f}",
-        "innovations of the speed (NIS)": f"{quality.velocity_nis:.2f}",
+        "innovations (NIS, 1 = as expected)": f"{quality.nis_per_dof:.2f}",
+        "innovations of the speed (NIS)": f"{quality.velocity_nis_per_dof:.2f}",
         "tilt of the map [deg]": f"{float(np.degrees(last.tilt)):.2f}",
         "beams corrected by (xi, beta, alpha) [deg]": " ".join(
             f"{angle:.2f}" for angle in np.degrees(quality.beam_correction)

@@ -53,8 +53,8 @@ def run(
 
 def test_corrections_as_large_as_allowed_are_no_surprise() -> None:
     found = run(1.0)
-    assert found.nis == pytest.approx(1.0, abs=0.3)
-    assert found.velocity_nis < tuning.NIS_CHANCE
+    assert found.nis_per_dof == pytest.approx(1.0, abs=0.3)
+    assert found.velocity_nis_per_dof < tuning.NIS_CHANCE
     assert found.variance_factor < 1.4
     assert not found.contradicts
 
@@ -69,29 +69,29 @@ def test_too_large_ones_are_suspect_and_tell_by_how_much() -> None:
 
 def test_small_ones_tell_that_variances_are_too_large() -> None:
     found = run(0.3)
-    assert found.nis == pytest.approx(0.09, abs=0.04)
-    assert found.variance_factor == pytest.approx(tuning.NIS_MARGIN * found.nis)
+    assert found.nis_per_dof == pytest.approx(0.09, abs=0.04)
+    assert found.variance_factor == pytest.approx(tuning.NIS_MARGIN * found.nis_per_dof)
     assert run(0.9).variance_factor <= 1.0  # the margin raises none
     assert run(0.01).variance_factor == 1.0 / tuning.NIS_MOST
     assert run(0.3, seconds=0.7).variance_factor == 1.0  # too few to say so
     # small ones that add up: their sum decides
     alike = run(0.3, drift=0.01)
-    assert alike.nis < 0.5 * alike.velocity_nis / tuning.NIS_CHANCE < 1.0
-    expected = tuning.NIS_MARGIN * alike.velocity_nis / tuning.NIS_CHANCE
+    assert alike.nis_per_dof < 0.5 * alike.velocity_nis_per_dof / tuning.NIS_CHANCE < 1.0
+    expected = tuning.NIS_MARGIN * alike.velocity_nis_per_dof / tuning.NIS_CHANCE
     assert alike.variance_factor == pytest.approx(min(expected, 1.0))
 
 
 def test_what_poses_add_to_the_drift_is_lowered_with_a_margin_of_its_own() -> None:
     found = run(0.3)
-    assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
+    assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis_per_dof)
     found.note_unobserved(at(5.0), ALONG)
-    assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis)
+    assert found.expected_share == pytest.approx(tuning.NIS_DRIFT_MARGIN * found.nis_per_dof)
     assert run(0.9).expected_share == run(100.0).expected_share == 1.0  # never raised
     assert run(0.01).expected_share == 1.0 / tuning.NIS_MOST
     assert run(0.3, seconds=0.7).expected_share == 1.0  # too few to say so
     alike = run(0.2, drift=0.005)  # here the sum decides
-    assert alike.nis < 0.8 * alike.velocity_nis / tuning.NIS_CHANCE
-    expected = tuning.NIS_DRIFT_MARGIN * alike.velocity_nis / tuning.NIS_CHANCE
+    assert alike.nis_per_dof < 0.8 * alike.velocity_nis_per_dof / tuning.NIS_CHANCE
+    expected = tuning.NIS_DRIFT_MARGIN * alike.velocity_nis_per_dof / tuning.NIS_CHANCE
     assert expected < 0.9
     assert alike.expected_share == pytest.approx(expected)
 
@@ -119,7 +119,7 @@ def test_the_velocity_is_lowered_by_less_in_the_directions_that_were_observed() 
     for scale in (0.6, 0.01):
         found = run(scale)
         found.note_unobserved(at(0.23 * last), ALONG)
-        expected = max(tuning.NIS_MARGIN * found.nis, 1.0 / tuning.NIS_PARTLY_MOST)
+        expected = max(tuning.NIS_MARGIN * found.nis_per_dof, 1.0 / tuning.NIS_PARTLY_MOST)
         assert found.velocity_factor == pytest.approx(expected)
     assert run(0.01).velocity_factor == 1.0  # all were: the variance factor says it
     few = run(0.3, seconds=0.7)
@@ -167,19 +167,19 @@ def test_what_unobserved_directions_explain_is_not_scaled(
 def test_small_ones_that_are_all_alike_contradict_the_accelerometer() -> None:
     # 0.1 m/s^2 for 3 s: each correction of 23 mm/s is allowed, all of them together are not
     found = run(0.3, drift=0.023)
-    assert found.nis < 1.1
-    assert found.velocity_nis > tuning.NIS_SUSPECT * tuning.NIS_CHANCE
+    assert found.nis_per_dof < 1.1
+    assert found.velocity_nis_per_dof > tuning.NIS_SUSPECT * tuning.NIS_CHANCE
     assert found.contradicts
 
 
 def test_only_what_is_measured_counts() -> None:
     found = run(1.0, measured=POSITION)
-    assert found.nis == pytest.approx(1.0, abs=0.4)
+    assert found.nis_per_dof == pytest.approx(1.0, abs=0.4)
     test = InnovationTest()
     for number in range(10):
         prior = dataclasses.replace(STILL, stamp=at(0.23 * number))
         test.take(prior, BEFORE, prior.boxplus(np.full(ERRORS, 0.1)), BEFORE)
-    assert (test.nis, test.variance_factor) == (0.0, 1.0)
+    assert (test.nis_per_dof, test.variance_factor) == (0.0, 1.0)
 
 
 def test_it_looks_back_some_seconds_and_forgets() -> None:
@@ -189,7 +189,7 @@ def test_it_looks_back_some_seconds_and_forgets() -> None:
         error = np.zeros(ERRORS)
         error[POSE] = 1e-3
         test.take(prior, BEFORE, prior.boxplus(error), corrected(BEFORE))
-    assert test.nis < 0.1
+    assert test.nis_per_dof < 0.1
     test = run(3.0)
     test.clear()
-    assert (test.nis, test.velocity_nis, test.variance_factor) == (0.0, 0.0, 1.0)
+    assert (test.nis_per_dof, test.velocity_nis_per_dof, test.variance_factor) == (0.0, 0.0, 1.0)

@@ -85,7 +85,7 @@ def test_the_covariance_of_the_velocity_is_neither_too_small_nor_too_large(
 ) -> None:
     """Normalized squared errors (NEES); 3 is their mean if the covariance is right."""
     run = recording(scene, "walk", 14.0)
-    moved = [item for item in drive(run, "half turn") if item.quality.nis > 0.0]
+    moved = [item for item in drive(run, "half turn") if item.quality.nis_per_dof > 0.0]
     assert len(moved) > 60
     seconds = (np.array([item.stamp for item in moved]) - sweep_epoch(run)) * 1e-9
     found = np.array([item.velocity for item in moved])
@@ -131,7 +131,7 @@ def test_the_covariance_of_the_pose_is_neither_too_small_nor_too_large(
     turns = rotations.matrices(quaternions)
     nees = []
     for item, place, turn in zip(estimates, places, turns, strict=True):
-        if item.quality.nis == 0.0:
+        if item.quality.nis_per_dof == 0.0:
             continue
         aligned = estimates[0].T_map_lidar[:3, :3] @ turns[0].T
         off = item.T_map_lidar[:3, :3] @ (aligned @ turn).T
