@@ -142,11 +142,20 @@ class SurfelMap:
         origin : ndarray, shape (3,), optional
             Where they were seen from [m], map frame.
         weighted : bool
-            Whether points near the origin, which then has to be given, count for more.
+            Whether points near the origin count for more.
         range_correction : float, optional
-            What was added to their ranges [m], if their lines of sight from the origin, which then
-            has to be given, are to be noted for :meth:`sights`.
+            What was added to their ranges [m], if their lines of sight from the origin are to be
+            noted for :meth:`sights`.
+
+        Raises
+        ------
+        ValueError
+            If ``weighted`` or ``range_correction`` is given without ``origin``.
         """
+        if origin is None and (weighted or range_correction is not None):
+            raise ValueError(
+                "weighted and range_correction need origin, where points are seen from"
+            )
         if not len(points):
             return 0.0
         self.latest = sweep

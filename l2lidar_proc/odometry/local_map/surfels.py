@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -35,7 +35,7 @@ PLANE: Final = np.dtype(
         ("spread", "<f8", (3,)),  # [m^2] variance along each of the axes, ascending
         ("born", "<i8"),  # number of the sweep that was the first at its place
         ("opened", "<i8"),  # number of the sweep whose points opened it
-        ("sided", "<i8"),  # from which sides its points were seen, as _NO_SIDE and others
+        ("sided", "<i8"),  # from which sides its points were seen, a value of Sides
     ],
 )
 """The surface in a cell: what points are matched with, and what seldom changes."""
@@ -49,9 +49,17 @@ SIGHT: Final = np.dtype(
 )
 """How the points of a cell were seen: what an error of their ranges has moved them by."""
 
-# Sides from which the points of a cell were seen: nobody said; the one that the normal points to;
-# both. A flat cell with points from both is a board. A wall is thicker, and has two surfaces.
-_NO_SIDE, _ONE_SIDE, _BOTH_SIDES = 0, 1, 2
+
+class Sides(IntEnum):
+    """Sides from which the points of a cell were seen.
+
+    A flat cell with points from both is a board. A wall is thicker, and has two surfaces.
+    """
+
+    UNKNOWN = 0  # its points came without an origin
+    ONE = 1  # the one that the normal points to
+    BOTH = 2
+
 
 FLAT: Final = 3
 """Kind of a flat cell; that of others is the number of axes along which their points lie close."""
@@ -197,7 +205,7 @@ def are_behind(points: F64, origins: F64, planes: NDArray[np.void]) -> NDArray[n
     ways = origins - points
     along = np.einsum("ni,ni->n", planes["axes"][:, 0], ways)
     least = tuning.SIDE_SLACK * np.sqrt(np.einsum("ni,ni->n", ways, ways))
-    return np.asarray((planes["sided"] == _ONE_SIDE) & (along < -least))
+    return np.asarray((planes["sided"] == Sides.ONE) & (along < -least))
 
 
 def are_within(
@@ -310,9 +318,9 @@ def fit(
         axes[behind, 0] *= -1.0
         least = tuning.SIDE_SLACK * np.sqrt(np.einsum("ni,ni->n", ways, ways))
         is_other = np.einsum("ni,ni->n", planes["axes"][:, 0], ways) < -least
-        both = is_other & (planes["sided"] == _ONE_SIDE)
-        both |= planes["sided"] == _BOTH_SIDES
-        planes["sided"] = np.where(both, _BOTH_SIDES, _ONE_SIDE)
+        both = is_other & (planes["sided"] == Sides.ONE)
+        both |= planes["sided"] == Sides.BOTH
+        planes["sided"] = np.where(both, Sides.BOTH, Sides.ONE)
     planes["mean"], planes["axes"], planes["spread"] = place, axes, spread
     close = spread[:, :2] < (tuning.NARROW * sizes[:, None]) ** 2
     close &= (cells["sweeps"] >= tuning.NARROW_SWEEPS)[:, None]

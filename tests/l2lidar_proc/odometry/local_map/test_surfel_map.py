@@ -579,3 +579,13 @@ def test_a_map_follows_a_correction_of_the_ranges() -> None:
     np.testing.assert_allclose(ours["corrected"] / scale, theirs["corrected"] / scale, atol=3e-3)
     thickness = np.sqrt(moved.planes(again.cells)["spread"][:, 0])
     assert np.median(thickness) < 0.008
+
+
+def test_what_depends_on_the_place_of_the_sensor_needs_it() -> None:
+    surfaces = SurfelMap((0.25,))
+    points = np.zeros((3, 3))
+    with pytest.raises(ValueError, match="origin"):
+        surfaces.add(points, weighted=True)
+    with pytest.raises(ValueError, match="origin"):
+        surfaces.add(points, range_correction=0.01)
+    assert not len(surfaces)
