@@ -1,8 +1,8 @@
-"""Places that a state has passed: kept for a while, and moved along with what corrects the state.
+"""Places passed in the last seconds, which each correction of the state moves as well.
 
-The difference of two of them then depends on the velocity, not on the place. They are moved along
-the way only. Across it, each sweep has measured where it was, better than a velocity tells that is
-carried back over seconds.
+So the distance between two of them depends on the velocity, not on the pose. They are moved along
+the direction of travel only: across it, each sweep has measured its own place better than a
+velocity that is carried back over seconds.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from l2lidar_proc.motion.filter import ACCEL_BIAS, GRAVITY, POSITION, VELOCITY, 
 
 
 def correction_of_passed(before: InertialState, after: InertialState, stamps: I64) -> F64:
-    """Return by how much a correction of the state moves what it has placed before, (N, 3) [m].
+    """Return how far a correction of the state moves places seen before it, (N, 3) [m].
 
-    The error of the velocity is taken for constant, as that of gravity and of the bias.
+    Assumes that the errors of velocity, gravity and bias were constant meanwhile.
 
     Parameters
     ----------
@@ -45,16 +45,12 @@ class PassedPlaces:
     Attributes
     ----------
     along : ndarray, shape (3,)
-        Unit vector of the way, map axes.
+        Direction of travel, unit, map axes.
     """
 
     def __init__(self, layout: np.dtype[np.void]) -> None:
         self._kept: NDArray[np.void] = np.zeros(0, layout)
         self.along: F64 = np.zeros(3)
-
-    def __len__(self) -> int:
-        """Return the number of places kept."""
-        return len(self._kept)
 
     def clear(self) -> None:
         """Forget all places."""

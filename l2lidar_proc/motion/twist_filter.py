@@ -92,11 +92,6 @@ class TwistFilter:
     # ---- what is known
 
     @property
-    def is_static(self) -> bool:
-        """Whether the IMU shows a sensor at rest."""
-        return self._reference is not None
-
-    @property
     def gyro_bias(self) -> F64:
         """Gyro bias [rad/s], cloud axes, shape (3,); zero while nothing is known."""
         return np.zeros(3) if self._state is None else self._state.gyro_bias

@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,14 +84,6 @@ class EarlierMaps:
         self._next_search = 0
         self._lost_at = 0
         self._meetings = _Meetings()
-
-    def __len__(self) -> int:
-        """Return the number of maps kept."""
-        return len(self._maps)
-
-    def __iter__(self) -> Iterator[EarlierMap]:
-        """Iterate over the maps kept."""
-        return iter(self._maps)
 
     def restart(self, stamp: HostNs) -> None:
         """Go on at an instant of another time line."""

@@ -147,8 +147,8 @@ def test_lines_of_another_time_line_are_forgotten(narrow: Recording) -> None:
     state = odometry.motion.state if odometry.motion else None
     assert state is not None
     odometry._walls.update(state, np.eye(18), np.zeros(0, SPOT), line, np.eye(3))
-    assert len(odometry._walls._lines) == 1
+    assert len(odometry._walls._lines._kept) == 1
     odometry.register(
         replace(some[-1], start=HostNs(some[-1].start - hour), end=HostNs(some[-1].end - hour))
     )
-    assert len(odometry._walls._lines) == 0
+    assert len(odometry._walls._lines._kept) == 0

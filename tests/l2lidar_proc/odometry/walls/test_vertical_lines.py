@@ -429,12 +429,12 @@ def test_lines_of_an_hour_take_no_memory() -> None:
     for number in range(60):
         many = np.concatenate([line(0.1 * number, 0.7 * k, 1.0) for k in range(40)])
         lines.update(at(0.1 * number), known(0.01), many, AXES)
-    assert len(lines) <= tuning.LINE_KEPT + 40
+    assert len(lines._kept) <= tuning.LINE_KEPT + 40
     lines.update(at(100.0), known(0.01), np.zeros(0, LINE), AXES)
-    assert len(lines) == 0
+    assert len(lines._kept) == 0
     lines.update(at(100.0), known(0.01), FIRST, AXES)
     lines.clear()
-    assert len(lines) == 0
+    assert len(lines._kept) == 0
 
 
 def test_a_colonnade_has_hundreds_of_votes() -> None:
@@ -460,5 +460,5 @@ def test_crowded_lines_take_bounded_memory() -> None:
         places = rng.uniform((3.0, 1.0), (3.2, 1.1), (tuning.LINE_MOST, 2)).tolist()
         many = np.concatenate([line(0.1 * number, *place) for place in places])
         lines.update(at(0.1 * number), known(1.0), many, AXES)
-    pairs = lines._pairs(len(lines) - tuning.LINE_MOST, at(0.9), 1.0, AXES)
+    pairs = lines._pairs(len(lines._kept) - tuning.LINE_MOST, at(0.9), 1.0, AXES)
     assert tuning.LINE_PAIRS / 2 < len(pairs) <= tuning.LINE_PAIRS

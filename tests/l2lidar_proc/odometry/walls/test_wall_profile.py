@@ -563,12 +563,12 @@ def test_spots_are_forgotten() -> None:
     for time in np.arange(0.0, 60.0, SWEEP_S).tolist():
         state = state_at(time)
         profile.update(state, known(0.1), swept(rng, time, DOORS, 0.0), AXES)
-        counts.append(len(profile))
+        counts.append(len(profile._kept))
     within = int(tuning.PROFILE_KEPT_NS * 1e-9 / SWEEP_S) + 2
     assert max(counts) <= within * tuning.PROFILE_SPOTS
     assert max(counts[60:]) < 1.5 * np.median(counts[60:])
     profile.clear()
-    assert len(profile) == 0
+    assert len(profile._kept) == 0
 
 
 def test_crowded_spots_take_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,10 +94,10 @@ def test_clearing_forgets_both() -> None:
     lines = np.zeros(1, LINE)
     lines["stamp"] = state.stamp
     walls.update(state, np.eye(eskf.ERRORS), passed(1, DOORS, 0.0), lines, AXES)
-    assert len(walls._lines) == 1
-    assert len(walls._profile) > 100
+    assert len(walls._lines._kept) == 1
+    assert len(walls._profile._kept) > 100
     walls.clear()
-    assert len(walls._lines) == len(walls._profile) == 0
+    assert len(walls._lines._kept) == len(walls._profile._kept) == 0
 
 
 def test_a_sweep_without_anything_changes_nothing() -> None:
