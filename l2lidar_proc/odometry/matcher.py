@@ -138,7 +138,8 @@ class SweepMatcher:
         self._oldest = 0  # sweep from which on places are still in the map
         self._ways: deque[tuple[float, int]] = deque()  # way at some sweeps since
         self._inliers = 0.0, 0  # recent mean inlier ratio, and its number of sweeps
-        self._scatter: F64 = np.zeros((3, 3))  # of the walls along which the carrier drives
+        # of the normals of the walls along which the carrier drives
+        self._normal_scatter: F64 = np.zeros((3, 3))
         self._is_weak = False  # along them, in the latest sweep
         self._range_correction = 0.0  # of what is in the map [m]
         self._height_fixed_s = 0.0, 0.0  # of late, and the time that counts in all
@@ -350,7 +351,7 @@ class SweepMatcher:
         """
         if not (self.driving and self._is_weak):
             return None
-        return np.asarray(np.linalg.eigh(self._scatter)[1][:, 0])
+        return np.asarray(np.linalg.eigh(self._normal_scatter)[1][:, 0])
 
     def _with_turned_axis(self, motion: SweepMotion) -> SweepMotion:
         """Return a predicted motion that allows for a loosest direction which is not known well.
@@ -493,9 +494,9 @@ class SweepMatcher:
             Since the sweep before.
         """
         self._note_height(found, seconds)
-        self._is_weak = found.scatter is not None
-        if found.scatter is not None:
-            self._scatter = found.scatter
+        self._is_weak = found.normal_scatter is not None
+        if found.normal_scatter is not None:
+            self._normal_scatter = found.normal_scatter
         free = unobserved_directions(found.information[POSITION, POSITION])
         if not free.size:
             self.drift.meet(found.support, found.state.position, found.weakly, found.strongly)
@@ -700,7 +701,8 @@ class SweepMatcher:
             self.config.surfaces,
             least,
             start,
-            self._scatter if self.driving else None,
+            driving=self.driving,
+            normal_scatter=self._normal_scatter,
         )
 
     def _placed(self, source: Source, motion: SweepMotion, most: float) -> Alignment:

@@ -90,7 +90,7 @@ class Matches:
         Of the point from the plane along the normal [m].
     variances : ndarray, shape (M,)
         Of the plane's place under the point [m^2].
-    scatter : ndarray, shape (M,)
+    point_variances : ndarray, shape (M,)
         Variance of the map's points about the plane where they are no flat surface, else 0 [m^2].
     born : ndarray, shape (M,)
         Number of the sweep that was the first at the surface's place, of the coarsest size.
@@ -109,7 +109,7 @@ class Matches:
     normals: F64
     distances: F64
     variances: F64
-    scatter: F64
+    point_variances: F64
     born: I64
     opened: I64
     is_fine: NDArray[np.bool_]

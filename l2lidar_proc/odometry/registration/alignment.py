@@ -73,7 +73,7 @@ class Alignment:
         Points near surfaces of the finest cells.
     fine_ratio : float
         Share of the points in such cells that these are, 0 to 1.
-    scatter : ndarray, shape (3, 3), optional
+    normal_scatter : ndarray, shape (3, 3), optional
         Of the walls along which the carrier drives, as in
         :class:`~l2lidar_proc.odometry.registration.weak_directions.WeakAxes`.
     """
@@ -90,7 +90,7 @@ class Alignment:
     strongly: tuple[tuple[F64, Support], ...] = ()
     fine_inliers: int = 0
     fine_ratio: float = 0.0
-    scatter: F64 | None = None
+    normal_scatter: F64 | None = None
 
     def fits_better_than(self, other: Alignment, points: int) -> bool:
         """Return whether this is right and another alignment of the sweep's points is wrong.
@@ -136,7 +136,9 @@ def align(
     config: SurfaceConfig,
     least: int,
     start: InertialState | None = None,
-    scatter: F64 | None = None,
+    *,
+    driving: bool = False,
+    normal_scatter: F64 | None = None,
 ) -> Alignment | None:
     """Return the posterior of a sweep, None where fewer than ``least`` points meet a surface.
 
@@ -155,8 +157,10 @@ def align(
     least : int
     start : InertialState, optional
         Where to begin instead of the prior.
-    scatter : ndarray, shape (3, 3), optional
-        That of the sweep before, zero if it has none; None where the carrier does not drive.
+    driving : bool
+        Whether the carrier drives: it then leaves the rims of its view behind.
+    normal_scatter : ndarray, shape (3, 3), optional
+        That of the sweep before, if it has one. Used while driving.
     """
     at = prior if start is None else start
     root = square_root(covariance)
@@ -164,7 +168,7 @@ def align(
     last = config.iterations - 1
     # what is ahead of a carrier that drives is seen from afar first: its surfaces grow with each
     # sweep, and points beyond their extent are right
-    reject_ambiguous = scatter is None
+    reject_ambiguous = not driving
     for number in range(config.iterations + tuning.WEAK_STEPS):
         reach = max(
             tuning.FIRST_REACH_M * 0.5**number, tuning.LAST_REACH_SCALES * config.outlier_scale
@@ -181,15 +185,15 @@ def align(
         if done and weak is None:
             if reject_ambiguous:
                 found = found.without_points_on_two_surfaces(at.rotation)
-            axes = weak_axes(at, found, surfaces, scatter)
+            axes = weak_axes(at, found, surfaces, driving=driving, normal_scatter=normal_scatter)
             if axes is None:
                 step = step if found is step.found else _step(prior, root, at, found, None)
                 break
-            views = _Views(prior, surfaces, config, reach, reject_ambiguous)
-            if axes.scatter is not None:
-                source = views.with_facing(source, at, axes)
-                found = views.of([(at, source)])[0]
-            again = partial(views.of_some, source)
+            matching = _Matching(prior, surfaces, config, reach, reject_ambiguous)
+            if axes.is_driven:
+                source = matching.with_facing(source, at, axes)
+                found = matching.of([(at, source)])[0]
+            again = partial(matching.of_some, source)
             weak = weak_directions(at, found, axes, again, prior, covariance[POSE, POSE])
             before = step.state
             step = _step(prior, root, at, found, weak)
@@ -201,8 +205,8 @@ def align(
     return None if step is None else step.alignment
 
 
-class _Views(NamedTuple):
-    """How the points of a sweep are matched with the map, from whatever state."""
+class _Matching(NamedTuple):
+    """Settings with which the points of a sweep are matched with the map, from any state."""
 
     prior: InertialState
     surfaces: SurfelMap
@@ -266,7 +270,7 @@ class _Step(NamedTuple):
             tuple((axis, found.places_along(self.normals @ axis)) for axis in others),
             found.fine_inliers,
             found.fine_inliers / max(found.met_fine, 1),
-            None if self.weak is None else self.weak.weak.scatter,
+            None if self.weak is None else self.weak.tested.normal_scatter,
         )
 
 
@@ -280,7 +284,7 @@ def _step(
     """Return the posterior of correspondences found from a state."""
     pose = by_pose = pose_jacobian(found, at.rotation)
     if weak is not None:
-        pose, by_pose = weak.reduced(pose, weak.weak.facing(at, found))
+        pose, by_pose = weak.reduced(pose, weak.tested.facing(at, found))
     h = residual_jacobian(pose, found.times, at.rotation)
     weighted = h * found.weights[:, None]
     information = weighted.T @ h

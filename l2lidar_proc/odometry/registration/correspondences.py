@@ -365,12 +365,12 @@ def correspondences_of(
             [source.ranges for _, source in views],
         )
     )
-    scales = np.sqrt(config.outlier_scale**2 + matches.scatter)
+    scales = np.sqrt(config.outlier_scale**2 + matches.point_variances)
     farthest = np.maximum(reach, tuning.LAST_REACH_SCALES * scales)
     near = np.flatnonzero(np.abs(matches.distances) < farthest)
     index, distances, scales = matches.index[near], matches.distances[near], scales[near]
     far = tuning.RANGE_NOISE_FACTOR * tuning.RANGE_NOISE_SLOPE * ranges[index]
-    surface = matches.variances[near] + tuning.SCATTER_SHARED * matches.scatter[near]
+    surface = matches.variances[near] + tuning.SCATTER_SHARED * matches.point_variances[near]
     variances = config.point_noise**2 + far**2 + surface
     found = Correspondences(
         index,

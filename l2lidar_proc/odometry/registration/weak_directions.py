@@ -83,9 +83,9 @@ class WeakAxes:
     axes : ndarray, shape (6, K)
         The directions, orthonormal in these units, weakest first.
     surfaces : SurfelMap
-    scatter : ndarray, shape (3, 3), optional
-        Of the walls' normals, map axes, in this sweep and those before; None where the carrier
-        does not drive along the weakest direction.
+    normal_scatter : ndarray, shape (3, 3), optional
+        Scatter matrix of the walls' normals, map axes, in this sweep and those before; None where
+        the carrier does not drive along the weakest direction.
     free : int
         How many of them, the first ones, are directions of the place that nothing faces.
     """
@@ -93,8 +93,13 @@ class WeakAxes:
     scale: F64
     axes: F64
     surfaces: SurfelMap
-    scatter: F64 | None = None
+    normal_scatter: F64 | None = None
     free: int = 0
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether the carrier drives along the weakest direction."""
+        return self.normal_scatter is not None
 
     def derivatives(self, state: InertialState, found: Correspondences) -> F64:
         """Return the derivatives (M, K) of the residuals by the directions."""
@@ -122,12 +127,12 @@ class WeakAxes:
         derivatives : ndarray, shape (M,)
             Derivatives of the residuals along the direction.
         """
-        age = tuning.WEAK_AGE if self.scatter is None else tuning.DRIVING_AGE
+        age = tuning.DRIVING_AGE if self.is_driven else tuning.WEAK_AGE
         is_ignored = number < self.free and found.young is YoungSurfaces.IGNORED
         settled = found.settled(age, strict=is_ignored)
         faces = (np.abs(derivatives) > tuning.WEAK_FACING) & settled
         some = np.flatnonzero(faces)
-        if self.scatter is None:
+        if not self.is_driven:
             faces[some] = ~found.on_two_surfaces(some, state.rotation)
             return faces
         if number == 0:  # the way that the carrier drives
@@ -149,7 +154,9 @@ def weak_axes(
     state: InertialState,
     found: Correspondences,
     surfaces: SurfelMap,
-    scatter: F64 | None = None,
+    *,
+    driving: bool = False,
+    normal_scatter: F64 | None = None,
 ) -> WeakAxes | None:
     """Return the directions that a sweep may not fix, None where it fixes all.
 
@@ -159,8 +166,10 @@ def weak_axes(
         From which the correspondences were found.
     found : Correspondences
     surfaces : SurfelMap
-    scatter : ndarray, shape (3, 3), optional
-        As in :class:`WeakAxes`, of the sweeps before; None where the carrier does not drive.
+    driving : bool
+        Whether the carrier drives, in whatever direction.
+    normal_scatter : ndarray, shape (3, 3), optional
+        As in :class:`WeakAxes`, of the sweeps before; None before the first. Used while driving.
     """
     # a turn counts as the way that it moves the points
     arm = float(np.sqrt((found.points**2).sum(axis=1).mean()))
@@ -171,14 +180,15 @@ def weak_axes(
     if not weak.any():
         return None
     axes = axes[:, weak]
-    if scatter is None or not _is_way(axes[:, 0], state.gravity):
+    if not driving or not _is_way(axes[:, 0], state.gravity):
         axes, free = _free_first(axes, found, state.gravity)
         return WeakAxes(scale, axes, surfaces, free=free)
     tilts = np.linalg.norm(surfaces.tilts(found.cells, found.axis), axis=2).max(axis=1)
     weights = found.weights / (1.0 + (tilts / tuning.NORMAL_KNOWN) ** 2)
     axes = _along_walls(axes, derivatives, weights)
-    axes, scatter = _steadied(axes, found.normals, weights, scatter)
-    return WeakAxes(scale, axes, surfaces, scatter)
+    before = np.zeros((3, 3)) if normal_scatter is None else normal_scatter
+    axes, normal_scatter = _steadied(axes, found.normals, weights, before)
+    return WeakAxes(scale, axes, surfaces, normal_scatter)
 
 
 def _free_first(axes: F64, found: Correspondences, gravity: F64) -> tuple[F64, int]:
@@ -306,7 +316,8 @@ class WeakDirections:
 
     Attributes
     ----------
-    weak : WeakAxes
+    tested : WeakAxes
+        The directions.
     shares : ndarray, shape (K,)
         How much of what facing surfaces claim is real, 0 to 1.
     associated : float
@@ -314,7 +325,7 @@ class WeakDirections:
         the surfaces may be others, 0 to 1.
     """
 
-    weak: WeakAxes
+    tested: WeakAxes
     shares: F64
     associated: float = 1.0
 
@@ -334,7 +345,7 @@ class WeakDirections:
         facing : ndarray, shape (M, K)
             Which surfaces face which direction.
         """
-        scaled = pose * self.weak.scale
+        scaled = pose * self.tested.scale
         shares = self.shares.copy()
         shares[0] *= self.associated
         information = self._without(scaled, facing, shares)
@@ -345,9 +356,9 @@ class WeakDirections:
 
     def _without(self, scaled: F64, facing: NDArray[np.bool_], shares: F64) -> F64:
         """Return derivatives (M, 6), given scaled, without what is not real in them."""
-        axes = self.weak.axes
+        axes = self.tested.axes
         lost = (scaled @ axes) * np.where(facing, 1.0 - shares, 1.0)
-        return np.asarray((scaled - lost @ axes.T) / self.weak.scale)
+        return np.asarray((scaled - lost @ axes.T) / self.tested.scale)
 
 
 def weak_directions(
@@ -375,7 +386,7 @@ def weak_directions(
     trials = [_Trial(state, found, weak, number) for number in range(weak.axes.shape[1])]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
-    if weak.scatter is None or shares[0] == 0.0:
+    if not weak.is_driven or shares[0] == 0.0:
         return WeakDirections(weak, shares)
     moved = state.boxminus(prior)[POSE]
     return WeakDirections(weak, shares, trials[0].associated(shares[0], moved, covariance))

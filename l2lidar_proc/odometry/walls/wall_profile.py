@@ -338,7 +338,7 @@ def _is_wall(depth: F64, variance: F64) -> bool:
     """
     far, sigmas, most = tuning.PROFILE_BEFORE
     before = float(np.mean(depth < -np.maximum(far, sigmas * np.sqrt(variance))))
-    return _scatter(depth) < tuning.PROFILE_SCATTER and before < most
+    return _robust_sigma(depth) < tuning.PROFILE_SCATTER and before < most
 
 
 def _without_trend(values: F64, *terms: F64) -> F64:
@@ -357,12 +357,12 @@ def _without_trend(values: F64, *terms: F64) -> F64:
         weighted = (base * weights[:, None]).T
         fit = np.linalg.lstsq(weighted @ base, weighted @ values, rcond=1e-9)[0]
         rest = values - base @ fit
-        scale = max(tuning.PROFILE_CAUCHY * _scatter(rest), 1e-6)
+        scale = max(tuning.PROFILE_CAUCHY * _robust_sigma(rest), 1e-6)
         weights = 1.0 / (1.0 + (rest / scale) ** 2)
     return np.asarray(rest)
 
 
-def _scatter(values: F64) -> float:
+def _robust_sigma(values: F64) -> float:
     """Return the standard deviation about zero of what most of the values (N,) are.
 
     1.4826: of a Gaussian, the standard deviation over the median of the sizes.

@@ -424,7 +424,8 @@ def test_a_sparse_sweep_of_a_drive_along_walls_keeps_more_points() -> None:
         alignment = matcher.match(found, at).alignment
         assert alignment is not None
         matcher.meet(alignment, 0.2)
-        scatters.append(0.0 if alignment.scatter is None else float(alignment.scatter.trace()))
+        scatter = alignment.normal_scatter
+        scatters.append(0.0 if scatter is None else float(scatter.trace()))
         return len(found.points)
 
     scatters: list[float] = []

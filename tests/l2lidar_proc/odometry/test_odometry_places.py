@@ -240,7 +240,7 @@ def test_a_pole_tells_two_directions_and_one_scan_line_none() -> None:
     assert found.index.tolist() == [0, 0]
     assert np.abs(found.normals[:, 2]).max() < 0.2
     assert np.linalg.norm(found.distances) == pytest.approx(0.03, abs=0.008)
-    assert (found.scatter > 0.01**2).all()
+    assert (found.point_variances > 0.01**2).all()
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -21,7 +21,6 @@ from l2lidar_proc.odometry.registration.weak_directions import WeakAxes, weak_ax
 
 SIZES = (0.15, 0.3, 0.6, 1.5)
 REACH = 0.15
-NOTHING = np.zeros((3, 3))  # scatter of no sweep
 
 
 def at(*place: float) -> InertialState:
@@ -70,11 +69,16 @@ def off(weak: WeakAxes) -> float:
 
 
 def weak_in(
-    surfaces: SurfelMap, points: F64, scatter: F64 | None, state: InertialState | None = None
+    surfaces: SurfelMap,
+    points: F64,
+    state: InertialState | None = None,
+    *,
+    driving: bool = True,
+    before: F64 | None = None,
 ) -> WeakAxes:
     state = at() if state is None else state
     found = correspondences(state, state, source(points), surfaces, SurfaceConfig(), REACH)
-    weak = weak_axes(state, found, surfaces, scatter)
+    weak = weak_axes(state, found, surfaces, driving=driving, normal_scatter=before)
     assert weak is not None
     return weak
 
@@ -121,10 +125,13 @@ def test_a_normal_that_is_hardly_known_faces_nothing() -> None:
     found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
     is_chance = found.index >= len(seen) - len(patch)
     assert np.count_nonzero(is_chance) >= 3
-    by_hand, driven = weak_axes(at(), found, surfaces), weak_axes(at(), found, surfaces, NOTHING)
+    by_hand, driven = (
+        weak_axes(at(), found, surfaces),
+        weak_axes(at(), found, surfaces, driving=True),
+    )
     assert by_hand is not None
     assert driven is not None
-    assert by_hand.scatter is None
+    assert by_hand.normal_scatter is None
     assert by_hand.facing(at(), found)[is_chance, 0].all()
     assert not driven.facing(at(), found)[is_chance, 0].any()
     is_reveal = (found.index >= 2000) & ~is_chance & (np.abs(found.normals[:, 0]) > 0.9)
@@ -149,7 +156,7 @@ def test_a_surface_hardly_wider_than_the_noise_does_not_tell_the_way() -> None:
         surfaces.add(walls(rng, 100), 12)
         seen = np.vstack((walls(rng, 2000), reveals(rng, 90), leaf(30, width)))
         found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
-        driven = weak_axes(at(), found, surfaces, NOTHING)
+        driven = weak_axes(at(), found, surfaces, driving=True)
         assert driven is not None
         some = (found.index >= len(seen) - 30) & (np.abs(found.normals[:, 0]) > 0.9)
         assert np.count_nonzero(some) > 10
@@ -170,12 +177,12 @@ def test_what_faces_the_direction_does_not_bend_it() -> None:
     for number in range(12):
         surfaces.add(np.vstack((walls(rng, 4000), oblique)), number)
     seen = np.vstack((walls(rng, 2000), oblique[::10]))
-    plain, steady = weak_in(surfaces, seen, None), weak_in(surfaces, seen, NOTHING)
+    plain, steady = weak_in(surfaces, seen, driving=False), weak_in(surfaces, seen)
 
     assert off(plain) > 2.0
     assert off(steady) < 0.5
     # also where the way before was another, so that only this sweep counts
-    assert off(weak_in(surfaces, seen, np.diag([1.0, 0.0, 1.0]) * 1e6)) < 1.0
+    assert off(weak_in(surfaces, seen, before=np.diag([1.0, 0.0, 1.0]) * 1e6)) < 1.0
     np.testing.assert_allclose(
         steady.axes.T @ steady.axes, np.eye(steady.axes.shape[1]), atol=1e-9
     )
@@ -184,25 +191,25 @@ def test_what_faces_the_direction_does_not_bend_it() -> None:
 def test_the_direction_is_steadied_until_the_way_bends() -> None:
     rng = np.random.default_rng(9)
     surfaces = mapped(rng)
-    scatter, single, steadied = NOTHING, [], []
+    scatter, single, steadied = np.zeros((3, 3)), [], []
     for _ in range(30):
         seen = walls(rng, 150)
-        single.append(weak_in(surfaces, seen, NOTHING).axes[4, 0])
-        weak = weak_in(surfaces, seen, scatter)
-        assert weak.scatter is not None
-        scatter = weak.scatter
+        single.append(weak_in(surfaces, seen).axes[4, 0])
+        weak = weak_in(surfaces, seen, before=scatter)
+        assert weak.normal_scatter is not None
+        scatter = weak.normal_scatter
         steadied.append(weak.axes[4, 0] * np.sign(weak.axes[3, 0]))
     assert np.std(steadied[10:]) < 0.5 * np.std(np.abs(single))
     # around a corner, only what is seen now counts
     corner = SurfelMap(SIZES)
     for number in range(12):
         corner.add(walls(rng, 4000, np.pi / 2.0), number)
-    weak = weak_in(corner, walls(rng, 1000, np.pi / 2.0), scatter)
+    weak = weak_in(corner, walls(rng, 1000, np.pi / 2.0), before=scatter)
     assert abs(weak.axes[4, 0]) > 0.999
     bend = SurfelMap(SIZES)
     for number in range(12):
         bend.add(walls(rng, 4000, 1.5 * tuning.WALL_BEND), number)
-    weak = weak_in(bend, walls(rng, 1000, 1.5 * tuning.WALL_BEND), scatter)
+    weak = weak_in(bend, walls(rng, 1000, 1.5 * tuning.WALL_BEND), before=scatter)
     slope = np.arctan(weak.axes[4, 0] / weak.axes[3, 0])
     assert slope == pytest.approx(1.5 * tuning.WALL_BEND, abs=0.02)
 
@@ -221,8 +228,8 @@ def test_normals_that_are_hardly_known_do_not_bend_the_direction() -> None:
         surfaces.add(cells + rng.normal(0.0, 0.001, cells.shape), number)
     surfaces.add(walls(rng, 100), 12)
     seen = np.vstack((walls(rng, 300), cells))
-    assert off(weak_in(surfaces, seen, None)) > 2.0
-    assert off(weak_in(surfaces, seen, NOTHING)) < 0.6
+    assert off(weak_in(surfaces, seen, driving=False)) > 2.0
+    assert off(weak_in(surfaces, seen)) < 0.6
 
 
 def test_surfaces_count_sooner_where_the_carrier_drives() -> None:
@@ -230,7 +237,10 @@ def test_surfaces_count_sooner_where_the_carrier_drives() -> None:
     surfaces = mapped(rng, facing=600, since=12 - tuning.DRIVING_AGE - 2)
     seen = np.vstack((walls(rng, 2000), reveals(rng, 90)))
     found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
-    by_hand, driven = weak_axes(at(), found, surfaces), weak_axes(at(), found, surfaces, NOTHING)
+    by_hand, driven = (
+        weak_axes(at(), found, surfaces),
+        weak_axes(at(), found, surfaces, driving=True),
+    )
     assert by_hand is not None
     assert driven is not None
     is_reveal = (found.index >= 2000) & (np.abs(found.normals[:, 0]) > 0.9)
@@ -248,7 +258,7 @@ def test_what_people_have_left_behind_does_not_tell_the_way(sweeps: int, counts:
         surfaces.add(np.vstack((walls(rng, 4000), seen)), number)
     seen = np.vstack((walls(rng, 2000), reveals(rng, 90)))
     found = correspondences(at(), at(), source(seen), surfaces, SurfaceConfig(), REACH)
-    driven = weak_axes(at(), found, surfaces, NOTHING)
+    driven = weak_axes(at(), found, surfaces, driving=True)
     assert driven is not None
     is_reveal = (found.index >= 2000) & (np.abs(found.normals[:, 0]) > 0.9)
     assert np.count_nonzero(is_reveal) > 20
@@ -269,9 +279,9 @@ def test_up_is_no_way_to_drive() -> None:
 
     for number in range(12):
         surfaces.add(shaft(4000), number)
-    weak = weak_in(surfaces, shaft(2000), NOTHING)
+    weak = weak_in(surfaces, shaft(2000))
     assert abs(weak.axes[5, 0]) > 0.99
-    assert weak.scatter is None
+    assert weak.normal_scatter is None
 
 
 def test_points_that_thinning_left_out_fix_the_place_if_they_face_the_way() -> None:
@@ -282,15 +292,15 @@ def test_points_that_thinning_left_out_fix_the_place_if_they_face_the_way() -> N
     covariance = 1e-6 * np.eye(eskf.ERRORS)
     covariance[eskf.POSITION, eskf.POSITION] = 0.02**2 * np.eye(3)
 
-    def found(scatter: F64 | None) -> Alignment:
+    def found(*, driving: bool) -> Alignment:
         alignment = align(
-            at(0.015, 0.0, 0.0), covariance, thin, surfaces, SurfaceConfig(), 100, None, scatter
+            at(0.015, 0.0, 0.0), covariance, thin, surfaces, SurfaceConfig(), 100, driving=driving
         )
         assert alignment is not None
         return alignment
 
-    by_hand, driven = found(None), found(NOTHING)
-    assert by_hand.scatter is None
+    by_hand, driven = found(driving=False), found(driving=True)
+    assert by_hand.normal_scatter is None
     assert by_hand.state.position[0] == pytest.approx(0.015, abs=0.005)
     assert driven.state.position[0] == pytest.approx(0.0, abs=0.006)
     assert driven.covariance[3, 3] < 0.3 * by_hand.covariance[3, 3]
@@ -311,7 +321,7 @@ def along_way(prior: float, count: int, offset: float = 0.0) -> tuple[float, flo
     # the direction that is found differs from x by some mrad
     covariance[4, 4] = covariance[5, 5] = 1e-6 + (0.02 * prior) ** 2
     found = align(
-        at(offset, 0.0, 0.0), covariance, seen, surfaces, SurfaceConfig(), 100, None, NOTHING
+        at(offset, 0.0, 0.0), covariance, seen, surfaces, SurfaceConfig(), 100, driving=True
     )
     assert found is not None
     return float(found.state.position[0]), float(np.sqrt(found.covariance[3, 3]))
@@ -354,7 +364,7 @@ def test_a_way_that_nothing_faces_is_free_however_weak_turns_are() -> None:
     for number in range(12):
         surfaces.add(seen(3000), number)
     points = seen(800)
-    weak = weak_in(surfaces, points, None)
+    weak = weak_in(surfaces, points, driving=False)
     np.testing.assert_allclose(weak.axes.T @ weak.axes, np.eye(weak.axes.shape[1]), atol=1e-9)
     first, others = weak.axes[:, 0], weak.axes[:, 1:]
     assert not first[:3].any()
@@ -379,7 +389,7 @@ def test_a_few_points_that_face_a_way_do_not_tell_it(facing: bool) -> None:
         surfaces.add(np.vstack((wall, patch)) + rng.normal(0.0, 0.005, (3400, 3)), number)
     wall = rng.uniform((-1.0, 1.5, -0.8), (1.0, 1.5, 0.8), (800, 3))
     count = tuning.FREE_FACING + (40 if facing else 0)
-    weak = weak_in(surfaces, np.vstack((wall, patch[:count])), None)
+    weak = weak_in(surfaces, np.vstack((wall, patch[:count])), driving=False)
     is_free = np.abs(weak.axes[3]) > 0.999
     assert bool(is_free.any()) != facing
 
