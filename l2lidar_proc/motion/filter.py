@@ -78,6 +78,13 @@ class InertialState:
         pose[:3, :3], pose[:3, 3] = self.rotation, self.position
         return pose
 
+    def cloud_origin(self, lever: F64) -> F64:
+        """Return the place (3,) of the cloud frame's origin, map frame [m].
+
+        ``lever`` (3,) is the place of the IMU in the cloud frame [m].
+        """
+        return np.asarray(self.position - self.rotation @ lever)
+
     def boxplus(self, error: F64) -> InertialState:
         """Return ``state boxplus error``, the error of shape (18,)."""
         return InertialState(

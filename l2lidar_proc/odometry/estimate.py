@@ -214,7 +214,7 @@ def cloud_pose(state: InertialState, lever: F64) -> F64:
     """Return the pose (4, 4) of the cloud frame, in which the IMU is at ``lever`` (3,) [m]."""
     pose = np.eye(4)
     pose[:3, :3] = state.rotation
-    pose[:3, 3] = state.position - state.rotation @ lever
+    pose[:3, 3] = state.cloud_origin(lever)
     return pose
 
 

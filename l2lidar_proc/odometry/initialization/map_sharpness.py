@@ -14,6 +14,7 @@ along with it. There the profile of the walls tells the velocity, and the accele
 from __future__ import annotations
 
 import itertools
+from typing import Final
 
 import numpy as np
 
@@ -24,14 +25,17 @@ from l2lidar_proc.odometry.initialization.posts_and_walls import Seen, Upright, 
 from l2lidar_proc.odometry.walls.wall_profile import (
     Spots,
     are_walls,
+    error_grid,
     extract_spots,
     log_likelihood,
 )
 from l2lidar_proc.odometry.walls.wall_velocity import level_axes
 
+_LEAST_STEPS: Final = 2  # of a grid of errors, to either side
 
-def candidates(sigma: float, step: float) -> list[float]:
-    """Return the errors of the velocity to compare along one axis [m/s].
+
+def candidates(sigma: float, step: float) -> F64:
+    """Return the errors (M,) of the velocity to compare along one axis [m/s].
 
     Parameters
     ----------
@@ -41,13 +45,7 @@ def candidates(sigma: float, step: float) -> list[float]:
         They are no farther apart [m/s].
     """
     reach = min(tuning.START_SIGMAS * sigma, tuning.START_REACH)
-    return _steps(reach, step)
-
-
-def _steps(reach: float, step: float) -> list[float]:
-    """Return values from -reach to reach, no farther apart than a step, and 0 among them."""
-    count = max(int(np.ceil(reach / step - 1e-6)), 2)
-    return [float(value) for value in np.linspace(-reach, reach, 2 * count + 1)]
+    return error_grid(reach, step, _LEAST_STEPS)
 
 
 def velocity_log_likelihoods(
@@ -163,7 +161,7 @@ def yaw_rate_error(
     along = velocity @ axes.T @ axes
     steps = candidates(tuning.START_PRIOR, tuning.START_YAW_VELOCITY_STEP)
     errors = np.array([*itertools.product(steps, repeat=len(axes))]) @ axes
-    rates = np.array(_steps(tuning.START_YAW_REACH, tuning.START_YAW_STEP))
+    rates = error_grid(tuning.START_YAW_REACH, tuning.START_YAW_STEP, _LEAST_STEPS)
     some = [one.decimated(tuning.START_YAW_MOST / count) for one in things]
     logs, best = _sharpest(some, now, rates, errors, along, tuning.START_CELLS[:2])
     logs -= 0.5 * (rates / tuning.START_YAW_SIGMA) ** 2
@@ -171,10 +169,9 @@ def yaw_rate_error(
     others = np.delete(np.arange(len(rates)), unchanged)
     other = others[np.argmax(logs[others])]
     better = logs[other] - logs[unchanged]
-    near = np.array([*itertools.product(
-        _steps(tuning.START_YAW_VELOCITY_STEP, tuning.START_STEP), repeat=len(axes)
-    )]) @ axes  # fmt: skip
-    finer = np.array(_steps(tuning.START_YAW_STEP, tuning.START_YAW_FINER))
+    steps = error_grid(tuning.START_YAW_VELOCITY_STEP, tuning.START_STEP, _LEAST_STEPS)
+    near = np.array([*itertools.product(steps, repeat=len(axes))]) @ axes
+    finer = error_grid(tuning.START_YAW_STEP, tuning.START_YAW_FINER, _LEAST_STEPS)
 
     def refined(index: int) -> tuple[F64, F64]:
         some = rates[index] + finer

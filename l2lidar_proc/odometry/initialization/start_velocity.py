@@ -252,8 +252,7 @@ class StartVelocity:
             self.clear()
             return
         state = motion.state
-        position = state.position - state.rotation @ self._lever
-        self._passed.append(Passed(sweep, state.stamp, position))
+        self._passed.append(Passed(sweep, state.stamp, state.cloud_origin(self._lever)))
 
     def note_velocity(self, covariance: F64) -> None:
         """Take how well the velocity is known by now, covariance (3, 3) [m^2/s^2]."""
@@ -427,22 +426,25 @@ def level_span(directions: F64, gravity: F64) -> F64:
 def with_level_gravity(
     motion: SweepMotion, vertical: F64, seconds: float, free: F64
 ) -> SweepMotion:
-    """Return a motion with gravity along the vertical of the place, the same if it is there.
+    """Return a motion whose gravity is along the vertical; unchanged if it agrees with it.
 
-    It leaves it where a young map confirms a velocity that grows: the acceleration passes for a
-    tilt. The place is then more certain than what has been learned about gravity. And it was
-    never there where the carrier accelerated at the start. Where the sweeps fix the place, they
-    have corrected the velocity all the time, whatever gravity was.
+    The filter may have tilted gravity, in two ways. A young map confirms a wrong velocity, and an
+    error that grows with time looks like a tilt. Or the carrier accelerated while gravity was
+    initialized. The vertical that upright walls show is better than either.
+
+    Wrong gravity has also accelerated the state, so its pose and velocity become less certain:
+    only along axes that the sweeps left free, since along the others they have corrected the
+    velocity.
 
     Parameters
     ----------
     motion : SweepMotion
     vertical : ndarray, shape (3,)
-        Unit vector, map axes.
+        That the sweeps show, unit vector, map axes.
     seconds : float
-        For how long gravity may have accelerated the state,
+        For how long wrong gravity may have accelerated the state.
     free : ndarray, shape (K, 3)
-        and along which level axes, orthonormal, map axes.
+        Level axes that the sweeps leave free, orthonormal, map axes.
     """
     state, covariance = motion.state, motion.covariance
     axes = level_basis(vertical).T
@@ -586,7 +588,7 @@ def _deviations(passed: list[Passed], motion: SweepMotion, lever: F64) -> F64:
     stamps = np.array([one.stamp for one in passed])
     places = np.array([one.position for one in passed])
     carried = motion.trajectory(lever).poses(stamps)[1] @ state.rotation.T
-    return places - (state.position - state.rotation @ lever) - carried
+    return places - state.cloud_origin(lever) - carried
 
 
 def _measured(

@@ -192,10 +192,24 @@ def acceleration_jacobian(state: InertialState, along: F64) -> F64:
 
 
 def _candidates(sigma: float) -> F64:
-    """Return the errors of the velocity to compare [m/s], evenly spaced."""
+    """Return the errors of the velocity to compare [m/s], for its standard deviation [m/s]."""
     reach = min(tuning.PROFILE_SIGMAS * sigma, tuning.PROFILE_REACH)
-    count = max(int(np.ceil(reach / tuning.PROFILE_STEP)), tuning.PROFILE_STEPS)
-    return np.asarray(np.linspace(-reach, reach, 2 * count + 1))
+    return error_grid(reach, tuning.PROFILE_STEP, tuning.PROFILE_STEPS)
+
+
+def error_grid(reach: float, step: float, least: int) -> F64:
+    """Return evenly spaced errors (M,) from -reach to reach, 0 among them.
+
+    Parameters
+    ----------
+    reach : float
+    step : float
+        They are no farther apart.
+    least : int
+        How many to either side of 0, at least.
+    """
+    count = max(int(np.ceil(reach / step - 1e-6)), least)  # less by what rounding adds
+    return np.linspace(-reach, reach, 2 * count + 1)
 
 
 def velocity_likelihood(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
