@@ -11,7 +11,29 @@ Each has its unit in brackets, its meaning and where it comes from:
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
+
+
+class ByPlace(NamedTuple):
+    """A number that depends on whether surfaces fix the place in every direction."""
+
+    fixed: float
+    free: float
+
+
+class OfPose(NamedTuple):
+    """A number for the rotation and one for the position of a pose."""
+
+    rotation: float  # [rad]
+    position: float  # [m]
+
+
+class ByPrediction(NamedTuple):
+    """A number that depends on how well the pose was predicted."""
+
+    good: float
+    loose: float
+
 
 # ---- IMU samples
 
@@ -114,14 +136,23 @@ START_FORCE_CHANGE: Final = 0.25  # [m/s^2]
 GRAVITY_AT_REST: Final = (8.8, 10.8)  # [m/s^2] sound units; the known fault reads 16 to 21
 GRAVITY_IN_MOTION: Final = (7.5, 12.5)  # [m/s^2] mean of |a| over a second of walking
 
-# ---- initialization. Of pairs, the first value is for a sensor at rest, the second in motion
+# ---- initialization
+
+
+class InitialSigmas(NamedTuple):
+    """How well the first state is known, 1 sigma."""
+
+    velocity: float  # [m/s]
+    gyro_bias: float  # [rad/s]
+    accel_bias: float  # [m/s^2]
+    gravity: tuple[float, float, float]  # [m/s^2] x, y, z of the map
+
 
 START_POSE_SIGMA: Final = 1e-4  # [m, rad] the first pose defines the map frame
-START_VELOCITY_SIGMA: Final = (0.02, 1.0)  # [m/s]
-# [rad/s] in motion: a third of the zero-rate levels of data sheets (MOST_GYRO_BIAS) on average
-START_GYRO_BIAS_SIGMA: Final = (0.01, 0.025)
-START_ACCEL_BIAS_SIGMA: Final = (0.02, 0.15)  # [m/s^2]
-START_GRAVITY_SIGMA: Final = ((0.01, 0.01, 0.01), (0.7, 0.7, 0.05))  # [m/s^2] x, y, z of the map
+CARRIER_SPEED_SIGMA: Final = 1.0  # [m/s] of a carrier of which nothing is known
+INITIAL_AT_REST: Final = InitialSigmas(0.02, 0.01, 0.02, (0.01, 0.01, 0.01))
+# Gyro bias: a third of the zero-rate levels of data sheets (MOST_GYRO_BIAS) on average
+INITIAL_IN_MOTION: Final = InitialSigmas(CARRIER_SPEED_SIGMA, 0.025, 0.15, (0.7, 0.7, 0.05))
 GRAVITY_SIZE_SIGMA: Final = 0.01  # [m/s^2] of its size, which is known to 0.1 %
 ACCEL_BIAS_SIGMA: Final = 0.15  # [m/s^2] of units; source: IMUs of this class
 
@@ -238,9 +269,10 @@ FACING_WIDTH: Final = 0.03
 # third; 14 with 8 people and 120 degrees, a quarter larger; 12 without people stayed the same
 FACING_SWEEPS: Final = 4
 # [m] How often surfaces that face the way are real, for a density of false ones: with fewer
-# points than below, and with as many. Tuned on: narrow corridors, seeds 100 to 115: 5 to
+# points than below, or with as many. Tuned on: narrow corridors, seeds 100 to 115: 5 to
 # 20 points had 0.12 of the sweeps with a right velocity, 0.05 of those with a wrong one
-FACING_TRUE: Final = (0.3, 1.7)
+FACING_TRUE: Final = 0.3
+FACING_TRUE_MANY: Final = 1.7
 FACING_MANY: Final = 20
 NORMAL_SCATTER: Final = 0.015  # [m] of points about their plane, at least: few happen to lie flat
 NORMAL_LEAST_EXTENT: Final = 0.001  # [m] Derived: keeps a division finite
@@ -298,7 +330,8 @@ LINE_WANDER: Final = 0.01  # [m/s^2/sqrt(Hz)] by which the error of the velocity
 LINE_FACE: Final = 0.02  # [m] along: lines of a sweep that are nearer are one face
 LINE_OUTLIER: Final = 2.5  # sigma by which a pair may disagree
 # Votes needed: where the velocity may have moved the lines by less than the length below, or more.
-LINE_VOTES: Final = (0.8, 1.5)
+LINE_VOTES: Final = 0.8
+LINE_VOTES_UNSURE: Final = 1.5
 LINE_UNSURE: Final = 0.025  # [m] 1 sigma
 LINE_CHANCE: Final = 2.0  # times the votes that chance gives, besides
 LINE_RIVAL: Final = 0.6  # of the votes, that no other velocity may have
@@ -562,17 +595,19 @@ NIS_DOUBT: Final = 2.0
 # A sweep that fits the map badly is also aligned as if the prediction might be wrong by so much
 # [m, m/s], once in a while, and believed there if so many more of its points fit. Derived: blows
 # of 3 to 12 m/s^2 for 0.2 s that only the accelerometer felt; maps that drifted by 0.1 to 0.5 m
-DOUBT_SIGMA: Final = (0.3, 1.0)
+DOUBT_POSITION_SIGMA: Final = 0.3
+DOUBT_VELOCITY_SIGMA: Final = 1.0
 DOUBT_BETTER: Final = 0.05  # share of the points
 # or if almost as many points fit, with so much of the mean square distance, and less of it where
 # they fix a place that was free. Observed in these blows: 0.2 to 0.63; chance alone: 0.99
 DOUBT_AS_MANY: Final = 0.97
-DOUBT_CLOSER: Final = (0.75, 0.5)
+DOUBT_CLOSER: Final = ByPlace(fixed=0.75, free=0.5)  # by whether it was fixed before
 # Outliers, by the usual ones and by a share, from which on a place that is free is doubted.
 # Observed: 0.055 in a warehouse where end walls were 12 cm off, 0.003 to 0.02 before
-DOUBT_OUTLIERS: Final = (2.0, 0.01)
+DOUBT_OUTLIERS_FACTOR: Final = 2.0
+DOUBT_OUTLIERS_SHARE: Final = 0.01
 # Of the points that are at known surfaces, at least, where these fix the place, or do not
-DOUBT_MATCHED: Final = (0.5, 0.9)
+DOUBT_MATCHED: Final = ByPlace(fixed=0.5, free=0.9)
 DOUBT_MANY: Final = 300  # points, where not. Tuned on: a cone, 134 at a wrong place
 # [m/s] that the IMU leaves open after a sweep, 1 sigma, from which on the points are blurred.
 # Observed: 0.01 to 0.11 in the hard runs, up to 0.18 in gaps; 0.23 and more where a blow spoils it
@@ -607,7 +642,7 @@ MOST_ACCEL_BIAS: Final = 1.0  # [m/s^2]
 
 LOOSE_POSITION: Final = 0.06  # [m] a prediction less certain may be a surface off
 LOOSE_ROTATION: Final = 0.03  # [rad] or turned too far
-INLIER_RATIO: Final = (0.6, 0.92)  # needed after a good prediction, after a loose one
+INLIER_RATIO: Final = ByPrediction(good=0.6, loose=0.92)  # needed
 # Sizes of cells in which a point off the surface contradicts it. Through a door that opens, a room
 # appears in coarse cells of what is known of its frame: no outlier in the two finest sizes at the
 # right pose, 12 to 45 % in all (camera looking into rooms).
@@ -617,8 +652,8 @@ FINE_LEVELS: Final = 2
 USUAL_OUTLIERS: Final = 2.5
 USUAL_BLEND: Final = 0.1  # share of each newer sweep in what is usual
 USUAL_LEAST: Final = 0.75  # inliers needed whatever is usual
-# Share of the points that must meet the map, after a good prediction and after a loose one
-OVERLAP: Final = (0.0, 0.25)
+# Share of the points that must meet the map
+OVERLAP: Final = ByPrediction(good=0.0, loose=0.25)
 # A pose farther from the predicted one than the robust kernel reaches needs so many points, as a
 # few fit in many places (tuned on: camera on stairs, where 30 at the right place were refused for
 # 6 s), and so many that fix the place along the way there. Tuned on: camera looking into rooms (4
@@ -636,7 +671,7 @@ YOUNG_SWEEPS: Final = 12  # in a map before a sweep without surfaces around is r
 # in a room, at 5 m, have moved by a voxel of it; a second of an L2, whose scan lines fill the map
 KEYFRAME_TURN: Final = 0.1  # [rad]
 KEYFRAME_SWEEPS: Final = 4
-KISS_SIGMA: Final = (0.03, 0.15)  # [rad, m] of KISS-ICP's registration on its own
+KISS_SIGMA: Final = OfPose(0.03, 0.15)  # of KISS-ICP's registration on its own
 # A surface that was not seen for so much way is forgotten: met again it contradicts the present by
 # the drift. Tuned on: a lap of 80 m in an office, typical unit (0.25 % of the way): the floor met
 # 0.19 m off, the odometry jumped, then slid along the corridor by 5 m.
@@ -870,8 +905,8 @@ EARLIER_MAPS: Final = 2  # kept after losses. Bounds the memory
 # Searching them takes 0.2 to 0.4 s, so it is done once a second at first, then ever more rarely.
 EARLIER_PAUSE_NS: Final = 1_000_000_000  # [ns]
 EARLIER_PAUSE_SHARE: Final = 0.1  # of the time since the loss
-EARLIER_SIGMA: Final = (0.05, 0.1)  # [rad, m] of a pose that the search has found
-EARLIER_SAME: Final = (0.05, 0.25)  # [rad, m] within which two meetings agree
+EARLIER_SIGMA: Final = OfPose(0.05, 0.1)  # of a pose that the search has found
+EARLIER_SAME: Final = OfPose(0.05, 0.25)  # within which two meetings agree
 # The older part of the map in use is searched likewise while the pose is less certain than that.
 # Tuned on: narrow views in rooms and flats.
 REVISIT_FROM_SIGMA: Final = 0.12  # [m] 1 sigma of the place
@@ -897,9 +932,11 @@ REVISIT_SIGHT_NS: Final = 2_000_000_000  # [ns]
 # moved. Observed: 9 of 10 were opened within a second, and the others up to 100 sweeps later
 REVISIT_SEEN: Final = 0.9  # share of them that count as older
 # It needs a place at least so uncertain. If it is less, what fits elsewhere may be something else.
-# Tuned on: camera in a room, 0.3 m. The second where sweeps see through the map as the pose has
-# it; just above REVISIT_FROM_SIGMA. Judged on: narrow views, seeds 190 to 205
-RELOCALIZE_FROM_SIGMA: Final = (0.35, 0.15)  # [m] 1 sigma
+# Tuned on: camera in a room, 0.3 m
+RELOCALIZE_FROM_SIGMA: Final = 0.35  # [m] 1 sigma
+# The same where sweeps see through the map as the pose has it; just above REVISIT_FROM_SIGMA.
+# Judged on: narrow views, seeds 190 to 205
+RELOCALIZE_CONTRADICTED_SIGMA: Final = 0.15  # [m] 1 sigma
 # How far from the predicted place others are tried, of the drift that has to be allowed for, and
 # how far the pose may jump, of the expected drift. Tuned on: cones of 70 degrees in flats, where
 # right places were up to 1.4 away, and other corners that look alike 2.2 to 3.4

@@ -386,13 +386,14 @@ def initial_state(samples: Samples, stamp: HostNs, may_rest: bool = True) -> Ini
 
 def _covariance(rotation: F64, at_rest: bool, trusted: bool) -> F64:
     """Return how well the first state is known, shape (18, 18)."""
+    known = tuning.INITIAL_AT_REST if at_rest else tuning.INITIAL_IN_MOTION
     sigma = np.zeros(ERRORS)
     sigma[ROTATION] = sigma[POSITION] = tuning.START_POSE_SIGMA
-    sigma[VELOCITY] = tuning.START_VELOCITY_SIGMA[not at_rest]
-    sigma[GYRO_BIAS] = tuning.START_GYRO_BIAS_SIGMA[not at_rest]
-    sigma[ACCEL_BIAS] = tuning.START_ACCEL_BIAS_SIGMA[not at_rest]
+    sigma[VELOCITY] = known.velocity
+    sigma[GYRO_BIAS] = known.gyro_bias
+    sigma[ACCEL_BIAS] = known.accel_bias
     # in motion the mean force is off by the motion too; the size of gravity is known
-    sigma[GRAVITY] = tuning.START_GRAVITY_SIGMA[not at_rest]
+    sigma[GRAVITY] = known.gravity
     if not trusted:
         sigma[GRAVITY] = 0.0  # there is none in the model, and none may be learned
     covariance = np.diag(sigma**2)

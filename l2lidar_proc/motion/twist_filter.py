@@ -100,7 +100,7 @@ class TwistFilter:
     def gyro_bias_sigma(self) -> float:
         """Standard deviation of the gyro bias about the worst axis [rad/s]."""
         if self._state is None:
-            return tuning.START_GYRO_BIAS_SIGMA[1]
+            return tuning.INITIAL_IN_MOTION.gyro_bias
         return float(np.sqrt(np.diag(self._covariance)[GYRO_BIAS].max()))
 
     @property
@@ -319,7 +319,7 @@ class TwistFilter:
         if found.nis > tuning.TWIST_NIS:
             # the filter was wrong, or the source jumped: follow the source
             speed = float(np.linalg.norm(self._state.velocity)) + self._speed
-            sigma = max(tuning.START_VELOCITY_SIGMA[1], speed)
+            sigma = max(tuning.CARRIER_SPEED_SIGMA, speed)
             self._covariance = eskf.decorrelated(self._covariance, VELOCITY, sigma)
             found = eskf.update_twist(
                 self._state, self._covariance, twist.velocity, twist.covariance, rate, self._lever

@@ -204,7 +204,7 @@ class _LevelFit(NamedTuple):
         change = self.shift - before.shift
         way = float(np.linalg.norm(change))
         if self.fixes_height and before.fixes_height:
-            return way < tuning.EARLIER_SAME[1]
+            return way < tuning.EARLIER_SAME.position
         seconds = (self.stamp - before.stamp) * 1e-9
         variance = max(float(change @ before.velocity @ change), 0.0) / max(way, 1e-9) ** 2
         return way < tuning.REVISIT_SAME_M + seconds * float(np.sqrt(variance))
@@ -440,7 +440,7 @@ def _is_loose_on_level(state: InertialState, uncertain: F64, *, contradicted: bo
         return False
     basis = level_basis(state.gravity)
     level = basis.T @ uncertain[:3, :3] @ basis
-    least = tuning.RELOCALIZE_FROM_SIGMA[contradicted]
+    least = tuning.RELOCALIZE_CONTRADICTED_SIGMA if contradicted else tuning.RELOCALIZE_FROM_SIGMA
     return bool(np.linalg.eigvalsh(level)[-1] > least**2)
 
 
@@ -489,7 +489,7 @@ def _met_in(
     source: Source,
     motion: SweepMotion,
     jump: FrameJump,
-    lean: float = tuning.EARLIER_SIGMA[0],
+    lean: float = tuning.EARLIER_SIGMA.rotation,
 ) -> Alignment | None:
     """Return how a sweep meets an earlier map, if it does beyond doubt.
 
@@ -513,9 +513,9 @@ def _met_in(
     covariance = axes @ motion.covariance @ axes.T
     covariance[POSE, :] = covariance[:, POSE] = 0.0
     free = _free_turns(there.gravity)
-    turns = tuning.EARLIER_SIGMA[0] ** 2 * free + lean**2 * (np.eye(3) - free)
+    turns = tuning.EARLIER_SIGMA.rotation**2 * free + lean**2 * (np.eye(3) - free)
     covariance[ROTATION, ROTATION] = there.rotation.T @ turns @ there.rotation
-    covariance[POSITION, POSITION] = tuning.EARLIER_SIGMA[1] ** 2 * np.eye(3)
+    covariance[POSITION, POSITION] = tuning.EARLIER_SIGMA.position**2 * np.eye(3)
     found, _ = kept.matcher.match(
         source, dataclasses.replace(motion, state=there, covariance=covariance)
     )
@@ -541,4 +541,4 @@ def _are_one(one: F64, other: F64) -> bool:
     change = np.linalg.inv(one) @ other
     turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
     way = float(np.linalg.norm(change[:3, 3]))
-    return turn < tuning.EARLIER_SAME[0] and way < tuning.EARLIER_SAME[1]
+    return turn < tuning.EARLIER_SAME.rotation and way < tuning.EARLIER_SAME.position

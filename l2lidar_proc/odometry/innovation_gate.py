@@ -211,6 +211,6 @@ def inflated_prior(covariance: F64, item: Correction) -> F64 | None:
 def with_loose_motion(covariance: F64) -> F64:
     """Return the covariance (18, 18) of a prior whose position and velocity may be wrong."""
     found = covariance.copy()
-    found[POSITION, POSITION] += tuning.DOUBT_SIGMA[0] ** 2 * np.eye(3)
-    found[VELOCITY, VELOCITY] += tuning.DOUBT_SIGMA[1] ** 2 * np.eye(3)
+    found[POSITION, POSITION] += tuning.DOUBT_POSITION_SIGMA**2 * np.eye(3)
+    found[VELOCITY, VELOCITY] += tuning.DOUBT_VELOCITY_SIGMA**2 * np.eye(3)
     return found

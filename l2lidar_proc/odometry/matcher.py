@@ -281,7 +281,7 @@ class SweepMatcher:
             # nobody measured the turn: where surfaces say nothing KISS-ICP by itself is not lost
             best = self._placed(source, motion, np.inf)
         elif best is None and young and found is None:
-            best = self._placed(source, motion, tuning.KISS_SIGMA[1])
+            best = self._placed(source, motion, tuning.KISS_SIGMA.position)
         if best is None and strict and self._is_unmapped(source, motion.state):
             return Match(None, MatchStatus.UNMAPPED)
         return Match(best, MatchStatus.REJECTED if best is None else MatchStatus.ALIGNED)
@@ -596,7 +596,8 @@ class SweepMatcher:
         self, found: Alignment | None, source: Source, motion: SweepMotion, strict: bool
     ) -> bool:
         """Return whether the result of an alignment fits the map as wrong ones do not."""
-        if found is None or found.matched < tuning.OVERLAP[strict] * len(source.points):
+        overlap = tuning.OVERLAP.loose if strict else tuning.OVERLAP.good
+        if found is None or found.matched < overlap * len(source.points):
             return False
         if strict and self._is_far_fetched(found, motion):
             return False
@@ -634,7 +635,7 @@ class SweepMatcher:
         usual, sweeps = self._inliers
         if self.driving or self.is_young or not sweeps or found.fixes_place:
             return False
-        most = tuning.DOUBT_OUTLIERS[0] * (1.0 - usual) + tuning.DOUBT_OUTLIERS[1]
+        most = tuning.DOUBT_OUTLIERS_FACTOR * (1.0 - usual) + tuning.DOUBT_OUTLIERS_SHARE
         return bool(1.0 - found.inlier_ratio > most)
 
     def _is_confirmed(self, found: Alignment | None, source: Source, motion: SweepMotion) -> bool:
@@ -643,7 +644,7 @@ class SweepMatcher:
         Where a new place comes into sight, most of it lies in coarse cells of what is known
         beside it, off their surfaces: these outliers are no sign of a wrong pose.
         """
-        least = max(self.config.min_points, tuning.OVERLAP[True] * len(source.points))
+        least = max(self.config.min_points, tuning.OVERLAP.loose * len(source.points))
         return (
             found is not None
             and not is_far(found, motion)
@@ -673,7 +674,7 @@ class SweepMatcher:
         In rain, foliage or a crowd the right place has one point in eight off every surface, and
         none would ever be found again if it had to fit as in a bare room.
         """
-        needed = tuning.INLIER_RATIO[strict]
+        needed = tuning.INLIER_RATIO.loose if strict else tuning.INLIER_RATIO.good
         usual, sweeps = self._inliers
         if strict and sweeps:
             usual = max(1.0 - tuning.USUAL_OUTLIERS * (1.0 - usual), tuning.USUAL_LEAST)
@@ -709,8 +710,8 @@ class SweepMatcher:
         """Return what the place that KISS-ICP's registration finds is worth by itself."""
         place = self._registered(source, motion.state, most)
         information = np.zeros_like(motion.covariance)
-        information[ROTATION, ROTATION] = np.eye(3) / tuning.KISS_SIGMA[0] ** 2
-        information[POSITION, POSITION] = np.eye(3) / tuning.KISS_SIGMA[1] ** 2
+        information[ROTATION, ROTATION] = np.eye(3) / tuning.KISS_SIGMA.rotation**2
+        information[POSITION, POSITION] = np.eye(3) / tuning.KISS_SIGMA.position**2
         still = np.zeros(len(information))
         state, covariance = update_with_information(
             motion.state, square_root(motion.covariance), place, information, still

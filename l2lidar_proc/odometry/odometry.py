@@ -576,7 +576,7 @@ class Odometry:
             *posterior,
             seconds,
             # the prior of an open start has said already how fast carriers are
-            least_speed=tuning.START_VELOCITY_SIGMA[1] if self._start.is_open else 0.0,
+            least_speed=tuning.CARRIER_SPEED_SIGMA if self._start.is_open else 0.0,
             height_observed=self.matcher.observes_height,
         )
         lean = float(np.linalg.norm(state.position - place)) * tuning.MAP_BEND**2

@@ -215,7 +215,7 @@ def _sharpest(
     """
     # posts at even distances look alike at several velocities, and carriers are not fast
     speeds = ((velocity + errors) ** 2).sum(axis=1)
-    prior = -0.5 * speeds / tuning.START_VELOCITY_SIGMA[1] ** 2
+    prior = -0.5 * speeds / tuning.CARRIER_SPEED_SIGMA**2
     logs, best = np.zeros(len(rates)), np.zeros((len(rates), 3))
     for number, rate in enumerate(rates.tolist()):
         found = prior - _cells(things, now, errors, cells, rate)

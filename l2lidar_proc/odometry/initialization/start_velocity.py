@@ -430,7 +430,7 @@ def with_level_gravity(
 
     The filter may have tilted gravity, in two ways. A young map confirms a wrong velocity, and an
     error that grows with time looks like a tilt. Or the carrier accelerated while gravity was
-    initialized. The vertical that upright walls show is better than either.
+    initialized. The vertical that the surfaces of the place show is better than either.
 
     Wrong gravity has also accelerated the state, so its pose and velocity become less certain:
     only along axes that the sweeps left free, since along the others they have corrected the
@@ -507,7 +507,7 @@ def _with_open_turns(state: InertialState, covariance: F64) -> F64:
     kept = np.eye(ERRORS)
     kept[GYRO_BIAS, GYRO_BIAS] = yaw
     out = kept @ covariance @ kept.T
-    out[GYRO_BIAS, GYRO_BIAS] += tuning.START_GYRO_BIAS_SIGMA[1] ** 2 * (np.eye(3) - yaw)
+    out[GYRO_BIAS, GYRO_BIAS] += tuning.INITIAL_IN_MOTION.gyro_bias**2 * (np.eye(3) - yaw)
     return np.asarray(out)
 
 
@@ -652,6 +652,6 @@ def _sharpest_velocity(
     if first:
         # posts at even distances look alike at several velocities, and carriers are not fast
         speeds = principal @ state.velocity + errors
-        logs = logs - 0.5 * ((speeds / tuning.START_VELOCITY_SIGMA[1]) ** 2).sum(axis=1)
+        logs = logs - 0.5 * ((speeds / tuning.CARRIER_SPEED_SIGMA) ** 2).sum(axis=1)
     mean, left = moments(errors, logs)
     return turn @ mean, turn @ left @ turn.T

@@ -102,19 +102,20 @@ class Alignment:
             return False
         if self.fixes_place:
             return self.is_rich(points)
-        nearly_all = tuning.DOUBT_MATCHED[1] * points
+        nearly_all = tuning.DOUBT_MATCHED.free * points
         return self.matched >= max(nearly_all, tuning.DOUBT_MANY)
 
     def fits_closer_than(self, other: Alignment, config: SurfaceConfig) -> bool:
         """Return whether this fixes the place, and as many points lie much closer to surfaces."""
         if not self.fixes_place or self.matched < tuning.DOUBT_AS_MANY * other.matched:
             return False
-        share = tuning.DOUBT_CLOSER[not other.fixes_place]
+        closer = tuning.DOUBT_CLOSER
+        share = closer.fixed if other.fixes_place else closer.free
         return bool(self.misfit(config) < share * other.misfit(config))
 
     def is_rich(self, points: int) -> bool:
         """Return whether it fixes the place by a good part of some points."""
-        return self.fixes_place and self.matched >= tuning.DOUBT_MATCHED[0] * points
+        return self.fixes_place and self.matched >= tuning.DOUBT_MATCHED.fixed * points
 
     @property
     def fixes_place(self) -> bool:

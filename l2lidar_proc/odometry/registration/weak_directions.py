@@ -438,7 +438,8 @@ class _Trial:
         before = float(unit @ covariance @ unit)
         expected = before + 1.0 / information
         many = len(derivatives) >= tuning.FACING_MANY
-        right = association_probability(innovation, expected, tuning.FACING_TRUE[many])
+        odds = tuning.FACING_TRUE_MANY if many else tuning.FACING_TRUE
+        right = association_probability(innovation, expected, odds)
         gain = before / expected
         spread = right * (1.0 - right) * (gain * innovation) ** 2
         mixed = right * before * (1.0 - gain) + (1.0 - right) * before + spread

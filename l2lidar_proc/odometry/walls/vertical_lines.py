@@ -324,7 +324,8 @@ def _agreeing(pairs: NDArray[np.void], sigma: float) -> tuple[NDArray[np.bool_],
     unsure = float(apart[agree].max()) * sigma > tuning.LINE_UNSURE
     # votes of pairs that are spread evenly within their reach
     chance = float((np.sqrt(2.0 * np.pi) * noise / (2.0 * pairs["reach"])).sum())
-    needed = tuning.LINE_VOTES[unsure] + tuning.LINE_CHANCE * chance
+    needed = tuning.LINE_VOTES_UNSURE if unsure else tuning.LINE_VOTES
+    needed += tuning.LINE_CHANCE * chance
     if votes[best] < needed or rival > tuning.LINE_RIVAL * votes[best]:
         return none, 0.0
     return agree, float(votes[best])

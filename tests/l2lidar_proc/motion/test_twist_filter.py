@@ -217,7 +217,7 @@ def test_nothing_is_known_before_the_first_samples() -> None:
     found = TwistFilter(ImuBuffer(), np.zeros(3), 0.1)
     found.follow()
     assert not found.gyro_bias.any()
-    assert found.gyro_bias_sigma == tuning.START_GYRO_BIAS_SIGMA[1]
+    assert found.gyro_bias_sigma == tuning.INITIAL_IN_MOTION.gyro_bias
     assert not found.up.any()
     assert not found.is_trusted
     assert not found.knows_velocity(at(0), 10**9)

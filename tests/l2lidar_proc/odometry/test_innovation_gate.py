@@ -160,8 +160,8 @@ def test_a_sweep_that_fits_badly_is_aligned_again(matcher: SweepMatcher, seen: S
     assert passed.alignment is not None
     assert passed.alignment.inlier_ratio > 0.9
     loosened = np.diag(passed.predicted.covariance - predicted.covariance)
-    np.testing.assert_allclose(loosened[POSITION], tuning.DOUBT_SIGMA[0] ** 2)
-    np.testing.assert_allclose(loosened[VELOCITY], tuning.DOUBT_SIGMA[1] ** 2)
+    np.testing.assert_allclose(loosened[POSITION], tuning.DOUBT_POSITION_SIGMA**2)
+    np.testing.assert_allclose(loosened[VELOCITY], tuning.DOUBT_VELOCITY_SIGMA**2)
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +286,7 @@ def test_sight_is_lost_where_a_free_place_has_more_outliers_than_of_late(
     found = aligned(matcher, seen, motion(TIGHT, PLACE + 0.01))
     free = dataclasses.replace(found, information=np.zeros_like(found.information))
     usual, _ = matcher._inliers
-    factor, more = tuning.DOUBT_OUTLIERS
+    factor, more = tuning.DOUBT_OUTLIERS_FACTOR, tuning.DOUBT_OUTLIERS_SHARE
     limit = factor * (1.0 - usual) + more
     assert not matcher.lost_sight(dataclasses.replace(free, inlier_ratio=1.001 - limit))
     assert matcher.lost_sight(dataclasses.replace(free, inlier_ratio=0.999 - limit))

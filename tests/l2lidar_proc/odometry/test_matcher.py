@@ -133,7 +133,7 @@ def test_a_room_that_comes_into_sight_does_not_contradict_what_is_known_beside_i
     cloud = source(np.vstack((known(300), behind)))
     found = matcher.match(cloud, motion(LOOSE, np.array([0.0, 0.03, 0.0]))).alignment
     assert found is not None
-    assert found.inlier_ratio < tuning.INLIER_RATIO[True] < found.fine_ratio
+    assert found.inlier_ratio < tuning.INLIER_RATIO.loose < found.fine_ratio
     assert np.abs(found.state.position).max() < 0.01
 
 
@@ -300,7 +300,7 @@ def test_a_scene_with_strays_lowers_what_is_needed_after_a_loose_prediction() ->
         assert off(matcher.match(rainy(0.2), motion(TIGHT, PLACE))) < 0.02
     usual, sweeps = matcher._inliers
     assert sweeps == 30
-    assert 0.75 < usual < tuning.INLIER_RATIO[True]
+    assert 0.75 < usual < tuning.INLIER_RATIO.loose
     assert off(matcher.match(rainy(0.2), loose)) < 0.02
     assert matcher.match(rainy(0.7), loose).alignment is None
 

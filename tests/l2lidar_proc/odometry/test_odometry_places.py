@@ -221,7 +221,7 @@ def test_a_loose_prediction_is_matched_as_well_as_good_ones_were_of_late(drops: 
     _, found = matched(_box(rng, 0.15), 0.2, np.array([0.15, 0.0, 0.0]))
     assert (found is not None) == (drops > 0.0)
     if found is not None:
-        assert found.inlier_ratio < tuning.INLIER_RATIO[True]
+        assert found.inlier_ratio < tuning.INLIER_RATIO.loose
         assert np.abs(found.state.position).max() < 0.01
 
 

@@ -474,7 +474,7 @@ def test_rates_that_were_learned_between_walls_with_a_wrong_velocity_are_open_ag
     assert found.state.velocity == pytest.approx(speed, abs=0.15)
     state, after, first, _ = start.beginning(motion.with_state(found.state, found.covariance))
     sigmas = np.sqrt(np.diag(after)[eskf.GYRO_BIAS])
-    opened = tuning.START_GYRO_BIAS_SIGMA[1]
+    opened = tuning.INITIAL_IN_MOTION.gyro_bias
     assert sigmas[:2] == pytest.approx(opened if between_walls else 0.002, rel=0.01)
     assert not after[eskf.GYRO_BIAS.start, eskf.VELOCITY].any()
     assert np.linalg.eigvalsh(after)[0] > -1e-12
