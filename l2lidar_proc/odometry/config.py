@@ -17,8 +17,8 @@ class InertialConfig:
 
     gyro_noise: float = setting(
         0.1,
-        "gyro noise per axis and sample at 250 Hz of an L2 until it has shown it at rest, as its "
-        "samples in motion do not; raised when the data show more",
+        "gyro noise per axis and sample at 250 Hz, used for an L2 until a rest has shown that of "
+        "the unit; raised when the data show more",
         unit="rad/s",
         lo=1e-4,
         hi=10.0,
