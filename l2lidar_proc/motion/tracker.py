@@ -51,8 +51,9 @@ class Quality:
     velocity_age_ns : int
         From the newest velocity used to the end of the sweep; 0 where it reaches that far.
     velocity_sigma : float
-        Standard deviation of the velocity along its least certain direction, where an odometry in
-        the same process gave it [m/s]; half a turn away a point is off by a tenth of it.
+        Standard deviation of the velocity along its least certain direction [m/s], where an
+        odometry in the same process gave it. A point 0.1 s from the reference is off by a tenth
+        of it [m].
     bias : tuple of float
         Of the gyro [rad/s], IMU axes.
     is_still : bool

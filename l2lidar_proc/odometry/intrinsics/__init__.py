@@ -1,1 +1,1 @@
-"""What a unit's own calibration is wrong by: beam angles and ranges, learned on the way."""
+"""Online calibration of a unit: errors of its beam angles and ranges."""

@@ -59,7 +59,7 @@ class Halves(NamedTuple):
 
 
 def halves(points: NDArray[np.void], rate: float | None = None) -> Halves | None:
-    """Return the halves of a cloud, None where it has not the pattern of an L2.
+    """Return the halves of a cloud, None where it does not have the pattern of an L2.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], head: Halv
 def angles_at_rest(
     sweeps: list[tuple[NDArray[np.void], Halves]], prior: F64
 ) -> tuple[F64, F64] | None:
-    """Return the beam angles with which both halves see a place at rest alike, and information.
+    """Return the beam angles with which both halves see the same at rest, and their information.
 
     In each cell, the mean of the points of one half is compared with that of the other, along the
     directions in which the points lie close together: across walls, but also across trunks and

@@ -1,4 +1,4 @@
-"""Online intrinsic calibration of an L2: what its clouds show of its own errors.
+"""Online intrinsic calibration of an L2 from its clouds.
 
 The fan of the head points both ways: within one turn it sees every surface twice, with the half
 that rises and with the half that falls. Units are off from their own calibration block by up to
@@ -32,11 +32,12 @@ from l2lidar_proc.odometry.intrinsics.fan_halves import (
 )
 from l2lidar_proc.odometry.intrinsics.range_bias import RangeBias, SeenAgain
 
-# A whole turn of a slow head shows the pattern in any view, shorter clouds seldom in narrow ones.
+# [ns] of points in which the pattern of an L2 is searched: a whole turn of a slow head shows it in
+# any view. Shorter clouds seldom show it in narrow views
 _TURN_NS: Final = 250_000_000
-_GIVE_UP: Final = 3  # of such without the pattern: it is another sensor
-_ENOUGH: Final = 1000  # points of one: fewer, as of a covered sensor, show nothing
-_RATE_MISSES: Final = 5  # with the pattern of the known rate: that is searched anew
+_GIVE_UP: Final = 3  # turns without the pattern, after which it is taken for another sensor
+_ENOUGH: Final = 1000  # points of a turn; fewer, as of a covered sensor, show nothing
+_RATE_MISSES: Final = 5  # sweeps without the known rate's pattern, after which it is searched anew
 # information of units [1/rad^2]
 _PRIOR: Final = np.diag(
     1.0 / np.square((tuning.BEAM_SIGMA, tuning.BEAM_SIGMA, tuning.ALPHA_SIGMA))
@@ -154,8 +155,8 @@ class LidarIntrinsics:
     ) -> None:
         """Take the gaps between the halves of a sweep.
 
-        Velocity and rate that deskewed it may be a little off, which moves halves apart as well;
-        so they are estimated along and forgotten.
+        Errors of the velocity and rate that deskewed it move the halves apart as well, so they are
+        estimated together with the angles, and then dropped.
 
         Parameters
         ----------
@@ -195,15 +196,15 @@ class LidarIntrinsics:
         self.angles = self._known()
 
     def learn_from_map(self, seen: SeenAgain) -> None:
-        """Take how the points of a sweep lie beside the map, for the range bias.
+        """Learn the range bias from the distances of a sweep's points to the map.
 
-        Halves of the fan that are apart bend the map as well: the beam angles have to be known.
+        Wrong beam angles bend the map as well, so they have to be known first.
         """
         if not self.is_other and self.errors.beams[0] < tuning.RANGE_BIAS_MAP_BEAMS:
             self.ranges.learn_from_map(seen)
 
     def is_due_at_rest(self, sweeps: list[Sweep]) -> bool:
-        """Return whether a rest has lasted long enough to :meth:`learn_at_rest`, again perhaps."""
+        """Return whether a rest has lasted long enough for :meth:`learn_at_rest`, or once more."""
         lasted = sweeps[-1].end - sweeps[0].start
         return lasted >= max(tuning.BEAM_REST_NS, tuning.BEAM_REST_AGAIN * self._rested_ns)
 
@@ -235,25 +236,25 @@ class LidarIntrinsics:
         self.ranges.learn(*seen, rest_force=rest_force)
 
     def forget(self) -> None:
-        """Forget what was learned, as after a rest that was none."""
+        """Forget what was learned, as when the sensor had moved during a supposed rest."""
         self.ranges.forget()
         self.angles = np.zeros(3)
         self._information, self._weighted = _PRIOR, np.zeros(3)
 
     @property
     def corrections(self) -> Corrections:
-        """What is added to what the unit reports."""
+        """Corrections that are added to the unit's angles and ranges."""
         return Corrections(self.angles, self.ranges.correction)
 
     @property
     def errors(self) -> IntrinsicErrors:
-        """What corrected clouds may be wrong by."""
+        """Uncertainty of corrected clouds."""
         return self.errors_with(self.corrections)
 
     def errors_with(self, used: Corrections) -> IntrinsicErrors:
-        """Return what clouds with some corrections may be wrong by, as is known now.
+        """Return the present uncertainty of clouds that got some corrections.
 
-        What the estimate says but is not sure enough of to correct it counts as well. Clouds
+        An estimate that is too uncertain to be used as a correction counts as an error. Clouds
         without the pattern of an L2 are as good as their makers say.
         """
         if self.is_other:
@@ -283,10 +284,11 @@ class LidarIntrinsics:
         return np.asarray(np.linalg.solve(self._information, self._weighted), dtype=np.float64)
 
     def _known(self) -> F64:
-        """Return the estimate along those directions that are known, and differ from zero.
+        """Return the estimate along directions in which it is certain and not zero.
 
-        Of xi and beta, both angles together move the halves apart only high above the sensor;
-        alpha stands for itself. No unit is off by a degree: what seems so has another cause.
+        One combination of xi and beta moves the halves apart only high above the sensor, so their
+        principal axes are judged; alpha is independent. No unit is off by a degree: a larger
+        estimate has another cause.
         """
         covariance = np.linalg.inv(self._information)
         variances, axes = np.ones(3), np.eye(3)

@@ -45,9 +45,9 @@ class RangeBias:
         self._map_information, self._map_weighted = 0.0, 0.0
 
     def sigma_with(self, correction: float) -> float:
-        """Return what ranges may be wrong by that have a correction [m], 1 sigma [m].
+        """Return the uncertainty of ranges that got a correction [m], 1 sigma [m].
 
-        What the estimate says but is not sure enough of to correct it counts as well.
+        An estimate that is too uncertain to be used as a correction counts as an error.
         """
         left = self._estimate - correction
         return float(np.sqrt(self._variance + left**2))
@@ -83,10 +83,10 @@ class RangeBias:
             self.correction = self._known()
 
     def learn_from_map(self, seen: SeenAgain) -> None:
-        """Take how the points of a sweep lie beside the map, if planes do not show the bias.
+        """Learn from the distances of a sweep's points to the map, if planes do not show the bias.
 
-        The correction changes slowly: sweeps with another one do not fit the map, and the pose
-        would jump. What is left of the bias has bent the map, which hides some of it, so only the
+        The correction changes slowly: sweeps with another correction do not fit the map, and the
+        pose would jump. The bias that is left bends the map, which hides part of it, so only the
         latest sweeps count.
         """
         if not self.needs_map:
@@ -105,12 +105,12 @@ class RangeBias:
 
     @property
     def _of_planes(self) -> float:
-        """Variance of the estimate that planes alone amount to [m^2]."""
+        """Variance of the estimate from planes alone [m^2]."""
         return 1.0 / self._information + tuning.RANGE_BIAS_FLOOR**2
 
     @property
     def _evidence(self) -> tuple[float, float]:
-        """Of the correction [1/m^2], and multiplied by the estimate."""
+        """Information about the bias [1/m^2], and the same multiplied by the estimate [1/m]."""
         # however long a map is looked at, it is not better than that
         share = 1.0 / (1.0 + self._map_information * tuning.RANGE_BIAS_MAP_FLOOR**2)
         return (
@@ -125,13 +125,13 @@ class RangeBias:
 
     @property
     def _variance(self) -> float:
-        """Of the estimate [m^2]: no wall is quite flat, however often it is seen."""
+        """Variance of the estimate [m^2]; has a floor, as no wall is perfectly flat."""
         return 1.0 / self._evidence[0] + tuning.RANGE_BIAS_FLOOR**2
 
     def _known(self) -> float:
-        """Return the estimate if it is known, and differs from zero; or was in use before.
+        """Return the estimate if it is certain and not zero, or if it was in use before; else 0.
 
-        Where planes show it well, it counts in any case: hardly a unit has none at all.
+        Where planes show it well, it is used in any case: hardly a unit has no bias at all.
         """
         variance, bias = self._variance, self._estimate
         if abs(bias) > tuning.RANGE_BIAS_MOST:
@@ -186,9 +186,9 @@ class _Flat(NamedTuple):
 
 
 def bend_of_planes(points: NDArray[np.void], rest_force: F64 | None = None) -> tuple[float, float]:
-    """Return what planes tell about a correction of ranges.
+    """Return what planes say about a correction of ranges: information and gradient.
 
-    Walls and ceilings are taken for straight. The ground counts only if it is smooth and shows no
+    Walls and ceilings are assumed to be flat. The ground counts only if it is smooth and shows no
     curvature of its own.
 
     Parameters
@@ -225,10 +225,10 @@ def bend_of_planes(points: NDArray[np.void], rest_force: F64 | None = None) -> t
 
 
 def bend_of_map(seen: SeenAgain) -> tuple[float, float]:
-    """Return what a map tells about a correction of ranges: information and gradient.
+    """Return what a map says about a correction of ranges: information and gradient.
 
-    What a point is off by along the normal depends on the angle at which it is seen, and so does
-    what its surface in the map is off by. The pose of the sweep is of no interest.
+    The bias moves a point along the normal by an amount that depends on the angle at which it is
+    seen, and the same holds for its surface in the map. The pose of the sweep is marginalized.
 
     Parameters
     ----------
@@ -254,16 +254,16 @@ def bend_of_map(seen: SeenAgain) -> tuple[float, float]:
 
 
 class _Bend(NamedTuple):
-    """What surfaces tell about a correction of ranges.
+    """What surfaces say about a correction of ranges.
 
     Attributes
     ----------
     information, gradient : float
         As of :func:`bend_of_planes`.
     residuals : ndarray, shape (N,)
-        What the fit with that correction leaves [m].
+        Of the fit with that correction [m].
     weights : ndarray, shape (N,)
-        0 to 1: what is far off has lost weight.
+        Robust weights, 0 to 1.
     """
 
     information: float
@@ -273,7 +273,7 @@ class _Bend(NamedTuple):
 
 
 def _bends_by_itself(bend: _Bend, in_plane: F64, design: F64, heights: F64) -> bool:
-    """Return whether the shape of a plane is not that which a correction of ranges explains.
+    """Return whether a plane is bent in a way that a correction of ranges does not explain.
 
     The ground is rough where it is natural, and curved where water has to run off.
 
@@ -303,7 +303,7 @@ def _bends_by_itself(bend: _Bend, in_plane: F64, design: F64, heights: F64) -> b
 
 
 def _bend_of(design: F64, measured: F64, sigma: float, prior_sigma: float) -> _Bend:
-    """Return what measurements tell about the last unknown; the others are of no interest.
+    """Return what measurements say about the last unknown; the others are marginalized.
 
     Parameters
     ----------
@@ -312,9 +312,9 @@ def _bend_of(design: F64, measured: F64, sigma: float, prior_sigma: float) -> _B
     measured : ndarray, shape (N,)
         [m]
     sigma : float
-        Of each [m]; what is far off loses weight.
+        Of each [m]; outliers lose weight.
     prior_sigma : float
-        Of the correction [m], for what is far off; information and gradient are without it.
+        Of the correction [m], used to find outliers; not part of information and gradient.
     """
     last = design.shape[1] - 1
     prior = 1e-6 * np.eye(last + 1)  # a single wall does not fix a pose
@@ -369,7 +369,7 @@ def _planes(flat: _Flat) -> Iterator[tuple[F64, F64, F64]]:
 
 
 def _flat_cells(at: F64) -> _Flat:
-    """Return the flat cells of points (3, N), without those that are too near to be right."""
+    """Return the flat cells of points (3, N), without those too near for a sound range."""
     at = at[:, np.linalg.norm(at, axis=0) > tuning.RANGE_BIAS_NEAREST]
     cell = cell_numbers(at)
     counts = np.bincount(cell).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Free space: what the rays to the points of a sweep pass through is not there."""
+"""Free-space test: finds surfaces of the map that the rays of a sweep pass through."""
 
 from __future__ import annotations
 

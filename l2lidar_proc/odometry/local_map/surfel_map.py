@@ -1,14 +1,14 @@
 """Surfel map: points binned into cells, a plane fitted to each cell.
 
 A surface averages the range noise of every point that ever fell into its cell, which
-nearest-neighbor methods cannot do. Cells come in several sizes; the finest flat one speaks for a
-place. Where none is flat (foliage, rock, trunks, cables) a cell still tells where its points are
-across the directions in which they are few: less sharply, by their scatter.
+nearest-neighbor methods cannot do. Cells come in several sizes; the finest flat one at a place is
+used. Where none is flat (foliage, rock, trunks, cables), a cell still constrains points along the
+directions in which its own points lie close together, as sharply as these scatter.
 
-Near points count for more than far ones, which are off by the noise of the ranges and by the
-attitude. A full cell takes points again from so near that they count for more than those in it. A
-wall that lies at the face of two cells needs that: seen from afar, its noise fills both, and the
-plane of either is off to its side, by up to 3 cm at 5 m.
+Near points count for more than far ones, which errors of the attitude move more. A full cell still
+takes points from so near that they count for more than those in it. A wall at the face between two
+cells needs that: seen from afar, its noise fills both, and each plane is off towards the middle of
+its cell, by up to 3 cm at 5 m.
 
 Two kinds of correspondences are ambiguous, and can be rejected. A point may lie in a surface's
 cell but not on the surface, as on the front of a wall beside its jamb (Turk and Levoy 1994 reject
@@ -114,7 +114,7 @@ class SurfelMap:
         self.latest = 0
         self.young = YoungSurfaces.TRUSTED
         self._index.clear()
-        # the arrays stay for the next map: memory freed and asked for again comes back in pieces
+        # the arrays stay for the next map: allocating them again fragments the memory
         for table in (self._cells, self._planes, self._sights):
             table[:used] = np.zeros(1, table.dtype)
         self._kind[:used] = 0
@@ -185,10 +185,11 @@ class SurfelMap:
         sweep: int,
         apart: NDArray[np.bool_] | None,
     ) -> float:
-        """Note who opened the new cells among some (C,).
+        """Note the sweep that opened the new cells among some (C,).
 
-        The coarsest level tells what is new, finer ones open cells in known walls as well: such a
-        place is as old as the coarsest cell around it. Return the share of points in new places.
+        Only a new cell of the coarsest level is a new place. Finer ones also open in known walls:
+        such a place is as old as the coarsest cell around it. Return the share of points in new
+        places.
 
         Parameters
         ----------
@@ -446,7 +447,7 @@ class SurfelMap:
         return widths_of(self.planes(cells), axis)
 
     def cells(self, rows: I64) -> NDArray[np.void]:
-        """Return what the cells (M,) of some :class:`Matches` have seen, dtype CELL."""
+        """Return the sums of the cells (M,) of some :class:`Matches`, dtype CELL."""
         return records.selected(self._cells, rows)
 
     def planes(self, rows: I64) -> NDArray[np.void]:
@@ -458,9 +459,9 @@ class SurfelMap:
         return records.selected(self._sights, rows)
 
     def correct_ranges(self, change: float) -> None:
-        """Move what was seen along its lines of sight, as another correction would have put it.
+        """Move points of the map along their lines of sight, by a change of their ranges.
 
-        What was seen without noting these stays.
+        Points whose lines of sight were not noted stay.
 
         Parameters
         ----------
@@ -495,9 +496,9 @@ class SurfelMap:
             self._drop(1 + np.flatnonzero(~kept))
 
     def _drop(self, rows: I64) -> None:
-        """Drop the cells of some rows, ascending; the last ones of the others take their places.
+        """Drop the cells of some rows, ascending; the last of the others take their rows.
 
-        The memory stays: what is freed and asked for again comes back in pieces.
+        The arrays keep their size: freeing and allocating them again fragments the memory.
         """
         end = len(self) + 1
         left = end - len(rows)

@@ -1,4 +1,4 @@
-"""Surfels: what a cell of the map knows of its surface, fitted to it, and told about a point."""
+"""Surfels: planes fitted to the points of map cells, and their distances from other points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CELL: Final = np.dtype(
         ("fitted", "<f8"),  # weight when its plane was fitted
     ],
 )
-"""What a cell has seen: what most of the cells that a sweep meets change with it."""
+"""The sums of a cell's points, which change with most sweeps."""
 
 PLANE: Final = np.dtype(
     [
@@ -38,7 +38,7 @@ PLANE: Final = np.dtype(
         ("sided", "<i8"),  # from which sides its points were seen, a value of Sides
     ],
 )
-"""The surface in a cell: what points are matched with, and what seldom changes."""
+"""The surface in a cell, with which points are matched; it seldom changes."""
 
 SIGHT: Final = np.dtype(
     [
@@ -47,7 +47,7 @@ SIGHT: Final = np.dtype(
         ("corrected", "<f4", (3,)),  # [m] the same, each by the correction of its range
     ],
 )
-"""How the points of a cell were seen: what an error of their ranges has moved them by."""
+"""From where the points of a cell were seen: an error of their ranges moves them along that."""
 
 
 class Sides(IntEnum):
@@ -66,14 +66,14 @@ FLAT: Final = 3
 
 
 class YoungSurfaces(Enum):
-    """What a map that has only just begun, and has no other surfaces, tells of weak directions.
+    """How surfaces of a map that has only just begun count in weak directions.
 
-    The rims of the view are surfaces as well, and move along with the sensor.
+    The rims of the view look like surfaces too, and move along with the sensor.
     """
 
-    TRUSTED = "trusted"  # as surfaces that are in the map for long
-    APART = "apart"  # weak directions of the place are told apart from all others
-    IGNORED = "ignored"  # the same, and nothing is told about them
+    TRUSTED = "trusted"  # like surfaces that have been in the map for long
+    APART = "apart"  # weak directions of the place are separated from all others
+    IGNORED = "ignored"  # the same, and young surfaces say nothing about them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +192,7 @@ def matches_with(
 
 
 def are_behind(points: F64, origins: F64, planes: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Return which points are seen from the other side than their surfaces.
+    """Return which points are seen from the back of their surfaces.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def widths_of(planes: NDArray[np.void], axis: I64) -> F64:
 
 
 def weights_from(ways: F64) -> F64:
-    """Return the weights (C,) of points that are seen at the ends of some ways (C, 3) [m]."""
+    """Return the weights (C,) of points at vectors (C, 3) from the sensor [m]."""
     squared = np.einsum("ni,ni->n", ways, ways)
     return np.asarray(1.0 / (1.0 + squared / tuning.WEIGHT_RANGE**2))
 

@@ -95,8 +95,8 @@ class Alignment:
     def fits_better_than(self, other: Alignment, points: int) -> bool:
         """Return whether this is right and another alignment of the sweep's points is wrong.
 
-        More points fit here, and they are most of the sweep and fix the place, or they are many
-        and nearly all.
+        More points must fit here. They must also be a large share of the sweep and fix the place,
+        or be many and nearly all of it.
         """
         if self.inlier_ratio < other.inlier_ratio + tuning.DOUBT_BETTER:
             return False
@@ -114,7 +114,7 @@ class Alignment:
         return bool(self.misfit(config) < share * other.misfit(config))
 
     def is_rich(self, points: int) -> bool:
-        """Return whether it fixes the place by a good part of some points."""
+        """Return whether it fixes the place, and a good part of so many points match."""
         return self.fixes_place and self.matched >= tuning.DOUBT_MATCHED.fixed * points
 
     @property
@@ -231,9 +231,9 @@ class _Matching(NamedTuple):
         return self.of([(state, source.some(index)) for state, index in views])
 
     def with_facing(self, source: Source, at: InertialState, weak: WeakAxes) -> Source:
-        """Return a source with all that its sweep has of surfaces that face the weakest direction.
+        """Return a source with all points of its sweep on surfaces facing the weakest direction.
 
-        The reveals of doors and niches are a hand wide: of these, thinning leaves a point or two.
+        Thinning leaves only a point or two on a reveal, which is a hand wide.
         """
         if source.denser is None:
             return source
@@ -255,7 +255,7 @@ class _Step(NamedTuple):
 
     @property
     def alignment(self) -> Alignment:
-        """What is reported where this is the last one."""
+        """The result, if this is the last iteration."""
         found = self.found
         weakest, *others = np.linalg.eigh(self.information[POSITION, POSITION])[1].T
         return Alignment(

@@ -181,11 +181,10 @@ class Correspondences:
         return support_of(self.born, self.weights)
 
     def settled(self, age: int, *, strict: bool = False) -> NDArray[np.bool_]:
-        """Return which surfaces are in the map for so many sweeps already, shape (M,).
+        """Return which surfaces have been in the map for at least ``age`` sweeps, shape (M,).
 
-        A young map has no old ones: there half of its age is enough, unless that is strict. In one
-        that began with an open velocity they have to last for as long as those of an L2, however
-        many sweeps that are.
+        In a young map half of the map's age is enough, unless ``strict``. In a map that began with
+        an open velocity, the time counts: that of so many sweeps of an L2.
         """
         if self.young is not YoungSurfaces.TRUSTED:
             age = round(age * tuning.SWEEP_S / self.sweep_s)
@@ -194,12 +193,12 @@ class Correspondences:
         return np.asarray(self.latest - self.opened >= age)
 
     def on_two_surfaces(self, some: I64, rotation: F64) -> NDArray[np.bool_]:
-        """Return which of some correspondences are ambiguous: of points on another surface too.
+        """Return which of some correspondences are of points that lie on another surface too.
 
-        Where the pose is off along a wall, points of its front still come to lie beside the jambs
-        in the map, and seem to confirm the pose. Two cases are left out: many correspondences, of
-        which most are right, and surfaces mapped so recently that the pose cannot be off by much
-        against them.
+        Where the pose is off along a wall, points on its front come to lie beside jambs in the
+        map, and seem to confirm the pose. Two cases do not count as ambiguous: many
+        correspondences, as most of them are right, and surfaces mapped so recently that the pose
+        cannot be far off relative to them.
 
         Parameters
         ----------
@@ -232,7 +231,8 @@ class Correspondences:
     def without_points_on_two_surfaces(self, rotation: F64) -> Correspondences:
         """Return these with zero weight where points are :meth:`on_two_surfaces`.
 
-        Asked for each principal direction that few points face. Returns itself if there are none.
+        The surfaces that face each principal direction are tested by themselves. Returns the same
+        object if no point is ambiguous.
 
         Parameters
         ----------
@@ -252,8 +252,8 @@ class Correspondences:
     def support_along(self, derivatives: F64) -> Support:
         """Return the sweeps that opened the surfaces which hold a direction.
 
-        A niche in a wall that was seen from afar long before is as well known along the wall as
-        the pose of the sweep that saw into it first.
+        Not those that first mapped the place: along a wall that was seen from afar long before, a
+        niche is only as certain as the pose of the sweep that first saw into it.
 
         Parameters
         ----------

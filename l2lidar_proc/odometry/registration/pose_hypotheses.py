@@ -1,4 +1,4 @@
-"""Hypotheses for a pose that is hardly known: where most points of a sweep lie on surfaces."""
+"""Pose hypotheses: poses at which most points of a sweep lie on surfaces of the map."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ def pose_hypotheses(
 ) -> list[InertialState]:
     """Return states nearby at which most points lie on surfaces, best first.
 
-    The place is searched on a grid; gyro and gravity keep the attitude good enough for tens of
-    seconds. Where they were missing, attitude and place are drawn together as the covariance has
-    them.
+    The position is searched on a grid; gyro and gravity keep the attitude good enough for tens of
+    seconds. Where they were missing, pairs of attitude and position are drawn from the covariance.
 
     Parameters
     ----------
@@ -54,8 +53,8 @@ def level_hypotheses(
 ) -> list[InertialState]:
     """Return states on the same level at which more points lie on surfaces, best first.
 
-    They are closer together than those of :func:`pose_hypotheses`, as few of the points may be on
-    the surface that fixes the place.
+    They are closer together than those of :func:`pose_hypotheses`, as only few of the points may
+    lie on the surface that fixes the position.
 
     Parameters
     ----------

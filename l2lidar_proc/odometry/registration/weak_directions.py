@@ -13,13 +13,13 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
 
-Weak directions mix turns with ways. What little is known of a turn would then speak about the way
-along a wall as well: watched with a narrow view, that halved the uncertainty of a velocity which
-was wrong by more. So the directions of the place that nothing faces come first, by themselves, and
-no point says anything about them.
+Eigenvectors mix rotations with translations, so what little is known about a rotation would
+constrain the translation along a wall as well. With a narrow view, that halved the uncertainty of
+a velocity which was wrong by more. So translations that no surface faces are taken out first, as
+directions of their own about which no point says anything.
 
-A carrier that drives leaves the rims of its view behind, and what is wrong by its velocity adds up
-soon. There, five things are stricter, and in turn surfaces count sooner:
+A carrier that drives leaves the rims of its view behind, and an error of its velocity soon adds
+up. There, five rules are stricter, and in turn surfaces count sooner:
 
 * a surface faces the direction only if the error of its own normal cannot explain that;
 * nor if it is hardly wider than the noise of the ranges: a scan line on the leaf of a door, just
@@ -28,12 +28,12 @@ soon. There, five things are stricter, and in turn surfaces count sooner:
   open velocity, where what faces the way may be seen for a moment only;
 * the direction is that of the walls: what faces it is left out, and normals count as well as they
   are known;
-* it is steadied over the last sweeps. One that differs from sweep to sweep lets the strong
-  directions speak about it.
+* it is averaged over the last sweeps. If it differed from sweep to sweep, the strong directions
+  would constrain it.
 
-What passes these tests is not always real either, and phantoms are always where they are expected:
-they confirm any velocity. So it is believed with the probability of an association, which is the
-lower, the less is known of the place.
+A surface that passes these tests may still move along with the view, and then confirms any
+velocity. So it counts with the probability that it is the surface in the map (data association),
+which is the lower, the less certain the position is.
 """
 
 from __future__ import annotations
@@ -230,10 +230,10 @@ def _free_first(axes: F64, found: Correspondences, gravity: F64) -> tuple[F64, i
 
 
 def _height_apart(places: F64, gravity: F64) -> tuple[F64, NDArray[np.bool_]]:
-    """Return directions (3, K) of which one is about the vertical, if any is, and which (K,).
+    """Return directions (3, K), one of them nearly vertical if possible, and whether each is (K,).
 
-    Floor and ceiling may say as little as what faces the way along a corridor. The two directions
-    are then any two of a plane.
+    Floor and ceiling may constrain the height as little as anything constrains the way along a
+    corridor. The two weak directions are then an arbitrary basis of a plane.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def _height_apart(places: F64, gravity: F64) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def _is_way(axis: F64, gravity: F64) -> bool:
-    """Return whether a direction (6,) is a way that one may drive, not a turn, nor up."""
+    """Return whether a direction (6,) is a level translation, along which one may drive."""
     way = axis[_PLACE]
     size = float(np.linalg.norm(gravity))
     level = abs(float(way @ gravity)) < tuning.DRIVING_SLOPE * size
@@ -282,7 +282,7 @@ def _along_walls(axes: F64, derivatives: F64, weights: F64) -> F64:
 
 
 def _steadied(axes: F64, normals: F64, weights: F64, before: F64) -> tuple[F64, F64]:
-    """Return the weak directions, the weakest steadied, and the scatter of the walls' normals.
+    """Return the weak directions, the weakest averaged over sweeps, and the normals' scatter.
 
     Parameters
     ----------
@@ -330,13 +330,14 @@ class WeakDirections:
     associated: float = 1.0
 
     def reduced(self, pose: F64, facing: NDArray[np.bool_]) -> tuple[F64, F64]:
-        """Return derivatives (M, 6) by turn and place, of residuals that claim no more than so.
+        """Return derivatives (M, 6) by turn and place, reduced to the share that is real.
 
-        Those of the information come first, then those of the gradient.
+        The first ones are for the information, the second ones for the gradient.
 
-        A residual of which the share f is real measures 1/f times as coarsely: information falls
-        by f^2 and the gradient by f, so that where it is zero stays. What may be another surface
-        is as far away as it seems, but less certain: information and gradient fall alike.
+        A residual of which the share f is real measures 1/f times as coarsely: its information is
+        scaled by f^2 and its gradient by f, which keeps the minimum where it is. A surface that
+        may be another one is as far away as it seems but less certain: information and gradient
+        are scaled alike.
 
         Parameters
         ----------
@@ -369,7 +370,7 @@ def weak_directions(
     prior: InertialState,
     covariance: F64,
 ) -> WeakDirections:
-    """Return how much of what is claimed about some directions a sweep confirms.
+    """Return which share of the information about weak directions is real.
 
     Parameters
     ----------
@@ -414,10 +415,10 @@ class _Trial:
     def associated(self, share: float, moved: F64, covariance: F64) -> float:
         """Return the square root of the share of the information that is left.
 
-        What moves along with the view is always where it is expected, and a few points face any
-        way. The less is known of the place, the less likely is it that what is near it is the
-        surface that was there before. The measurement then counts as a coarser one, which leaves
-        the same variance as the mixture of both cases.
+        A surface that moves along with the view is always where it is expected, and a few points
+        face any direction. The less certain the position is, the less likely is a nearby surface
+        the one in the map. The measurement then counts as a coarser one, which leaves the same
+        variance as the mixture of both cases.
 
         Parameters
         ----------
@@ -447,11 +448,11 @@ class _Trial:
 
     @property
     def views(self) -> Views:
-        """What is to be matched: nothing where no surface faces the direction."""
+        """The moved states and the points to match from each; empty if no surface faces."""
         return [(moved, self._some) for moved in self._moved]
 
     def real_share(self, there: list[Correspondences]) -> float:
-        """Return how much of the information about the direction the moved points confirm."""
+        """Return the share of the information that the moved points confirm, 0 to 1."""
         derivatives, distances, scales = self._facing
         claimed = pulled = noise = 0.0
         for step, moved, seen in zip(_STEPS, self._moved, there, strict=bool(there)):

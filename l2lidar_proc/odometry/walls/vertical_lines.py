@@ -1,20 +1,20 @@
 """Vertical lines in a sweep: they measure the velocity along bare walls.
 
-Between bare walls only the reveals of doors, niches and pillars fix the place along them: narrow
-faces across the direction of travel, 2 to 12 cm deep. Thinned to a point or two each, they say
-nothing, and the cells of the map are wider than they are. In the whole sweep, however, a scan line
-that meets such a face runs down it, and leaves 12 to 60 points at one place of the plan. That is a
-vertical line, whose place along the direction is known to some millimeters. Several sweeps see a
-door while it is passed, so its lines measure the velocity.
+Between bare walls only the reveals of doors, niches and pillars fix the position along them:
+narrow faces across the direction of travel, 2 to 12 cm deep. Registration cannot use them:
+thinning leaves a point or two of each, and the cells of the map are wider than they are. In the
+whole sweep, however, a scan line that meets such a face runs down it, and leaves 12 to 60 points
+above one another. The position of such a vertical line along the walls is known to some
+millimeters. Several sweeps see a door while it is passed, so its lines measure the velocity.
 
-Most vertical lines are no reveals: a scan line that crosses a wall which the map does not have yet
-leaves one as well. So points on known walls are left out, and the lines of a sweep vote with those
-of the last seconds: two lines of one reveal are apart by the error of the velocity times the time
-between them, whichever reveal it is, others by anything. The error for which most pairs vote is
-believed if chance hardly explains it, and if no other error has nearly as many votes; and then
-with the probability that it is right, as two votes are false in one of ten cases.
+Most vertical lines are not reveals: a scan line that crosses a wall which is not in the map yet
+leaves one as well. So points on known walls are left out, and the lines of a sweep are paired with
+those of the last seconds. Two lines of one reveal are apart by the error of the velocity times the
+time between them; other pairs are apart by anything. Each pair votes for an error. The one with
+most votes is used if chance hardly explains so many, and if no other one has nearly as many. It
+is weighted by the probability that it is right: two votes are wrong in one of ten cases.
 
-Earlier lines are kept where the state has them by now: whenever that is corrected, so are they.
+When the state is corrected, the positions of earlier lines are corrected with it.
 """
 
 from __future__ import annotations
@@ -296,7 +296,7 @@ def _agreeing(pairs: NDArray[np.void], sigma: float) -> tuple[NDArray[np.bool_],
     """Return which pairs (P,) agree with the error of the velocity that most vote for.
 
     None of them where chance explains as many votes, or another error has nearly as many. The
-    second result is how many these are.
+    second result is the number of votes.
 
     Parameters
     ----------

@@ -1,16 +1,14 @@
-"""Brightness and depth of walls along the way: what tells how fast a sensor passes bare walls.
+"""Velocity along bare walls, from how their brightness and depth change along the way.
 
-Between bare walls only doors, niches and what else is drawn on a wall or let into it fix the place
-along them. Thinned to a point or two each, they say nothing, and the cells of the map are wider
-than they are. A whole sweep of an L2 sees a wall in upright lines, up to half a meter apart, which
-seldom hit an edge. But the sensor passes by, and each sweep has its lines elsewhere. Placed with
-the right velocity, the lines of some seconds show each edge once. With a wrong one, bright and
-dark ones, or near and deep ones, alternate about it. So the velocity at which neighboring lines
-differ least is the most likely one.
+Only doors, niches and marks fix the position along a bare wall. Registration cannot use them:
+thinning leaves a point or two of each, and the cells of the map are wider than they are. A sweep
+of an L2 samples a wall in upright lines up to half a meter apart, elsewhere in each sweep. Placed
+with the right velocity, the lines of some seconds show each edge once. With a wrong one, bright
+and dark lines, or near and deep ones, alternate around the edge. So the velocity at which
+neighboring lines differ least is the most likely one.
 
-Such a profile needs no map, so errors of the map do not confirm themselves; nor does it have to
-tell one edge from another. What stands before a wall does not count: it may be people, who walk at
-a speed of their own.
+The profile uses no map, so it cannot confirm errors of the map, and it does not have to tell one
+edge from another. Objects in front of a wall are left out: people walk at a speed of their own.
 """
 
 from __future__ import annotations
@@ -215,8 +213,8 @@ def error_grid(reach: float, step: float, least: int) -> F64:
 def velocity_likelihood(spots: Spots, now: int, axes: F64, errors: F64) -> F64:
     """Return how likely each of some errors (M,) of the velocity along walls is; 1 at most.
 
-    As :func:`log_likelihood`, but allowing for its terms that say the same, and for an error that
-    is common to all.
+    :func:`log_likelihood`, corrected for terms that are not independent, and for an error that is
+    common to all.
 
     Parameters
     ----------
@@ -295,7 +293,7 @@ def log_likelihood(
 def are_walls(spots: Spots, axes: F64) -> bool:
     """Return whether most of the spots (N,) are those of walls along the way, on one side or both.
 
-    Other than for their profile, something may stand before them.
+    Unlike for their profile, objects may stand in front of them.
     """
     if len(spots) < tuning.PROFILE_SIDE:
         return False
@@ -345,10 +343,10 @@ def _samples(spots: Spots, now: int, axes: F64) -> NDArray[np.void]:
 
 
 def _is_wall(depth: F64, variance: F64) -> bool:
-    """Return whether spots (N,) are of one wall with nothing before it.
+    """Return whether spots (N,) are of one wall with nothing in front of it.
 
-    What stands before a wall hides another part of it from each place, and the edge of what it
-    hides moves with the view.
+    An object in front of a wall hides a different part of it in each sweep, so the edge of the
+    hidden part moves with the sensor.
     """
     far, sigmas, most = tuning.PROFILE_BEFORE
     before = float(np.mean(depth < -np.maximum(far, sigmas * np.sqrt(variance))))
@@ -377,8 +375,8 @@ def _without_trend(values: F64, *terms: F64) -> F64:
 
 
 def _robust_sigma(values: F64) -> float:
-    """Return the standard deviation about zero of what most of the values (N,) are.
+    """Return a robust standard deviation of values (N,) about zero.
 
-    1.4826: of a Gaussian, the standard deviation over the median of the sizes.
+    1.4826 is the ratio of standard deviation and median absolute deviation of a Gaussian.
     """
     return 1.4826 * float(np.median(np.abs(values)))

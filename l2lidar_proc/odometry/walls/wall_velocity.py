@@ -1,7 +1,7 @@
-"""Velocity along bare walls: what sweeps tell about it where surfaces leave it free.
+"""Velocity along bare walls, measured where the surfaces of the map do not constrain it.
 
-Two measurements share the work. The profile of the walls is seldom precise and never far off, so
-it comes first: it leaves the vertical lines little room for false votes.
+The profile of the walls is used first: it is seldom precise but never far off. That leaves the
+vertical lines, which are precise, little room for false votes.
 """
 
 from __future__ import annotations
