@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,9 @@ from l2lidar_node.types import POINT
 from l2lidar_proc.deskew import filters
 from l2lidar_proc.deskew.config import FilterConfig
 from l2lidar_proc.deskew.filters import organise
+from tests.support.build import SHARED_DATA
 
-FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"
+FOLDER = SHARED_DATA / "unitree_l2_static"
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="the recordings are not here")
 
 PACKETS = 50

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from l2lidar_proc.odometry.matcher import xyz
 from l2lidar_proc.odometry.odometry import Odometry
 from l2lidar_proc.verbs.recorded import run_events
 from tests.l2lidar_proc.odometry.odometry_world import T_CLOUD_IMU, errors, feed
+from tests.support.build import SHARED_DATA
 from tests.support.odometry_runs import record, sweeps
 
 HEAD_RATE, SLOTS, PACKETS = 27.1, 300, 50
@@ -32,7 +32,7 @@ ROOM = np.array([4.2, 3.3, 2.7])  # [m] half the edges
 CLOUD = np.dtype([(name, "<f4") for name in ("x", "y", "z", "time")])
 UNIT = (0.4, -0.3, 0.0)  # [degrees] xi, beta, alpha
 CONFIG = OdometryNodeConfig()
-REAL = Path(__file__).resolve().parents[4] / "shared" / "data" / "unitree_l2_static"
+REAL = SHARED_DATA / "unitree_l2_static"
 
 
 def turn(
