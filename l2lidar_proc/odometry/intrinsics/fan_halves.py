@@ -190,7 +190,7 @@ def between_halves(points: NDArray[np.void], moved: NDArray[np.void], head: Halv
 
 
 def angles_at_rest(
-    sweeps: list[tuple[NDArray[np.void], Halves]], prior: F64
+    sweeps: list[tuple[NDArray[np.void], Halves]], prior: F64, start: tuple[F64, F64]
 ) -> tuple[F64, F64] | None:
     """Return the beam angles with which both halves see the same at rest, and their information.
 
@@ -209,6 +209,9 @@ def angles_at_rest(
         From one place: the points (N,) of each, cloud frame, as the unit reports them.
     prior : ndarray, shape (3, 3)
         Information of the angles' being zero [1/rad^2].
+    start : tuple of ndarray
+        Angles (3,) to begin with, and information (3, 3) of them: far cells can be compared at
+        once if it is known. It adds nothing to what is returned.
 
     Returns
     -------
@@ -225,7 +228,7 @@ def angles_at_rest(
     sign = np.concatenate([head.sign for _, head in sweeps])
     line = np.floor(np.arctan2(at[1], at[0]) / tuning.BEAM_REST_APART).astype(np.int64)
     line -= line.min(initial=0)
-    angles, information = np.zeros(3), prior
+    angles, information = start
     compared = False
     for number, scales in enumerate(_SCALES_AT_REST):
         moved = at + np.einsum("jan,a->jn", along, angles)

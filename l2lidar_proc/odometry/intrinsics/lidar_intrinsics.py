@@ -225,15 +225,34 @@ class LidarIntrinsics:
         whole = [(points, found) for points, found in shown if found is not None]
         if not whole:
             return
-        found = angles_at_rest(whole, _PRIOR)
+        found = angles_at_rest(whole, _PRIOR, (self._estimate, self._information))
         if found is not None:
-            angles, self._information = found
-            self._weighted = self._information @ angles
+            self._intersect(*found)
             self.angles = self._known()
         self.ranges.forget()
         step = -(-len(sweeps) // tuning.RANGE_BIAS_SWEEPS)
         seen = (self.applied_to(one).points for one in sweeps[::step])
         self.ranges.learn(*seen, rest_force=rest_force)
+
+    def _intersect(self, angles: F64, information: F64) -> None:
+        """Fuse another estimate of the angles, from points that this one may come from as well.
+
+        Covariance intersection (Julier and Uhlmann 1997) with the smallest determinant: it is not
+        overconfident however the errors of the two are correlated.
+
+        Parameters
+        ----------
+        angles : ndarray, shape (3,)
+            [rad]
+        information : ndarray, shape (3, 3)
+            Of them, the prior's included [1/rad^2].
+        """
+        shares = np.linspace(0.0, 1.0, 21)[:, None, None]
+        fused = shares * information + (1.0 - shares) * self._information
+        best = int(np.linalg.slogdet(fused)[1].argmax())
+        share = float(shares[best, 0, 0])
+        self._weighted = share * information @ angles + (1.0 - share) * self._weighted
+        self._information = fused[best]
 
     def forget(self) -> None:
         """Forget what was learned, as when the sensor had moved during a supposed rest."""

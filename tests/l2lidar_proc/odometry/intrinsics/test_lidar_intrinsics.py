@@ -29,6 +29,7 @@ from tests.support.odometry_runs import record, sweeps
 HEAD_RATE, SLOTS, PACKETS = 27.1, 300, 50
 BLOCK = Block(np.zeros(1, wire.CALIBRATION).tobytes())
 ROOM = np.array([4.2, 3.3, 2.7])  # [m] half the edges
+HALL = np.array([10.0, 10.0, 4.0])
 CLOUD = np.dtype([(name, "<f4") for name in ("x", "y", "z", "time")])
 UNIT = (0.4, -0.3, 0.0)  # [degrees] xi, beta, alpha
 CONFIG = OdometryNodeConfig()
@@ -42,6 +43,7 @@ def turn(
     drift: Any = (0.0, 0.0, 0.0),
     *,
     trunks: Any = None,
+    box: Any = ROOM,
     advance: float = 0.37,
 ) -> Any:
     """Return one turn, as a unit off by (xi, beta, alpha) [degrees] reports it, and halves.
@@ -52,6 +54,8 @@ def turn(
         Velocity of the sensor [m/s], for which nobody corrects the points.
     trunks : array_like, shape (N, 3), optional
         Places and radii [m] of upright cylinders. Without them there is a box.
+    box : array_like, shape (3,)
+        Half its edges [m]; the sensor is in its middle.
     advance : float
         Of the head from turn to turn, beside whole ones [rad].
     """
@@ -69,7 +73,7 @@ def turn(
     direction = model.beams(returns, BLOCK, correction).direction
     place = time[:, None] * drift
     if trunks is None:
-        reach = (np.sign(direction) * ROOM - place) / np.where(direction == 0.0, 1e-9, direction)
+        reach = (np.sign(direction) * box - place) / np.where(direction == 0.0, 1e-9, direction)
     else:
         reach = _to_trunks(direction, np.asarray(trunks))
     nearest = reach.min(axis=1)
@@ -276,6 +280,22 @@ def rested(unit: Any, turns: int, trunks: Any, advance: float = OUT_OF_STEP) -> 
 def test_sweeps_at_rest_show_both_angles_together(unit: Any) -> None:
     """Single sweeps show only one direction of them in a room."""
     np.testing.assert_allclose(np.degrees(rested(unit, 12, None).angles), unit, atol=0.06)
+
+
+def test_what_sweeps_have_shown_one_by_one_outlasts_a_comparison_that_shows_less() -> None:
+    """In a large hall no cell has enough points of both halves to compare all sweeps."""
+    some = [
+        turn((0.1, 0.1, -0.45), number, box=HALL, advance=OUT_OF_STEP)[0] for number in range(6)
+    ]
+    intrinsics = LidarIntrinsics()
+    for sweep in some:
+        corrected = intrinsics.corrected(sweep)
+        intrinsics.learn(corrected, corrected.points, at_rest=True)
+    before, error = intrinsics.angles, intrinsics.errors.alpha
+    assert before[2] < -2.0 * error
+    intrinsics.learn_at_rest(some)
+    np.testing.assert_allclose(intrinsics.angles, before, atol=0.1 * error)
+    assert intrinsics.errors.alpha <= 1.05 * error
 
 
 def at_rest() -> tuple[Odometry, list[Sweep]]:
