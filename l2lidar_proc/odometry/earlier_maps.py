@@ -124,7 +124,8 @@ class EarlierMaps:
             found = _met_in(kept, source, motion, jump)
             if found is None:
                 continue
-            if self._meetings.confirm(kept, _moves(motion.state, found.state)):
+            if self._meetings.add(kept, _moves(motion.state, found.state)) > 1:
+                self._meetings.clear()
                 # those after it began where it was lost: what they tell of it is no news any more
                 del self._maps[self._maps.index(kept) :]
                 return Relocalization(kept, found)
@@ -239,6 +240,11 @@ class _LevelFits:
     def are_one_place(self) -> bool:
         """Whether the last two agree; three, where others before them do not."""
         return self._agreeing() >= (tuning.REVISIT_AGREEING if self.disagree else 2)
+
+    @property
+    def are_one_unlikely_place(self) -> bool:
+        """Whether so many of the last agree that the place may be an unlikely one."""
+        return self._agreeing() >= tuning.REVISIT_UNLIKELY_AGREEING
 
     def _agreeing(self) -> int:
         """Return how many of the last agree, each with the one before."""
@@ -395,7 +401,10 @@ class MapRevisit:
             drift, kept = FrameJump(place, uncertain), EarlierMap(older, FrameJump())
             found = _met_in(kept, source, motion, drift, lean=tuning.REVISIT_LEAN)
             if found is not None and _is_elsewhere(found, motion, len(source.points), expected):
-                return found, self._meetings.confirm(None, _moves(motion.state, found.state))
+                agreeing = self._meetings.add(None, _moves(motion.state, found.state))
+                is_explained = is_explained_by_drift(found.state.position - place, expected)
+                least = 2 if is_explained else tuning.REVISIT_UNLIKELY_AGREEING
+                return found, agreeing >= least
         if not _is_loose_on_level(motion.state, uncertain, contradicted=part.is_contradicted):
             return None, False
         loose = with_loose_pose(motion.state, motion.covariance, uncertain)
@@ -404,13 +413,15 @@ class MapRevisit:
         if found is None:
             return None, False
         move = found.state.position - place
-        if not is_explained_by_drift(move, expected):
+        if not is_explained_by_drift(move, expected, tuning.RELOCALIZE_UNLIKELY):
             return None, False
         stamp, fits = int(motion.state.stamp), self._fits
         free = unobserved_directions(found.information[POSITION, POSITION])
         fits.add(_LevelFit(stamp, move, motion.covariance[VELOCITY, VELOCITY], not free.size))
         is_doubted = part.is_contradicted or self._returned.at(stamp) or fits.disagree
         is_likely = is_explained_by_drift(move, expected, tuning.RELOCALIZE_LIKELY)
+        if not is_explained_by_drift(move, expected):
+            return found, fits.are_one_unlikely_place
         return found, (is_likely and not is_doubted) or fits.are_one_place
 
 
@@ -454,29 +465,32 @@ def _is_elsewhere(found: Alignment, motion: SweepMotion, points: int, expected: 
     move = found.state.position - motion.state.position
     return (
         float(np.linalg.norm(move)) > tuning.REVISIT_LEAST_M
-        and is_explained_by_drift(move, expected)
+        and is_explained_by_drift(move, expected, tuning.RELOCALIZE_UNLIKELY)
         and found.matched > tuning.REVISIT_MATCHED * points
         and found.inlier_ratio > tuning.REVISIT_INLIERS
     )
 
 
 class _Meetings:
-    """Meetings with maps: one counts if the next says the same."""
+    """Meetings with maps, one after the other."""
 
     def __init__(self) -> None:
         self._last: tuple[EarlierMap | None, F64] | None = None
+        self._agreeing = 0
 
     def clear(self) -> None:
-        """Forget the last one, as after a search that found nothing."""
-        self._last = None
+        """Forget them, as after a search that found nothing."""
+        self._last, self._agreeing = None, 0
 
-    def confirm(self, met: EarlierMap | None, moves: F64) -> bool:
-        """Take a meeting that moves the poses by a transform (4, 4); return whether it counts."""
+    def add(self, met: EarlierMap | None, moves: F64) -> int:
+        """Take a meeting that moves the poses by a transform (4, 4).
+
+        Return how many of the latest agree, each with the one before; 1 if this one is alone.
+        """
         last, self._last = self._last, (met, moves)
-        if last is None or last[0] is not met or not _are_one(last[1], moves):
-            return False
-        self._last = None
-        return True
+        agrees = last is not None and last[0] is met and _are_one(last[1], moves)
+        self._agreeing = self._agreeing + 1 if agrees else 1
+        return self._agreeing
 
 
 def _moves(state: InertialState, found: InertialState) -> F64:

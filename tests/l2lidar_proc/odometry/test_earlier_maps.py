@@ -282,6 +282,26 @@ def test_a_meeting_farther_away_than_drift_explains_does_not_count(
     assert (back is not None) == counts
 
 
+@pytest.mark.parametrize(("drift", "counts"), [(DRIFT, True), (1.9 * DRIFT, False)])
+def test_an_unlikely_meeting_counts_if_many_sweeps_agree(drift: F64, counts: bool) -> None:
+    """It is 2.3 sigma away, or 4.3: so far something that looks alike may agree for long."""
+    matcher, revisit = drifted_matcher(0.2, drift=drift), MapRevisit()
+    rng, at = np.random.default_rng(43), motion(TIGHT, PLACE + drift)
+    backs = []
+    for number in range(tuning.REVISIT_UNLIKELY_AGREEING + 4):
+        sweep = later(at, 0.1 * number)
+        part = revisit.part_due(matcher, sweep.state, unseen)
+        if part is not None:
+            backs.append(revisit.search(view(rng), part, sweep, FrameJump()))
+        if backs and backs[-1] is not None:
+            break
+    assert (backs[-1] is not None) == counts
+    if counts:
+        assert len(backs) >= tuning.REVISIT_UNLIKELY_AGREEING
+        assert backs[-1] is not None
+        np.testing.assert_allclose(backs[-1].alignment.state.position, PLACE, atol=0.01)
+
+
 def test_a_meeting_with_something_else_does_not_count_even_if_sweeps_match_no_better_of_late() -> (
     None
 ):
