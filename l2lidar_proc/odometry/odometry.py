@@ -204,9 +204,10 @@ class Odometry:
         self._reported = sweep  # as the unit reports it, for what is mapped again
         head = self._intrinsics.head(sweep)
         # The gyro's noise in the settings has room for the lines of an L2's spinning head. Without
-        # such a head it is taken for less, but only while tracking: at rest the samples show the
-        # noise themselves, and until a map begins, and while lost, the larger noise is kept.
-        tracks_without_head = self.phase is Phase.TRACKING and self._intrinsics.is_other
+        # such a head it is taken for less once a map has begun, but not at rest, where the samples
+        # show it themselves.
+        moves = self.phase in (Phase.TRACKING, Phase.LOST)
+        tracks_without_head = moves and self._intrinsics.is_other
         self._predictor.may_have_head_lines = not tracks_without_head
         if head is not None:
             self._predictor.note_head(head, sweep.end)
