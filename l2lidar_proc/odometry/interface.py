@@ -1,4 +1,4 @@
-"""What a pipeline asks of an odometry, whether it uses an IMU or not."""
+"""Interface of an odometry, with or without an IMU, and the order of the sweeps it takes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from enum import Enum
 from typing import Protocol
 
 from l2lidar_node.types import F64, HostNs, Sweep
+from l2lidar_proc import tuning
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.config import OdometryConfig
@@ -19,6 +20,29 @@ class Phase(Enum):
     TRACKING = "tracking"  # each sweep is predicted and aligned with the map
     STATIONARY = "stationary"  # the sensor is at rest: the pose is held, each sweep tests it
     LOST = "lost"  # a new map has begun at the predicted pose and no sweep has met it yet
+
+
+class SweepOrder(Enum):
+    """How a sweep lies in time relative to the one before."""
+
+    FOLLOWS = "later"
+    LATE = "late or repeated"  # it is refused
+    OTHER_TIME_LINE = "far back or far ahead"  # the clock was set
+
+
+def sweep_order(step_ns: int) -> SweepOrder:
+    """Return how a sweep lies in time relative to the one before.
+
+    Parameters
+    ----------
+    step_ns : int
+        From the sweep before to this one [ns].
+    """
+    if -tuning.LONG_GAP_NS < step_ns <= 0:
+        return SweepOrder.LATE
+    if 0 < step_ns <= tuning.TIME_JUMP_NS:
+        return SweepOrder.FOLLOWS
+    return SweepOrder.OTHER_TIME_LINE
 
 
 class SweepOdometry(Protocol):

@@ -19,8 +19,7 @@ from l2lidar_proc.cloud import positions
 from l2lidar_proc.motion.imu_buffer import Samples
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import AlignmentQuality, OdometryEstimate, Status
-from l2lidar_proc.odometry.interface import Phase, SweepOdometry
-from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
+from l2lidar_proc.odometry.interface import Phase, SweepOdometry, SweepOrder, sweep_order
 
 if TYPE_CHECKING:
     from kiss_icp.config import KISSConfig

@@ -36,13 +36,12 @@ from l2lidar_proc.odometry.innovation_gate import (
     is_narrow,
 )
 from l2lidar_proc.odometry.innovations import InnovationTest
-from l2lidar_proc.odometry.interface import Phase
+from l2lidar_proc.odometry.interface import Phase, SweepOrder, sweep_order
 from l2lidar_proc.odometry.intrinsics.lidar_intrinsics import LidarIntrinsics
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import ImuUse, Predictor, blur_of
 from l2lidar_proc.odometry.registration.alignment import Alignment, unobserved_directions
 from l2lidar_proc.odometry.registration.correspondences import Source
-from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.odometry.uncertainty import FrameJump
 from l2lidar_proc.odometry.walls.wall_velocity import WallVelocity, level_axes
 from l2lidar_proc.odometry.zero_velocity import (

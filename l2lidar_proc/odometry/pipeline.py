@@ -16,10 +16,9 @@ from l2lidar_proc.motion.tracker import KnownMotion
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.estimate import DOUBTFUL, OdometryEstimate, Status
 from l2lidar_proc.odometry.imu_calibration import ExtrinsicCheck
-from l2lidar_proc.odometry.interface import Phase, SweepOdometry
+from l2lidar_proc.odometry.interface import Phase, SweepOdometry, SweepOrder, sweep_order
 from l2lidar_proc.odometry.kiss import PlainOdometry
 from l2lidar_proc.odometry.odometry import Odometry
-from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.recording.outputs import Trajectory
 
 _MS: Final = 1_000_000

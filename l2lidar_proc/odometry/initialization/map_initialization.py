@@ -28,10 +28,10 @@ from l2lidar_proc.motion.sweep_motion import SweepMotion
 from l2lidar_proc.odometry.initialization.start_velocity import Beginning, FittedStart
 from l2lidar_proc.odometry.initialization.trial import Trial
 from l2lidar_proc.odometry.initialization.vertical_direction import Vertical, vertical_direction
+from l2lidar_proc.odometry.interface import SweepOrder, sweep_order
 from l2lidar_proc.odometry.local_map.surfels import YoungSurfaces
 from l2lidar_proc.odometry.matcher import MatchStatus, SweepMatcher
 from l2lidar_proc.odometry.prediction import Predictor
-from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
 from l2lidar_proc.odometry.walls.wall_profile import are_walls
 from l2lidar_proc.odometry.walls.wall_velocity import level_axes
 from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest, free_pose

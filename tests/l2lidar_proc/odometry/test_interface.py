@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from l2lidar_proc import tuning
-from l2lidar_proc.odometry.time_line import SweepOrder, sweep_order
+from l2lidar_proc.odometry.interface import SweepOrder, sweep_order
 
 
 @pytest.mark.parametrize(
