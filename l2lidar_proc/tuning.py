@@ -1,12 +1,16 @@
 """Tuning constants of the estimators: every number that is neither physics nor a parameter.
 
-Each has its unit in brackets, its meaning and where it comes from:
+Each has its unit in brackets and its meaning; a comment above several, or above their section,
+holds for all of them. Where they come from:
 
 * *derived*: follows from the sensor's data sheet or from another number,
-* *source*: taken from the publication named,
+* *source*: taken from the publication or the measurement named,
 * *tuned on*: chosen on the recordings named; the built-in scenes are room, yard, corridor and box
   with walk, trot and drone, and "captures" are the two of a real unit at rest
-  (docs/odometry_design.md).
+  (docs/odometry_design.md),
+* *observed*: a figure that was measured, and that the number keeps clear of,
+* *judged on*: chosen otherwise, and confirmed on the recordings named,
+* *speed only*, *bounds the time* or *the memory*: accuracy does not depend on it.
 """
 
 from __future__ import annotations
@@ -89,8 +93,8 @@ PRIOR_LEARN_SIGMAS: Final = 2.0  # less certain ones count with so many sigmas s
 PRIOR_MEMORY_S: Final = 60.0  # [s] time constant of its decay
 # A carrier that was never as fast as DRIVING_SPEED is moved by hand. Tuned on: narrow views and
 # corridors, seeds 100 to 115
-HAND_FROM_SIGMA: Final = 0.1  # [m/s] less certain, its velocity is drawn to zero,
-HAND_SPEED: Final = 0.3  # [m/s] with its peak speed as the standard deviation, at least this
+HAND_FROM_SIGMA: Final = 0.1  # [m/s] a velocity less certain than this is drawn to zero
+HAND_SPEED: Final = 0.3  # [m/s] least sigma of that; the peak speed if it is more
 # The same for the vertical velocity where sweeps hardly ever fix the height. Derived: the height
 # of what walks or drives wanders by half a meter in a minute. Tuned on: bare trunks.
 RISE_FROM_SIGMA: Final = 0.02  # [m/s] least sigma, as the IMU may know better
@@ -163,8 +167,8 @@ TRACKER_STEP_NS: Final = 100_000_000  # [ns] of the static detector
 TRACKER_IDLE_NS: Final = 5_000_000_000  # [ns] between updates while an odometry knows the motion
 TRACKER_WINDOW: Final = 10  # steps a static decision spans
 TRACKER_TURN: Final = 3  # steps of a turn of the head, over which its vibration averages out
-TRACKER_LAG_NS: Final = 500_000_000  # [ns] the filter waits for late velocities,
-TRACKER_LAG_MAX_NS: Final = 2_000_000_000  # [ns] longer for a source that is later
+TRACKER_LAG_NS: Final = 500_000_000  # [ns] the filter waits for late velocities
+TRACKER_LAG_MAX_NS: Final = 2_000_000_000  # [ns] and at most, for a source that is later
 TRACKER_BREAK_NS: Final = 500_000_000  # [ns] a gap after which the vertical is unknown
 TRACKER_STILL_NS: Final = 500_000_000  # [ns] static is judged over two turns of the head at least
 TRACKER_GAP_NS: Final = 50_000_000  # [ns] a longer stretch without samples is bridged
@@ -308,8 +312,8 @@ WALL_POINTS: Final = 15_000  # of a sweep. Bounds the time; a turn of an L2 has 
 LINE_SLOPE: Final = 0.3  # sine of the direction against the horizontal
 LINE_RANGE: Final = 8.0  # [m] farther away they are few, and false ones prevail
 LINE_WALL_SLOPE: Final = 0.2  # cosine: surfaces along the direction are walls
-LINE_WALL_REACH: Final = 0.02  # [m] points nearer to such a surface belong to it,
-LINE_WALL_THICKNESS: Final = 0.015  # [m] unless it is thicker: that may be wall and reveal
+LINE_WALL_REACH: Final = 0.02  # [m] points nearer to a wall belong to it
+LINE_WALL_THICKNESS: Final = 0.015  # [m] a thicker surface may be a wall and a reveal in one
 LINE_RADIUS: Final = 0.03  # [m] in plan, 2.5 times the range noise
 LINE_ROUNDS: Final = 3  # of mean shift
 LINE_MOST: Final = 60  # of a sweep. Bounds the time
@@ -322,10 +326,10 @@ LINE_KEPT: Final = 1000  # lines at most. Bounds memory and time
 LINE_PAIRS: Final = 1000  # of lines at most, likewise: a matrix has as many rows and columns
 LINE_PAUSE_S: Final = 0.1  # [s] between two sweeps, at least
 LINE_DEEPEST: Final = 0.15  # [m] across, between two lines of one reveal
-LINE_REACH: Final = 0.3  # [m] along, likewise: two reveals are farther apart
-LINE_SIGMAS: Final = 3.0  # of the velocity, likewise,
-LINE_BETWEEN: Final = 0.008  # [m] and of the places
-LINE_FIT_NOISE: Final = 0.003  # [m] of the places, besides their own
+LINE_REACH: Final = 0.3  # [m] along, between two of one reveal: two reveals are farther apart
+LINE_SIGMAS: Final = 3.0  # of that distance, as the velocity may err, at most
+LINE_BETWEEN: Final = 0.008  # [m] 1 sigma of that distance with the right velocity
+LINE_FIT_NOISE: Final = 0.003  # [m] added to the noise of that distance, 1 sigma
 LINE_WANDER: Final = 0.01  # [m/s^2/sqrt(Hz)] by which the error of the velocity changes meanwhile
 LINE_FACE: Final = 0.02  # [m] along: lines of a sweep that are nearer are one face
 LINE_OUTLIER: Final = 2.5  # sigma by which a pair may disagree
@@ -347,14 +351,14 @@ LINE_RELIEF: Final = 0.015  # [m] across, by which the lines of a reveal differ 
 # poses; the rest in the corridor of tests/l2lidar_proc/odometry/walls/test_wall_profile.py.
 
 PROFILE_RANGE: Final = 10.0  # [m] farther away, lines on a wall are meters apart
-PROFILE_CELL: Final = 0.03  # [m] of a spot along the way, 2.5 times the range noise,
-PROFILE_ROW: Final = 0.3  # [m] and upwards: four points of an L2 at 6 m
+PROFILE_CELL: Final = 0.03  # [m] length of a spot along the way, 2.5 times the range noise
+PROFILE_ROW: Final = 0.3  # [m] height of a spot: four points of an L2 at 6 m
 PROFILE_POINTS: Final = 3  # of a spot, at least
 PROFILE_FLAT: Final = 0.03  # [m] standard deviation across, at most: 2.5 times the range noise
 PROFILE_UPRIGHT: Final = 1.5  # times as high as wide, at least: a floor is not
 PROFILE_BESIDE: Final = 0.3  # [m] beside the sensor, at least
-PROFILE_SPOTS: Final = 300  # of a sweep at most; an L2 has 130 to 250. Bounds memory and time,
-PROFILE_MOST: Final = 10_000  # and so does this number of those compared
+PROFILE_SPOTS: Final = 300  # of a sweep at most; an L2 has 130 to 250. Bounds memory and time
+PROFILE_MOST: Final = 10_000  # spots compared, at most. Bounds the time
 PROFILE_KEPT_NS: Final = 4_000_000_000  # [ns] in which a door is passed
 PROFILE_PAUSE_NS: Final = 900_000_000  # [ns] between comparisons, four sweeps
 PROFILE_SPAN_NS: Final = 1_500_000_000  # [ns] over which spots are spread, at least
@@ -376,10 +380,10 @@ PROFILE_BEHIND: Final = 0.6
 PROFILE_DEPENDENT: Final = 20.0
 PROFILE_NOISE: Final = 0.01  # [m/s] 1 sigma, common to all spots: what niches hide, for one
 PROFILE_SURE: Final = 0.03  # [m/s] 1 sigma: below, that would count
-PROFILE_SIGMAS: Final = 4.0  # of the velocity, to which errors are compared,
-PROFILE_REACH: Final = 1.5  # [m/s] and at most
-PROFILE_STEP: Final = 0.01  # [m/s] between them, which is 4 cm in the time that spots are kept
-PROFILE_STEPS: Final = 15  # to each side, at least
+PROFILE_SIGMAS: Final = 4.0  # of the velocity: how far errors of it are tried
+PROFILE_REACH: Final = 1.5  # [m/s] largest error of the velocity that is tried
+PROFILE_STEP: Final = 0.01  # [m/s] between errors: 4 cm in the time that spots are kept
+PROFILE_STEPS: Final = 15  # errors to each side, at least
 # Standard deviations, common to a spot and of one of its points (12 mm: range noise), and of an
 # edge: of the logarithm of the intensity; and of the depth [m], where errors of the beams add
 # some per meter
@@ -501,8 +505,8 @@ BEAM_REST_APART: Final = 0.008  # [rad] apart; a head in step with its packets r
 BEAM_REST_WIDTH: Final = 0.15
 BEAM_REST_SCATTER: Final = 2.0  # a mean's variance, by the points' over the number of lines
 BEAM_REST_UNKNOWN: Final = 0.1  # [m] of a gap as the angles are known, 1 sigma, to be compared
-BEAM_REST_NS: Final = 1_200_000_000  # [ns] of rest before they are compared,
-BEAM_REST_AGAIN: Final = 1.4  # and again when it has lasted so many times as long. Speed only
+BEAM_REST_NS: Final = 1_200_000_000  # [ns] of rest before its sweeps are compared
+BEAM_REST_AGAIN: Final = 1.4  # times as long until they are compared again. Speed only
 # Sweeps at rest deviate by so many standard deviations of the angle that is known less. Source:
 # trunks and woods, where 0.57 degrees turned them by 0.35 to 0.66 degrees; 12 mm allow for noise
 BEAM_DRIFT_TURN: Final = 1.3
@@ -691,8 +695,8 @@ RAY_STEP: Final = 0.08  # [m]
 RAY_NEAR: Final = 0.06  # [m] to the surface; more than half of a step
 RAY_FACING: Final = 0.5  # cosine of the angle between ray and normal
 RAY_EXTENT: Final = 1.5  # standard deviations of a surface's points within which it is known
-RAY_POINTS: Final = 30.0  # of a surface,
-RAY_SWEEPS: Final = 3.0  # from so many sweeps
+RAY_POINTS: Final = 30.0  # of a surface, at least
+RAY_SWEEPS: Final = 3.0  # that have seen it, at least
 
 # ---- odometry: relocalization
 
@@ -702,8 +706,8 @@ SEARCH_RADIUS_M: Final = (0.3, 4.0)  # [m] least and most about the prediction
 SEARCH_ROTATION: Final = 1.0  # [rad] about each axis
 SEARCH_PLACES: Final = 1200  # hypotheses scored. Bounds the time to 0.1 s
 SEARCH_POINTS: Final = 200  # of the sweep that score one
-SEARCH_REFINED: Final = 24  # attitudes of the first round that are varied again,
-SEARCH_FINER: Final = 4.0  # by so much less
+SEARCH_REFINED: Final = 24  # attitudes of the first round that are varied again
+SEARCH_FINER: Final = 4.0  # times smaller variations of these
 SEARCH_ARM_M: Final = 3.0  # [m] at which a rotation counts like the way it makes there
 
 # ---- odometry: vertical of a built place. Tuned on: family `starts`, seeds 0 to 143, first maps.
@@ -740,27 +744,27 @@ START_PAUSE_NS: Final = 1_100_000_000  # [ns] between searches
 START_AWAITED_NS: Final = 5_000_000_000
 START_WATCHED_NS: Final = 12_000_000_000  # [ns] of the searches; by then gravity is known
 # Share of the information along the strongest direction, below which the first sweeps leave a
-# velocity open: it was wrong in 14 of 22 starts, above in 1 of 86,
+# velocity open: it was wrong in 14 of 22 starts, above in 1 of 86
 START_FIXED: Final = 0.01
-START_SHARE: Final = 0.05  # and below which a later sweep is worth a search
+START_SHARE: Final = 0.05  # such a share, below which a later sweep is worth a search
 START_LEVEL: Final = 0.7  # length that is left of a direction in the plane
 START_LEVEL_SIGMA: Final = 0.085  # [m/s^2] of gravity along the vertical of the map: half a degree
 START_LEVEL_SIGMAS: Final = 3.0  # by which it has to be off to be put there
 # [m/s^2] sigma of gravity's level components, beyond which any vertical of a built place is
 # better: at 0.5, two drives begun at 1.2 m/s^2 had 2.5 sigma left of it, and ended 1 and 86 m off
 START_LEVEL_KNOWN: Final = 0.3
-START_PRIOR: Final = 0.7  # [m/s] sigma along such a direction, at the first search,
-START_LATER: Final = 0.25  # [m/s] and at later ones, at least
+START_PRIOR: Final = 0.7  # [m/s] sigma along an open direction at the first search, at least
+START_LATER: Final = 0.25  # [m/s] sigma at later searches, at least
 START_ACCELERATION: Final = 0.15  # [m/s^2] sigma; of accelerometers' biases
 START_OPEN: Final = 0.2  # [m/s] sigma of a velocity that is open
-START_CHANGE: Final = 0.15  # [m/s] and
-START_SIGNIFICANT: Final = 3.0  # sigmas, of a change that is news,
-START_MOST_CHANGE: Final = 0.6  # [m/s] unless it is more, after the first: then points mislead
-START_SIGMAS: Final = 3.0  # to which errors are compared,
-START_REACH: Final = 3.0  # [m/s] and at most,
-START_STEP: Final = 0.1  # [m/s] in steps that are 0.2 m in the time of the points
-START_NOISE: Final = 0.08  # [m/s] error besides, 1 sigma: the median of 90 searches
-START_BETTER: Final = 0.5  # of the variance before, at most: else nothing is found
+START_CHANGE: Final = 0.15  # [m/s] of the velocity, at least, to be news
+START_SIGNIFICANT: Final = 3.0  # sigmas of that change, at least
+START_MOST_CHANGE: Final = 0.6  # [m/s] after the first search: larger changes are not believed
+START_SIGMAS: Final = 3.0  # of the velocity: how far errors of it are tried
+START_REACH: Final = 3.0  # [m/s] largest error of the velocity that is tried
+START_STEP: Final = 0.1  # [m/s] between errors: 0.2 m in the time of the points
+START_NOISE: Final = 0.08  # [m/s] added error, 1 sigma: the median of 90 searches
+START_BETTER: Final = 0.5  # of the variance before, at most, or nothing was found
 # Difference of logarithms between the most and the least likely velocity by the profile of walls.
 # Observed at the right velocity: 500 to 5000; without edges in view 0 to 310
 START_PROFILE: Final = 500.0
@@ -785,23 +789,23 @@ START_SLICE_NS: Final = 50_000_000  # [ns] in which 3 m/s are half a column
 START_COLUMN: Final = (0.3, 0.3, 0.25)  # [m] three on top of each other are upright
 START_SPOT: Final = (0.05, 0.05, 0.25)  # [m] in which one point of a sweep counts
 START_MOST: Final = 8000  # such points; bounds the time
-START_POSTS: Final = 300  # and fewer tell nothing
-START_CELLS: Final = (0.4, 0.2, 0.1)  # [m] along the way,
-START_ACROSS: Final = 0.15  # [m] across at least, as the way is known to that,
-START_ROW: Final = 0.5  # [m] and up
+START_POSTS: Final = 300  # such points, at least: fewer tell nothing
+START_CELLS: Final = (0.4, 0.2, 0.1)  # [m] length of cells along the way
+START_ACROSS: Final = 0.15  # [m] least width of cells across it, to which it is known
+START_ROW: Final = 0.5  # [m] height of cells
 # Walls: columns of points of one sweep that lie in a row. Tuned on: starts in halls, seeds 2000 to
 # 2139
 START_WALL_COLUMN: Final = 0.2  # [m] in which points are one column
 # Of the range, in which columns are compared: scan lines are 0.12 of it apart. [m] at least, most
 START_WALL_REACH: Final = (0.3, 0.6, 5.0)
-START_WALL_COLUMNS: Final = 3  # columns there, at least,
+START_WALL_COLUMNS: Final = 3  # columns within that reach, at least
 START_WALL_LENGTH: Final = 0.15  # 1 sigma of them along the wall, of the reach, at least
-START_WALL_FLAT: Final = 0.15  # and across it, of that along it, at most
+START_WALL_FLAT: Final = 0.15  # 1 sigma of them across it, of that along it, at most
 START_WALL_ANGLE: Final = 0.14  # [rad] walls that differ by less have one direction
-START_WALL_POINTS: Final = 40  # of walls of one direction, at least,
-START_WALLS: Final = 4  # and so many directions
-START_WALL_CELL: Final = 4.0  # [m] along a wall, longer than the gaps between its columns,
-START_WALL_ROW: Final = 2.0  # [m] and up
+START_WALL_POINTS: Final = 40  # of walls of one direction, at least
+START_WALLS: Final = 4  # directions of walls, at most
+START_WALL_CELL: Final = 4.0  # [m] length of cells, longer than the gaps between columns
+START_WALL_ROW: Final = 2.0  # [m] height of these cells
 START_FEW_POSTS: Final = 100  # points of posts, below which the scale below stays
 # Cells more for one unit of the logarithm, by the square root of the points. With it, a gap of
 # 5 units to the next best velocity was right to 0.3 m/s in 85 of 90 searches
@@ -811,9 +815,9 @@ START_SCALE: Final = 0.3
 # right to 0.4, but for one of 1.2 and one where gravity was off. At later searches it was wrong in
 # 4 starts and right in 2
 START_YAW_SIGMA: Final = 0.04  # [rad/s] of what is known before, at least
-START_YAW_REACH: Final = 0.105  # [rad/s] of the search,
-START_YAW_STEP: Final = 0.0175  # [rad/s] in steps that are 0.4 m at 10 m in the time of the points
-START_YAW_FINER: Final = 0.0045  # [rad/s] and then about the best one
+START_YAW_REACH: Final = 0.105  # [rad/s] largest error of the rate that is tried
+START_YAW_STEP: Final = 0.0175  # [rad/s] between errors: 0.4 m at 10 m in the time of the points
+START_YAW_FINER: Final = 0.0045  # [rad/s] between errors near the best of them
 START_YAW_VELOCITY_STEP: Final = 0.3  # [m/s] between velocities compared at each
 START_YAW_MOST: Final = 3000  # points of the first search, with the two coarser cells. Bounds time
 START_YAW_BETTER: Final = 4.0  # by the logarithm, than near no change
@@ -862,8 +866,8 @@ STILL_REACH: Final = (0.02, 0.05)  # [rad, m] a sweep may deviate, a priori
 STILL_LEAST: Final = (1e-4, 5e-4)  # [rad, m] deviations that never count
 STILL_FAR: Final = (0.035, 0.1)  # [rad, m] and one that always does
 STILL_TURN_NS: Final = 200_000_000  # [ns] shorter sweeps are averaged into a turn
-STILL_COMPARED: Final = 40  # turns whose deviations are compared,
-STILL_TESTED: Final = 12  # of these up to so many of the latest with all before
+STILL_COMPARED: Final = 40  # turns whose deviations are compared
+STILL_TESTED: Final = 12  # of the latest of these are compared with all before, at most
 # Turns that agreed before the latest one or two did not: it was a rest until then. Derived: with
 # fewer, one that accelerates evenly from the start looks like that
 STILL_OLDER: Final = 6
@@ -880,9 +884,9 @@ STILL_ONSET_NS: Final = 300_000_000  # [ns] before that, in which it may have be
 # [rad, m, m/s] 1 sigma of a motion that has begun and is not noticed yet. Source: errors of the
 # poses at rest in the hard runs, which rest for two seconds
 STILL_UNNOTICED: Final = (4e-4, 2e-4, 2.5e-3)
-RETRY_NS: Final = 4_000_000_000  # [ns] until then a rest that was none is begun again, as motion,
-RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] or, if the IMU ends it by then, if that fits closer
-RETRY_FARTHEST_M: Final = 0.5  # [m] if that went no farther
+RETRY_NS: Final = 4_000_000_000  # [ns] so long the map of a rest may begin again as in motion
+RETRY_SHORT_NS: Final = 1_000_000_000  # [ns] so long also if the IMU alone ends it, and it fits
+RETRY_FARTHEST_M: Final = 0.5  # [m] how far such a motion may lead
 # A rest that has ended is mapped again with what the first sweeps in motion tell about the unit,
 # until then, and if it went no farther. Tuned on: halls, seeds 222 to 228, where walks at 1.2 m/s
 # had known the range bias 0.2 to 1.9 s after the rest
@@ -898,9 +902,10 @@ LOST_NS: Final = 5_000_000_000  # [ns] of sweeps without a match
 UNMAPPED_NS: Final = 1_000_000_000  # [ns] of sweeps without a match
 UNMAPPED_POINTS: Final = 300  # of a sweep, at least; with fewer it is blind
 UNMAPPED_KNOWN: Final = 0.25  # share of these in known cells of the coarsest size, at most
-UNSEEN_POSITION: Final = 0.5  # [m] a clock that went back may hide such a step,
-UNSEEN_ROTATION: Final = 0.5  # [rad] such a turn,
-UNSEEN_S: Final = 2.0  # [s] and going on for so long
+# How a sensor may have moved unseen while a clock went back, 1 sigma
+UNSEEN_POSITION: Final = 0.5  # [m]
+UNSEEN_ROTATION: Final = 0.5  # [rad]
+UNSEEN_S: Final = 2.0  # [s] at the velocity that it had
 EARLIER_MAPS: Final = 2  # kept after losses. Bounds the memory
 # Searching them takes 0.2 to 0.4 s, so it is done once a second at first, then ever more rarely.
 EARLIER_PAUSE_NS: Final = 1_000_000_000  # [ns]
@@ -951,8 +956,8 @@ REVISIT_UNLIKELY_AGREEING: Final = 8
 RELOCALIZE_STEP_M: Final = 0.1  # [m] between the places; the robust kernel reaches as far
 # At most; they are farther apart where these do not suffice. Bounds the time
 RELOCALIZE_PLACES: Final = 600
-RELOCALIZE_STARTS: Final = 4  # of these places from which sweeps are aligned,
-RELOCALIZE_APART_M: Final = 0.25  # [m] so far apart
+RELOCALIZE_STARTS: Final = 4  # places from which sweeps are aligned, at most
+RELOCALIZE_APART_M: Final = 0.25  # [m] between these, at least
 # Tuned on: camera on stairs, where sweeps fit 0.16 m and more higher or lower as well, and flats
 # with a cone of 70 degrees and a rosette, where the height had drifted by 0.1 m besides
 RELOCALIZE_HEIGHT_M: Final = 0.15  # [m] by which the place may move up or down
