@@ -373,7 +373,7 @@ def turned(samples: Samples, rotation: F64) -> Samples:
     return samples
 
 
-def carried_over(linear: ArrayLike, angular: ArrayLike, T_cloud_body: F64) -> F64:
+def cloud_velocity(linear: ArrayLike, angular: ArrayLike, T_cloud_body: F64) -> F64:
     """Return the velocity of the cloud frame's origin in cloud axes [m/s], shape (3,).
 
     Parameters
@@ -389,8 +389,8 @@ def carried_over(linear: ArrayLike, angular: ArrayLike, T_cloud_body: F64) -> F6
     return np.asarray(turn @ moved)
 
 
-def covariance_of_carried(covariance: F64 | None, T_cloud_body: F64) -> F64 | None:
-    """Return the covariance (3, 3) of a velocity that :func:`carried_over` returns.
+def cloud_velocity_covariance(covariance: F64 | None, T_cloud_body: F64) -> F64 | None:
+    """Return the covariance (3, 3) of a velocity that :func:`cloud_velocity` returns.
 
     From that of the body's velocity, in its axes; None stays None. What the body's rate is
     uncertain by is left out.

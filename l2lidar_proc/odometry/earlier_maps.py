@@ -135,7 +135,7 @@ class EarlierMaps:
         return None
 
 
-class _Recently:
+class _RecentEvent:
     """Whether an event is less than a time ago.
 
     Parameters
@@ -266,10 +266,10 @@ class MapRevisit:
     def __init__(self) -> None:
         self._is_uncertain = self.is_contradicted = False
         self._meetings, self._fits = _Meetings(), _LevelFits()
-        self._met = _Recently(tuning.REVISIT_MET_NS)
-        self._unobserved = _Recently(tuning.REVISIT_SIGHT_NS)
-        self._returned = _Recently(tuning.REVISIT_MET_NS)
-        self._contradicted = _Recently(tuning.REVISIT_MET_NS)
+        self._met = _RecentEvent(tuning.REVISIT_MET_NS)
+        self._unobserved = _RecentEvent(tuning.REVISIT_SIGHT_NS)
+        self._returned = _RecentEvent(tuning.REVISIT_MET_NS)
+        self._contradicted = _RecentEvent(tuning.REVISIT_MET_NS)
         self.restart(HostNs(0))
 
     def restart(self, stamp: HostNs) -> None:

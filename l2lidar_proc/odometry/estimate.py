@@ -157,7 +157,7 @@ class OdometryEstimate:
         [rad/s], cloud axes. What else the angular velocity is uncertain by is noise of samples.
     map_error : MapError, optional
         What the map adds to ``covariance``; None where nothing is known of it.
-    late : ndarray, shape (3,)
+    stamp_velocity_error : ndarray, shape (3,)
         Error of the velocity for stamps of IMU samples that are off, 1 sigma, cloud axes [m/s].
         Part of ``twist_covariance``, but it does not last: it is the velocity of another instant.
     gyro_line : LineRates, optional
@@ -178,7 +178,7 @@ class OdometryEstimate:
     gravity: F64
     gyro_bias_covariance: F64 = field(default_factory=lambda: np.zeros((9, 3)))
     map_error: MapError | None = None
-    late: F64 = field(default_factory=lambda: np.zeros(3))
+    stamp_velocity_error: F64 = field(default_factory=lambda: np.zeros(3))
     gyro_line: LineRates | None = None
 
     def refusing(self, points: NDArray[np.void]) -> OdometryEstimate:
@@ -271,8 +271,8 @@ def estimate_of(
     twist[3:, GYRO_BIAS] = -np.eye(3)  # the rate is what was measured less the bias
     twist_covariance = twist @ p @ twist.T
     twist_covariance[3:, 3:] += gyro_noise**2 * np.eye(3)
-    late = tuning.IMU_STAMP_SIGMA * motion.acceleration
-    twist_covariance[:3, :3] += np.outer(late, late)
+    stamp_velocity_error = tuning.IMU_STAMP_SIGMA * motion.acceleration
+    twist_covariance[:3, :3] += np.outer(stamp_velocity_error, stamp_velocity_error)
     rate = motion.rate
     found = OdometryEstimate(
         stamp=state.stamp,
@@ -289,7 +289,7 @@ def estimate_of(
         gravity=state.gravity,
         gyro_bias_covariance=np.vstack((pose @ p, p[GYRO_BIAS]))[:, GYRO_BIAS],
         map_error=drift.error,
-        late=late,
+        stamp_velocity_error=stamp_velocity_error,
         gyro_line=gyro_line,
     )
     added = found.map_covariance(state.position)

@@ -410,7 +410,7 @@ class DeadReckoning:
             velocity=rotation.T @ self._velocity - rotations.cross(self._rate, self._lever),
             angular_velocity=self._rate,
             twist_covariance=twist @ self._anchor.twist_covariance @ twist.T,
-            late=turned @ self._anchor.late,
+            stamp_velocity_error=turned @ self._anchor.stamp_velocity_error,
             gyro_bias_covariance=of_bias,
         )
 
@@ -485,7 +485,9 @@ def _grown(
     """
     found = anchor.covariance.copy()
     place = found[:3, :3]
-    lasting = anchor.twist_covariance[:3, :3] - np.outer(anchor.late, anchor.late)
+    lasting = anchor.twist_covariance[:3, :3] - np.outer(
+        anchor.stamp_velocity_error, anchor.stamp_velocity_error
+    )
     then = anchor.T_map_lidar[:3, :3]
     speed = then @ lasting @ then.T * seconds**2
     ratio = np.sqrt(max(float(np.trace(speed)), 0.0) / max(float(np.trace(place)), 1e-12))

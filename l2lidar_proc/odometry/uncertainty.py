@@ -110,7 +110,7 @@ class MapError:
 
         ``first`` is that of the turn (3, 3) by these of the first pose against the map [rad^2].
         """
-        moved = _carried(place)
+        moved = _adjoint(place)
         begun = drift + self.first_pose
         begun[3:, 3:] += first
         unit[3:, 3:] += np.outer(self.lean, self.lean)
@@ -250,7 +250,7 @@ class MapDrift:
 
         Return what they are there.
         """
-        moved, back = _carried(place), _carried(-place)
+        moved, back = _adjoint(place), _adjoint(-place)
         across = np.eye(6) - along
         there = across @ moved @ most @ moved.T @ across + along @ moved @ some @ moved.T @ along
         self._current = back @ there @ back.T
@@ -303,7 +303,7 @@ class MapDrift:
         axes = np.asarray(free @ axes)
         now[_EXPECTED, :3, :3] += (axes * np.maximum(strength, 0.0)) @ axes.T
         self._with_velocity = shared + along[:3, :3] @ velocity * seconds
-        back = _carried(-place)
+        back = _adjoint(-place)
         self._current = back @ now @ back.T
         self._fall()
 
@@ -346,14 +346,14 @@ class MapDrift:
         if self._way < tuning.UNIT_FROM_M:
             self.began = self.corrections
         self._before = place
-        moved = _carried(-place)
+        moved = _adjoint(-place)
         added = moved @ covariance @ moved.T
         scale = np.repeat((np.sqrt(expected_share), 1.0), 3)
         less = moved @ (covariance * np.outer(scale, scale)) @ moved.T
         found = self._current + np.stack((added, less))
         # of sweeps that share an entry, the least certain: sight may have been lost in between
         if row < self._known:
-            here = _carried(place)[:3]
+            here = _adjoint(place)[:3]
             drift = self._history["drift"][row]
             more = here @ (found - drift) @ here.T
             is_less_certain = np.trace(more, axis1=1, axis2=2) > 0.0
@@ -413,7 +413,7 @@ class MapDrift:
 
         ``least`` is a standard deviation [m]; None where the drift is less.
         """
-        here = _carried(place)[:3]
+        here = _adjoint(place)[:3]
         squared = float(np.trace(here @ drift @ here.T))
         if squared < least**2:
             return None
@@ -481,17 +481,17 @@ def _bent(place: F64, turn: F64) -> F64:
     """Return what a covariance (3, 3) of the turn at a place makes of a pose there: (6, 6).
 
     The map was not turned at once but has bent on the way, and a unit that became known on the way
-    has bent it in part of it only. So the place is less tied to the turn than by :func:`_carried`.
+    has bent it in part of it only. So the place is less tied to the turn than by :func:`_adjoint`.
     """
-    moved = _carried(place)[:, 3:]
+    moved = _adjoint(place)[:, 3:]
     whole = moved @ turn @ moved.T
     whole[:3, 3:] *= tuning.BEND_CORRELATION
     whole[3:, :3] *= tuning.BEND_CORRELATION
     return np.asarray(whole)
 
 
-def _carried(place: F64) -> F64:
-    """Return what a shift and a turn about the origin do at a place: (6, 6)."""
+def _adjoint(place: F64) -> F64:
+    """Return the adjoint (6, 6): what a shift and a turn about the origin do at a place (3,)."""
     moved = np.eye(6)
     moved[:3, 3:] = -skew(place)
     return moved
@@ -516,7 +516,7 @@ class FrameJump:
 
     def at(self, place: F64) -> F64:
         """Return the covariance (6, 6) at another place (3,): a turn moves what is far away."""
-        moved = _carried(place - self.place)
+        moved = _adjoint(place - self.place)
         return np.asarray(moved @ self.covariance @ moved.T)
 
     def added(self, state: InertialState, covariance: F64, drift: F64) -> FrameJump:

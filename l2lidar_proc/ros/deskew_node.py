@@ -42,8 +42,8 @@ from l2lidar_proc.motion.imu_corrections import ImuConvention
 from l2lidar_proc.motion.tracker import (
     KnownMotion,
     MotionTracker,
-    carried_over,
-    covariance_of_carried,
+    cloud_velocity,
+    cloud_velocity_covariance,
 )
 from l2lidar_proc.ros import odometry_messages as messages
 from l2lidar_proc.ros.inputs import InputMonitor, load_libraries, steady_timer
@@ -342,10 +342,10 @@ class DeskewNode(ManagedNode):
         T_cloud_body = self._frames.find(self._cloud_frame, frame) if self._frames else None
         if T_cloud_body is None:
             T_cloud_body = np.eye(4)
-        velocity = carried_over(
+        velocity = cloud_velocity(
             (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), T_cloud_body
         )
-        covariance = covariance_of_carried(covariance, T_cloud_body)
+        covariance = cloud_velocity_covariance(covariance, T_cloud_body)
         self.pipeline.velocity(from_time(message.header.stamp), velocity, source, covariance)
 
     def advance(self) -> None:

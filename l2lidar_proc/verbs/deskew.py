@@ -18,7 +18,7 @@ from l2lidar_node.types import is_ros_time
 from l2lidar_proc.cloud import CloudError, position_problem, to_sweep, without_time
 from l2lidar_proc.deskew.config import DeskewNodeConfig
 from l2lidar_proc.deskew.pipeline import Deskewed, Pipeline, PipelineCounts
-from l2lidar_proc.motion.tracker import carried_over, covariance_of_carried
+from l2lidar_proc.motion.tracker import cloud_velocity, cloud_velocity_covariance
 from l2lidar_proc.odometry.config import OdometryConfig
 from l2lidar_proc.odometry.pipeline import OdometryPipeline
 from l2lidar_proc.recording import bag
@@ -170,9 +170,9 @@ class _Deskewer:
         if T_cloud_body is not None:
             self.pipeline.velocity(
                 bag.stamp_of(message),
-                carried_over(twist.linear, twist.angular, T_cloud_body),
+                cloud_velocity(twist.linear, twist.angular, T_cloud_body),
                 self._topics.velocity,
-                covariance_of_carried(twist.covariance, T_cloud_body),
+                cloud_velocity_covariance(twist.covariance, T_cloud_body),
             )
 
 

@@ -16,7 +16,7 @@ from l2lidar_node.types import IMU_SAMPLE, HostNs
 from l2lidar_proc.deskew.deskew import deskew
 from l2lidar_proc.motion.config import MotionConfig
 from l2lidar_proc.motion.sweep_motion import SweepTrajectory
-from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, carried_over
+from l2lidar_proc.motion.tracker import Flag, KnownMotion, MotionTracker, cloud_velocity
 from tests.l2lidar_proc.motion.analytic import (
     EPOCH,
     T_CLOUD_IMU,
@@ -273,7 +273,7 @@ def test_another_scale_of_the_accelerometer_holds_for_the_samples_so_far() -> No
 def test_velocity_of_a_mounted_sensor() -> None:
     """A sensor one meter ahead of a body that turns left moves to the left as well."""
     mount = rotations.transform([np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)], (1.0, 0.0, 0.2))
-    velocity = carried_over((0.5, 0, 0), (0, 0, 2.0), rotations.inverse(mount))
+    velocity = cloud_velocity((0.5, 0, 0), (0, 0, 2.0), rotations.inverse(mount))
     expected = Rotation.from_euler("z", -90, degrees=True).apply((0.5, 2.0, 0))
     np.testing.assert_allclose(velocity, expected, atol=1e-12)
 

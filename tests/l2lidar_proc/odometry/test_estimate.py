@@ -129,7 +129,7 @@ def test_the_covariances_of_an_estimate_follow_its_derivatives_by_the_state() ->
     both = jacobian @ motion.covariance @ jacobian.T
     pose = here.covariance - here.map_covariance(motion.state.position)
     twist = here.twist_covariance.copy()
-    twist[:3, :3] -= np.outer(here.late, here.late)
+    twist[:3, :3] -= np.outer(here.stamp_velocity_error, here.stamp_velocity_error)
     np.testing.assert_allclose(pose, both[:6, :6], atol=1e-8)
     np.testing.assert_allclose(twist, both[6:, 6:], atol=1e-8)
     bias = both[:6, :6] * 0.0

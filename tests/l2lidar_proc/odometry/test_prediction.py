@@ -270,7 +270,7 @@ def test_the_covariance_of_the_twist_turns_with_its_axes(estimate: Any) -> None:
         found = carry(reckoning, step)
     sigmas = np.sqrt(np.diag(found.twist_covariance)[:3])
     np.testing.assert_allclose(sigmas, (0.01, 0.1, 0.01), rtol=1e-3)
-    np.testing.assert_allclose(found.late, (0.0, -0.02, 0.0), atol=1e-4)
+    np.testing.assert_allclose(found.stamp_velocity_error, (0.0, -0.02, 0.0), atol=1e-4)
     place = np.sqrt(np.diag(found.covariance)[:3])  # of the map, where nothing has turned
     np.testing.assert_allclose(place[1:], 0.24 * 0.01, rtol=1e-3)
     assert place[0] == pytest.approx(0.24 * np.sqrt(0.1**2 - 0.02**2), rel=1e-3)
