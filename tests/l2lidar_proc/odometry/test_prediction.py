@@ -258,7 +258,7 @@ def test_the_covariance_of_the_twist_turns_with_its_axes(estimate: Any) -> None:
         twist_covariance=np.diag(np.square([0.1, 0.01, 0.01, 1e-4, 1e-4, 1e-4])),
         gyro_bias=np.zeros(3),
         gyro_bias_covariance=np.zeros((9, 3)),
-        late=np.array([0.02, 0.0, 0.0]),
+        stamp_velocity_error=np.array([0.02, 0.0, 0.0]),
         map_error=None,
         gravity=np.zeros(3),
     )
