@@ -234,14 +234,6 @@ SWEEP_MOST_S: Final = 0.5
 SWEEP_BLEND: Final = 0.05
 # Weak directions. Tuned on: camera in the room, corridor with a view of 80 degrees, rosette lidar
 WEAK_SHARE: Final = 0.12  # of the strongest; below it rims and noise of normals may prevail
-# A direction that the sweep before left free is fixed by two sweeps in a row, of so short a time
-# [ns] that the second soon follows. Tuned on: cameras looking into rooms, seeds 284 to 300, which
-# one sweep in between let run away by 6 m. Sweeps of an L2 take longer, and show more: of cones of
-# 70 degrees, which have a corner in view for a second, 4 of 10 failed with it instead of 2
-FREED_NS: Final = 150_000_000
-FREED_SHARE: Final = 0.3  # as WEAK_SHARE, of such a direction. With 0.12 too, 3 of 17 still failed
-FREED_SAME: Final = 0.7  # length of a direction within what was free, to be one of it
-FREED_PLACE: Final = 0.5  # length of the translation in a direction that is free, at least
 WEAK_FACING: Final = 0.35  # cosine: normals of walls are up to 20 degrees off in the finest cells
 # Points on surfaces that face a direction of the place: with no more than so many, the whole sweep
 # tells nothing about it. Tuned on: narrow views, seeds 100 to 115; 8 do as well, 0 worse

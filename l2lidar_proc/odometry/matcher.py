@@ -141,8 +141,6 @@ class SweepMatcher:
         # of the normals of the walls along which the carrier drives
         self._normal_scatter: F64 = np.zeros((3, 3))
         self._is_weak = False  # along them, in the latest sweep
-        self._free: F64 | None = None  # what the latest sweep left free by itself
-        self._met_at = HostNs(0)
         self._range_correction = 0.0  # of what is in the map [m]
         self._height_fixed_s = 0.0, 0.0  # of late, and the time that counts in all
 
@@ -497,7 +495,6 @@ class SweepMatcher:
         """
         self._note_height(found, seconds)
         self._is_weak = found.normal_scatter is not None
-        self._free, self._met_at = found.free, found.state.stamp
         if found.normal_scatter is not None:
             self._normal_scatter = found.normal_scatter
         free = unobserved_directions(found.information[POSITION, POSITION])
@@ -697,7 +694,6 @@ class SweepMatcher:
     ) -> Alignment | None:
         share, enough = tuning.MEETING
         least = min(enough, max(self.config.min_points // 2, round(share * len(source.points))))
-        since = motion.state.stamp - self._met_at
         return align(
             motion.state,
             motion.covariance,
@@ -708,7 +704,6 @@ class SweepMatcher:
             start,
             driving=self.driving,
             normal_scatter=self._normal_scatter,
-            free_before=self._free if since < tuning.FREED_NS else None,
         )
 
     def _placed(self, source: Source, motion: SweepMotion, most: float) -> Alignment:

@@ -76,10 +76,6 @@ class Alignment:
     normal_scatter : ndarray, shape (3, 3), optional
         Of the walls along which the carrier drives, as in
         :class:`~l2lidar_proc.odometry.registration.weak_directions.WeakAxes`.
-    free : ndarray, shape (3, L), optional
-        Directions of the place that it leaves free by itself, as in
-        :class:`~l2lidar_proc.odometry.registration.weak_directions.WeakDirections`; None where no
-        direction is weak.
     """
 
     state: InertialState
@@ -95,7 +91,6 @@ class Alignment:
     fine_inliers: int = 0
     fine_ratio: float = 0.0
     normal_scatter: F64 | None = None
-    free: F64 | None = None
 
     def fits_better_than(self, other: Alignment, points: int) -> bool:
         """Return whether this is right and another alignment of the sweep's points is wrong.
@@ -145,7 +140,6 @@ def align(
     *,
     driving: bool = False,
     normal_scatter: F64 | None = None,
-    free_before: F64 | None = None,
 ) -> Alignment | None:
     """Return the posterior of a sweep, None where fewer than ``least`` points meet a surface.
 
@@ -168,8 +162,6 @@ def align(
         Whether the carrier drives: it then leaves the rims of its view behind.
     normal_scatter : ndarray, shape (3, 3), optional
         That of the sweep before, if it has one. Used while driving.
-    free_before : ndarray, shape (3, L), optional
-        :attr:`Alignment.free` of a sweep a moment before. Used while not driving.
     """
     at = prior if start is None else start
     root = square_root(covariance)
@@ -194,14 +186,7 @@ def align(
         if done and weak is None:
             if reject_ambiguous:
                 found = found.without_points_on_two_surfaces(at.rotation)
-            axes = weak_axes(
-                at,
-                found,
-                surfaces,
-                driving=driving,
-                normal_scatter=normal_scatter,
-                free_before=free_before,
-            )
+            axes = weak_axes(at, found, surfaces, driving=driving, normal_scatter=normal_scatter)
             if axes is None:
                 step = step if found is step.found else _step(prior, root, at, found, None)
                 break
@@ -210,9 +195,7 @@ def align(
                 source = matching.with_facing(source, at, axes)
                 found = matching.of([(at, source)])[0]
             again = partial(matching.of_some, source)
-            weak = weak_directions(
-                at, found, axes, again, prior, covariance[POSE, POSE], free_before
-            )
+            weak = weak_directions(at, found, axes, again, prior, covariance[POSE, POSE])
             before = step.state
             step = _step(prior, root, at, found, weak)
             done = _is_small(step.state.boxminus(before))
@@ -289,7 +272,6 @@ class _Step(NamedTuple):
             found.fine_inliers,
             found.fine_inliers / max(found.met_fine, 1),
             None if self.weak is None else self.weak.tested.normal_scatter,
-            None if self.weak is None else self.weak.free,
         )
 
 

@@ -13,11 +13,6 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
   divided by what they should if the surfaces were there, is the share of the information that is
   real. The rest is the noise of the gradient.
 
-A direction that the sweep before left free, a moment ago, has to pass twice. The next sweep is
-tested along it even if it seems to fix it well, and what it says counts only if the one after it
-says so too: rims that have just come into view pass for a sweep, and then confirm the velocity
-with which they were mapped. Corners stay in view.
-
 Eigenvectors mix rotations with translations, so what little is known about a rotation would
 constrain the translation along a wall as well. With a narrow view, that halved the uncertainty of
 a velocity which was wrong by more. So translations that no surface faces are taken out first, as
@@ -44,7 +39,7 @@ which is the lower, the less certain the position is.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -162,7 +157,6 @@ def weak_axes(
     *,
     driving: bool = False,
     normal_scatter: F64 | None = None,
-    free_before: F64 | None = None,
 ) -> WeakAxes | None:
     """Return the directions that a sweep may not fix, None where it fixes all.
 
@@ -176,8 +170,6 @@ def weak_axes(
         Whether the carrier drives, in whatever direction.
     normal_scatter : ndarray, shape (3, 3), optional
         As in :class:`WeakAxes`, of the sweeps before; None before the first. Used while driving.
-    free_before : ndarray, shape (3, L), optional
-        :attr:`WeakDirections.free` of a sweep a moment before. Used while not driving.
     """
     # a turn counts as the way that it moves the points
     arm = float(np.sqrt((found.points**2).sum(axis=1).mean()))
@@ -185,9 +177,6 @@ def weak_axes(
     derivatives = pose_jacobian(found, state.rotation) * scale
     strength, axes = np.linalg.eigh((derivatives * found.weights[:, None]).T @ derivatives)
     weak = strength < tuning.WEAK_SHARE * strength[-1]
-    if free_before is not None and not driving:
-        is_doubted = strength < tuning.FREED_SHARE * strength[-1]
-        weak |= is_doubted & _are_among(axes, free_before)
     if not weak.any():
         return None
     axes = axes[:, weak]
@@ -263,11 +252,6 @@ def _height_apart(places: F64, gravity: F64) -> tuple[F64, NDArray[np.bool_]]:
     return np.asarray(places @ turn), is_height
 
 
-def _are_among(axes: F64, free: F64) -> NDArray[np.bool_]:
-    """Return which directions (6, K) are translations along free ones (3, L), orthonormal."""
-    return np.asarray(np.linalg.norm(free.T @ axes[_PLACE], axis=0) > tuning.FREED_SAME)
-
-
 def _is_way(axis: F64, gravity: F64) -> bool:
     """Return whether a direction (6,) is a level translation, along which one may drive."""
     way = axis[_PLACE]
@@ -339,15 +323,11 @@ class WeakDirections:
     associated : float
         Square root of the share of the information along the first direction that is left, since
         the surfaces may be others, 0 to 1.
-    free : ndarray, shape (3, L)
-        Directions of the place, orthonormal, map axes, about which this sweep by itself says
-        nothing. Empty where the carrier drives.
     """
 
     tested: WeakAxes
     shares: F64
     associated: float = 1.0
-    free: F64 = field(default_factory=lambda: np.zeros((3, 0)))
 
     def reduced(self, pose: F64, facing: NDArray[np.bool_]) -> tuple[F64, F64]:
         """Return derivatives (M, 6) by turn and place, reduced to the share that is real.
@@ -389,7 +369,6 @@ def weak_directions(
     match_again: MatchAgain,
     prior: InertialState,
     covariance: F64,
-    free_before: F64 | None = None,
 ) -> WeakDirections:
     """Return which share of the information about weak directions is real.
 
@@ -404,28 +383,14 @@ def weak_directions(
         As predicted.
     covariance : ndarray, shape (6, 6)
         Of its turn and place.
-    free_before : ndarray, shape (3, L), optional
-        As for :func:`weak_axes`.
     """
     trials = [_Trial(state, found, weak, number) for number in range(weak.axes.shape[1])]
     there = iter(match_again([view for trial in trials for view in trial.views]))
     shares = np.array([trial.real_share([next(there) for _ in trial.views]) for trial in trials])
-    if not weak.is_driven:
-        free = _places(weak.axes[:, shares == 0.0])
-        if free_before is not None:
-            shares = np.where(_are_among(weak.axes, free_before), 0.0, shares)
-        return WeakDirections(weak, shares, free=free)
-    if shares[0] == 0.0:
+    if not weak.is_driven or shares[0] == 0.0:
         return WeakDirections(weak, shares)
     moved = state.boxminus(prior)[POSE]
     return WeakDirections(weak, shares, trials[0].associated(shares[0], moved, covariance))
-
-
-def _places(axes: F64) -> F64:
-    """Return what translations there are among directions (6, K), orthonormal (3, L)."""
-    places = axes[_PLACE]
-    places = places[:, np.linalg.norm(places, axis=0) > tuning.FREED_PLACE]
-    return np.asarray(np.linalg.qr(places)[0])
 
 
 class _Trial:

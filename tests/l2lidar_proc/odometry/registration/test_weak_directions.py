@@ -11,15 +11,13 @@ from l2lidar_node.types import F64, HostNs
 from l2lidar_proc import tuning
 from l2lidar_proc.motion import filter as eskf
 from l2lidar_proc.motion.filter import InertialState
-from l2lidar_proc.odometry.config import OdometryConfig, SurfaceConfig
+from l2lidar_proc.odometry.config import SurfaceConfig
 from l2lidar_proc.odometry.local_map.surfel_map import SurfelMap
 from l2lidar_proc.odometry.local_map.surfels import YoungSurfaces
-from l2lidar_proc.odometry.matcher import SweepMatcher
 from l2lidar_proc.odometry.registration import weak_directions
 from l2lidar_proc.odometry.registration.alignment import Alignment, align
 from l2lidar_proc.odometry.registration.correspondences import Source, correspondences
 from l2lidar_proc.odometry.registration.weak_directions import WeakAxes, weak_axes
-from tests.l2lidar_proc.odometry import mapped_room
 
 SIZES = (0.15, 0.3, 0.6, 1.5)
 REACH = 0.15
@@ -379,55 +377,6 @@ def test_a_way_that_nothing_faces_is_free_however_weak_turns_are() -> None:
     assert found is not None
     assert found.information[3, 3] < 1e-4 * found.information[4, 4]
     assert found.covariance[3, 3] > 0.19**2
-
-
-@pytest.mark.parametrize("facing", [60, 180])
-def test_two_sweeps_in_a_row_fix_what_one_has_left_free(facing: int) -> None:
-    """With 180 points the way along the corridor is not even weak, but for that."""
-    rng = np.random.default_rng(12)
-    surfaces = mapped(rng, facing=600)
-    covariance = 0.02**2 * np.eye(eskf.ERRORS)
-
-    def found(count: int, before: F64 | None) -> Alignment:
-        points = np.vstack((walls(rng, 1000), reveals(rng, count)))
-        alignment = align(
-            at(), covariance, source(points), surfaces, SurfaceConfig(), 100, free_before=before
-        )
-        assert alignment is not None
-        return alignment
-
-    bare = found(0, None)
-    assert bare.free is not None
-    np.testing.assert_allclose(np.abs(bare.free.T), [[1.0, 0.0, 0.0]], atol=0.05)
-    assert bare.information[3, 3] < 1e-4 * bare.information[4, 4]
-    undoubted = found(facing, None).information[3, 3]
-    assert undoubted > 0.02 * bare.information[4, 4]
-    first = found(facing, bare.free)
-    assert first.free is not None
-    assert first.free.shape == (3, 0)  # by itself it fixes the way
-    assert first.information[3, 3] < 0.15 * undoubted
-    second = found(facing, first.free)
-    assert second.information[3, 3] == pytest.approx(undoubted, rel=0.5)
-
-
-def test_what_a_sweep_leaves_free_is_forgotten_after_a_moment() -> None:
-    rng = np.random.default_rng(13)
-    surfaces = mapped(rng, facing=600)
-    matcher = SweepMatcher(OdometryConfig(), np.zeros(3))
-    matcher.surfaces = surfaces
-    known = []
-    for seconds, count in ((0.0, 0), (0.1, 60), (0.2, 60), (0.3, 0), (0.5, 60)):
-        motion = mapped_room.motion((0.02, 0.02), np.zeros(3))
-        stamp = HostNs(motion.state.stamp + round(1e9 * seconds))
-        motion = motion.with_state(
-            dataclasses.replace(motion.state, stamp=stamp), motion.covariance
-        )
-        points = np.vstack((walls(rng, 1000), reveals(rng, count)))
-        found = matcher.match(source(points), motion).alignment
-        assert found is not None
-        matcher.meet(found, 0.1)
-        known.append(found.fixes_place)
-    assert known == [False, False, True, False, True]
 
 
 @pytest.mark.parametrize("facing", [True, False])
