@@ -243,7 +243,7 @@ class _LevelFits:
 
     @property
     def are_one_unlikely_place(self) -> bool:
-        """Whether so many of the last agree that the place may be an unlikely one."""
+        """Whether enough of the last agree for a place that an unlikely drift would lead to."""
         return self._agreeing() >= tuning.REVISIT_UNLIKELY_AGREEING
 
     def _agreeing(self) -> int:
@@ -390,9 +390,10 @@ class MapRevisit:
     ) -> tuple[Alignment | None, bool]:
         """Return how a sweep meets the older part of the map, and whether that counts already.
 
-        It does where the latest sweeps agree, and at once where it relocalizes the pose by a
-        likely drift, unless it has just returned, and no other sweep has fitted elsewhere. A pose
-        that is known to be wrong is searched with each sweep, so that one may fit by chance.
+        It does where the latest sweeps agree, more of them where the drift would be an unlikely
+        one; and at once where it relocalizes the pose by a likely drift, unless it has just
+        returned, and no other sweep has fitted elsewhere. A pose that is known to be wrong is
+        searched with each sweep, so that one may fit by chance.
         """
         older, place = part.matcher, motion.state.position
         uncertain = _kept_level(motion.state, older.drift.at(place))
