@@ -207,6 +207,9 @@ class FirstRest:
     def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> Remapping:
         """Begin the map again, if the beams are known better than in it.
 
+        A rest that is not in doubt is not refuted by that: people who walk by move a sweep or two.
+        If the sensor does move, the sweeps to come show it.
+
         Parameters
         ----------
         still : SweepMotion
@@ -223,8 +226,14 @@ class FirstRest:
         self._mapped_with = self._intrinsics.corrections
         better = [self._intrinsics.applied_to(one) for one in self.sweeps]
         self.initializer.matcher.drift.corrections = self._intrinsics.corrections
-        agree = self.initializer.begin_again_at_rest(better, still.state, still.covariance)
-        return Remapping.CONFIRMED if agree else Remapping.REFUTED
+        start = still.state, still.covariance
+        if self.initializer.begin_again_at_rest(better, *start):
+            return Remapping.CONFIRMED
+        if doubted:
+            return Remapping.REFUTED
+        self.initializer.map_rest(better, *start)
+        self._zero_velocity.resume(still.state)
+        return Remapping.CONFIRMED
 
     def resume_if_beams_explain(self, still: SweepMotion, seen: Source) -> bool:
         """Resume the rest if unknown beam angles may be why sweeps deviate; return whether so.

@@ -319,6 +319,28 @@ def test_sweeps_that_deviate_are_compared_at_once() -> None:
     assert odometry._intrinsics._rested_ns > 600_000_000
 
 
+@pytest.mark.parametrize("doubted", [False, True])
+def test_a_better_known_unit_does_not_refute_a_rest_that_is_not_in_doubt(doubted: bool) -> None:
+    """Somebody walks by: mapped again, the sweeps seem to drift by more than a rest allows."""
+    odometry, _ = at_rest()
+    rest, test, still = odometry._first_rest, odometry._zero_velocity, odometry.motion
+    assert still is not None
+    for number, sweep in enumerate(rest.sweeps):
+        points = sweep.points.copy()
+        points["x"] += 0.08 * number
+        rest.sweeps[number] = dataclasses.replace(sweep, points=points)
+    odometry._intrinsics.ranges.correction += 0.03
+    count = len(rest.sweeps)
+    found = rest.map_with_known_beams(still, doubted=doubted)
+    assert found is (Remapping.REFUTED if doubted else Remapping.CONFIRMED)
+    assert (test.anchor is None) == doubted
+    if not doubted:  # all sweeps are in the map, and the next are compared from here on
+        assert test.anchor is not None
+        np.testing.assert_array_equal(test.anchor.position, still.state.position)
+        assert not test.drifted
+        assert odometry.matcher._sweeps == count
+
+
 def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better() -> None:
     odometry, some = at_rest()
     rest, intrinsics = odometry._first_rest, odometry._intrinsics
