@@ -67,7 +67,7 @@ TUNED: Final[dict[str, tuple[range, ...]]] = {
         range(100, 176),
         range(190, 206),
         range(222, 257),
-        range(261, 302),
+        range(261, 310),
     ),
 }
 """Seeds of each family that were looked at while the estimator was tuned; the others judge it."""
