@@ -32,10 +32,10 @@ from l2lidar_proc.odometry.zero_velocity import ZeroVelocityTest
 
 
 class Remapping(Enum):
-    """Whether the map of a rest has begun again, and what its sweeps show then."""
+    """Whether the map of a rest has begun again, and whether the rest stands then."""
 
     NONE = "the map stays as it is"
-    CONFIRMED = "the map has begun again, and its sweeps agree that the sensor is at rest"
+    CONFIRMED = "the map has begun again, and the rest stands"
     REFUTED = "the map has begun again, and its sweeps show motion"
 
 
@@ -207,8 +207,8 @@ class FirstRest:
     def map_with_known_beams(self, still: SweepMotion, *, doubted: bool) -> Remapping:
         """Begin the map again, if the beams are known better than in it.
 
-        A rest that is not in doubt is not refuted by that: people who walk by move a sweep or two.
-        If the sensor does move, the sweeps to come show it.
+        Sweeps that deviate only in the new map do not refute the rest, as people who walk by make
+        them deviate too. If the sensor does move, the next sweeps show it.
 
         Parameters
         ----------

@@ -16,7 +16,7 @@ that. A direction that is weak by the eigenvalues (Zhang et al. 2016) is therefo
 Eigenvectors mix rotations with translations, so what little is known about a rotation would
 constrain the translation along a wall as well. With a narrow view, that halved the uncertainty of
 a velocity which was wrong by more. So translations that no surface faces are taken out first, as
-directions of their own, about which only the few points say anything that face them.
+directions of their own. For these, only the few points that face them count.
 
 A carrier that drives leaves the rims of its view behind, and an error of its velocity soon adds
 up. There, five rules are stricter, and in turn surfaces count sooner:

@@ -334,11 +334,14 @@ def test_a_better_known_unit_does_not_refute_a_rest_that_is_not_in_doubt(doubted
     found = rest.map_with_known_beams(still, doubted=doubted)
     assert found is (Remapping.REFUTED if doubted else Remapping.CONFIRMED)
     assert (test.anchor is None) == doubted
-    if not doubted:  # all sweeps are in the map, and the next are compared from here on
+    if not doubted:  # all sweeps are in the map, corrected; the next are compared from here on
         assert test.anchor is not None
         np.testing.assert_array_equal(test.anchor.position, still.state.position)
         assert not test.drifted
         assert odometry.matcher._sweeps == count
+        corrected = odometry._intrinsics.applied_to(rest.sweeps[0])
+        met = odometry.matcher.surfaces.match(xyz(corrected.points))
+        assert np.median(np.abs(met.distances)) < 0.01  # else 0.02
 
 
 def test_a_rest_that_has_just_ended_is_recalibrated_if_the_unit_is_known_better() -> None:
